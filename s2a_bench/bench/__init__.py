@@ -1,0 +1,1 @@
+"""What is measured: sessions, interleaving, servers as processes, environment, guards."""

@@ -1,0 +1,69 @@
+"""Time as a dependency: CLOCK_MONOTONIC for measuring, a virtual clock for tests and studies.
+
+All times are integer nanoseconds. Times of two processes on one host are comparable because Linux keeps
+one CLOCK_MONOTONIC per boot; `clock_id` names that clock, so that times of two hosts are never subtracted.
+"""
+
+from __future__ import annotations
+
+import time
+from functools import cache
+from pathlib import Path
+from typing import Protocol
+
+now_ns = time.monotonic_ns
+"""Read CLOCK_MONOTONIC, in nanoseconds."""
+
+
+@cache
+def clock_id() -> str:
+    """Name this host's CLOCK_MONOTONIC: the kernel's boot id."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+
+def realtime_offset_ns() -> int:
+    """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, read between two readings of the latter."""
+    before = now_ns()
+    real = time.clock_gettime_ns(time.CLOCK_REALTIME)
+    return real - (before + now_ns()) // 2
+
+
+class Clock(Protocol):
+    """Something that tells the time and can wait for a time."""
+
+    def now_ns(self) -> int:
+        """Tell the time."""
+        ...
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Return at ``deadline_ns`` or at once if that is past."""
+        ...
+
+
+class SystemClock:
+    """CLOCK_MONOTONIC."""
+
+    def now_ns(self) -> int:
+        """Read CLOCK_MONOTONIC."""
+        return now_ns()
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Sleep; returns late by the scheduler's latency, never early."""
+        while (left := deadline_ns - now_ns()) > 0:
+            time.sleep(left / 1e9)
+
+
+class VirtualClock:
+    """A clock that jumps: sleeping takes no time and moves the clock to the deadline."""
+
+    def __init__(self, start_ns: int = 0) -> None:
+        """Start at ``start_ns``."""
+        self._now_ns = start_ns
+
+    def now_ns(self) -> int:
+        """Tell the virtual time."""
+        return self._now_ns
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Jump to the deadline; never backwards."""
+        self._now_ns = max(self._now_ns, deadline_ns)

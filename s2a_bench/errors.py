@@ -1,0 +1,59 @@
+"""Every error a user can meet, as one tree; the message names the flag, path or key and the way out.
+
+S2AError
+├── UsageError           a flag's value, or a combination of flags, makes no sense (exit code 2)
+├── SourceError          a camera, video or image folder cannot deliver frames
+├── EngineError          an engine cannot start or answer
+│   └── ModelError       a model file is missing, damaged or of the wrong kind
+├── TransportError       a request did not make its way
+│   ├── RequestFailed    the server refused or broke off this one request; the next may succeed
+│   ├── PortInUse        a server cannot bind its address
+│   └── ServerDied       the server's process is gone
+└── StoreError           a run folder cannot be written or read
+"""
+
+from __future__ import annotations
+
+
+class S2AError(Exception):
+    """Base of every expected failure: printed as one line, without a traceback."""
+
+    exit_code = 1
+
+
+class UsageError(S2AError):
+    """A flag's value, or a combination of flags, makes no sense."""
+
+    exit_code = 2
+
+
+class SourceError(S2AError):
+    """A camera, video or image folder cannot deliver frames."""
+
+
+class EngineError(S2AError):
+    """An engine cannot start or answer."""
+
+
+class ModelError(EngineError):
+    """A model file is missing, damaged or of the wrong kind."""
+
+
+class TransportError(S2AError):
+    """A request did not make its way to the server and back."""
+
+
+class RequestFailed(TransportError):
+    """The server refused or broke off this one request; the next may succeed."""
+
+
+class PortInUse(TransportError):
+    """A server cannot bind its address."""
+
+
+class ServerDied(TransportError):
+    """The server's process is gone."""
+
+
+class StoreError(S2AError):
+    """A run folder cannot be written or read."""

@@ -1,0 +1,64 @@
+"""What answers: an Engine turns a request with RGB pictures into a stream of tokens."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Protocol
+
+from s2a_bench.errors import UsageError
+from s2a_bench.types import Request, Token
+
+
+class Engine(Protocol):
+    """A model, or something that behaves like one. One request at a time; not thread-safe."""
+
+    def generate(self, request: Request) -> Iterator[Token]:
+        """Yield the answer's tokens, at most ``request.max_tokens``; closing the iterator cancels the rest.
+
+        Pictures are ``rgb8``. Raises EngineError for a request that cannot be answered (a bad grammar,
+        a prompt longer than the context).
+        """
+        ...
+
+    def describe(self) -> dict[str, str | int | float | bool]:
+        """Say what answers, for the manifest: engine, model file, hash, whether the weights are dummies."""
+        ...
+
+    def close(self) -> None:
+        """Free the model; may be called twice."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class EngineConfig:
+    """Which engine, on which files, with which settings; plain data, so that a server process can be told."""
+
+    name: str = "llama"
+    model: Path | None = None
+    """GGUF language model; None: the tiny dummy, made on first use."""
+    mmproj: Path | None = None
+    """GGUF vision tower and projector that goes with ``model``."""
+    threads: int = 0
+    """CPU threads; 0: as many as this process may use."""
+    gpu_layers: int = 0
+    """Layers on the GPU; -1: all."""
+    context: int = 4096
+    """Context length in tokens."""
+
+
+ENGINES: dict[str, str] = {
+    "llama": "s2a_bench.inference.llama_cpp:LlamaCppEngine",
+    "echo": "s2a_bench.inference.echo:EchoEngine",
+}
+"""Value of ``--engine`` -> class, built as ``Class(config)``."""
+
+
+def open_engine(config: EngineConfig) -> Engine:
+    """Start the engine that ``config`` names; raises UsageError for an unknown name, EngineError otherwise."""
+    if config.name not in ENGINES:
+        raise UsageError(f"--engine: '{config.name}' is none of {', '.join(ENGINES)}")
+    engine: Engine = resolve_name(ENGINES[config.name])(config)
+    return engine

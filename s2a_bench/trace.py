@@ -1,0 +1,157 @@
+"""Marks and stages: where the time of one request went.
+
+A *mark* closes the stretch of time since the mark before it and says which stage that stretch was; the empty
+name says that it belongs to no stage. The marks of client and server, on one clock, form one chain in order of
+time, so the stages and the residual (the unnamed stretches) add up to the whole by construction.
+
+The chain starts with an unnamed mark when capture (request mode) or the prompt (stream mode) starts, and the
+first token seen by the client is the mark `return`. Everything is in integer nanoseconds of CLOCK_MONOTONIC.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from s2a_bench.clock import clock_id, now_ns
+
+Mark: TypeAlias = tuple[str, int]
+"""(stage that ends here or "", time in ns)."""
+
+RESIDUAL = ""
+"""The name of a stretch that belongs to no stage."""
+
+STAGES: dict[str, str] = {
+    "capture": "capture",
+    "convert": "encode",
+    "image_encode": "encode",
+    "base64_encode": "encode",
+    "json_pack": "pack",
+    "cdr_pack": "pack",
+    "connect": "network",
+    "network": "network",
+    "ingest": "ingest",
+    "json_parse": "parse",
+    "cdr_parse": "parse",
+    "base64_decode": "decode",
+    "image_decode": "decode",
+    "yuv_decode": "decode",
+    "channel_swap": "decode",
+    "queue": "queue",
+    "inference": "inference",
+    "return": "return",
+}
+"""Fine stage -> group, in the order of the path. `connect` appears where a client is built per request,
+`ingest` where the server is a black box (last byte packed -> slot started: network, parse, decode and queue)."""
+
+GROUPS: tuple[str, ...] = tuple(dict.fromkeys(STAGES.values()))
+"""The groups in the order of the path."""
+
+
+@dataclass(slots=True)
+class Remote:
+    """What a server tells about one request, in its last message."""
+
+    clock: str
+    marks: list[Mark] = field(default_factory=list)
+    token_ns: list[int] = field(default_factory=list)
+    frame_index: int = -1
+    frame_marks: list[Mark] = field(default_factory=list)
+
+
+class Trace:
+    """The record of one request on one side of the wire.
+
+    ``token_ns`` holds a server's times at which tokens left the engine, a client's times at which it saw them.
+    ``facts`` holds what the other side says about itself (llama.cpp's ``timings`` and the like).
+    """
+
+    __slots__ = ("facts", "frame_index", "frame_marks", "marks", "remote", "token_ns")
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self.marks: list[Mark] = []
+        self.token_ns: list[int] = []
+        self.facts: dict[str, float] = {}
+        self.remote: Remote | None = None
+        self.frame_index = -1
+        self.frame_marks: list[Mark] = []
+
+    def mark(self, stage: str) -> None:
+        """Say that the time since the previous mark was spent in ``stage``; costs about 0.15 us."""
+        self.marks.append((stage, now_ns()))
+
+    def to_remote(self) -> Remote:
+        """Return what a server sends back about this request."""
+        return Remote(clock_id(), self.marks, self.token_ns, self.frame_index, self.frame_marks)
+
+    def chain(self) -> list[Mark]:
+        """Join both sides' marks in order of time; the server's are left out if its clock is not ours."""
+        if self.remote is None or self.remote.clock != clock_id():
+            return list(self.marks)
+        return sorted([*self.marks, *self.remote.marks], key=lambda mark: mark[1])
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """Durations derived from one chain, in ns: stages and residual sum to ``e2e_ns`` exactly."""
+
+    stages_ns: dict[str, int]
+    residual_ns: int
+    e2e_ns: int
+
+    @property
+    def inference_ns(self) -> int | None:
+        """Return the inference stage, or None where the chain has none."""
+        return self.stages_ns.get("inference")
+
+    @property
+    def e2e_without_inference_ns(self) -> int | None:
+        """Return e2e minus inference: what the paper's 101.8 and 15.5 ms can only be."""
+        inference = self.inference_ns
+        return None if inference is None else self.e2e_ns - inference
+
+    @property
+    def residual_share(self) -> float | None:
+        """Return the residual as a share of e2e without inference."""
+        whole = self.e2e_without_inference_ns
+        return None if not whole else self.residual_ns / whole
+
+    def groups_ns(self) -> dict[str, int]:
+        """Sum the stages by group; a group without stages is absent."""
+        groups: dict[str, int] = {}
+        for stage, duration in self.stages_ns.items():
+            group = STAGES[stage]
+            groups[group] = groups.get(group, 0) + duration
+        return groups
+
+
+def budget(chain: Iterable[Mark]) -> Budget:
+    """Derive the durations of a chain; a stage that was marked twice is the sum of both stretches.
+
+    Raises KeyError for a stage that `STAGES` does not list.
+    """
+    marks = iter(chain)
+    stages: dict[str, int] = {}
+    residual = 0
+    _, first = next(marks, (RESIDUAL, 0))
+    previous = first
+    for stage, now in marks:
+        if stage:
+            STAGES[stage]
+            stages[stage] = stages.get(stage, 0) + now - previous
+        else:
+            residual += now - previous
+        previous = now
+    return Budget(stages, residual, previous - first)
+
+
+def mark_cost_ns(repeats: int = 20_000) -> float:
+    """Measure what one mark costs on this machine, in ns."""
+    trace = Trace()
+    mark = trace.mark
+    start = now_ns()
+    for _ in range(repeats):
+        mark("capture")
+    return (now_ns() - start) / repeats

@@ -1,0 +1,57 @@
+"""The nouns every package shares: a frame, a request about frames, a token of the answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Pixels: TypeAlias = NDArray[np.uint8]
+
+Encoding: TypeAlias = Literal["yuv422_yuy2", "bgr8", "rgb8", "mono8", "jpeg", "png"]
+"""Pixel formats by their ROS names (``sensor_msgs/image_encodings.hpp``), and the two compressed ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One picture, in the format its source delivers.
+
+    ``data`` is uint8: (height, width, 2) for ``yuv422_yuy2``, (height, width, 3) for ``bgr8`` and
+    ``rgb8``, (height, width) for ``mono8``, (n,) for ``jpeg`` and ``png``. ``stamp_ns`` is the instant
+    of capture on CLOCK_MONOTONIC; ``index`` counts frames of one source from 0.
+    """
+
+    index: int
+    stamp_ns: int
+    width: int
+    height: int
+    encoding: Encoding
+    data: Pixels
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One question to a model: a prompt about zero or more pictures.
+
+    A client receives it with frames as captured; a handler and an engine receive it with ``rgb8`` frames.
+    ``grammar`` is GBNF text (llama.cpp ``grammars/README.md``); an empty string means none.
+    """
+
+    id: str
+    prompt: str
+    images: tuple[Frame, ...] = ()
+    max_tokens: int = 32
+    grammar: str = ""
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Token:
+    """One piece of the answer as it leaves the model; ``id`` is the vocabulary index, -1 if unknown."""
+
+    index: int
+    text: str
+    id: int = -1
