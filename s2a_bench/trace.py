@@ -40,10 +40,12 @@ STAGES: dict[str, str] = {
     "channel_swap": "decode",
     "queue": "queue",
     "inference": "inference",
+    "server": "server",
     "return": "return",
 }
 """Fine stage -> group, in the order of the path. `connect` appears where a client is built per request,
-`ingest` where the server is a black box (last byte packed -> slot started: network, parse, decode and queue)."""
+`ingest` where the server is a llama-server (last byte packed -> slot started: network, parse, decode and queue), and
+`server` where it is a black box that tells nothing (last byte packed -> first token)."""
 
 GROUPS: tuple[str, ...] = tuple(dict.fromkeys(STAGES.values()))
 """The groups in the order of the path."""
@@ -51,23 +53,28 @@ GROUPS: tuple[str, ...] = tuple(dict.fromkeys(STAGES.values()))
 
 @dataclass(slots=True)
 class Remote:
-    """What a server tells about one request, in its last message."""
+    """What a server tells about one request, in its last message.
+
+    ``frame_stamp_ns`` and ``frame_marks`` are there in stream mode: the ROS-time stamp of the cached frame that
+    was used, and that frame's own way through the server.
+    """
 
     clock: str
     marks: list[Mark] = field(default_factory=list)
     token_ns: list[int] = field(default_factory=list)
-    frame_index: int = -1
+    frame_stamp_ns: int = -1
     frame_marks: list[Mark] = field(default_factory=list)
+    facts: dict[str, float] = field(default_factory=dict)
 
 
 class Trace:
     """The record of one request on one side of the wire.
 
-    ``token_ns`` holds a server's times at which tokens left the engine, a client's times at which it saw them.
-    ``facts`` holds what the other side says about itself (llama.cpp's ``timings`` and the like).
+    ``token_ns`` holds the times at which tokens left the engine; ``facts`` what the engine or a black-box server
+    says about itself (llama.cpp's ``timings`` and the like); a client's ``remote`` what the server sent back.
     """
 
-    __slots__ = ("facts", "frame_index", "frame_marks", "marks", "remote", "token_ns")
+    __slots__ = ("facts", "frame_marks", "frame_stamp_ns", "marks", "remote", "token_ns")
 
     def __init__(self) -> None:
         """Start empty."""
@@ -75,16 +82,21 @@ class Trace:
         self.token_ns: list[int] = []
         self.facts: dict[str, float] = {}
         self.remote: Remote | None = None
-        self.frame_index = -1
+        self.frame_stamp_ns = -1
         self.frame_marks: list[Mark] = []
 
     def mark(self, stage: str) -> None:
         """Say that the time since the previous mark was spent in ``stage``; costs about 0.15 us."""
         self.marks.append((stage, now_ns()))
 
+    def receive(self, remote: Remote) -> None:
+        """Keep what the server sent back about this request."""
+        self.remote = remote
+        self.facts.update(remote.facts)
+
     def to_remote(self) -> Remote:
         """Return what a server sends back about this request."""
-        return Remote(clock_id(), self.marks, self.token_ns, self.frame_index, self.frame_marks)
+        return Remote(clock_id(), self.marks, self.token_ns, self.frame_stamp_ns, self.frame_marks, self.facts)
 
     def chain(self) -> list[Mark]:
         """Join both sides' marks in order of time; the server's are left out if its clock is not ours."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import NDArray
 
-    Pixels: TypeAlias = NDArray[np.uint8]
+Pixels: TypeAlias = NDArray[np.uint8]
 
 Encoding: TypeAlias = Literal["yuv422_yuy2", "bgr8", "rgb8", "mono8", "jpeg", "png"]
 """Pixel formats by their ROS names (``sensor_msgs/image_encodings.hpp``), and the two compressed ones."""

@@ -1,0 +1,52 @@
+"""Cyclone DDS configuration: loopback unless the user's ROS environment asks for more, tuned unless told not to.
+
+Honoured when set: CYCLONEDDS_URI (replaces everything here), ROS_AUTOMATIC_DISCOVERY_RANGE
+(OFF, LOCALHOST, SUBNET, SYSTEM_DEFAULT) and ROS_STATIC_PEERS (REP-2021-style, separated by ';').
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from xml.sax.saxutils import quoteattr
+
+from s2a_bench.errors import UsageError
+from s2a_bench.ros import Tuning
+
+RANGES = ("OFF", "LOCALHOST", "SUBNET", "SYSTEM_DEFAULT")
+
+TUNED_GENERAL = "<MaxMessageSize>65500B</MaxMessageSize><FragmentSize>65000B</FragmentSize>"
+TUNED_INTERNAL = '<Internal><SocketReceiveBufferSize max="16MB"/></Internal>'
+"""Fragments of nearly the largest UDP datagram, and the receive buffer the kernel allows: half the time for a VGA
+image, and no lost fragments at 1920x1080 (shared/LIMITS.md)."""
+
+
+def domain_id(environ: Mapping[str, str]) -> int:
+    """Return the DDS domain ROS_DOMAIN_ID names, 0 without it; raises UsageError for what is no domain."""
+    text = environ.get("ROS_DOMAIN_ID") or "0"
+    if not text.isdecimal() or not 0 <= int(text) <= 232:  # noqa: PLR2004 - the last domain with valid ports
+        raise UsageError(f"ROS_DOMAIN_ID: '{text}' is not a number from 0 to 232; unset it or choose one")
+    return int(text)
+
+
+def configuration(environ: Mapping[str, str], tuning: Tuning) -> str | None:
+    """Return the XML for ``cyclonedds.domain.Domain``, or None to leave it to the user's CYCLONEDDS_URI."""
+    if environ.get("CYCLONEDDS_URI"):
+        return None
+    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST").upper()
+    if reach not in RANGES:
+        raise UsageError(f"ROS_AUTOMATIC_DISCOVERY_RANGE: '{reach}' is none of {', '.join(RANGES)}")
+    peers = [peer for peer in environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
+    local = reach in {"OFF", "LOCALHOST"} and not peers
+    if local or reach == "LOCALHOST":
+        peers.insert(0, "127.0.0.1")
+    interface = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>' if local else ""
+    general = interface + f"<AllowMulticast>{'false' if reach in {'OFF', 'LOCALHOST'} else 'true'}</AllowMulticast>"
+    if tuning == "tuned":
+        general += TUNED_GENERAL
+    listed = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in peers)
+    return (
+        f'<CycloneDDS><Domain id="any"><General>{general}</General>'
+        f"{TUNED_INTERNAL if tuning == 'tuned' else ''}"
+        "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+        f"<SPDPInterval>1s</SPDPInterval><Peers>{listed}</Peers></Discovery></Domain></CycloneDDS>"
+    )
