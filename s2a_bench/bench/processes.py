@@ -1,0 +1,164 @@
+"""Server processes seen from the harness: start, wait until ready, notice death, stop."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from abc import ABC, abstractmethod
+from pathlib import Path
+from selectors import EVENT_READ, DefaultSelector
+from typing import IO, Any
+
+import httpx
+
+from s2a_bench import errors
+from s2a_bench.bench.serving import ServerJob
+from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.errors import EngineError, PortInUse, ServerDied, UsageError
+from s2a_bench.inference import EngineConfig
+
+READY_TIMEOUT_S = 600.0
+"""A model of several GB may have to come from a slow disk."""
+STOP_TIMEOUT_S = 3.0
+
+
+class ServerProcess(ABC):
+    """A child process that serves; use as a context manager."""
+
+    def __init__(self, name: str, command: list[str], log: Path) -> None:
+        """Start ``command``; whatever it prints goes to ``log``."""
+        self.name = name
+        self.log = log
+        self.address = ""
+        self.facts: dict[str, Any] = {}
+        self._log: IO[bytes] = log.open("wb")
+        self._process = subprocess.Popen(  # noqa: S603 - the command is ours or the user's own llama-server
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE if self._speaks_json else self._log,
+            stderr=self._log,
+            start_new_session=True,  # Ctrl-C is the harness's to handle
+        )
+
+    _speaks_json = True
+
+    @abstractmethod
+    def wait_ready(self) -> None:
+        """Return when requests can be sent; raises ServerDied, or what the server says is wrong."""
+
+    @property
+    def pid(self) -> int:
+        """Return the process id."""
+        return self._process.pid
+
+    def alive(self) -> bool:
+        """Tell whether the process still runs."""
+        return self._process.poll() is None
+
+    def death(self) -> ServerDied:
+        """Describe how the process ended, with the last line it wrote."""
+        code = self._process.poll()
+        how = f"killed by signal {-code}" if code is not None and code < 0 else f"exit code {code}"
+        lines = self.log.read_text(errors="replace").strip().splitlines()
+        last = f": {lines[-1][:200]}" if lines else ""
+        return ServerDied(f"the {self.name} server (pid {self.pid}) died, {how}{last}; its log is {self.log}")
+
+    def stop(self) -> None:
+        """Ask the process to stop, then make it."""
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
+        for end in (lambda: None, self._process.terminate, self._process.kill):
+            end()
+            try:
+                self._process.wait(STOP_TIMEOUT_S)
+                break
+            except subprocess.TimeoutExpired:
+                continue
+        self._log.close()
+
+    def __enter__(self) -> ServerProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+class OwnServer(ServerProcess):
+    """Our instrumented server."""
+
+    def __init__(self, job: ServerJob, log: Path) -> None:
+        """Start it and tell it its job."""
+        super().__init__(job.route.transport, [sys.executable, "-m", "s2a_bench.bench.serving"], log)
+        assert self._process.stdin is not None  # noqa: S101 - opened as a pipe above
+        self._process.stdin.write(job.to_json().encode() + b"\n")
+        self._process.stdin.flush()
+
+    def wait_ready(self) -> None:
+        """Read the one line it answers."""
+        stdout = self._process.stdout
+        assert stdout is not None  # noqa: S101 - opened as a pipe above
+        with DefaultSelector() as selector:
+            selector.register(stdout, EVENT_READ)
+            if not selector.select(READY_TIMEOUT_S):
+                raise ServerDied(f"the {self.name} server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
+        line = stdout.readline()
+        if not line:
+            self._process.wait(STOP_TIMEOUT_S)
+            raise self.death()
+        answer = json.loads(line)
+        if "error" in answer:
+            kind = getattr(errors, answer["kind"], EngineError)
+            raise kind(answer["error"])
+        self.address = answer.pop("address")
+        self.facts = answer
+
+
+class LlamaServer(ServerProcess):
+    """llama.cpp's own server on the same model files: a black box."""
+
+    _speaks_json = False
+
+    def __init__(self, binary: Path, engine: EngineConfig, port: int, log: Path) -> None:
+        """Start the binary on ``port``, or any free one for 0; raises UsageError when it cannot be run."""
+        if not (binary.is_file() and os.access(binary, os.X_OK)):
+            raise UsageError(f"--llama-server: {binary} is no program that can be run")
+        port = port or _free_port()
+        command = [str(binary), "--model", str(engine.model), "--mmproj", str(engine.mmproj)]
+        command += ["--host", "127.0.0.1", "--port", str(port), "--ctx-size", str(engine.context), "--parallel", "1"]
+        if engine.threads:
+            command += ["--threads", str(engine.threads)]
+        if engine.gpu_layers:
+            command += ["--gpu-layers", str(engine.gpu_layers) if engine.gpu_layers > 0 else "999"]
+        super().__init__("llama-server", command, log)
+        self.address = f"http://127.0.0.1:{port}"
+        self.facts = {"command": command}
+
+    def wait_ready(self) -> None:
+        """Poll ``/health`` until the model is loaded."""
+        clock = SystemClock()
+        deadline = now_ns() + int(READY_TIMEOUT_S * 1e9)
+        while now_ns() < deadline:
+            if not self.alive():
+                raise self.death()
+            try:
+                if httpx.get(self.address + "/health", trust_env=False).is_success:
+                    return
+            except httpx.TransportError:
+                pass  # it does not listen yet
+            clock.sleep_until_ns(now_ns() + 100_000_000)
+        raise ServerDied(f"llama-server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
+
+
+def _free_port() -> int:
+    """Find a port that is free now."""
+    with socket.socket() as probe:
+        try:
+            probe.bind(("127.0.0.1", 0))
+        except OSError as error:
+            raise PortInUse(f"--port: no free port on 127.0.0.1: {error.strerror}") from error
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,0 +1,124 @@
+"""The words on the HTTP wire: request bodies and streamed events, without any I/O.
+
+The dialect is OpenAI's ``chat/completions`` with Server-Sent Events. Three things are added, all optional: the
+media type ``application/x-raw`` for uncompressed pixels, the fields ``grammar`` (as llama-server has it) and
+``request_id``, and in the last event the key ``s2a`` with the server's marks.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import orjson
+import pybase64
+
+from s2a_bench.trace import Remote
+from s2a_bench.types import Request
+
+AS_DEPLOYED, BEST_EFFORT, BINARY = VARIANTS = ("as-deployed", "best-effort", "binary")
+
+PATHS = {
+    AS_DEPLOYED: "/v1/chat/completions",
+    BEST_EFFORT: "/best-effort/v1/chat/completions",
+    BINARY: "/binary/v1/chat/completions",
+}
+"""Variant -> path on our own server; a black box is always asked at the first."""
+
+PARAMETERS_HEADER = "s2a-request"
+"""Binary variant: the parameters as ASCII JSON in this header, the picture's bytes as the body."""
+
+
+@dataclass(frozen=True, slots=True)
+class Codec:
+    """The JSON and Base64 functions of a variant."""
+
+    dumps: Callable[[Any], bytes]
+    loads: Callable[[str | bytes], Any]
+    to_base64: Callable[[Any], str]
+    from_base64: Callable[[str], bytes]
+
+
+def _dumps(value: Any) -> bytes:
+    """Serialise exactly as httpx and the OpenAI SDK do."""
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
+
+
+STANDARD = Codec(
+    dumps=_dumps,
+    loads=json.loads,
+    to_base64=lambda data: base64.b64encode(data).decode("ascii"),
+    from_base64=base64.b64decode,
+)
+# validate=True is pybase64's fast path: .06 against .35 ms for a VGA frame (shared/LIMITS.md)
+FAST = Codec(
+    dumps=orjson.dumps,
+    loads=orjson.loads,
+    to_base64=pybase64.b64encode_as_string,
+    from_base64=lambda text: pybase64.b64decode(text, validate=True),
+)
+CODECS = {AS_DEPLOYED: STANDARD, BEST_EFFORT: FAST, BINARY: FAST}
+
+
+def data_uri(media_type: str, encoded: str) -> str:
+    """Join a data URI (RFC 2397)."""
+    return f"data:{media_type};base64,{encoded}"
+
+
+def split_data_uri(uri: str) -> tuple[str, str]:
+    """Return the media type and the Base64 text of a data URI; ValueError for anything else."""
+    head, comma, encoded = uri.partition(",")
+    if not (comma and head.startswith("data:") and head.endswith(";base64")):
+        raise ValueError(f"image_url.url should be a data:...;base64,... URI, not '{uri[:40]}...'")
+    return head[len("data:") : -len(";base64")], encoded
+
+
+def parameters(request: Request, model: str, *, black_box: bool) -> dict[str, Any]:
+    """Return the request's fields apart from the messages."""
+    fields: dict[str, Any] = {
+        "model": model,
+        "stream": True,
+        "stream_options": {"include_usage": True},
+        "max_tokens": request.max_tokens,
+        "temperature": 0.0,
+        "seed": request.seed,
+    }
+    if request.grammar:
+        fields["grammar"] = request.grammar
+    if black_box:
+        fields["cache_prompt"] = False  # llama-server: a repeated picture must not give a false fast first token
+    else:
+        fields["request_id"] = request.id
+    return fields
+
+
+def messages(prompt: str, uris: list[str]) -> list[dict[str, Any]]:
+    """Return one user message: the pictures, then the prompt."""
+    parts: list[dict[str, Any]] = [{"type": "image_url", "image_url": {"url": uri}} for uri in uris]
+    return [{"role": "user", "content": [*parts, {"type": "text", "text": prompt}]}]
+
+
+def chunk(request_id: str, delta: dict[str, str], finish_reason: str | None = None, **extra: Any) -> dict[str, Any]:
+    """Return one streamed event; with ``usage`` in ``extra`` it is the last and has no choices."""
+    choices = [] if "usage" in extra else [{"index": 0, "delta": delta, "finish_reason": finish_reason}]
+    return {"id": request_id, "object": "chat.completion.chunk", "model": "s2a", "choices": choices, **extra}
+
+
+def remote_to_json(remote: Remote) -> dict[str, Any]:
+    """Turn a server's marks into what the last event carries."""
+    return asdict(remote)
+
+
+def remote_of_json(value: dict[str, Any]) -> Remote:
+    """Read a server's marks from the last event."""
+    return Remote(
+        clock=value["clock"],
+        marks=[(stage, stamp) for stage, stamp in value["marks"]],
+        token_ns=value["token_ns"],
+        frame_stamp_ns=value["frame_stamp_ns"],
+        frame_marks=[(stage, stamp) for stage, stamp in value["frame_marks"]],
+        facts=value["facts"],
+    )

@@ -1,0 +1,70 @@
+"""The pipeline without a wire: the client calls the server's handler, in process, without a copy.
+
+The same conversions and the same hand-over as everywhere else, so it is the floor that other transports are
+compared with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import count
+from threading import Event
+
+from s2a_bench.errors import EngineError, RequestFailed, ServerDied
+from s2a_bench.trace import Trace
+from s2a_bench.transport import Handler, Route
+from s2a_bench.transport.pictures import bgr_of, rgb_of
+from s2a_bench.types import Request, Token
+
+_servers: dict[str, LoopbackServer] = {}
+_numbers = count()
+
+
+class LoopbackServer:
+    """A handler that clients of this process find by its address."""
+
+    def __init__(self, route: Route, handler: Handler) -> None:
+        """Register under ``route.address``, or a new name without one."""
+        self.address = route.address or f"loopback-{next(_numbers)}"
+        self.handler = handler
+        self._stopped = Event()
+        _servers[self.address] = self
+
+    def serve(self) -> None:
+        """Wait for `stop`; requests run on their clients' threads."""
+        self._stopped.wait()
+
+    def stop(self) -> None:
+        """Become unknown to clients."""
+        _servers.pop(self.address, None)
+        self._stopped.set()
+
+
+class LoopbackClient:
+    """Calls the handler directly."""
+
+    def __init__(self, route: Route, alive: Callable[[], bool]) -> None:
+        """Remember the address; the server is looked up for each request."""
+        del alive  # a server in this process lives as long as it is registered
+        self._address = route.address
+
+    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
+        """Convert, swap channels and hand over, all on the calling thread."""
+        server = _servers.get(self._address)
+        if server is None:
+            raise ServerDied(f"no loopback server '{self._address}' in this process")
+        images = tuple(rgb_of(bgr_of(frame, trace), trace) for frame in request.images)
+        served = Trace()
+        tokens = server.handler(replace(request, images=images), served)
+        try:
+            for index, token in enumerate(tokens):
+                if not index:
+                    trace.mark("return")
+                yield token
+        except EngineError as error:
+            raise RequestFailed(str(error)) from error
+        trace.receive(served.to_remote())
+
+    def close(self) -> None:
+        """Do nothing: there is no connection."""

@@ -1,0 +1,82 @@
+"""What happens to a picture on its way, whatever carries it: client-side encoding, server-side decoding to RGB."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from s2a_bench.errors import RequestFailed, UsageError
+from s2a_bench.frames.convert import (
+    bgr_to_rgb,
+    decode_image,
+    encode_jpeg,
+    encode_png,
+    to_bgr,
+    yuyv_to_rgb,
+)
+from s2a_bench.trace import Trace
+from s2a_bench.types import Frame, Pixels
+
+JPEG_QUALITY = 90
+RAW_MIME = "application/x-raw"
+PREENCODED = {"jpeg": "image/jpeg", "png": "image/png"}
+
+
+def bgr_of(frame: Frame, trace: Trace) -> Frame:
+    """Convert what a camera delivers to ``bgr8``; marks `convert` where there is something to do."""
+    if frame.encoding == "bgr8":
+        return frame
+    converted = replace(frame, encoding="bgr8", data=to_bgr(frame))
+    trace.mark("convert")
+    return converted
+
+
+def rgb_of(frame: Frame, trace: Trace) -> Frame:
+    """Turn any raw frame into the ``rgb8`` an engine wants; marks `channel_swap` or `yuv_decode`."""
+    if frame.encoding == "rgb8":
+        return frame
+    if frame.encoding == "bgr8":
+        data = bgr_to_rgb(frame.data)
+        trace.mark("channel_swap")
+    elif frame.encoding == "yuv422_yuy2":
+        data = yuyv_to_rgb(frame.data)
+        trace.mark("yuv_decode")
+    else:
+        data = bgr_to_rgb(to_bgr(frame))
+        trace.mark("image_decode")
+    return replace(frame, encoding="rgb8", data=data)
+
+
+def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
+    """Return the media type and the bytes that travel for ``payload``; marks `convert` and `image_encode`."""
+    if frame.encoding in PREENCODED:
+        return PREENCODED[frame.encoding], frame.data
+    bgr = bgr_of(frame, trace)
+    if payload == "raw":
+        return f"{RAW_MIME};encoding=bgr8;width={bgr.width};height={bgr.height}", bgr.data.reshape(-1)
+    if payload == "jpeg":
+        data = encode_jpeg(bgr.data, JPEG_QUALITY)
+    elif payload == "png":
+        data = encode_png(bgr.data)
+    else:
+        raise UsageError(f"payload '{payload}' needs a frame that is encoded already")
+    trace.mark("image_encode")
+    return f"image/{payload}", data
+
+
+def decoded(media_type: str, data: bytes, trace: Trace) -> Frame:
+    """Turn received bytes into an ``rgb8`` frame; marks `image_decode` or `channel_swap`. Raises RequestFailed."""
+    try:
+        if media_type.startswith(RAW_MIME):
+            facts = dict(part.split("=", 1) for part in media_type.split(";")[1:])
+            width, height = int(facts["width"]), int(facts["height"])
+            pixels = np.frombuffer(data, np.uint8).reshape(height, width, 3)
+            if facts["encoding"] != "bgr8":
+                raise ValueError(f"raw encoding '{facts['encoding']}' is not bgr8")
+            return rgb_of(Frame(-1, 0, width, height, "bgr8", pixels), trace)
+        rgb = decode_image(data)
+    except (ValueError, KeyError) as error:
+        raise RequestFailed(f"the {len(data)} bytes sent as {media_type} are no such picture: {error}") from error
+    trace.mark("image_decode")
+    return Frame(-1, 0, rgb.shape[1], rgb.shape[0], "rgb8", rgb)
