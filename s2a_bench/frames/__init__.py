@@ -47,3 +47,11 @@ def open_source(spec: str, width: int, height: int, *, fps: float = 30.0, seed: 
         raise UsageError(f"--source: '{spec}' should be " + (f"{scheme}:PATH" if not where else "plain 'synthetic'"))
     source: FrameSource = resolve_name(SOURCES[scheme])(where, width, height, fps=fps, seed=seed)
     return source
+
+
+def check_size(width: int, height: int, *, smallest: int = 1, even: bool = False) -> None:
+    """Raise UsageError unless a source can have this size; ``even`` is for YUYV, which holds pixels in pairs."""
+    if width < smallest or height < smallest:
+        raise UsageError(f"--size: {width}x{height} should be {smallest}x{smallest} or more")
+    if even and width % 2:
+        raise UsageError(f"--size: {width}x{height} should have an even width, YUYV holds pixels in pairs")

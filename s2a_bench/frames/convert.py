@@ -1,0 +1,117 @@
+"""Exact colour conversion and image coding on uint8 arrays, by OpenCV on one thread.
+
+YUYV is ITU-R BT.601 with limited range (Y 16..235), as V4L2 cameras deliver it. OpenCV computes it in 20-bit
+fixed point, within 1 of the real-valued formula. Pixel arrays may be read-only or windows of larger ones as long as
+the pixels of a row lie together; ``out`` must not overlap ``data``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeAlias, cast
+
+import cv2
+import numpy as np
+
+if TYPE_CHECKING:
+    from s2a_bench.types import Frame, Pixels
+
+    BytesLike: TypeAlias = bytes | bytearray | memoryview | Pixels
+
+# One conversion takes a fraction of a millisecond: OpenCV's worker threads save little of it and compete with
+# the model and the middleware for cores, which would disturb what is measured.
+cv2.setNumThreads(1)
+
+# Newer OpenCV has the decoder write RGB itself: the same pixels without another pass over the picture; 4.9 cannot.
+_DECODE_RGB: int | None = getattr(cv2, "IMREAD_COLOR_RGB", None)
+
+
+def yuyv_to_bgr(data: Pixels, out: Pixels | None = None) -> Pixels:
+    """Convert (h, w, 2) ``yuv422_yuy2`` to (h, w, 3) ``bgr8``, into ``out`` if given; ValueError on a wrong shape."""
+    return _convert(data, 2, cv2.COLOR_YUV2BGR_YUY2, out)
+
+
+def yuyv_to_rgb(data: Pixels, out: Pixels | None = None) -> Pixels:
+    """Convert (h, w, 2) ``yuv422_yuy2`` to (h, w, 3) ``rgb8``, into ``out`` if given; ValueError on a wrong shape."""
+    return _convert(data, 2, cv2.COLOR_YUV2RGB_YUY2, out)
+
+
+def bgr_to_rgb(data: Pixels, out: Pixels | None = None) -> Pixels:
+    """Swap the outer channels of (h, w, 3), either way, into ``out`` if given; ValueError on a wrong shape."""
+    return _convert(data, 3, cv2.COLOR_BGR2RGB, out)
+
+
+def to_bgr(frame: Frame) -> Pixels:
+    """Return the frame's picture as (h, w, 3) ``bgr8``: its own data where it is that already, else a new array.
+
+    Raises ValueError when the data does not fit the frame's encoding.
+    """
+    data = frame.data
+    match frame.encoding:
+        case "bgr8":
+            return data
+        case "yuv422_yuy2":
+            return yuyv_to_bgr(data)
+        case "rgb8":
+            return bgr_to_rgb(data)
+        case "mono8":
+            return cast("Pixels", cv2.cvtColor(data, cv2.COLOR_GRAY2BGR))
+        case "jpeg" | "png":
+            return _decode(data, cv2.IMREAD_COLOR)
+
+
+def encode_jpeg(bgr: Pixels, quality: int = 90) -> Pixels:
+    """Compress (h, w, 3) ``bgr8`` to JPEG with 4:2:0 chroma, as (n,) uint8; ``quality`` is libjpeg's, 1 to 100."""
+    return _encode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def encode_png(bgr: Pixels) -> Pixels:
+    """Compress (h, w, 3) ``bgr8`` to PNG without loss, as (n,) uint8."""
+    return _encode(".png", bgr, [])
+
+
+def decode_image(data: BytesLike) -> Pixels:
+    """Decode a JPEG, PNG or other picture file to (h, w, 3) ``rgb8``; ValueError when it is none.
+
+    A JPEG that is cut short is an error to OpenCV 5; OpenCV 4 fills in what is missing.
+    """
+    if _DECODE_RGB is not None:
+        return _decode(data, _DECODE_RGB)
+    return bgr_to_rgb(_decode(data, cv2.IMREAD_COLOR))
+
+
+def resize(bgr: Pixels, width: int, height: int) -> Pixels:
+    """Scale (h, w, 3) to (height, width, 3), as it is where it fits already; the aspect ratio is not kept."""
+    if bgr.shape[:2] == (height, width):
+        return bgr
+    return cast("Pixels", cv2.resize(bgr, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def _convert(data: Pixels, channels: int, code: int, out: Pixels | None) -> Pixels:
+    """Run one cvtColor; checked first, because OpenCV would quietly leave an unfit ``out`` untouched."""
+    if data.ndim != 3 or data.shape[2] != channels or data.dtype != np.uint8:  # noqa: PLR2004
+        raise ValueError(f"pixels should be uint8 of shape (h, w, {channels}), not {data.dtype} {data.shape}")
+    if channels == 2 and data.shape[1] % 2:  # noqa: PLR2004
+        raise ValueError(f"YUYV holds pixels in pairs: the width cannot be {data.shape[1]}")
+    if out is not None and (out.shape != (*data.shape[:2], 3) or out.dtype != np.uint8):
+        raise ValueError(f"out should be uint8 of shape {(*data.shape[:2], 3)}, not {out.dtype} {out.shape}")
+    return cast("Pixels", cv2.cvtColor(data, code, dst=out))
+
+
+def _encode(suffix: str, bgr: Pixels, parameters: list[int]) -> Pixels:
+    """Compress with one of OpenCV's encoders."""
+    done, data = cv2.imencode(suffix, bgr, parameters)
+    if not done:
+        raise ValueError(f"OpenCV cannot write {bgr.dtype} {bgr.shape} as {suffix}")
+    return data
+
+
+def _decode(data: BytesLike, flags: int) -> Pixels:
+    """Decode with OpenCV, every way of failing made one."""
+    buffer = np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
+    try:
+        picture = cv2.imdecode(buffer, flags) if buffer.size else None
+    except cv2.error as error:
+        raise ValueError(f"the {buffer.size} bytes are no picture that OpenCV can read: {error}") from error
+    if picture is None:
+        raise ValueError(f"the {buffer.size} bytes are no picture that OpenCV can read")
+    return cast("Pixels", picture)

@@ -1,0 +1,204 @@
+"""Colour conversion against OpenCV's own codes and against BT.601 written out."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from numpy.typing import NDArray
+
+from s2a_bench.frames.convert import (
+    bgr_to_rgb,
+    decode_image,
+    encode_jpeg,
+    encode_png,
+    resize,
+    to_bgr,
+    yuyv_to_bgr,
+    yuyv_to_rgb,
+)
+from s2a_bench.types import Encoding, Frame
+
+Array = NDArray[np.uint8]
+
+
+def pictures(channels: int, *, even: bool = False) -> st.SearchStrategy[Array]:
+    """Any small picture."""
+    width = st.integers(1, 35).map(lambda half: half * 2) if even else st.integers(1, 70)
+    shapes = st.tuples(st.integers(1, 5), width, st.just(channels))
+    return shapes.flatmap(lambda shape: npst.arrays(np.uint8, shape))
+
+
+def _noise(*shape: int) -> Array:
+    return np.random.default_rng(1).integers(0, 256, shape, np.uint8)
+
+
+def planes(yuyv: Array) -> tuple[NDArray[np.int64], ...]:
+    """Return Y - 16, and each pixel's U - 128 and V - 128."""
+    wide = yuyv.astype(np.int64)
+    return wide[..., 0] - 16, wide[:, 0::2, 1].repeat(2, axis=1) - 128, wide[:, 1::2, 1].repeat(2, axis=1) - 128
+
+
+def bt601_fixed_point(yuyv: Array) -> Array:
+    """BT.601 limited range in 20-bit fixed point, black below Y = 16: what OpenCV documents in its source."""
+    y, u, v = planes(yuyv)
+    y = np.maximum(y, 0) * 1220542
+    rgb = (y + 1673527 * v, y - 852492 * v - 409993 * u, y + 2116026 * u)
+    return np.stack([((channel + (1 << 19)) >> 20).clip(0, 255) for channel in rgb], axis=-1).astype(np.uint8)
+
+
+def bt601_real(yuyv: Array) -> NDArray[np.float64]:
+    """BT.601 limited range from its two constants, Kr and Kb."""
+    y, u, v = planes(yuyv)
+    red, blue = 0.299, 0.114
+    green = 1 - red - blue
+    luma = np.maximum(y, 0) / 219
+    u_, v_ = u / 112, v / 112
+    r = luma + (1 - red) * v_
+    b = luma + (1 - blue) * u_
+    g = luma - (red * (1 - red) * v_ + blue * (1 - blue) * u_) / green
+    return (np.stack([r, g, b], axis=-1) * 255).clip(0, 255)
+
+
+@given(pictures(2, even=True))
+def test_yuyv_is_bt601_in_fixed_point_exactly(yuyv: Array) -> None:
+    np.testing.assert_array_equal(yuyv_to_rgb(yuyv), bt601_fixed_point(yuyv))
+
+
+@given(pictures(2, even=True))
+def test_yuyv_is_within_one_and_a_half_of_bt601_in_real_numbers(yuyv: Array) -> None:
+    # one from OpenCV's coefficients, rounded to three decimals (1.164, 1.596, ...), a half from rounding the result
+    assert np.abs(yuyv_to_rgb(yuyv) - bt601_real(yuyv)).max() <= 1.5
+
+
+@given(pictures(2, even=True))
+def test_the_conversions_are_opencvs_documented_codes(yuyv: Array) -> None:
+    np.testing.assert_array_equal(yuyv_to_bgr(yuyv), cv2.cvtColor(yuyv, cv2.COLOR_YUV2BGR_YUY2))
+    np.testing.assert_array_equal(yuyv_to_rgb(yuyv), cv2.cvtColor(yuyv, cv2.COLOR_YUV2RGB_YUY2))
+
+
+@pytest.mark.parametrize(
+    ("y", "u", "v", "rgb"),
+    [
+        (16, 128, 128, (0, 0, 0)),
+        (235, 128, 128, (255, 255, 255)),
+        (81, 90, 240, (254, 0, 0)),
+        (145, 54, 34, (0, 255, 1)),
+        (41, 240, 110, (0, 0, 255)),
+    ],
+)
+def test_the_colour_bars_come_out_right(y: int, u: int, v: int, rgb: tuple[int, int, int]) -> None:
+    pair = np.array([[[y, u], [y, v]]], np.uint8)
+    assert yuyv_to_rgb(pair)[0].tolist() == [list(rgb)] * 2
+
+
+@given(pictures(3))
+def test_swapping_twice_changes_nothing(bgr: Array) -> None:
+    np.testing.assert_array_equal(bgr_to_rgb(bgr), bgr[..., ::-1])
+    np.testing.assert_array_equal(bgr_to_rgb(bgr_to_rgb(bgr)), bgr)
+
+
+@given(pictures(2, even=True))
+def test_rgb_is_bgr_swapped(yuyv: Array) -> None:
+    np.testing.assert_array_equal(bgr_to_rgb(yuyv_to_bgr(yuyv)), yuyv_to_rgb(yuyv))
+
+
+def test_a_given_buffer_is_filled_and_returned() -> None:
+    yuyv = _noise(8, 10, 2)
+    out = np.zeros((8, 10, 3), np.uint8)
+    assert yuyv_to_bgr(yuyv, out) is out
+    np.testing.assert_array_equal(out, yuyv_to_bgr(yuyv))
+    swapped = np.zeros_like(out)
+    assert bgr_to_rgb(out, swapped) is swapped
+    np.testing.assert_array_equal(swapped, yuyv_to_rgb(yuyv))
+
+
+def test_read_only_pixels_and_windows_convert_as_well() -> None:
+    yuyv = _noise(20, 40, 2)
+    received = np.frombuffer(yuyv.tobytes(), np.uint8).reshape(yuyv.shape)
+    assert not received.flags.writeable
+    np.testing.assert_array_equal(yuyv_to_bgr(received), yuyv_to_bgr(yuyv))
+    np.testing.assert_array_equal(yuyv_to_bgr(yuyv[3:9, 4:20]), yuyv_to_bgr(yuyv)[3:9, 4:20])
+
+
+@pytest.mark.parametrize("shape", [(4, 4, 3), (4, 4), (4, 5, 2)])
+def test_pixels_that_are_no_yuyv_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"\(h, w, 2\)|width cannot be 5"):
+        yuyv_to_bgr(np.zeros(shape, np.uint8))
+
+
+def test_a_buffer_that_does_not_fit_is_refused_and_not_passed_over() -> None:
+    with pytest.raises(ValueError, match=r"out should be uint8 of shape \(4, 4, 3\)"):
+        yuyv_to_bgr(np.zeros((4, 4, 2), np.uint8), np.zeros((4, 6, 3), np.uint8))
+
+
+@given(pictures(3))
+@settings(max_examples=30)
+def test_png_keeps_every_pixel(bgr: Array) -> None:
+    np.testing.assert_array_equal(decode_image(encode_png(bgr)), bgr_to_rgb(bgr))
+
+
+def test_jpeg_keeps_colours_and_their_order() -> None:
+    bgr = np.full((32, 48, 3), (200, 120, 40), np.uint8)
+    assert np.abs(decode_image(encode_jpeg(bgr)).astype(int) - (40, 120, 200)).max() <= 2
+
+
+def test_decoding_gives_the_pixels_of_opencvs_bgr_decoder_swapped() -> None:
+    data = encode_jpeg(_noise(40, 60, 3))
+    bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert bgr is not None
+    np.testing.assert_array_equal(decode_image(data), bgr[..., ::-1])
+
+
+def test_a_lower_quality_weighs_less() -> None:
+    bgr = _noise(64, 64, 3)
+    assert encode_jpeg(bgr, 50).nbytes < encode_jpeg(bgr).nbytes < encode_jpeg(bgr, 100).nbytes
+
+
+def test_any_bytes_like_decodes() -> None:
+    data = encode_png(_noise(6, 8, 3))
+    expected = decode_image(data)
+    for same in (data.tobytes(), bytearray(data), data.data):
+        np.testing.assert_array_equal(decode_image(same), expected)
+
+
+@pytest.mark.parametrize("data", [b"", b"x", b"\xff\xd8\xff\xe0" + bytes(60), bytes(1000)])
+def test_garbage_is_no_picture(data: bytes) -> None:
+    with pytest.raises(ValueError, match=f"the {len(data)} bytes are no picture"):
+        decode_image(data)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "make"),
+    [
+        ("bgr8", lambda bgr: bgr),
+        ("rgb8", bgr_to_rgb),
+        ("png", encode_png),
+    ],
+)
+def test_to_bgr_undoes_every_lossless_encoding(encoding: Encoding, make: object) -> None:
+    bgr = _noise(6, 8, 3)
+    assert callable(make)
+    np.testing.assert_array_equal(to_bgr(Frame(0, 0, 8, 6, encoding, make(bgr))), bgr)
+
+
+def test_to_bgr_converts_cameras_grey_and_jpeg() -> None:
+    yuyv, grey = _noise(6, 8, 2), _noise(6, 8)
+    np.testing.assert_array_equal(to_bgr(Frame(0, 0, 8, 6, "yuv422_yuy2", yuyv)), yuyv_to_bgr(yuyv))
+    np.testing.assert_array_equal(to_bgr(Frame(0, 0, 8, 6, "mono8", grey)), grey[..., None].repeat(3, axis=2))
+    jpeg = encode_jpeg(yuyv_to_bgr(yuyv))
+    np.testing.assert_array_equal(to_bgr(Frame(0, 0, 8, 6, "jpeg", jpeg)), bgr_to_rgb(decode_image(jpeg)))
+
+
+def test_resizing_averages_and_leaves_a_fitting_picture_alone() -> None:
+    bgr = np.zeros((4, 8, 3), np.uint8)
+    bgr[:, 4:] = 200
+    assert resize(bgr, 8, 4) is bgr
+    assert resize(bgr, 2, 1).tolist() == [[[0, 0, 0], [200, 200, 200]]]
+
+
+def test_opencv_runs_on_one_thread() -> None:
+    assert cv2.getNumThreads() == 1

@@ -1,0 +1,54 @@
+"""What ``--source`` accepts, and how it says no."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.errors import SourceError, UsageError
+from s2a_bench.frames import SOURCES, open_source
+from s2a_bench.frames.synthetic import SyntheticCamera
+
+
+def test_the_synthetic_camera_opens_with_its_settings() -> None:
+    source = open_source("synthetic", 32, 16, fps=12.5, seed=9)
+    assert isinstance(source, SyntheticCamera)
+    assert (source.width, source.height, source.fps) == (32, 16, 12.5)
+    assert source.read().data.tobytes() == SyntheticCamera("", 32, 16, fps=12.5, seed=9).read().data.tobytes()
+
+
+@pytest.mark.parametrize("spec", ["webcam", "", "http://camera", "Synthetic"])
+def test_an_unknown_scheme_lists_those_there_are(spec: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        open_source(spec, 64, 48)
+    message = str(caught.value)
+    assert message.startswith(f"--source: '{spec}'")
+    assert all(scheme in message for scheme in SOURCES)
+
+
+@pytest.mark.parametrize("scheme", ["video", "images", "v4l2"])
+def test_a_scheme_without_its_path_is_refused(scheme: str) -> None:
+    with pytest.raises(UsageError, match=f"--source: '{scheme}' should be {scheme}:PATH"):
+        open_source(scheme, 64, 48)
+
+
+def test_a_path_for_the_synthetic_camera_is_refused() -> None:
+    with pytest.raises(UsageError, match="should be plain 'synthetic'"):
+        open_source("synthetic:x", 64, 48)
+
+
+@pytest.mark.parametrize("scheme", ["video", "images", "v4l2"])
+def test_a_path_that_is_missing_is_named(scheme: str, tmp_path: Path) -> None:
+    path = tmp_path / "with:colon"
+    with pytest.raises(SourceError) as caught:
+        open_source(f"{scheme}:{path}", 64, 48)
+    assert str(caught.value).startswith("--source: ")
+    assert str(path) in str(caught.value)
+
+
+def test_importing_the_package_does_not_load_opencv() -> None:
+    check = "import sys, s2a_bench.frames; sys.exit('cv2' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
