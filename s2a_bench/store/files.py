@@ -1,0 +1,149 @@
+r"""Tables on disk: a CSV that grows by whole records, and the Parquet file made from it.
+
+A record goes to the kernel in one write, so a killed process loses at most the record under way. A record ends
+at a line feed with an even number of quotation marks before it (RFC 4180, with ``\n``); what follows the last
+such line feed is torn and is dropped when read. An empty field is null, in text columns the empty text.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from s2a_bench.errors import StoreError
+from s2a_bench.store.schema import Kind, Row, Table, Value
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class CsvFile:
+    """One table's CSV, open for appending; it must not exist before."""
+
+    def __init__(self, path: Path, columns: Iterable[str]) -> None:
+        """Create the file and write its header."""
+        self.path = path
+        try:
+            self._file = path.open("xb", buffering=0)
+        except OSError as error:
+            raise StoreError(f"cannot create {path}: {error.strerror}; choose another --output") from error
+        self._end = 0
+        self._write(",".join(columns) + "\n")
+
+    def append(self, table: Table[Row], rows: Iterable[Row]) -> None:
+        """Write rows in one system call."""
+        self._write("".join(",".join(map(_field, table.values(row))) + "\n" for row in rows))
+
+    def close(self) -> None:
+        """Close the file; may be called twice."""
+        self._file.close()
+
+    def _write(self, text: str) -> None:
+        """Append the text as a whole or not at all."""
+        # A model may yield half a character; the file must stay valid UTF-8.
+        data = text.encode("utf-8", "backslashreplace")
+        try:
+            written = self._file.write(data)
+            while written < len(data):
+                # Cut short: the rest either goes through now or says why not (the disk is full).
+                written += self._file.write(data[written:])
+        except OSError as error:
+            self._file.truncate(self._end)
+            self._file.seek(self._end)
+            raise StoreError(f"cannot write {self.path}: {error.strerror}; samples so far are kept") from error
+        self._end += len(data)
+
+
+def _field(value: Value) -> str:
+    """Write one field; floats in full, so that they read back as they were."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    text = str(value)
+    if any(mark in text for mark in ',"\r\n'):
+        return '"' + text.replace('"', '""') + '"'
+    return text
+
+
+def whole_records(data: bytes) -> bytes:
+    """Return the data up to the end of its last whole record."""
+    end = position = quotes = 0
+    for line in data.split(b"\n")[:-1]:
+        position += len(line) + 1
+        quotes += line.count(b'"')
+        if quotes % 2 == 0:
+            end = position
+    return data[:end]
+
+
+def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
+    """Read a table's CSV as a ``pyarrow.Table``, without its torn end; a file that is not there is an empty table."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    schema = _arrow_schema(columns)
+    data = whole_records(path.read_bytes()) if path.exists() else b""
+    if not data:
+        return schema.empty_table()
+    try:
+        return csv.read_csv(
+            pa.BufferReader(data),
+            # One block: a quoted line feed may stand anywhere.
+            read_options=csv.ReadOptions(use_threads=False, block_size=len(data) + 1),
+            parse_options=csv.ParseOptions(newlines_in_values=True, ignore_empty_lines=False),
+            convert_options=csv.ConvertOptions(
+                column_types=schema,
+                include_columns=list(columns),
+                null_values=[""],
+                strings_can_be_null=False,
+                true_values=["true"],
+                false_values=["false"],
+            ),
+        )
+    except (pa.ArrowInvalid, pa.ArrowKeyError) as error:
+        raise StoreError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
+
+
+def write_parquet(path: Path, table: Any) -> None:
+    """Write a ``pyarrow.Table``; the file appears whole or not at all."""
+    from pyarrow import parquet
+
+    part = path.with_suffix(".part")
+    try:
+        parquet.write_table(table, part)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise StoreError(f"cannot write {path}: {os.strerror(error.errno or 0)}; the CSV files are complete") from error
+
+
+def read_parquet(path: Path, columns: dict[str, Kind]) -> Any:
+    """Read a table's Parquet file as a ``pyarrow.Table``."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        return parquet.read_table(path, columns=list(columns)).cast(_arrow_schema(columns))
+    except (OSError, pa.ArrowException, ValueError) as error:
+        raise StoreError(f"{path} is damaged: {str(error).splitlines()[0]}; remove it to read the CSV") from error
+
+
+def to_pandas(table: Any) -> pd.DataFrame:
+    """Turn a ``pyarrow.Table`` into a DataFrame whose integers stay integers and whose nulls stay nulls."""
+    import pandas as pd
+    import pyarrow as pa
+
+    dtypes = {pa.int64(): pd.Int64Dtype(), pa.float64(): pd.Float64Dtype(), pa.string(): pd.StringDtype()}
+    frame: pd.DataFrame = table.to_pandas(types_mapper=dtypes.get)
+    return frame
+
+
+def _arrow_schema(columns: dict[str, Kind]) -> Any:
+    """Return the ``pyarrow.Schema`` of a table."""
+    import pyarrow as pa
+
+    types = {"string": pa.string(), "int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_()}
+    return pa.schema([(name, types[kind]) for name, kind in columns.items()])

@@ -1,0 +1,78 @@
+"""The manifest of a run: what was asked, where it ran, how it ended; one JSON file, replaced atomically."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from s2a_bench.errors import StoreError
+from s2a_bench.store.schema import SCHEMA
+
+NAME = "manifest.json"
+
+
+def utc_now() -> str:
+    """Tell the time for people, in UTC; durations never come from it."""
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def merge(into: dict[str, Any], facts: Mapping[str, Any]) -> None:
+    """Merge facts: mappings key by key, anything else replaces what was there."""
+    for key, value in facts.items():
+        old = into.get(key)
+        if isinstance(old, dict) and isinstance(value, Mapping):
+            merge(old, value)
+        else:
+            into[key] = plain(value)
+
+
+def plain(value: Any) -> Any:
+    """Turn a value into what JSON holds: dataclasses into objects, paths into text, NaN and infinity into null."""
+    if isinstance(value, float):
+        value = value if math.isfinite(value) else None
+    if value is None or isinstance(value, (str, int, float)):
+        return value
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {item.name: getattr(value, item.name) for item in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return str(value)
+
+
+def write(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Write the manifest; a reader sees the old one or the new one, never half of one."""
+    path, part = folder / NAME, folder / f"{NAME}.part"
+    try:
+        with part.open("w", encoding="utf-8") as file:
+            json.dump(manifest, file, indent=2, ensure_ascii=False, allow_nan=False)
+            file.write("\n")
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise StoreError(f"cannot write {path}: {error.strerror}; the CSV files beside it are complete") from error
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """Read a run's manifest; raises StoreError where there is none or another version's."""
+    path = folder / NAME
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise StoreError(f"{folder} is no run folder: {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise StoreError(f"{path} is damaged: {error}") from error
+    schema = manifest.get("schema") if isinstance(manifest, dict) else None
+    if schema != SCHEMA:
+        raise StoreError(
+            f"{path} has schema {schema!r}, this s2a-bench reads {SCHEMA!r}; use the version that wrote it"
+        )
+    return dict(manifest)

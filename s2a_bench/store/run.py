@@ -1,0 +1,186 @@
+"""A run folder: opened before measuring, appended row by row, readable at any moment, even after a kill."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, final
+
+from s2a_bench.errors import StoreError
+from s2a_bench.store import manifest as manifests
+from s2a_bench.store.files import CsvFile, read_csv, read_parquet, to_pandas, write_parquet
+from s2a_bench.store.schema import FRAMES, SAMPLES, SCHEMA, TOKENS, FrameRow, SampleRow, Table, TokenRow
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+STATES = ("running", "finished", "interrupted", "failed")
+"""A run that says "running" and whose process is gone was killed; its rows are whole."""
+
+
+@final
+class RunWriter:
+    """Writes one run folder. Use as a context manager; not thread-safe.
+
+    Leaving the block finishes the run: "finished", "interrupted" on KeyboardInterrupt, "failed" on any other
+    exception, unless `finish` was called before.
+    """
+
+    def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
+        """Open the files in an existing, empty folder; `create` makes it."""
+        self.path = path
+        self._manifest = manifest
+        self._finished = False
+        manifests.write(path, manifest)
+        self._samples = CsvFile(path / "samples.csv", SAMPLES.columns)
+        self._tokens = CsvFile(path / "tokens.csv", TOKENS.columns)
+        self._frames: CsvFile | None = None
+
+    @classmethod
+    def create(cls, root: Path, command: str, manifest: dict[str, Any]) -> RunWriter:
+        """Make ``<root>/<UTC time>-<command>-<host>`` and open its files.
+
+        ``manifest`` may bring ``argv``, ``configuration``, ``environment``, ``warnings``, ``seeds`` and more.
+        Raises StoreError, naming ``--output``, where the folder cannot be made.
+        """
+        host = socket.gethostname()
+        stem = f"{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}-{_slug(command)}-{_slug(host)}"
+        try:
+            path = _make_unique(Path(root), stem)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise StoreError(f"--output {root}: {error.filename} is not a folder; name another one") from error
+        except OSError as error:
+            raise StoreError(f"--output {root}: cannot create a folder there: {error.strerror}") from error
+        whole: dict[str, Any] = {
+            "schema": SCHEMA,
+            "command": command,
+            "argv": list(sys.argv),
+            "host": host,
+            "state": "running",
+            "error": None,
+            "started": manifests.utc_now(),
+            "finished": None,
+            "configuration": {},
+            "environment": {},
+            "seeds": {},
+            "warnings": [],
+        }
+        manifests.merge(whole, manifest)
+        return cls(path, whole)
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """The manifest as last written; change it through `update`."""
+        return self._manifest
+
+    def sample(self, row: SampleRow) -> None:
+        """Append one sample."""
+        self._samples.append(SAMPLES, [row])
+
+    def tokens(self, rows: Iterable[TokenRow]) -> None:
+        """Append the tokens of one request."""
+        self._tokens.append(TOKENS, rows)
+
+    def frame(self, row: FrameRow) -> None:
+        """Append one frame of a stream; the first one creates the file."""
+        if self._frames is None:
+            self._frames = CsvFile(self.path / "frames.csv", FRAMES.columns)
+        self._frames.append(FRAMES, [row])
+
+    def update(self, **facts: Any) -> None:
+        """Merge facts into the manifest (mappings key by key) and replace the file."""
+        manifests.merge(self._manifest, facts)
+        manifests.write(self.path, self._manifest)
+
+    def finish(self, state: str, error: str | None = None) -> None:
+        """Close the files, write the Parquet ones and the final state; a second call does nothing."""
+        if state not in STATES[1:]:
+            raise ValueError(f"a run ends {', '.join(STATES[1:])}, not {state!r}")
+        if self._finished:
+            return
+        self._finished = True
+        for file in (self._samples, self._tokens, self._frames):
+            if file is not None:
+                file.close()
+        try:
+            tables: list[Table[Any]] = [SAMPLES, TOKENS, *([] if self._frames is None else [FRAMES])]
+            for table in tables:
+                rows = read_csv(self.path / f"{table.name}.csv", table.columns)
+                write_parquet(self.path / f"{table.name}.parquet", rows)
+        finally:
+            # The state is written even where there is no room for Parquet, or Ctrl-C comes a second time.
+            self.update(state=state, error=error, finished=manifests.utc_now())
+
+    def __enter__(self) -> RunWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        state = "finished" if error is None else "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        try:
+            self.finish(state, None if error is None else str(error) or type(error).__name__)
+        except StoreError:
+            # What went wrong first matters more; the CSV files are complete.
+            if error is None:
+                raise
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run as read: the manifest and one DataFrame a table, empty where the run has no such rows.
+
+    Times are integers (Int64) in ns, `marks` and `facts` JSON text; a missing value is ``pd.NA``.
+    """
+
+    path: Path
+    manifest: dict[str, Any]
+    samples: pd.DataFrame
+    tokens: pd.DataFrame
+    frames: pd.DataFrame
+
+
+def read_run(path: Path) -> Run:
+    """Read a run folder: Parquet where the run came to its end, else the whole records of the CSV files.
+
+    Raises StoreError where it is no run folder, another version's, or damaged.
+    """
+    path = Path(path)
+    manifest = manifests.read(path)
+    return Run(path, manifest, _read(path, SAMPLES), _read(path, TOKENS), _read(path, FRAMES))
+
+
+def _read(path: Path, table: Table[Any]) -> pd.DataFrame:
+    """Read one table."""
+    parquet = path / f"{table.name}.parquet"
+    if parquet.exists():
+        return to_pandas(read_parquet(parquet, table.columns))
+    return to_pandas(read_csv(path / f"{table.name}.csv", table.columns))
+
+
+def _slug(name: str) -> str:
+    """Make a name fit for one part of a path."""
+    return re.sub(r"[^A-Za-z0-9._]+", "-", name).strip("-.") or "unnamed"
+
+
+def _make_unique(root: Path, stem: str) -> Path:
+    """Create a folder that nobody else has; the second of one second gets the suffix -2."""
+    root.mkdir(parents=True, exist_ok=True)
+    if not os.access(root, os.W_OK | os.X_OK):
+        raise PermissionError(13, "permission denied", str(root))
+    for number in count(1):
+        path = root / (stem if number == 1 else f"{stem}-{number}")
+        try:
+            path.mkdir()
+        except FileExistsError:
+            continue
+        return path
+    raise AssertionError  # count() does not end

@@ -1,0 +1,379 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from io import FileIO
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from s2a_bench.errors import StoreError
+from s2a_bench.store.files import read_csv, read_parquet
+from s2a_bench.store.run import RunWriter, read_run
+from s2a_bench.store.schema import FRAMES, SAMPLES, TOKENS, FrameRow, SampleRow, TokenRow
+from s2a_bench.trace import STAGES
+
+CHAIN = [
+    ("", 1_000),
+    ("capture", 1_100),
+    ("", 1_150),
+    ("cdr_pack", 1_350),
+    ("network", 2_350),
+    ("inference", 12_350),
+    ("return", 12_850),
+]
+
+
+def sample(request_id: str = "r1", **facts: object) -> SampleRow:
+    row = SampleRow(
+        cell="ros/topic",
+        pipeline="ros",
+        variant="topic",
+        payload="bgr",
+        connection="keep-alive",
+        engine="echo",
+        mode="request",
+        size="640x480",
+        block=0,
+        position=1,
+        warmup=False,
+        request_id=request_id,
+        frame_index=7,
+        marks=CHAIN,
+        payload_bytes=921_600,
+        n_tokens=3,
+        last_token_ns=13_000,
+        server_prompt_ms=0.1,
+        facts={"load": 0.30000000000000004},
+    )
+    return replace(row, **facts)
+
+
+def token(index: int, text: str, engine_ns: int | None = 5) -> TokenRow:
+    return TokenRow("r1", "ros/topic", index, 100 + index, text, engine_ns, 9_007_199_254_740_993)
+
+
+@pytest.fixture
+def open_run(tmp_path: Path) -> Iterator[Callable[..., RunWriter]]:
+    """Open runs that the test leaves unfinished."""
+    runs: list[RunWriter] = []
+
+    def create(root: Path = tmp_path) -> RunWriter:
+        runs.append(RunWriter.create(root, "latency", {}))
+        return runs[-1]
+
+    yield create
+    for run in runs:
+        run._samples.close()
+        run._tokens.close()
+
+
+def test_a_finished_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {"configuration": {"runs": 2}, "seeds": {"order": 3}}) as run:
+        run.sample(sample())
+        run.tokens([token(0, "a")])
+        run.update(environment={"cpu": "EPYC"}, configuration={"warmup": 1}, warnings=[{"code": "x"}])
+    read = read_run(run.path)
+    assert read.manifest["schema"] == "s2a-bench/1"
+    assert read.manifest["command"] == "latency"
+    assert read.manifest["state"] == "finished"
+    assert read.manifest["configuration"] == {"runs": 2, "warmup": 1}
+    assert read.manifest["environment"] == {"cpu": "EPYC"}
+    assert read.manifest["seeds"] == {"order": 3}
+    assert read.manifest["argv"] == sys.argv
+    assert read.manifest["started"] <= read.manifest["finished"]
+    row = read.samples.iloc[0]
+    assert row["payload_bytes"] == 921_600
+    assert row["server_prompt_ms"] == 0.1
+    assert json.loads(row["marks"]) == [list(mark) for mark in CHAIN]
+    assert json.loads(row["facts"]) == {"load": 0.30000000000000004}
+    assert row["warmup"] == False  # noqa: E712 - a numpy bool
+    assert read.tokens["client_ns"].tolist() == [9_007_199_254_740_993]
+    assert read.frames.empty
+    assert list(read.frames.columns) == list(FRAMES.columns)
+
+
+def test_derived_columns_are_the_budget_of_the_chain(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample())
+    row = read_run(run.path).samples.iloc[0]
+    assert row["capture_ns"] == 100
+    assert row["cdr_pack_ns"] == 200
+    assert row["network_ns"] == 1_000
+    assert row["inference_ns"] == 10_000
+    assert row["return_ns"] == 500
+    assert row["residual_ns"] == 50
+    assert row["e2e_ns"] == 11_850
+    assert row["e2e_without_inference_ns"] == 1_850
+    assert row["ttft_ns"] == 11_750
+    assert row["residual_share"] == 50 / 1_850
+
+
+def test_an_absent_stage_is_null_and_never_zero(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample())
+    samples = read_run(run.path).samples
+    absent = [f"{stage}_ns" for stage in STAGES if stage not in dict(CHAIN)]
+    assert len(absent) == len(STAGES) - 5
+    assert samples[absent].isna().all(axis=None)
+    assert pd.isna(samples["frame_age_ns"][0])
+
+
+def test_a_stage_that_took_no_time_is_zero_and_not_null(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample(marks=[("", 5), ("capture", 5), ("inference", 5), ("return", 9)]))
+    row = read_run(run.path).samples.iloc[0]
+    assert row["capture_ns"] == 0
+
+
+def test_a_failed_sample_is_a_row_with_its_error_and_without_durations(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample(error='refused: "no", 503\nretry'))
+        run.sample(sample("r2"))
+    samples = read_run(run.path).samples
+    assert samples["error"].tolist() == ['refused: "no", 503\nretry', ""]
+    derived = [*(f"{stage}_ns" for stage in STAGES), "e2e_ns", "ttft_ns", "residual_ns", "residual_share"]
+    assert samples[derived].iloc[0].isna().all()
+    assert samples["e2e_ns"].iloc[1] == 11_850
+
+
+def test_a_sample_without_a_token_has_no_end_to_end(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample(marks=CHAIN[:-1], n_tokens=0))
+    assert pd.isna(read_run(run.path).samples["e2e_ns"][0])
+
+
+def test_csv_and_parquet_hold_the_same_columns_and_values(tmp_path: Path) -> None:
+    texts = [
+        "plain",
+        "",
+        'qu"ote',
+        "a,b",
+        "line\nfeed",
+        "return\r\n",
+        "  spaces ",
+        "NULL",
+        "nan",
+        "é漢\U0001f916",
+        "\x00",
+    ]
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample())
+        run.sample(sample("r2", error="x", server_prompt_ms=float("nan"), facts={"nan": float("nan")}))
+        run.tokens(token(index, text, None if index % 2 else index) for index, text in enumerate(texts))
+        run.frame(FrameRow("ros/topic", 3, 900, CHAIN[:4], "r1"))
+    for table in (SAMPLES, TOKENS, FRAMES):
+        csv = read_csv(run.path / f"{table.name}.csv", table.columns)
+        parquet = read_parquet(run.path / f"{table.name}.parquet", table.columns)
+        assert csv.column_names == parquet.column_names == list(table.columns)
+        assert csv.equals(parquet)
+    read = read_run(run.path)
+    assert read.tokens["text"].tolist() == texts
+    assert read.tokens["engine_ns"].isna().tolist() == [index % 2 == 1 for index in range(len(texts))]
+    assert pd.isna(read.samples["server_prompt_ms"][1])
+    assert json.loads(read.samples["facts"][1]) == {"nan": None}
+
+
+def test_integers_stay_integers_beside_nulls(tmp_path: Path) -> None:
+    big = 9_007_199_254_740_993  # 2^53 + 1: a float would lose it
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample(last_token_ns=big))
+        run.sample(sample("r2", last_token_ns=None))
+    raw = pd.read_parquet(run.path / "samples.parquet", dtype_backend="numpy_nullable")
+    assert raw["last_token_ns"][0] == big
+    assert str(read_run(run.path).samples["last_token_ns"].dtype) == "Int64"
+
+
+def test_half_a_character_from_a_model_does_not_stop_the_run(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.tokens([token(0, "\udcff")])
+    assert read_run(run.path).tokens["text"].tolist() == ["\\udcff"]
+
+
+def test_frames_of_a_stream_have_a_budget_of_their_own(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        assert not (run.path / "frames.csv").exists()
+        run.frame(FrameRow("ros/topic", 3, 900, CHAIN[:5], ""))
+        run.frame(FrameRow("ros/topic", 4, 950, [], "r2"))
+    frames = read_run(run.path).frames
+    assert frames["network_ns"][0] == 1_000
+    assert frames["path_ns"][0] == 1_350
+    assert frames["latency_ns"][0] == 2_350 - 900
+    assert frames["residual_ns"][0] == 50
+    assert frames["path_ns"].isna().tolist() == [False, True]
+    assert frames["used_by"].tolist() == ["", "r2"]
+
+
+def test_a_torn_last_record_is_dropped(open_run: Callable[..., RunWriter]) -> None:
+    run = open_run()
+    run.sample(sample("r1"))
+    run.sample(sample("r2"))
+    run.tokens([token(0, "a\nb"), token(1, "c\nd,e")])
+    samples, tokens = run.path / "samples.csv", run.path / "tokens.csv"
+    whole = samples.read_bytes()
+    last = whole.rindex(b"ros/topic,ros,")
+    for size in (*range(last, len(whole), 11), len(whole) - 1):
+        samples.write_bytes(whole[:size])
+        assert read_run(run.path).samples["request_id"].tolist() == ["r1"]
+    whole = tokens.read_bytes()
+    tokens.write_bytes(whole[: whole.rindex(b"d,e")])  # inside quotation marks, after a line feed
+    assert read_run(run.path).tokens["text"].tolist() == ["a\nb"]
+    tokens.write_bytes(whole[:5])  # not even a header
+    assert read_run(run.path).tokens.empty
+    assert read_run(run.path).manifest["state"] == "running"
+
+
+def test_a_killed_process_loses_no_finished_sample(tmp_path: Path) -> None:
+    script = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from test_run import RunWriter, sample, token
+run = RunWriter.create(Path({str(tmp_path)!r}), "latency", {{}})
+for number in range(5):
+    run.sample(sample(f"r{{number}}"))
+    run.tokens([token(number, "x")])
+print("ready", flush=True)
+sys.stdin.read()
+"""
+    child = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == b"ready\n"
+        os.kill(child.pid, signal.SIGKILL)
+    (folder,) = tmp_path.iterdir()
+    read = read_run(folder)
+    assert read.samples["request_id"].tolist() == ["r0", "r1", "r2", "r3", "r4"]
+    assert read.samples["e2e_ns"].tolist() == [11_850] * 5
+    assert len(read.tokens) == 5
+    assert read.manifest["state"] == "running"
+    assert not list(folder.glob("*.parquet"))
+
+
+def test_two_runs_of_one_second_get_folders_of_their_own(tmp_path: Path, open_run: Callable[..., RunWriter]) -> None:
+    paths = [open_run(tmp_path / "new" / "results").path for _ in range(4)]
+    assert len(set(paths)) == 4
+    assert all(path.name.split("-")[1] == "latency" for path in paths)
+    assert all(path.name[8] == "T" and path.name[15] == "Z" for path in paths)
+
+
+@pytest.mark.parametrize("where", ["file", "file/below"])
+def test_an_output_that_is_no_folder_is_refused_by_name(tmp_path: Path, where: str) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match=r"--output .*file.*is not a folder"):
+        RunWriter.create(tmp_path / where, "latency", {})
+
+
+def test_an_output_that_cannot_be_written_is_refused_by_name() -> None:
+    with pytest.raises(StoreError, match=r"--output /proc/s2a: cannot create"):
+        RunWriter.create(Path("/proc/s2a"), "latency", {})
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_write_permission_is_refused(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(StoreError, match="--output"):
+        RunWriter.create(tmp_path, "latency", {})
+
+
+class FullDisk:
+    """A file on a disk with room for ten more bytes."""
+
+    def __init__(self, file: FileIO) -> None:
+        self.room = 10
+        self.file = file
+        self.truncate, self.seek = file.truncate, file.seek
+
+    def write(self, data: bytes) -> int:
+        if not self.room:
+            raise OSError(28, "No space left on device")
+        written = self.file.write(data[: self.room])
+        self.room -= written
+        return written
+
+
+def test_a_full_disk_names_the_file_and_leaves_whole_records(
+    open_run: Callable[..., RunWriter], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = open_run()
+    run.sample(sample("r1"))
+    file = run._samples._file
+    monkeypatch.setattr(run._samples, "_file", FullDisk(file))
+    with pytest.raises(StoreError, match=r"samples\.csv: No space left on device"):
+        run.sample(sample("r2"))
+    assert (run.path / "samples.csv").read_bytes().endswith(b"\n")
+    monkeypatch.setattr(run._samples, "_file", file)
+    run.sample(sample("r3"))
+    assert read_run(run.path).samples["request_id"].tolist() == ["r1", "r3"]
+
+
+def test_the_way_out_of_the_block_is_the_state_of_the_run(tmp_path: Path) -> None:
+    def leave(error: BaseException) -> dict[str, object]:
+        run = RunWriter.create(tmp_path, "latency", {})
+        with pytest.raises(type(error)), run:  # noqa: PT012 - the block is what is tested
+            run.sample(sample())
+            raise error
+        assert len(read_run(run.path).samples) == 1
+        assert (run.path / "samples.parquet").exists()
+        return read_run(run.path).manifest
+
+    interrupted = leave(KeyboardInterrupt())
+    assert (interrupted["state"], interrupted["error"]) == ("interrupted", "KeyboardInterrupt")
+    failed = leave(StoreError("server died"))
+    assert (failed["state"], failed["error"]) == ("failed", "server died")
+
+
+def test_finishing_twice_keeps_the_first_state(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.finish("failed", "server died")
+        run.finish("finished")
+    assert read_run(run.path).manifest["state"] == "failed"
+    assert read_run(run.path).manifest["error"] == "server died"
+
+
+def test_an_unknown_final_state_is_refused(open_run: Callable[..., RunWriter]) -> None:
+    with pytest.raises(ValueError, match="not 'running'"):
+        open_run().finish("running")
+
+
+def test_a_folder_that_is_no_run_or_anothers_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="no run folder"):
+        read_run(tmp_path)
+    (tmp_path / "manifest.json").write_text('{"schema": "s2a-bench/9"}')
+    with pytest.raises(StoreError, match=r"s2a-bench/9.*s2a-bench/1"):
+        read_run(tmp_path)
+    (tmp_path / "manifest.json").write_text("{")
+    with pytest.raises(StoreError, match="damaged"):
+        read_run(tmp_path)
+
+
+def test_a_damaged_csv_is_an_error_and_not_a_number(open_run: Callable[..., RunWriter]) -> None:
+    run = open_run()
+    run.sample(sample())
+    path = run.path / "samples.csv"
+    path.write_bytes(path.read_bytes().replace(b"11850", b"many"))
+    with pytest.raises(StoreError, match=r"samples\.csv is damaged"):
+        read_run(run.path)
+
+
+def test_the_manifest_holds_only_strict_json(tmp_path: Path) -> None:
+    facts = {"configuration": {"path": Path("/x"), "loss": float("nan"), "t": (1,)}}
+    with RunWriter.create(tmp_path, "latency", facts) as run:
+        run.update(row=token(0, "a"))
+    manifest = read_run(run.path).manifest
+    assert manifest["configuration"] == {"path": "/x", "loss": None, "t": [1]}
+    assert manifest["row"]["token_id"] == 100
+    assert not (run.path / "manifest.json.part").exists()
+
+
+def test_the_store_does_not_import_heavy_libraries_before_it_needs_them() -> None:
+    code = (
+        "import sys; import s2a_bench.store.run, s2a_bench.report;"
+        "print([name for name in ('pandas', 'pyarrow', 'matplotlib', 'scipy', 'numpy') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
