@@ -1,0 +1,75 @@
+"""How figures look: one paper column wide, colour-blind safe (Okabe and Ito), nothing told by colour alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+WIDTH_IN: Final = 3.5
+"""One column of a two-column paper."""
+
+GREY: Final = "#BBBBBB"
+"""What is not ours: the paper's values."""
+
+GROUP_FILLS: Final = {
+    "capture": ("#56B4E9", ""),
+    "encode": ("#E69F00", "////"),
+    "pack": ("#F0E442", "...."),
+    "network": ("#0072B2", "\\\\\\\\"),
+    "ingest": ("#999999", "xxxx"),
+    "parse": ("#CC79A7", "----"),
+    "decode": ("#D55E00", "||||"),
+    "queue": ("#000000", ""),
+    "inference": ("#666666", "++++"),
+    "server": ("#666666", "oooo"),
+    "return": ("#009E73", "xxxx"),
+}
+"""Group of stages -> colour and hatch."""
+
+RESIDUAL_FILL: Final = ("#FFFFFF", "//////")
+
+_CELL_LOOKS: Final = {
+    "http/as-deployed": ("#D55E00", "-"),
+    "http/best-effort": ("#E69F00", "--"),
+    "http/binary": ("#CC79A7", "-."),
+    "ros/topic": ("#0072B2", "-"),
+    "ros/action": ("#56B4E9", "--"),
+    "loopback": ("#009E73", ":"),
+}
+_OTHER_LOOKS: Final = (("#56B4E9", "-."), ("#F0E442", "--"), ("#999999", ":"), ("#000000", "-"))
+
+
+def cell_looks(names: list[str]) -> dict[str, tuple[str, str]]:
+    """Return name -> colour and line style; a known cell looks the same in every figure of every run."""
+    others = [name for name in names if name not in _CELL_LOOKS]
+    looks = {name: _OTHER_LOOKS[place % len(_OTHER_LOOKS)] for place, name in enumerate(others)}
+    return looks | {name: look for name, look in _CELL_LOOKS.items() if name in names}
+
+
+@contextmanager
+def paper_column() -> Iterator[None]:
+    """Draw with 7 and 8 point text, thin lines, and fonts that a publisher accepts (Type 42)."""
+    import matplotlib as mpl
+
+    settings: Any = {  # newer stubs list every key
+        "font.family": "DejaVu Sans",
+        "font.size": 7,
+        "axes.labelsize": 8,
+        "axes.titlesize": 7,
+        "figure.titlesize": 7,
+        "legend.fontsize": 7,
+        "xtick.labelsize": 7,
+        "ytick.labelsize": 7,
+        "axes.linewidth": 0.6,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "hatch.linewidth": 0.5,
+        "lines.linewidth": 1.3,
+        "legend.frameon": False,
+        "legend.handlelength": 2.2,
+        "pdf.fonttype": 42,
+        "savefig.dpi": 300,
+    }
+    with mpl.rc_context(settings):
+        yield

@@ -1,0 +1,219 @@
+"""The tables of a run for people: text, rounded to three digits, as Markdown and LaTeX."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from s2a_bench.errors import StoreError
+from s2a_bench.report.cells import (
+    RESIDUAL_LIMIT,
+    Cell,
+    cells_of,
+    engine_note,
+    groups_present,
+    ratio_between,
+    seed_of,
+    stages_present,
+    summary_of,
+)
+from s2a_bench.report.full import csv_texts
+from s2a_bench.trace import STAGES
+
+if TYPE_CHECKING:
+    from s2a_bench.report.cells import Floats
+    from s2a_bench.stats import Ratio, Summary
+    from s2a_bench.store.run import Run
+
+ABSENT = "\N{EN DASH}"
+"""Stands where a cell does not have a stage or a ratio."""
+
+TITLES = {"e2e_without_inference": "End to end without inference", "e2e": "End to end"}
+"""What is compared, and how it is called."""
+
+
+_FOOT = ("residual", "e2e_without_inference", "inference", "e2e")
+
+
+@dataclass(frozen=True, slots=True)
+class TextTable:
+    """One table: ``left`` columns of names, then columns of numbers; ``rules`` are the rows that a line precedes."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    left: int
+    rules: frozenset[int] = frozenset()
+    notes: tuple[str, ...] = ()
+
+
+def number(value: float) -> str:
+    """Write a time in ms, or a ratio, with three digits; never more than three decimals."""
+    return f"{value:.{_decimals(value)}f}"
+
+
+def mean_sd(summary: Summary) -> str:
+    """Write mean ± standard deviation with the decimals of the mean."""
+    places = _decimals(summary.mean)
+    return f"{summary.mean:.{places}f}" + ("" if summary.sd is None else f" ± {summary.sd:.{places}f}")
+
+
+def interval(ratio: Ratio | None) -> str:
+    """Write a ratio with its interval."""
+    if ratio is None or ratio.value is None:
+        return ABSENT
+    if ratio.low is None or ratio.high is None:
+        return number(ratio.value)
+    places = _decimals(ratio.value)
+    return f"{ratio.value:.{places}f} [{ratio.low:.{places}f}, {ratio.high:.{places}f}]"
+
+
+def stage_table(run: Run, *, full: bool = True) -> TextTable:
+    """Lay out the stages in the order of the path, a column a cell: the median, and mean ± sd where ``full``.
+
+    Inference stands below the residual, so that what is compared, e2e without inference, reads as one sum.
+    """
+    cells = cells_of(run)
+    rows: list[tuple[str, ...]] = []
+    last = ""
+
+    def add(group: str, name: str, values: list[Floats]) -> None:
+        rows.append((group, name, *(_entry(summary_of(found), full) for found in values)))
+
+    for stage in stages_present(cells):
+        if stage != "inference":
+            group = STAGES[stage]
+            add("" if group == last else group, stage, [cell.values_ms(stage) for cell in cells])
+            last = group
+    below = len(rows)
+    for metric in _FOOT:
+        add("", metric.replace("_", " "), [cell.values_ms(metric) for cell in cells])
+    title = "Stages in ms: median (mean ± sd)" if full else "Stages in ms: medians"
+    return TextTable(
+        title,
+        ("group", "stage", *(cell.name for cell in cells)),
+        rows,
+        2,
+        frozenset({below + 1}),
+        _notes(run, cells),
+    )
+
+
+def group_table(run: Run) -> TextTable:
+    """Lay out the groups as columns and the cells as rows: for runs of many cells."""
+    cells = cells_of(run)
+    groups = [group for group in groups_present(cells) if group != "inference"]
+    rows = []
+    for cell in cells:
+        values = [cell.group_ms(group) for group in groups]
+        values += [cell.values_ms(metric) for metric in _FOOT[1:]]
+        rows.append((cell.name, *(_entry(summary_of(found), full=False) for found in values)))
+    header = ("cell", *groups, "e2e w/o infer.", "infer.", "e2e")
+    return TextTable("Groups of stages in ms: medians", header, rows, 1, notes=_notes(run, cells))
+
+
+def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
+    """Lay out what a publication quotes: n, spread, percentiles, and the ratios to ROS and to loopback."""
+    cells = cells_of(run)
+    bases = [cell for cell in cells if cell.pipeline in {"ros", "loopback"} and cell.values_ms(metric).size]
+    rows = []
+    for cell in cells:
+        summary = summary_of(cell.values_ms(metric))
+        numbers = (
+            [mean_sd(summary), number(summary.median), number(summary.p90), number(summary.p99)]
+            if summary
+            else [ABSENT] * 4
+        )
+        over = [_ratio(cell, base, metric, seed_of(run)) for base in bases]
+        rows.append((cell.name, str(cell.n), str(cell.errors), *numbers, *over))
+    header = ("cell", "n", "errors", "mean ± sd", "median", "p90", "p99", *(f"ratio to {base.name}" for base in bases))
+    title = f"{TITLES[metric]} in ms; ratios of medians [95 % interval]"
+    return TextTable(title, header, rows, 1, notes=_notes(run, cells))
+
+
+def to_markdown(table: TextTable) -> str:
+    """Write a table as Markdown, its title and notes around it."""
+    rule = ["---"] * table.left + ["---:"] * (len(table.header) - table.left)
+    lines = ["| " + " | ".join(row) + " |" for row in (table.header, tuple(rule), *table.rows)]
+    return "\n".join([f"**{table.title}**", "", *lines, "", *table.notes]) + "\n"
+
+
+def to_latex(table: TextTable) -> str:
+    """Write a table as a LaTeX ``tabular`` for the package booktabs; title and notes are comments."""
+    lines = [f"% {note}" for note in (table.title, *table.notes)]
+    lines += [f"\\begin{{tabular}}{{{'l' * table.left}{'r' * (len(table.header) - table.left)}}}", "\\toprule"]
+    lines += [_latex_row(table.header), "\\midrule"]
+    for place, row in enumerate(table.rows):
+        lines += [*(["\\midrule"] if place in table.rules else []), _latex_row(row)]
+    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}"]) + "\n"
+
+
+def write_tables(run: Run) -> list[Path]:
+    """Write ``tables/``: stages and summaries as .md and .tex, and stages, summary and ratios in full as .csv."""
+    tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
+    texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
+    texts |= {f"{name}.tex": to_latex(table) for name, table in tables.items()}
+    texts |= csv_texts(run)
+    folder = run.path / "tables"
+    try:
+        folder.mkdir(exist_ok=True)
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"cannot write {folder}: {error.strerror}; the samples are kept") from error
+    return [folder / name for name in texts]
+
+
+def _decimals(value: float) -> int:
+    """Return how many decimals leave three digits."""
+    for places, limit in ((0, 99.95), (1, 9.995), (2, 0.9995)):
+        if abs(value) >= limit:
+            return places
+    return 3
+
+
+def _entry(summary: Summary | None, full: bool) -> str:
+    """Write one entry of the stage table."""
+    if summary is None:
+        return ABSENT
+    return f"{number(summary.median)} ({mean_sd(summary)})" if full else number(summary.median)
+
+
+def _ratio(cell: Cell, base: Cell, metric: str, seed: int) -> str:
+    """Write the ratio of a cell to a base, where that is a comparison: loopback over ROS is none."""
+    if cell.name == base.name:
+        return "1"
+    if base.pipeline == "ros" and cell.pipeline != "http":
+        return ABSENT
+    return interval(ratio_between(cell, base, metric, seed))
+
+
+def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
+    """Say what a reader must know besides the numbers."""
+    counts = sorted({cell.n for cell in cells})
+    span = " to ".join(str(count) for count in dict.fromkeys((*counts[:1], *counts[-1:])))
+    notes = [f"n = {span} samples a cell, warm-ups left out." if counts else "No samples."]
+    if sizes := sorted({cell.about["size"] for cell in cells}):
+        payloads = dict.fromkeys(
+            f"{cell.pipeline} {cell.about['payload']}" for cell in cells if cell.about["payload"] not in {"none", ""}
+        )
+        notes.append(f"{', '.join(sizes)}; payload: {', '.join(payloads) or 'none'}.")
+    if note := engine_note(run, cells):
+        notes.append(f"{note[0].upper()}{note[1:]}.")
+    if flagged := sum(cell.flagged() for cell in cells):
+        notes.append(
+            f"{flagged} of {sum(cell.n for cell in cells)} samples have a residual above {RESIDUAL_LIMIT:.0%}"
+            " of e2e without inference."
+        )
+    if failed := sum(cell.errors for cell in cells):
+        notes.append(f"{failed} samples failed and are in no number here; samples.csv says why.")
+    return tuple(notes)
+
+
+def _latex_row(row: tuple[str, ...]) -> str:
+    """Write one row of a LaTeX table."""
+    escapes = {"_": "\\_", "%": "\\%", "&": "\\&", "#": "\\#", "±": "$\\pm$", ABSENT: "--"}
+    texts = ("".join(escapes.get(char, char) for char in text) for text in row)
+    # A booktabs row that opens with a bracket would be read as an option of the row before it.
+    return " & ".join(f"{{{text}}}" if text.startswith("[") else text for text in texts) + " \\\\"
