@@ -7,6 +7,7 @@ S2AError
 │   └── ModelError       a model file is missing, damaged or of the wrong kind
 ├── TransportError       a request did not make its way
 │   ├── RequestFailed    the server refused or broke off this one request; the next may succeed
+│   │   └── MessagesLost the middleware lost messages of this request
 │   ├── PortInUse        a server cannot bind its address
 │   └── ServerDied       the server's process is gone
 └── StoreError           a run folder cannot be written or read
@@ -45,6 +46,10 @@ class TransportError(S2AError):
 
 class RequestFailed(TransportError):
     """The server refused or broke off this one request; the next may succeed."""
+
+
+class MessagesLost(RequestFailed):
+    """The middleware lost messages of this request."""
 
 
 class PortInUse(TransportError):

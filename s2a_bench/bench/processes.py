@@ -71,8 +71,9 @@ class ServerProcess(ABC):
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 pipe.close()
-        for end in (lambda: None, self._process.terminate, self._process.kill):
-            end()
+        for end in (None, self._process.terminate, self._process.kill):
+            if end is not None:
+                end()
             try:
                 self._process.wait(STOP_TIMEOUT_S)
                 break
@@ -80,7 +81,7 @@ class ServerProcess(ABC):
                 continue
         self._log.close()
 
-    def __enter__(self) -> ServerProcess:
+    def __enter__(self) -> ServerProcess:  # noqa: PYI034 - Self is typing's since 3.11
         return self
 
     def __exit__(self, *_: object) -> None:

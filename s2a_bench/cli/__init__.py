@@ -1,1 +1,66 @@
-"""One module per command: parse, compose, print, exit code; nothing else."""
+"""The command line: one module per command, and one place where errors become a line and an exit code.
+
+Modules here import heavy libraries inside their functions only, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import Any
+
+import typer
+
+from s2a_bench import __version__
+from s2a_bench.cli import latency, model
+from s2a_bench.errors import S2AError
+
+INTERRUPTED = 130
+ParseError: Any = typer.BadParameter.__mro__[1]
+"""Click's UsageError: newer typer brings a click of its own, so it cannot be named by import."""
+
+app = typer.Typer(
+    name="s2a-bench",
+    help="Measure how a vision-language model is wired to a robot, and when the robot may act.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.command("latency")(latency.latency)
+app.add_typer(model.app, name="model", help="Make and inspect model files.")
+
+
+@app.callback(invoke_without_command=True)
+def _version(*, version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
+    if version:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+def _interrupt(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Run the command line and exit: 0 done, 1 failed, 2 wrongly used, 130 interrupted."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        code = app(standalone_mode=False)
+    except S2AError as error:
+        code = _say(f"error: {error}", error.exit_code)
+    except ParseError as error:
+        context = getattr(error, "ctx", None)
+        hint = f" (see '{context.command_path} --help')" if context else ""
+        code = _say(f"error: {error.format_message()}{hint}", error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        code = _say("interrupted", INTERRUPTED)
+    except BrokenPipeError:  # the reader of our output has gone, as with `| head`
+        sys.stderr.close()
+        code = 1
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _say(line: str, code: int) -> int:
+    print(line, file=sys.stderr)  # noqa: T201 - the command line's own output
+    return code

@@ -133,9 +133,13 @@ def _stage_values(spent: Budget) -> dict[str, Value]:
     return {f"{stage}_ns": duration for stage, duration in spent.stages_ns.items()}
 
 
+FIRST_TOKEN: Final = frozenset({"return", "ingest", "server"})
+"""A chain with one of these stages ends when the client sees the first token; the last two stand for black boxes."""
+
+
 def _derive_sample(row: SampleRow) -> dict[str, Value]:
-    """Compute a sample's durations; without the mark `return` no token was seen and there is no end to end."""
-    if row.error or not any(stage == "return" for stage, _ in row.marks):
+    """Compute a sample's durations; a chain that does not reach the first token has no end to end."""
+    if row.error or not any(stage in FIRST_TOKEN for stage, _ in row.marks):
         return {}
     spent = budget(row.marks)
     return {

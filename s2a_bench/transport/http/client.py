@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import httpx
-from httpx_sse import EventSource, SSEError
+from httpx_sse import EventSource
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError
@@ -61,7 +61,8 @@ class HttpClient:
                 client.stream("POST", self._url, content=body, headers=headers) as response,
             ):
                 headers_ns = now_ns()
-                if response.status_code != httpx.codes.OK:
+                streams = response.headers.get("content-type", "").startswith("text/event-stream")
+                if response.status_code != httpx.codes.OK or not streams:
                     response.read()
                     raise RequestFailed(f"{self._url} answered {response.status_code}: {_error_of(response.text)}")
                 yield from self._tokens(response, trace, headers_ns, packed_ns)
@@ -90,6 +91,7 @@ class HttpClient:
             fields["messages"] = dialect.messages(request.prompt, uris)
             body, headers = self._codec.dumps(fields), self._headers
         trace.mark("json_pack")
+        trace.facts["payload_bytes"] = len(body)
         return body, headers
 
     def _tokens(self, response: httpx.Response, trace: Trace, headers_ns: int, packed_ns: int) -> Iterator[Token]:
@@ -98,7 +100,7 @@ class HttpClient:
         for data in _events(response):
             if data == "[DONE]":
                 done = True
-                break
+                continue  # read to the end, or the connection could not be kept
             event = self._codec.loads(data)
             if "error" in event:
                 raise RequestFailed(f"the server broke off: {_message_of(event['error'])}")
@@ -147,7 +149,7 @@ def _events(response: httpx.Response) -> Iterator[str]:
 
 @contextmanager
 def _translated(alive: Callable[[], bool], url: str) -> Iterator[None]:
-    """Turn what httpx, httpx-sse and the JSON decoders raise into this project's errors."""
+    """Turn what httpx and the JSON decoders raise into this project's errors."""
     try:
         yield
     except httpx.ConnectError as error:
@@ -158,7 +160,7 @@ def _translated(alive: Callable[[], bool], url: str) -> Iterator[None]:
         if not alive():
             raise ServerDied(f"the server at {url} is gone: {error}") from error
         raise RequestFailed(f"{url} broke the connection: {error}") from error
-    except (SSEError, json.JSONDecodeError, KeyError, AttributeError) as error:  # orjson's error is a JSONDecodeError
+    except (json.JSONDecodeError, KeyError, AttributeError) as error:  # orjson's error is a JSONDecodeError
         raise RequestFailed(f"{url} does not speak the OpenAI dialect: {error!r}") from error
     except httpx.InvalidURL as error:
         raise TransportError(f"--url: '{url}' is no URL: {error}") from error

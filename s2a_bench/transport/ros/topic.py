@@ -12,7 +12,7 @@ from threading import Lock, Thread
 from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
-from s2a_bench.errors import RequestFailed, S2AError, ServerDied, TransportError
+from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, TransportError
 from s2a_bench.ros import Middleware, QoS, Tuning, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Mark, Remote, Trace
@@ -131,11 +131,12 @@ class TopicClient:
         )
         trace.mark("cdr_pack")
         self._publisher.send(packed)
+        trace.facts["payload_bytes"] = len(packed)
         expected = 0
         while True:
             token = self._next(request.id)
             if token.index != expected:
-                raise RequestFailed(f"{token.index - expected} token messages were lost before index {token.index}")
+                raise MessagesLost(f"{token.index - expected} token messages were lost before index {token.index}")
             if token.last:
                 break
             if not expected:

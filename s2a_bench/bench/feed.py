@@ -1,0 +1,199 @@
+"""How frames come to a request: captured for it (request mode), or taken from a running camera (stream mode)."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from random import Random
+from threading import Condition, Thread
+from typing import Protocol
+
+from s2a_bench.clock import Clock, SystemClock
+from s2a_bench.errors import S2AError, SourceError
+from s2a_bench.frames import FrameSource
+from s2a_bench.frames.convert import encode_jpeg, to_bgr
+from s2a_bench.trace import RESIDUAL, Mark, Trace
+from s2a_bench.transport.pictures import JPEG_QUALITY, bgr_of
+from s2a_bench.types import Frame
+
+
+def fingerprint(frame: Frame) -> int:
+    """Return a checksum of the picture, to notice one that comes twice."""
+    return zlib.crc32(frame.data.reshape(-1).data)
+
+
+class Feed(Protocol):
+    """Gives each request its frame."""
+
+    def get_ready(self) -> None:
+        """Do what need not be timed."""
+        ...
+
+    def capture(self, trace: Trace) -> Frame | None:
+        """Return the frame that goes with the prompt, or None when the server has it; marks the trace."""
+        ...
+
+
+class RequestFeed:
+    """Captures a frame for each request; with ``preencoded`` the camera is one that delivers JPEG."""
+
+    def __init__(self, source: FrameSource, *, preencoded: bool) -> None:
+        """Take frames from ``source``."""
+        self._source = source
+        self._preencoded = preencoded
+        self._ready: Frame | None = None
+
+    def get_ready(self) -> None:
+        """Encode ahead, where a JPEG is to be at hand."""
+        if self._preencoded:
+            frame = self._source.read()
+            self._ready = replace(frame, encoding="jpeg", data=encode_jpeg(to_bgr(frame), JPEG_QUALITY))
+
+    def capture(self, trace: Trace) -> Frame:
+        """Read a frame, or hand over the one that is ready."""
+        trace.mark(RESIDUAL)
+        frame = self._ready or self._source.read()
+        trace.mark("capture")
+        return frame
+
+
+@dataclass(slots=True)
+class StreamedFrame:
+    """The record of one frame of the running camera, without its pixels."""
+
+    index: int
+    captured_ns: int
+    intended_ns: int
+    marks: list[Mark]
+    stamp_ns: int
+    """ROS-time stamp if it was published, else -1."""
+    used_by: str = ""
+
+
+class Camera:
+    """Reads a source at its rate on a thread of its own and gives every frame to the sink of the moment.
+
+    The ticks are fixed beforehand, so a late frame does not delay the ones after it, and its lateness shows.
+    """
+
+    def __init__(self, source: FrameSource, fps: float, clock: Clock | None = None) -> None:
+        """Prepare; `start` starts."""
+        self._source = source
+        self._period_ns = int(1e9 / fps)
+        self._clock = clock or SystemClock()
+        self._changed = Condition()
+        self._publish: Callable[[Frame, Trace], int] | None = None
+        self._newest: tuple[StreamedFrame, Frame] | None = None
+        self._frames: list[StreamedFrame] = []
+        self._stopped = False
+        self._failure: S2AError | None = None
+        self._thread = Thread(target=self._run, name="camera", daemon=True)
+
+    def start(self) -> None:
+        """Start reading."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop reading."""
+        self._stopped = True
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def use(self, publish: Callable[[Frame, Trace], int] | None) -> None:
+        """Publish every frame from now on, or with None just keep the newest, converted to BGR."""
+        with self._changed:
+            if self._publish is not publish:
+                self._publish, self._newest, self._frames = publish, None, []
+
+    def next_frame(self, after: int, timeout_s: float = 10.0) -> int:
+        """Wait for a frame whose index is above ``after`` and return its index; raises what the source raised."""
+
+        def is_there() -> bool:
+            return self._failure is not None or (self._newest is not None and self._newest[0].index > after)
+
+        with self._changed:
+            self._changed.wait_for(is_there, timeout_s)
+            if self._failure is not None:
+                raise self._failure
+            if self._newest is None:
+                raise SourceError(f"--source: the camera delivered nothing for {timeout_s:.0f} s")
+            return self._newest[0].index
+
+    def newest(self) -> tuple[StreamedFrame, Frame] | None:
+        """Return the newest frame, as record and picture."""
+        with self._changed:
+            return self._newest
+
+    def drain(self) -> list[StreamedFrame]:
+        """Return the frames since the last call."""
+        with self._changed:
+            frames, self._frames = self._frames, []
+            return frames
+
+    def _run(self) -> None:
+        intended_ns = self._clock.now_ns()
+        while not self._stopped:
+            self._clock.sleep_until_ns(intended_ns)
+            try:
+                self._step(intended_ns)
+            except S2AError as error:
+                with self._changed:
+                    self._failure = error
+                    self._changed.notify_all()
+                return
+            intended_ns += self._period_ns
+
+    def _step(self, intended_ns: int) -> None:
+        publish = self._publish
+        trace = Trace()
+        trace.mark(RESIDUAL)
+        frame = self._source.read()
+        trace.mark("capture")
+        stamp_ns = -1
+        if publish is not None:
+            stamp_ns = publish(frame, trace)
+        else:
+            frame = bgr_of(frame, trace)
+        with self._changed:
+            if publish is self._publish:
+                record = StreamedFrame(frame.index, frame.stamp_ns, intended_ns, trace.marks, stamp_ns)
+                self._newest = record, frame
+                self._frames.append(record)
+                self._changed.notify_all()
+
+
+class StreamFeed:
+    """Prompts about the camera's newest frame, at a random moment between two frames."""
+
+    def __init__(
+        self, camera: Camera, publish: Callable[[Frame, Trace], int] | None, period_ns: int, random: Random
+    ) -> None:
+        """Use ``publish`` for pipelines whose server keeps the newest frame itself."""
+        self._camera = camera
+        self._publish = publish
+        self._period_ns = period_ns
+        self._random = random
+        self._clock = SystemClock()
+        self.last: StreamedFrame | None = None
+
+    def get_ready(self) -> None:
+        """Wait for two new frames, so that the server has one, and then for a random part of the period."""
+        self._camera.use(self._publish)
+        newest = self._camera.newest()
+        first = self._camera.next_frame(newest[0].index if newest else -1)
+        self._camera.next_frame(first)
+        self._clock.sleep_until_ns(self._clock.now_ns() + self._random.randrange(self._period_ns))
+
+    def drain(self) -> list[StreamedFrame]:
+        """Return the camera's frames since the last call."""
+        return self._camera.drain()
+
+    def capture(self, trace: Trace) -> Frame | None:
+        """Start the prompt's clock and take the newest frame; None where the server has it."""
+        newest = self._camera.newest()
+        trace.mark(RESIDUAL)
+        if newest is None:
+            return None
+        self.last = newest[0]
+        return newest[1] if self._publish is None else None

@@ -1,0 +1,161 @@
+"""What a latency run is asked to do, checked, and the cells that follow from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from s2a_bench.errors import UsageError
+from s2a_bench.inference import ENGINES, EngineConfig
+from s2a_bench.transport import TRANSPORTS, Route
+
+HTTP_VARIANTS = ("as-deployed", "best-effort", "binary")
+PAYLOADS = ("jpeg", "jpeg-preencoded", "png", "raw")
+WIRES = ("bgr", "yuyv", "compressed")
+CONNECTIONS = ("keep-alive", "per-request", "client-per-request")
+MODES = ("request", "stream")
+TUNINGS = ("tuned", "default")
+
+DEFAULT_PROMPT = """You are a robot task planner.
+Skills: go_to(location), open(object), close(object), pick(object), place(object, location).
+Rules: Output only numbered skill calls, one per line.
+Do not output any explanation."""
+"""The paper's prompt (section IV-E)."""
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyConfig:
+    """The settings of one ``s2a-bench latency`` run, as the flags of the same names give them."""
+
+    transports: tuple[str, ...] = ("http", "ros")
+    http: tuple[str, ...] = ()
+    """Variants; empty: all that the server speaks."""
+    source: str = "synthetic"
+    width: int = 640
+    height: int = 480
+    payload: str = "jpeg"
+    wire: str = "bgr"
+    connection: str = "keep-alive"
+    url: str = ""
+    llama_server: Path | None = None
+    port: int = 0
+    dds_tuning: str = "tuned"
+    domain_id: int = 0
+    namespace: str = "/s2a_bench"
+    engine: EngineConfig = field(default_factory=EngineConfig)
+    runs: int = 50
+    warmup: int = 5
+    mode: str = "request"
+    fps: float = 30.0
+    max_tokens: int = 32
+    prompt: str = DEFAULT_PROMPT
+    grammar: str = ""
+    seed: int = 0
+    timeout_s: float = 300.0
+
+    @property
+    def black_box(self) -> bool:
+        """Tell whether the HTTP server is somebody else's."""
+        return bool(self.url or self.llama_server)
+
+    @property
+    def http_variants(self) -> tuple[str, ...]:
+        """Return the variants to measure."""
+        speaks = HTTP_VARIANTS[:2] if self.black_box else HTTP_VARIANTS
+        return self.http or speaks
+
+    def check(self) -> None:
+        """Raise UsageError, naming the flag, for a value or combination that makes no sense."""
+        _one_of("--transport", self.transports, tuple(TRANSPORTS))
+        _one_of("--http", self.http, HTTP_VARIANTS)
+        _one_of("--payload", [self.payload], PAYLOADS)
+        _one_of("--wire", [self.wire], WIRES)
+        _one_of("--connection", [self.connection], CONNECTIONS)
+        _one_of("--engine", [self.engine.name], tuple(ENGINES))
+        _one_of("--mode", [self.mode], MODES)
+        _one_of("--dds-tuning", [self.dds_tuning], TUNINGS)
+        for flag, value, least in (
+            ("--runs", self.runs, 1),
+            ("--warmup", self.warmup, 0),
+            ("--max-tokens", self.max_tokens, 1),
+            ("--timeout", self.timeout_s, 0.1),
+            ("--fps", self.fps, 0.1),
+        ):
+            if value < least:
+                raise UsageError(f"{flag}: {value} is too few, {least} is the least")
+        if self.width < 16 or self.height < 16 or self.width % 2:  # noqa: PLR2004
+            raise UsageError(f"--size: {self.width}x{self.height} should be at least 16x16, of even width")
+        if not self.namespace.startswith("/") or self.namespace.endswith("/"):
+            raise UsageError(f"--namespace: '{self.namespace}' should look like /name")
+        self._check_black_box()
+        self._check_stream()
+
+    def _check_black_box(self) -> None:
+        if self.url and self.llama_server:
+            raise UsageError("--url and --llama-server name two HTTP servers; give one of them")
+        if not self.black_box:
+            return
+        flag = "--url" if self.url else "--llama-server"
+        if "http" not in self.transports:
+            raise UsageError(f"{flag} needs http among --transport")
+        if self.url and not self.url.startswith(("http://", "https://")):
+            raise UsageError(f"--url: '{self.url}' should start with http:// or https://")
+        if self.payload == "raw":
+            raise UsageError(f"--payload raw needs our own server; with {flag} use jpeg, jpeg-preencoded or png")
+        if "binary" in self.http:
+            raise UsageError(f"--http binary needs our own server; leave it out with {flag}")
+        if self.llama_server and self.engine.name != "llama":
+            raise UsageError(f"--llama-server runs a model; leave out --engine {self.engine.name}")
+
+    def _check_stream(self) -> None:
+        if self.mode == "stream" and self.payload == "jpeg-preencoded":
+            raise UsageError("--payload jpeg-preencoded has no meaning in --mode stream; use jpeg")
+
+    def to_manifest(self) -> dict[str, Any]:
+        """Return the settings as plain data."""
+        from dataclasses import asdict
+
+        return {**asdict(self), "http": list(self.http_variants), "size": f"{self.width}x{self.height}"}
+
+
+def _one_of(flag: str, values: tuple[str, ...] | list[str], known: tuple[str, ...]) -> None:
+    for value in values:
+        if value not in known:
+            raise UsageError(f"{flag}: '{value}' is none of {', '.join(known)}")
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One thing that is compared: a pipeline with its settings."""
+
+    name: str
+    route: Route
+    payload: str
+    """What travels: the HTTP payload, the ROS wire format, or nothing for loopback."""
+
+
+def plan_cells(config: LatencyConfig, addresses: dict[str, str]) -> list[Cell]:
+    """List the cells of a run; ``addresses`` maps each transport to where its server is."""
+    common = Route(
+        transport="",
+        payload=config.payload,
+        wire=config.wire,
+        connection=config.connection,
+        dds_tuning=config.dds_tuning,
+        domain_id=config.domain_id,
+        timeout_s=config.timeout_s,
+    )
+    cells = []
+    for transport in config.transports:
+        route = replace(common, transport=transport, address=addresses[transport])
+        if transport == "http":
+            cells += [
+                Cell(f"http/{variant}", replace(route, variant=variant, black_box=config.black_box), config.payload)
+                for variant in config.http_variants
+            ]
+        elif transport == "ros":
+            cells.append(Cell("ros/topic", replace(route, variant="topic"), config.wire))
+        else:
+            cells.append(Cell(transport, route, ""))
+    return cells

@@ -1,0 +1,176 @@
+"""One request, measured: capture, ask, collect tokens, and turn the trace into rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+from s2a_bench.bench.feed import Feed, StreamedFrame, StreamFeed, fingerprint
+from s2a_bench.bench.plan import Cell, LatencyConfig
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import EngineError, S2AError, ServerDied, SourceError, UsageError
+from s2a_bench.store.schema import FrameRow, SampleRow, TokenRow
+from s2a_bench.trace import Mark, Trace
+from s2a_bench.transport import Client
+from s2a_bench.types import Frame, Request, Token
+
+FATAL = (ServerDied, SourceError, UsageError, EngineError)
+"""Errors after which the next request cannot succeed either."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where in the run a request stands."""
+
+    block: int
+    position: int
+    warmup: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """The rows of one request; ``fingerprint`` tells its picture from others."""
+
+    sample: SampleRow
+    tokens: list[TokenRow]
+    fingerprint: int
+
+
+class Session:
+    """The client side of one cell."""
+
+    def __init__(self, cell: Cell, client: Client, feed: Feed, config: LatencyConfig) -> None:
+        """Measure ``cell`` with an open client."""
+        self.cell = cell
+        self.client = client
+        self.feed = feed
+        self._config = config
+        self._published: dict[int, StreamedFrame] = {}
+
+    def measure(self, place: Place) -> Measured:
+        """Make one request; a failure that concerns only it becomes a row with its error."""
+        self.feed.get_ready()
+        request_id = f"{self.cell.name}-{place.block}"
+        seen: list[tuple[Token, int]] = []
+        trace = Trace()
+        error = ""
+        frame = self.feed.capture(trace)
+        images = () if frame is None else (frame,)
+        config = self._config
+        request = Request(request_id, config.prompt, images, config.max_tokens, config.grammar, config.seed)
+        try:
+            seen.extend((token, now_ns()) for token in self.client.request(request, trace))
+        except FATAL:
+            raise
+        except S2AError as failure:
+            error = f"{type(failure).__name__}: {failure}"
+        if not error and not seen:
+            error = "RequestFailed: the answer was empty"
+        return self._rows(place, request_id, frame, trace, seen, error)
+
+    def _rows(
+        self,
+        place: Place,
+        request_id: str,
+        frame: Frame | None,
+        trace: Trace,
+        seen: list[tuple[Token, int]],
+        error: str,
+    ) -> Measured:
+        """Turn what was seen into rows."""
+        config, facts = self._config, trace.facts
+        streamed = self._streamed(trace, request_id)
+        if streamed:
+            index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index
+        elif frame:
+            index, captured_ns, picture = frame.index, frame.stamp_ns, fingerprint(frame)
+        else:
+            index, captured_ns, picture = -1, -1, place.block
+        started_ns = inference_start_ns(trace)
+        sample = SampleRow(
+            cell=self.cell.name,
+            pipeline=self.cell.route.transport,
+            variant=self.cell.route.variant,
+            payload=self.cell.payload,
+            connection=self.cell.route.connection if self.cell.route.transport == "http" else "",
+            engine=config.engine.name,
+            mode=config.mode,
+            size=f"{config.width}x{config.height}",
+            block=place.block,
+            position=place.position,
+            warmup=place.warmup,
+            request_id=request_id,
+            frame_index=index,
+            error=error,
+            marks=trace.chain(),
+            n_tokens=len(seen),
+            last_token_ns=seen[-1][1] if seen else None,
+            frame_age_ns=started_ns - captured_ns if started_ns is not None and captured_ns >= 0 else None,
+            cache_n=_whole(facts.get("cache_n")),
+            prompt_n=_whole(facts.get("prompt_n")),
+            server_prompt_ms=facts.get("prompt_ms"),
+            payload_bytes=_whole(facts.get("payload_bytes")),
+            facts=facts,
+        )
+        engine_ns = trace.remote.token_ns if trace.remote else []
+        tokens = [
+            TokenRow(
+                request_id=request_id,
+                cell=self.cell.name,
+                index=token.index,
+                token_id=token.id,
+                text=token.text,
+                engine_ns=engine_ns[position] if position < len(engine_ns) else None,
+                client_ns=client_ns,
+            )
+            for position, (token, client_ns) in enumerate(seen)
+        ]
+        return Measured(sample, tokens, picture)
+
+    def _streamed(self, trace: Trace, request_id: str) -> StreamedFrame | None:
+        """Find the camera frame that the answer is about, and complete its marks with the server's."""
+        if not isinstance(self.feed, StreamFeed):
+            return None
+        used = self.feed.last
+        if trace.remote is not None and trace.remote.frame_stamp_ns >= 0:
+            used = self._published.get(trace.remote.frame_stamp_ns, used)
+            if used is not None and not used.used_by:
+                used.marks = [*used.marks, *trace.remote.frame_marks]
+        if used is not None:
+            used.used_by = request_id
+        return used
+
+    def remember(self, frames: list[StreamedFrame]) -> list[FrameRow]:
+        """Take the camera's frames since the last call; return the rows of those before the newest few."""
+        for frame in frames:
+            self._published[frame.stamp_ns if frame.stamp_ns >= 0 else frame.intended_ns] = frame
+        rows = []
+        while len(self._published) > KEPT_FRAMES:
+            rows.append(self._row(self._published.pop(next(iter(self._published)))))
+        return rows
+
+    def finish(self) -> list[FrameRow]:
+        """Return the rows of the frames that are left."""
+        rows = [self._row(frame) for frame in self._published.values()]
+        self._published.clear()
+        return rows
+
+    def _row(self, frame: StreamedFrame) -> FrameRow:
+        return FrameRow(self.cell.name, frame.index, frame.intended_ns, frame.marks, frame.used_by)
+
+
+KEPT_FRAMES = 90
+"""Frames kept until an answer may name them: three seconds at 30 Hz."""
+
+
+def inference_start_ns(trace: Trace) -> int | None:
+    """Return when the request was handed to the engine: the mark before `inference`, where there is one."""
+    chain: list[Mark] = trace.chain()
+    for (_, before_ns), (stage, _) in pairwise(chain):
+        if stage == "inference":
+            return before_ns
+    return None
+
+
+def _whole(value: float | None) -> int | None:
+    return None if value is None else int(value)

@@ -1,0 +1,162 @@
+"""`s2a-bench latency`: what the transport costs, stage by stage."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from s2a_bench.errors import S2AError, UsageError
+
+if TYPE_CHECKING:
+    from s2a_bench.cli.progress import RunProgress
+
+WIDTH = 100
+"""Columns of the tables where the output is no terminal."""
+QUICK = {"runs": 10, "warmup": 2, "max_tokens": 8}
+FULL = {"runs": 50, "warmup": 5, "max_tokens": 32}
+
+
+def latency(
+    transport: Annotated[str, typer.Option(help="http, ros, loopback; several with commas")] = "http,ros",
+    source: Annotated[str, typer.Option(help="synthetic, video:FILE, images:DIR, v4l2:/dev/video0")] = "synthetic",
+    size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the frames")] = "640x480",
+    payload: Annotated[str, typer.Option(help="HTTP picture: jpeg, jpeg-preencoded, png, raw")] = "jpeg",
+    http: Annotated[
+        str, typer.Option(help="as-deployed, best-effort, binary; several with commas [default: all]")
+    ] = "",
+    wire: Annotated[str, typer.Option(help="ROS picture: bgr, yuyv, compressed")] = "bgr",
+    url: Annotated[str, typer.Option(help="an OpenAI-compatible server that runs already (a black box)")] = "",
+    llama_server: Annotated[
+        Path | None, typer.Option(help="start this llama.cpp server on the same model files (a black box)")
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port of the HTTP server; 0: any free one")] = 0,
+    dds_tuning: Annotated[str, typer.Option(help="tuned, default")] = "tuned",
+    namespace: Annotated[str, typer.Option(help="ROS namespace of the topics")] = "/s2a_bench",
+    connection: Annotated[str, typer.Option(help="HTTP: keep-alive, per-request, client-per-request")] = "keep-alive",
+    engine: Annotated[str, typer.Option(help="llama (a real model), echo (no model: transport alone)")] = "llama",
+    model: Annotated[Path | None, typer.Option(help="GGUF model [default: the tiny dummy]")] = None,
+    mmproj: Annotated[Path | None, typer.Option(help="GGUF vision tower that goes with --model")] = None,
+    threads: Annotated[int, typer.Option(min=0, help="CPU threads of the model; 0: all")] = 0,
+    gpu_layers: Annotated[int, typer.Option(min=-1, help="model layers on the GPU; -1: all")] = 0,
+    context: Annotated[int, typer.Option(min=256, help="context length in tokens")] = 4096,
+    runs: Annotated[int | None, typer.Option(help="samples a pipeline [default: 50, quick: 10]")] = None,
+    warmup: Annotated[int | None, typer.Option(help="warm-ups a pipeline, kept and marked [default: 5]")] = None,
+    mode: Annotated[str, typer.Option(help="request (a frame each), stream (a camera runs)")] = "request",
+    fps: Annotated[float, typer.Option(help="rate of the camera in --mode stream")] = 30.0,
+    max_tokens: Annotated[int | None, typer.Option(help="tokens an answer [default: 32, quick: 8]")] = None,
+    prompt: Annotated[str | None, typer.Option(help="text, or @FILE [default: the paper's prompt]")] = None,
+    grammar: Annotated[Path | None, typer.Option(help="GBNF file that every answer obeys")] = None,
+    seed: Annotated[int, typer.Option(help="seed of the order, the source and the sampling")] = 0,
+    timeout: Annotated[float, typer.Option(help="longest silence of a server, in seconds")] = 300.0,
+    output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
+    against: Annotated[str, typer.Option(help="paper: draw the paper's figures beside ours")] = "",
+    quick: Annotated[bool, typer.Option("--quick", help="fewer samples: a first look")] = False,
+    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="also the cost of a mark and the environment")] = False,
+) -> None:
+    """Measure what the transport costs: HTTP/JSON + Base64 against ROS 2-native, every stage, one interleaved run."""
+    from s2a_bench.bench.latency import run_latency
+    from s2a_bench.bench.plan import DEFAULT_PROMPT, LatencyConfig
+    from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.inference import EngineConfig
+    from s2a_bench.ros.config import domain_id
+
+    if against not in {"", "paper"}:
+        raise UsageError(f"--against: '{against}' should be paper")
+    few = QUICK if quick else FULL
+    width, height = _size(size)
+    config = LatencyConfig(
+        transports=_listed(transport),
+        http=_listed(http),
+        source=source,
+        width=width,
+        height=height,
+        payload=payload,
+        wire=wire,
+        connection=connection,
+        url=url,
+        llama_server=llama_server,
+        port=port,
+        dds_tuning=dds_tuning,
+        domain_id=domain_id(os.environ),
+        namespace=namespace,
+        engine=EngineConfig(engine, model, mmproj, threads, gpu_layers, context),
+        runs=few["runs"] if runs is None else runs,
+        warmup=few["warmup"] if warmup is None else warmup,
+        mode=mode,
+        fps=fps,
+        max_tokens=few["max_tokens"] if max_tokens is None else max_tokens,
+        prompt=DEFAULT_PROMPT if prompt is None else _text(prompt),
+        grammar=_file(grammar, "--grammar") if grammar else "",
+        seed=seed,
+        timeout_s=timeout,
+    )
+    config.check()
+    with RunProgress() as progress:
+        try:
+            folder = run_latency(config, output, progress)
+        except (S2AError, KeyboardInterrupt):
+            if progress.folder is not None:
+                progress.console.print(f"samples so far: {progress.folder}", highlight=False, soft_wrap=True)
+            raise
+        progress.stage("drawing")
+        _show(folder, progress, as_json=json_, against_paper=against == "paper", verbose=verbose)
+
+
+def _show(folder: Path, progress: RunProgress, *, as_json: bool, against_paper: bool, verbose: bool) -> None:
+    """Write tables and figures, and print what the user asked for."""
+    from rich.console import Console
+
+    from s2a_bench.report.figures import write_figures
+    from s2a_bench.report.machine import to_json
+    from s2a_bench.report.tables import write_tables
+    from s2a_bench.report.terminal import renderables
+    from s2a_bench.store.run import read_run
+
+    run = read_run(folder)
+    write_tables(run)
+    write_figures(run, against_paper=against_paper)
+    for doubt in run.manifest["warnings"]:
+        progress.console.print(
+            f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}", markup=False, soft_wrap=True
+        )
+    if as_json:
+        json.dump(to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
+        sys.stdout.write("\n")
+        return
+    terminal = Console()
+    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    for part in renderables(run):
+        console.print(part)
+    if verbose:
+        console.print(f"a mark costs {run.manifest['mark_cost_ns']} ns")
+        console.print_json(data=run.manifest["environment"])
+    console.print(f"run folder: {folder}", highlight=False, soft_wrap=True)
+
+
+def _listed(text: str) -> tuple[str, ...]:
+    """Split at commas, each name once."""
+    return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, cross, height = text.lower().partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal()):
+        raise UsageError(f"--size: '{text}' should look like 640x480")
+    return int(width), int(height)
+
+
+def _text(value: str) -> str:
+    return _file(Path(value[1:]), "--prompt") if value.startswith("@") else value
+
+
+def _file(path: Path, flag: str) -> str:
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{flag}: cannot read {path}: {error}") from error

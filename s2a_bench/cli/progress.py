@@ -1,0 +1,64 @@
+"""How a run shows on the terminal: a bar with the time left, or plain lines where there is no terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+PLAIN_STEPS = 5
+"""Without a terminal, progress is told this often."""
+
+
+class RunProgress:
+    """Progress of one run, on standard error. Use as a context manager."""
+
+    def __init__(self) -> None:
+        self.console = Console(stderr=True)
+        self.folder: Path | None = None
+        self._bar = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=self.console,
+            transient=True,
+            disable=not self.console.is_terminal,
+        )
+        self._task = self._bar.add_task("starting", total=None)
+        self._total = 0
+        self._done = 0
+        self._said = ""
+
+    def __enter__(self) -> RunProgress:  # noqa: PYI034 - Self is typing's since 3.11
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def opened(self, folder: Path) -> None:
+        """Remember where the results go."""
+        self.folder = folder
+
+    def stage(self, text: str) -> None:
+        """Show what is being done."""
+        self._bar.update(self._task, description=text)
+        if self._bar.disable and text != self._said:
+            self.console.print(text, highlight=False)
+        self._said = text
+
+    def expect(self, samples: int) -> None:
+        """Start counting."""
+        self._total = samples
+        self._bar.update(self._task, total=samples)
+
+    def advance(self) -> None:
+        """Count one."""
+        self._done += 1
+        self._bar.advance(self._task)
+        step = max(1, self._total // PLAIN_STEPS)
+        if self._bar.disable and self._done % step == 0:
+            self.console.print(f"  {self._done} of {self._total} samples", highlight=False)

@@ -1,0 +1,177 @@
+"""The HTTP server and client beyond the contract."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack
+from threading import Thread
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from s2a_bench.errors import PortInUse
+from s2a_bench.trace import Trace, budget
+from s2a_bench.transport import Route, open_client, open_server
+from s2a_bench.transport.http import dialect
+from s2a_bench.types import Request
+from tests.conformance.transport import Recorder, ask, yuyv_frame
+
+
+@pytest.fixture
+def handler() -> Recorder:
+    return Recorder(["go", "_to"])
+
+
+@pytest.fixture
+def url(handler: Recorder) -> Iterator[str]:
+    with ExitStack() as stack:
+        server = open_server(Route("http"), handler)
+        thread = Thread(target=server.serve)
+        thread.start()
+        stack.callback(thread.join)
+        stack.callback(server.stop)
+        yield server.address
+
+
+def stages(url: str, variant: str, payload: str) -> set[str]:
+    client = open_client(Route("http", variant, url, payload=payload))
+    try:
+        _, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
+    finally:
+        client.close()
+    return set(budget(trace.chain()).stages_ns)
+
+
+COMMON = {"convert", "json_pack", "network", "json_parse", "inference", "return"}
+
+
+@pytest.mark.parametrize(
+    ("variant", "payload", "expected"),
+    [
+        ("as-deployed", "jpeg", {"image_encode", "base64_encode", "base64_decode", "image_decode"}),
+        ("as-deployed", "raw", {"base64_encode", "base64_decode", "channel_swap"}),
+        ("best-effort", "png", {"image_encode", "base64_encode", "base64_decode", "image_decode"}),
+        ("binary", "jpeg", {"image_encode", "image_decode"}),
+        ("binary", "raw", {"channel_swap"}),
+    ],
+)
+def test_each_variant_has_its_stages_and_no_other(url: str, variant: str, payload: str, expected: set[str]) -> None:
+    assert stages(url, variant, payload) == COMMON | expected
+
+
+def test_a_new_client_per_request_shows_as_connect(url: str) -> None:
+    client = open_client(Route("http", "as-deployed", url, connection="client-per-request"))
+    _, trace = ask(client, Request("a", "plan"))
+    assert "connect" in budget(trace.chain()).stages_ns
+
+
+@pytest.mark.parametrize(("connection", "connections"), [("keep-alive", 1), ("per-request", 3)])
+def test_connections_are_kept_or_not(
+    handler: Recorder, connection: str, connections: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import socket
+
+    opened = []
+    connect = socket.create_connection
+    monkeypatch.setattr(socket, "create_connection", lambda *a, **k: opened.append(1) or connect(*a, **k))
+    server = open_server(Route("http"), handler)
+    thread = Thread(target=server.serve)
+    thread.start()
+    client = open_client(Route("http", "as-deployed", server.address, connection=connection))
+    try:
+        for _ in range(3):
+            ask(client, Request("a", "plan"))
+    finally:
+        client.close()
+        server.stop()
+        thread.join()
+    assert len(opened) == connections
+
+
+def test_the_whole_answer_comes_without_stream(url: str) -> None:
+    body = {"messages": [{"role": "user", "content": "plan"}], "max_tokens": 2}
+    answer = httpx.post(url + "/v1/chat/completions", json=body).json()
+    assert answer["choices"][0] == {
+        "index": 0,
+        "message": {"role": "assistant", "content": "go_to"},
+        "finish_reason": "length",
+    }
+    assert answer["usage"]["completion_tokens"] == 2
+
+
+def test_the_stream_is_what_openai_clients_expect(url: str) -> None:
+    body = {"messages": [{"role": "user", "content": [{"type": "text", "text": "plan"}]}], "stream": True}
+    lines = httpx.post(url + "/v1/chat/completions", json=body).text.split("\n\n")
+    assert lines[-2:] == ["data: [DONE]", ""]
+    events = [json.loads(line.removeprefix("data: ")) for line in lines[:-2]]
+    assert [event["choices"][0]["delta"] for event in events[:-1]] == [{"content": "go"}, {"content": "_to"}, {}]
+    assert events[-2]["choices"][0]["finish_reason"] == "stop"
+    assert events[-1]["choices"] == []
+    assert [stage for stage, _ in events[-1]["s2a"]["marks"]] == ["network", "json_parse", "inference"]
+
+
+def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: Recorder) -> None:
+    picture = np.full((8, 8, 3), (255, 0, 0), np.uint8)  # blue in OpenCV's order
+    uri = "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", picture)[1]).decode()
+    part = {"type": "image_url", "image_url": {"url": uri}}
+    httpx.post(url + "/v1/chat/completions", json={"messages": [{"role": "user", "content": [part]}]})
+    assert handler.requests[0].images[0].data[0, 0].tolist() == [0, 0, 255]
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "status", "message"),
+    [
+        (dialect.PATHS["as-deployed"], b"{}", 422, "body.messages"),
+        (dialect.PATHS["as-deployed"], b"{", 422, "JSON"),
+        (dialect.PATHS["best-effort"], b"{", 400, "no JSON"),
+        (dialect.PATHS["best-effort"], b"{}", 400, "messages"),
+        (dialect.PATHS["binary"], b"", 400, "s2a-request"),
+    ],
+)
+def test_a_bad_body_is_refused_with_the_reason(url: str, path: str, body: bytes, status: int, message: str) -> None:
+    answer = httpx.post(url + path, content=body, headers={"content-type": "application/json"})
+    assert answer.status_code == status
+    assert message in answer.json()["error"]["message"]
+
+
+@pytest.mark.parametrize("uri", ["http://example.org/x.jpg", "data:image/jpeg;base64,AAAA", "data:image/png;base64,%"])
+def test_a_bad_picture_is_refused_with_the_reason(url: str, uri: str) -> None:
+    part = {"type": "image_url", "image_url": {"url": uri}}
+    body = {"messages": [{"role": "user", "content": [part]}]}
+    assert httpx.post(url + "/v1/chat/completions", json=body).status_code == 400
+
+
+def test_health_and_models_answer(url: str) -> None:
+    assert httpx.get(url + "/health").json() == {"status": "ok"}
+    assert httpx.get(url + "/v1/models").json()["data"][0]["id"] == "s2a"
+
+
+def test_a_port_in_use_is_named(url: str, handler: Recorder) -> None:
+    with pytest.raises(PortInUse, match=r"--port: .* is in use"):
+        open_server(Route("http", address=url.removeprefix("http://")), handler)
+
+
+def test_servers_bind_loopback_unless_told(url: str) -> None:
+    assert url.startswith("http://127.0.0.1:")
+
+
+@pytest.mark.parametrize("codec", [dialect.STANDARD, dialect.FAST])
+def test_both_codecs_write_the_same_wire(codec: dialect.Codec) -> None:
+    data = np.arange(256, dtype=np.uint8)
+    assert codec.to_base64(data) == base64.b64encode(bytes(range(256))).decode()
+    assert codec.from_base64(codec.to_base64(data)) == bytes(range(256))
+    assert codec.loads(codec.dumps({"a": ["ü", 1, None]})) == {"a": ["ü", 1, None]}
+    assert codec.dumps({"a": ["ü", 1]}) == '{"a":["ü",1]}'.encode()
+
+
+def test_marks_survive_the_wire() -> None:
+    trace = Trace()
+    trace.mark("network")
+    trace.facts["prompt_n"] = 5.0
+    trace.token_ns.append(17)
+    remote = trace.to_remote()
+    assert dialect.remote_of_json(json.loads(json.dumps(dialect.remote_to_json(remote)))) == remote
