@@ -1,0 +1,276 @@
+"""Write shape-faithful dummy weights: MiniCPM-V 2.6's architecture with random numbers, as two GGUF files.
+
+Token speed depends on shapes and types, not on values. The language model is Qwen2-7B's; the mmproj is SigLIP-so400m
+at 980 pixels' positions with a `resampler` of 64 queries (minicpmv_version 3). Names and keys are those that llama.cpp
+reads (``src/models/qwen2.cpp``, ``tools/mtmd/clip.cpp``) and its converter writes (``tools/mtmd/legacy-models``).
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+
+from s2a_bench.errors import ModelError, UsageError
+from s2a_bench.inference.dummy_vocab import Vocab, make_vocab
+from s2a_bench.inference.dummy_weights import Kind, Tensor
+
+if TYPE_CHECKING:
+    from gguf import GGUFWriter
+
+Size: TypeAlias = Literal["tiny", "full"]
+Quant: TypeAlias = Literal["f16", "q8_0", "q4_0"]
+Progress: TypeAlias = Callable[[int, int], None]
+"""Called with (bytes written, bytes in all)."""
+
+REVISION = 1
+"""Part of the file names; raise it when the bytes change, so that old files in caches are not used."""
+
+DUMMY_KEY = "s2a_bench.dummy"
+_POSITIONS = 70 * 70
+_PATCH = 14
+_QUERIES = 64
+_MEAN_STD = [0.5, 0.5, 0.5]
+_FILE_TYPES = {"f16": 1, "q4_0": 2, "q8_0": 7}  # llama_ftype
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """The lengths that make a MiniCPM-V of one size."""
+
+    layers: int
+    width: int
+    ffn: int
+    heads: int
+    kv_heads: int
+    vision_layers: int
+    vision_width: int
+    vision_ffn: int
+    vision_heads: int
+
+
+SHAPES: dict[Size, Shape] = {
+    # the resampler's heads are 128 wide, so 256 is the smallest width with more than one; one head of 64 in the
+    # vision tower, as attention over a thousand patches is most of its time (SigLIP's heads are 72 wide)
+    "tiny": Shape(4, 256, 768, 4, 2, 2, 64, 256, 1),
+    "full": Shape(28, 3584, 18944, 28, 4, 27, 1152, 4304, 16),
+}
+
+
+class DummyFiles(NamedTuple):
+    """Where the two files of a model are."""
+
+    model: Path
+    mmproj: Path
+
+
+def dummy_files(folder: Path, size: Size, quant: Quant, seed: int = 0) -> DummyFiles:
+    """Name the files that `write_dummy` writes into ``folder``."""
+    stem = f"MiniCPM-V-2_6-dummy-{size}-r{REVISION}-s{seed}"
+    return DummyFiles(folder / f"{stem}-{quant}.gguf", folder / f"mmproj-{stem}-f16.gguf")
+
+
+def write_dummy(
+    folder: Path, size: Size = "tiny", quant: Quant = "f16", *, seed: int = 0, progress: Progress | None = None
+) -> DummyFiles:
+    """Write both files into ``folder``, each in one step at its end, so that a crash leaves no half file.
+
+    Two processes may write the same files at once. Raises UsageError for an unknown size or type, ModelError
+    where the folder cannot be written.
+    """
+    if size not in SHAPES:
+        raise UsageError(f"--size: '{size}' is none of {', '.join(SHAPES)}")
+    if quant not in _FILE_TYPES:
+        raise UsageError(f"--quant: '{quant}' is none of {', '.join(_FILE_TYPES)}")
+    shape = SHAPES[size]
+    files = dummy_files(folder, size, quant, seed)
+    vocab = make_vocab(full=size == "full")
+    model, mmproj = list(_model_tensors(shape, len(vocab.tokens), quant)), list(_mmproj_tensors(shape))
+    meter = _Meter(sum(tensor.nbytes for tensor in (*model, *mmproj)), progress)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write(files.mmproj, "clip", lambda writer: _mmproj_keys(writer, shape, size), mmproj, seed=seed, meter=meter)
+        _write(
+            files.model,
+            "qwen2",
+            lambda writer: _model_keys(writer, shape, size, quant, vocab),
+            model,
+            seed=seed,
+            meter=meter,
+        )
+    except OSError as error:
+        raise ModelError(
+            f"--output {folder}: cannot write the dummy model ({error.strerror or error}); "
+            f"it needs {meter.total / 1e9:.2f} GB, choose another folder"
+        ) from error
+    return files
+
+
+class _Meter:
+    """Adds up bytes written and passes them on."""
+
+    def __init__(self, total: int, progress: Progress | None) -> None:
+        self.total = total
+        self._done = 0
+        self._progress = progress
+
+    def add(self, count: int) -> None:
+        self._done += count
+        if self._progress is not None:
+            self._progress(self._done, self.total)
+
+
+def _write(
+    path: Path,
+    architecture: str,
+    keys: Callable[[GGUFWriter], None],
+    tensors: Iterable[Tensor],
+    *,
+    seed: int,
+    meter: _Meter,
+) -> None:
+    """Write one file: gguf-py writes header and keys, the tensors are streamed behind them."""
+    import numpy as np
+    from gguf import GGMLQuantizationType, GGUFWriter
+
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    os.close(handle)
+    temporary = Path(name)
+    writer = GGUFWriter(temporary, architecture)
+    try:
+        keys(writer)
+        for tensor in tensors:
+            writer.add_tensor_info(
+                tensor.name,
+                tensor.shape,
+                np.dtype(np.float32),
+                tensor.nbytes,
+                raw_dtype=GGMLQuantizationType[tensor.kind.upper()],
+            )
+        writer.write_header_to_file()
+        writer.write_kv_data_to_file()
+        writer.write_ti_data_to_file()
+        (file,) = writer.fout
+        writer.write_padding(file, file.tell())
+        for tensor in tensors:
+            for chunk in tensor.chunks(seed):
+                file.write(chunk.data)
+                meter.add(chunk.nbytes)
+            writer.write_padding(file, tensor.nbytes)
+        writer.close()
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    finally:
+        writer.close()
+        temporary.unlink(missing_ok=True)
+
+
+def _general_keys(writer: GGUFWriter, size: Size, quant: Quant, part: str) -> None:
+    writer.add_name(f"MiniCPM-V 2.6 {part}, DUMMY random weights ({size})")
+    writer.add_description("Random weights in the shapes of MiniCPM-V 2.6, for timing only; written by s2a-bench.")
+    writer.add_bool(DUMMY_KEY, val=True)
+    writer.add_string("s2a_bench.dummy_size", size)
+    writer.add_file_type(_FILE_TYPES[quant])
+    writer.add_quantization_version(2)
+
+
+def _model_keys(writer: GGUFWriter, shape: Shape, size: Size, quant: Quant, vocab: Vocab) -> None:
+    _general_keys(writer, size, quant, "language model")
+    writer.add_context_length(32768)
+    writer.add_embedding_length(shape.width)
+    writer.add_block_count(shape.layers)
+    writer.add_feed_forward_length(shape.ffn)
+    writer.add_head_count(shape.heads)
+    writer.add_head_count_kv(shape.kv_heads)
+    writer.add_rope_freq_base(1_000_000.0)
+    writer.add_layer_norm_rms_eps(1e-6)
+    writer.add_tokenizer_model("gpt2")
+    writer.add_tokenizer_pre("qwen2")
+    writer.add_token_list(vocab.tokens)
+    writer.add_token_types(vocab.types)
+    writer.add_token_merges(vocab.merges)
+    writer.add_bos_token_id(vocab.bos)
+    writer.add_eos_token_id(vocab.eos)
+    writer.add_pad_token_id(vocab.pad)
+    writer.add_unk_token_id(vocab.unknown)
+    writer.add_add_bos_token(value=False)
+
+
+def _model_tensors(shape: Shape, n_vocab: int, quant: Quant) -> Iterator[Tensor]:
+    """Yield Qwen2's tensors in the types that llama-quantize gives them."""
+    kind: Kind = quant
+    width, kv_width = shape.width, shape.width // shape.heads * shape.kv_heads
+    yield Tensor("token_embd.weight", (n_vocab, width), kind)
+    for layer in range(shape.layers):
+        block = f"blk.{layer}"
+        yield Tensor(f"{block}.attn_norm.weight", (width,), value=1)
+        for part, rows in (("q", width), ("k", kv_width), ("v", kv_width)):
+            yield Tensor(f"{block}.attn_{part}.weight", (rows, width), kind)
+            yield Tensor(f"{block}.attn_{part}.bias", (rows,))
+        yield Tensor(f"{block}.attn_output.weight", (width, width), kind)
+        yield Tensor(f"{block}.ffn_norm.weight", (width,), value=1)
+        yield Tensor(f"{block}.ffn_gate.weight", (shape.ffn, width), kind)
+        yield Tensor(f"{block}.ffn_up.weight", (shape.ffn, width), kind)
+        yield Tensor(f"{block}.ffn_down.weight", (width, shape.ffn), kind)
+    yield Tensor("output_norm.weight", (width,), value=1)
+    # llama-quantize keeps the output matrix of a Q4_0 model in Q6_K
+    yield Tensor("output.weight", (n_vocab, width), "q6_k" if quant == "q4_0" else kind)
+
+
+def _mmproj_keys(writer: GGUFWriter, shape: Shape, size: Size) -> None:
+    _general_keys(writer, size, "f16", "vision tower and resampler")
+    writer.add_bool("clip.has_text_encoder", val=False)
+    writer.add_bool("clip.has_vision_encoder", val=True)
+    writer.add_bool("clip.has_minicpmv_projector", val=True)
+    writer.add_string("clip.projector_type", "resampler")
+    writer.add_int32("clip.minicpmv_version", 3)
+    writer.add_uint32("clip.minicpmv_query_num", _QUERIES)
+    writer.add_uint32("clip.vision.image_size", 448)
+    writer.add_uint32("clip.vision.patch_size", _PATCH)
+    writer.add_uint32("clip.vision.embedding_length", shape.vision_width)
+    writer.add_uint32("clip.vision.feed_forward_length", shape.vision_ffn)
+    writer.add_uint32("clip.vision.projection_dim", 0)
+    writer.add_uint32("clip.vision.attention.head_count", shape.vision_heads)
+    writer.add_float32("clip.vision.attention.layer_norm_epsilon", 1e-6)
+    writer.add_uint32("clip.vision.block_count", shape.vision_layers)
+    writer.add_array("clip.vision.image_mean", _MEAN_STD)
+    writer.add_array("clip.vision.image_std", _MEAN_STD)
+    writer.add_bool("clip.use_gelu", val=True)
+
+
+def _mmproj_tensors(shape: Shape) -> Iterator[Tensor]:
+    """Yield SigLIP's and the resampler's tensors: matrices in half, all else in single precision."""
+    width, out = shape.vision_width, shape.width
+    yield Tensor("resampler.query", (_QUERIES, out))
+    yield Tensor("resampler.pos_embed_k", (_POSITIONS, out))
+    yield Tensor("resampler.proj.weight", (out, out), "f16")
+    yield Tensor("resampler.kv.weight", (out, width), "f16")
+    for part in ("q", "k", "v", "out"):
+        yield from _linear(f"resampler.attn.{part}", out, out)
+    for part in ("q", "kv", "post"):
+        yield from _norm(f"resampler.ln_{part}", out)
+    yield Tensor("v.patch_embd.weight", (width, 3, _PATCH, _PATCH), "f16")
+    yield Tensor("v.patch_embd.bias", (width,))
+    yield Tensor("v.position_embd.weight", (_POSITIONS, width), "f16")
+    for layer in range(shape.vision_layers):
+        block = f"v.blk.{layer}"
+        for part in ("q", "k", "v", "out"):
+            yield from _linear(f"{block}.attn_{part}", width, width)
+        yield from _norm(f"{block}.ln1", width)
+        yield from _linear(f"{block}.ffn_up", shape.vision_ffn, width)
+        yield from _linear(f"{block}.ffn_down", width, shape.vision_ffn)
+        yield from _norm(f"{block}.ln2", width)
+    yield from _norm("v.post_ln", width)
+
+
+def _linear(name: str, rows: int, columns: int) -> Iterator[Tensor]:
+    yield Tensor(f"{name}.weight", (rows, columns), "f16")
+    yield Tensor(f"{name}.bias", (rows,))
+
+
+def _norm(name: str, width: int) -> Iterator[Tensor]:
+    yield Tensor(f"{name}.weight", (width,), value=1)
+    yield Tensor(f"{name}.bias", (width,))

@@ -1,0 +1,80 @@
+"""Make a vocabulary that Qwen2's tokeniser can use: 256 bytes, merges of letters, MiniCPM-V 2.6's special tokens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+NORMAL, CONTROL = 1, 3
+"""Token types of GGUF (``gguf.TokenType``)."""
+
+FULL_BASE = 151_643
+"""Qwen2's byte-level tokens and merges; the special tokens follow."""
+
+FULL_UNKNOWN = 128_244
+"""MiniCPM-V 2.6 keeps ``<unk>`` within Qwen2's range."""
+
+_LETTERS = "etaoinshrdlcumwfgypbvkjxqz"
+
+_QWEN_SPECIAL = ("<|endoftext|>", "<|im_start|>", "<|im_end|>")
+_IMAGE_SPECIAL = tuple(
+    mark
+    for name in ("image", "ref", "box", "quad", "point", "slice", "image_id")
+    for mark in (f"<{name}>", f"</{name}>")
+)
+_RESERVED = tuple(f"<|reserved_special_token_{index}|>" for index in range(6))
+SPECIAL = _QWEN_SPECIAL + _IMAGE_SPECIAL + _RESERVED
+
+
+@dataclass(frozen=True, slots=True)
+class Vocab:
+    """Tokens by index with their GGUF types, merges by rank, and the indices that the file's keys name."""
+
+    tokens: list[str]
+    types: list[int]
+    merges: list[str]
+    pad: int
+    bos: int
+    eos: int
+    unknown: int
+
+
+def byte_alphabet() -> list[str]:
+    """Return GPT-2's printable character for each of the 256 bytes (``bytes_to_unicode``), in GPT-2's order."""
+    printable = [*range(33, 127), *range(161, 173), *range(174, 256)]
+    others = [byte for byte in range(256) if byte not in printable]
+    return [chr(byte) for byte in printable] + [chr(256 + index) for index in range(len(others))]
+
+
+def make_vocab(*, full: bool) -> Vocab:
+    """Make the vocabulary of Qwen2's size, or the byte-level one of the tiny model."""
+    alphabet = byte_alphabet()
+    tokens, merges = list(alphabet), ["\u0120 t"]  # llama.cpp wants at least one merge; \u0120 stands for a space
+    if full:
+        merges = _letter_merges(FULL_BASE - len(alphabet))
+    tokens += [merge.replace(" ", "") for merge in merges]
+    types = [NORMAL] * len(tokens) + [CONTROL] * len(SPECIAL)
+    first = len(tokens)
+    tokens += SPECIAL
+    if full:
+        unknown = FULL_UNKNOWN
+        tokens[unknown], types[unknown] = "<unk>", CONTROL
+    else:
+        unknown = len(tokens)
+        tokens.append("<unk>")
+        types.append(CONTROL)
+    return Vocab(tokens, types, merges, pad=first, bos=first + 1, eos=first + 2, unknown=unknown)
+
+
+def _letter_merges(count: int) -> list[str]:
+    """Return ``count`` merges, shorter words first: pairs of letters, the same after a space, triples, fours."""
+    pairs = [first + second for first, second in product(_LETTERS, repeat=2)]
+    merges = [f"{pair[0]} {pair[1]}" for pair in pairs]
+    merges += [f"\u0120 {pair}" for pair in pairs]
+    merges += [f"{pair} {letter}" for pair, letter in product(pairs, _LETTERS)]
+    # the commonest pairs with each other, so that English text takes about as few tokens as it does in Qwen2
+    side = 1
+    while side * side < count - len(merges):
+        side += 1
+    merges += [f"{first} {second}" for first, second in product(pairs[:side], repeat=2)]
+    return merges[:count]

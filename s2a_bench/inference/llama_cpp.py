@@ -1,0 +1,254 @@
+"""llama.cpp as an engine: llama-cpp-python's MiniCPM-V 2.6 handler, given RGB pixels and read token by token."""
+
+from __future__ import annotations
+
+import codecs
+import ctypes
+import os
+from collections.abc import Iterator
+from importlib.metadata import version
+from typing import Any
+
+import llama_cpp
+import numpy as np
+from llama_cpp.llama_chat_format import MiniCPMv26ChatHandler
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import EngineError, ModelError
+from s2a_bench.inference import EngineConfig, llama_log
+from s2a_bench.inference.llama_gbnf import GrammarSampler, grammar_error
+from s2a_bench.inference.models import ModelFiles, load_headers, sha256
+from s2a_bench.types import Frame, Request, Token
+
+_URL = "s2a-bench:image/{:04d}/"
+_SAMPLING = {"temp": 0.7, "top_p": 0.8, "top_k": 100, "min_p": 0.0}
+"""That of llama.cpp's ``README-minicpmv2.6.md``, without the penalty on repetition, which breaks structured output."""
+
+_PIECE_BYTES = 1024
+_MS_NS = 1_000_000
+
+
+class _Prefilled(llama_cpp.Llama):  # type: ignore[misc]  # the library has no types
+    """A Llama that stops where the library's handler would start to generate, and keeps the evaluated prompt."""
+
+    prompt: list[int]
+
+    def _init_sampler(self, *args: Any, grammar: Any = None, **settings: Any) -> Any:
+        """Build the library's chain of samplers, and let a grammar judge what comes out of it."""
+        chain = super()._init_sampler(*args, **settings)
+        return chain if grammar is None else GrammarSampler(chain, self._model.vocab, grammar, self._candidates)
+
+    def create_completion(self, prompt: list[int], **_settings: Any) -> Iterator[Any]:
+        """Keep the prompt; the library's own loop joins tokens into characters and drops their indices."""
+        self.prompt = prompt
+        return iter(())
+
+
+class _PixelHandler(MiniCPMv26ChatHandler):  # type: ignore[misc]  # the library has no types
+    """The library's handler, except that a picture is an RGB array and not the bytes of a JPEG."""
+
+    def __init__(self, mmproj: str, *, use_gpu: bool) -> None:
+        super().__init__(clip_model_path=mmproj, verbose=False)
+        self.mtmd_ctx: Any = None
+        self.frames: tuple[Frame, ...] = ()
+        self._use_gpu = use_gpu
+
+    def _init_mtmd_context(self, llama_model: Any) -> None:
+        """Load the vision tower; the library's version puts it on a GPU whatever the user chose."""
+        if self.mtmd_ctx is not None:
+            return
+        mtmd = self._mtmd_cpp
+        params = mtmd.mtmd_context_params_default()
+        params.use_gpu = self._use_gpu
+        params.print_timings = False
+        params.n_threads = llama_model.n_threads
+        params.flash_attn_type = llama_model.context_params.flash_attn_type
+        self.mtmd_ctx = mtmd.mtmd_init_from_file(self.clip_model_path.encode(), llama_model.model, params)
+        if self.mtmd_ctx is None:
+            raise ValueError(llama_log.reason() or "MTMD cannot load it")
+        llama_model._stack.callback(self._free)  # noqa: SLF001 the library's own way to tie the two together
+
+    def _free(self) -> None:
+        self._mtmd_cpp.mtmd_free(self.mtmd_ctx)
+        self.mtmd_ctx = None
+
+    def load_image(self, image_url: str) -> Frame:
+        """Return the frame that the URL counts."""
+        return self.frames[int(image_url.rstrip("/").rpartition("/")[2])]
+
+    def _create_bitmap_from_bytes(self, image_bytes: Frame) -> Any:
+        """Hand the pixels over; MTMD copies them."""
+        pixels = np.ascontiguousarray(image_bytes.data)
+        pointer = pixels.ctypes.data_as(ctypes.POINTER(ctypes.c_uint8))
+        return self._mtmd_cpp.mtmd_bitmap_init(image_bytes.width, image_bytes.height, pointer)
+
+
+class LlamaCppEngine:
+    """A GGUF model on this machine. ``facts`` holds prompt_n, prompt_ms, predicted_n, predicted_ms of the last request.
+
+    ``prompt_n`` is what llama.cpp says it evaluated, pictures included; ``prompt_ms`` is the time from the request to
+    the first token's logits, slicing and vision tower included.
+    """
+
+    def __init__(self, config: EngineConfig) -> None:
+        """Load both files; raises ModelError where llama.cpp refuses one."""
+        self.facts: dict[str, float] = {}
+        self._files = load_headers(config)
+        self._config = config
+        self._threads = config.threads or len(os.sched_getaffinity(0))
+        self._turn = 0
+        self._grammar_errors: dict[str, str] = {}  # checked once each: an answer's grammar rarely changes
+        self._piece = ctypes.create_string_buffer(_PIECE_BYTES)
+        self._llama: _Prefilled | None = None
+        llama_log.silence()
+        llama_log.reason()
+        self._handler = _PixelHandler(str(self._files.mmproj.path), use_gpu=config.gpu_layers != 0)
+        self._llama = self._load(self._files)
+
+    def _load(self, files: ModelFiles) -> _Prefilled:
+        try:
+            llama = _Prefilled(
+                str(files.model.path),
+                n_ctx=self._config.context,
+                n_gpu_layers=self._config.gpu_layers,
+                n_threads=self._threads,
+                n_threads_batch=self._threads,
+                chat_handler=self._handler,
+                verbose=llama_log.verbose(),
+            )
+        except (ValueError, RuntimeError, OSError) as error:
+            raise ModelError(f"--model {files.model.path}: llama.cpp: {llama_log.reason() or error}") from error
+        llama_log.silence()  # the library sets its own log level while it loads
+        try:
+            self._handler._init_mtmd_context(llama)  # noqa: SLF001 load now, not within the first request's time
+        except ValueError as error:
+            llama.close()
+            raise ModelError(f"--mmproj {files.mmproj.path}: llama.cpp: {error}") from error
+        return llama
+
+    def generate(self, request: Request) -> Iterator[Token]:
+        """Yield one `Token` per token of the model; bytes of a character not yet complete come with its last token.
+
+        Raises EngineError for a bad grammar, pictures that are not ``rgb8``, and a request longer than the context.
+        """
+        llama = self._llama
+        if llama is None:
+            raise EngineError("llama: the engine is closed; open a new one")
+        self._turn += 1
+        turn = self._turn
+        self._check(llama, request)
+        started = now_ns()
+        self._evaluate(llama, request)
+        llama_cpp.llama_synchronize(llama.ctx)  # a GPU works behind our back; sampling would wait for it anyway
+        prompt_done = now_ns()
+        perf = llama_cpp.llama_perf_context(llama.ctx)
+        self.facts = {
+            "prompt_n": float(perf.n_p_eval),
+            "prompt_ms": (prompt_done - started) / _MS_NS,
+            "predicted_n": 0.0,
+            "predicted_ms": 0.0,
+        }
+        ignore_end = self._files.dummy and not request.grammar  # random weights end at random, counts should not
+        decoder = codecs.getincrementaldecoder("utf-8")("replace")
+        llama.set_seed(request.seed & 0x7FFF_FFFF)  # 2**32-1 would mean a random seed
+        ids = llama.generate(llama.prompt, grammar=request.grammar or None, **_SAMPLING)
+        try:
+            for index in range(request.max_tokens):
+                if turn != self._turn:
+                    raise EngineError("llama: a later request took over the engine; one request at a time")
+                token = next(ids)
+                if not ignore_end and llama_cpp.llama_vocab_is_eog(llama._model.vocab, token):  # noqa: SLF001
+                    return
+                text = decoder.decode(self._bytes(llama, token), final=index + 1 == request.max_tokens)
+                self.facts["predicted_n"] = float(index + 1)
+                self.facts["predicted_ms"] = (now_ns() - prompt_done) / _MS_NS
+                yield Token(index, text, token)
+        except RuntimeError as error:
+            raise EngineError(f"llama: generation failed: {llama_log.reason() or error}") from error
+        finally:
+            ids.close()
+
+    def _evaluate(self, llama: _Prefilled, request: Request) -> None:
+        """Run pictures and prompt through the model, on an empty KV cache, up to the first token's logits."""
+        pictures = [{"type": "image_url", "image_url": _URL.format(index)} for index in range(len(request.images))]
+        content = [*pictures, {"type": "text", "text": request.prompt}]
+        self._handler.frames = request.images
+        llama_log.reason()
+        llama_cpp.llama_perf_context_reset(llama.ctx)
+        try:
+            self._handler(llama=llama, messages=[{"role": "user", "content": content}], stream=True)
+        except (ValueError, RuntimeError) as error:
+            if "exceeds n_ctx" in str(error):
+                raise EngineError(self._too_long(request)) from error
+            raise EngineError(f"llama: request {request.id} was refused: {llama_log.reason() or error}") from error
+        finally:
+            self._handler.frames = ()
+        if len(llama.prompt) + request.max_tokens > llama.n_ctx():
+            raise EngineError(self._too_long(request, len(llama.prompt)))
+
+    def _too_long(self, request: Request, prompt_n: int | None = None) -> str:
+        prompt = "the prompt alone is longer" if prompt_n is None else f"prompt of {prompt_n} tokens"
+        return (
+            f"llama: request {request.id} does not fit the context of {self._config.context} tokens ({prompt}, "
+            f"answer of up to {request.max_tokens}); shorten it or raise --context"
+        )
+
+    def _check(self, llama: _Prefilled, request: Request) -> None:
+        """Refuse what llama.cpp would not survive: pictures that are not what they say, grammars it cannot read."""
+        for frame in request.images:
+            if frame.encoding != "rgb8":
+                raise EngineError(f"llama: request {request.id} has a {frame.encoding} picture; engines take rgb8")
+            if frame.data.shape != (frame.height, frame.width, 3) or frame.data.dtype != np.uint8:
+                raise EngineError(
+                    f"llama: request {request.id} has a picture of {frame.width}x{frame.height} whose data are "
+                    f"{frame.data.dtype} of shape {frame.data.shape}"
+                )
+        wrong = self._grammar_errors.get(request.grammar) if request.grammar else ""
+        if wrong is None:
+            wrong = grammar_error(llama._model.vocab, request.grammar)  # noqa: SLF001
+            self._grammar_errors[request.grammar] = wrong
+        if wrong:
+            raise EngineError(f"llama: the grammar of request {request.id} is not valid GBNF: {wrong}")
+
+    def _bytes(self, llama: _Prefilled, token: int) -> bytes:
+        """Return a token's bytes; the library's `detokenize` cuts at 32. Special tokens have none."""
+        vocab = llama._model.vocab  # noqa: SLF001
+        size = llama_cpp.llama_token_to_piece(vocab, token, self._piece, _PIECE_BYTES, 0, False)
+        return self._piece.raw[: max(0, size)]
+
+    def describe(self) -> dict[str, str | int | float | bool]:
+        """Say what answers; the first call hashes the files, which takes seconds for gigabytes."""
+        model, mmproj = self._files.model, self._files.mmproj
+        facts: dict[str, str | int | float | bool] = {
+            "engine": "llama",
+            "dummy": self._files.dummy,
+            "name": str(model.fields.get("general.name", "")),
+            "architecture": model.architecture,
+            "model": str(model.path),
+            "model_sha256": sha256(model.path),
+            "mmproj": str(mmproj.path),
+            "mmproj_sha256": sha256(mmproj.path),
+            "projector": str(mmproj.fields.get("clip.projector_type", "")),
+            "llama_cpp_python": version("llama-cpp-python"),
+            "threads": self._threads,
+            "gpu_layers": self._config.gpu_layers,
+            "gpu_offload_supported": bool(llama_cpp.llama_supports_gpu_offload()),
+            "context": self._config.context,
+        }
+        if self._llama is not None:
+            handle = self._llama.model
+            facts["parameters"] = int(llama_cpp.llama_model_n_params(handle))
+            facts["model_bytes"] = int(llama_cpp.llama_model_size(handle))
+            description = ctypes.create_string_buffer(256)
+            llama_cpp.llama_model_desc(handle, description, len(description))
+            model_type = description.value.decode()  # for instance "qwen2 7B Q4_0"
+            facts["model_type"] = model_type
+            facts["quantisation"] = model_type.rpartition(" ")[2]
+        return facts
+
+    def close(self) -> None:
+        """Free the model; may be called twice."""
+        self._turn += 1
+        if self._llama is not None:
+            self._llama.close()
+            self._llama = None

@@ -1,0 +1,48 @@
+"""Keep llama.cpp quiet: its messages go to memory, where errors find their reason, not to stderr."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+from collections import deque
+from typing import Any
+
+import llama_cpp
+from llama_cpp import mtmd_cpp
+
+VARIABLE = "S2A_BENCH_LLAMA_LOG"
+"""Set to 1, llama.cpp writes to stderr as usual."""
+
+_ERROR = 4  # GGML_LOG_LEVEL_ERROR of ggml.h; the bindings' own list is out of date
+_lines: deque[str] = deque(maxlen=20)
+
+
+def _keep(level: int, text: bytes, _user_data: Any) -> None:
+    if level == _ERROR:
+        _lines.append(text.decode(errors="replace").strip())
+
+
+_callback = llama_cpp.llama_log_callback(_keep)  # must outlive the library's use of it
+
+
+def verbose() -> bool:
+    """Tell whether the user wants llama.cpp's log."""
+    return os.environ.get(VARIABLE) == "1"
+
+
+def silence() -> None:
+    """Send the log of llama.cpp, ggml and MTMD to memory, unless the user wants to see it."""
+    if verbose():
+        return
+    nothing = ctypes.c_void_p(0)
+    llama_cpp.llama_log_set(_callback, nothing)
+    mtmd_cpp.mtmd_log_set(_callback, nothing)
+    mtmd_cpp.mtmd_helper_log_set(_callback, nothing)
+
+
+def reason() -> str:
+    """Return the first error logged since the last call, without the function's name; "" if there is none."""
+    first = _lines[0] if _lines else ""
+    _lines.clear()
+    return re.sub(r"^[a-z_]+: ", "", first)

@@ -1,0 +1,125 @@
+"""Find the two files of a model: the user's own, checked, or the tiny dummy, made on first use."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from s2a_bench.errors import ModelError
+from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.dummy import Quant, Size, dummy_files, write_dummy
+from s2a_bench.inference.gguf_file import GgufHeader, read_header
+
+CACHE_VARIABLE = "S2A_BENCH_CACHE"
+
+
+@dataclass(frozen=True, slots=True)
+class ModelFiles:
+    """The headers of the two files of a model, both checked."""
+
+    model: GgufHeader
+    mmproj: GgufHeader
+
+    @property
+    def dummy(self) -> bool:
+        """Tell whether any of the weights are dummies."""
+        return self.model.is_dummy or self.mmproj.is_dummy
+
+
+def cache_folder() -> Path:
+    """Return the user's cache folder of s2a-bench; the variable S2A_BENCH_CACHE replaces it."""
+    if chosen := os.environ.get(CACHE_VARIABLE):
+        return Path(chosen)
+    from platformdirs import user_cache_path
+
+    return user_cache_path("s2a-bench")
+
+
+def dummy_folder(size: Size) -> Path:
+    """Return where dummy models of a size are kept unless the user says otherwise."""
+    return cache_folder() / "models" / f"dummy-{size}"
+
+
+def tiny_dummy() -> tuple[Path, Path]:
+    """Return the tiny dummy's two files, written first if they are not in the cache; processes may race."""
+    size: Size = "tiny"
+    quant: Quant = "f16"
+    files = dummy_files(dummy_folder(size), size, quant)
+    if not (files.model.is_file() and files.mmproj.is_file()):
+        write_dummy(dummy_folder(size), size, quant)
+    return files
+
+
+def resolve(config: EngineConfig) -> tuple[Path, Path]:
+    """Return the paths of language model and mmproj for ``config``; raises ModelError, see `load_headers`."""
+    files = load_headers(config)
+    return files.model.path, files.mmproj.path
+
+
+def load_headers(config: EngineConfig) -> ModelFiles:
+    """Read and check both headers.
+
+    Raises ModelError where a file is missing, damaged or of the wrong kind, or where no mmproj is found.
+    """
+    model_path, mmproj_path = config.model, config.mmproj
+    if model_path is None:
+        if mmproj_path is not None:
+            raise ModelError(f"--mmproj {mmproj_path}: needs the language model too; give --model, or leave out both")
+        model_path, mmproj_path = tiny_dummy()
+    model = read_header(model_path, "--model")
+    if model.is_mmproj:
+        raise ModelError(f"--model {model_path}: this is an mmproj (vision tower); give it as --mmproj")
+    mmproj = read_header(mmproj_path or _mmproj_beside(model_path), "--mmproj")
+    if not mmproj.is_mmproj:
+        raise ModelError(
+            f"--mmproj {mmproj.path}: this is a language model ({mmproj.architecture or 'no architecture'}), "
+            "not an mmproj; give it as --model"
+        )
+    if not mmproj.has_vision:
+        raise ModelError(f"--mmproj {mmproj.path}: has no vision tower; give the mmproj of a model that takes pictures")
+    return ModelFiles(model, mmproj)
+
+
+def _mmproj_beside(model: Path) -> Path:
+    found = sorted(model.parent.glob("mmproj*.gguf"))
+    if len(found) == 1:
+        return found[0]
+    if not found:
+        raise ModelError(
+            f"--model {model}: not multimodal by itself, and no mmproj*.gguf lies beside it; give --mmproj"
+        )
+    names = ", ".join(path.name for path in found)
+    raise ModelError(f"--model {model}: several mmproj files lie beside it ({names}); choose one with --mmproj")
+
+
+def sha256(path: Path) -> str:
+    """Return a file's SHA-256; remembered in the cache by path, size and time of change, as models are large."""
+    status = path.stat()
+    key = hashlib.sha256(f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}".encode()).hexdigest()
+    note = cache_folder() / "sha256" / f"{key}.json"
+    try:
+        return str(json.loads(note.read_text())["sha256"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # not there yet, or damaged: compute it
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 22):
+            digest.update(block)
+    value = digest.hexdigest()
+    _remember(note, {"path": str(path.resolve()), "sha256": value})
+    return value
+
+
+def _remember(note: Path, facts: dict[str, str]) -> None:
+    """Write a note in one step; a cache that cannot be written costs time, nothing else."""
+    try:
+        note.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", dir=note.parent, delete=False) as file:
+            json.dump(facts, file)
+        Path(file.name).replace(note)
+    except OSError:
+        return

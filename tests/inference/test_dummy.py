@@ -1,0 +1,158 @@
+import hashlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from s2a_bench.errors import ModelError, UsageError
+from s2a_bench.inference import dummy
+from s2a_bench.inference.dummy import DummyFiles, dummy_files, write_dummy
+from s2a_bench.inference.dummy_vocab import FULL_UNKNOWN, byte_alphabet, make_vocab
+from s2a_bench.inference.dummy_weights import KINDS, Kind, Tensor
+from s2a_bench.inference.gguf_file import read_header
+
+gguf = pytest.importorskip("gguf")
+
+
+def digests(files: DummyFiles) -> list[str]:
+    return [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(tmp_path: Path) -> None:
+    first, again = write_dummy(tmp_path / "a"), write_dummy(tmp_path / "b")
+    assert digests(first) == digests(again)
+    other = write_dummy(tmp_path / "c", seed=1)
+    assert not set(digests(first)) & set(digests(other))
+
+
+def test_the_numbers_are_those_of_this_revision() -> None:
+    # the caches of users hold these; raise REVISION whenever this changes
+    assert dummy.REVISION == 1
+    shape, digest = dummy.SHAPES["tiny"], hashlib.sha256()
+    for tensor in (*dummy._model_tensors(shape, 281, "f16"), *dummy._mmproj_tensors(shape)):
+        digest.update(tensor.name.encode())
+        for chunk in tensor.chunks(0):
+            digest.update(chunk)
+    assert digest.hexdigest()[:16] == "95728bf57f26e584"
+
+
+def test_tiny_is_about_13_mb_in_two_files_and_nothing_else_is_left(tmp_path: Path) -> None:
+    files = write_dummy(tmp_path)
+    assert 12e6 < sum(path.stat().st_size for path in files) < 14e6
+    assert sorted(tmp_path.iterdir()) == sorted(files)
+
+
+def test_both_files_say_that_they_are_dummies(tmp_path: Path) -> None:
+    for path in write_dummy(tmp_path):
+        header = read_header(path, "--model")
+        assert header.is_dummy
+        assert "DUMMY" in str(header.fields["general.name"])
+
+
+@pytest.mark.parametrize("quant", ["f16", "q8_0", "q4_0"])
+def test_gguf_py_reads_finite_weights_of_the_right_spread(tmp_path: Path, quant: dummy.Quant) -> None:
+    files = write_dummy(tmp_path, "tiny", quant)
+    tensors = {tensor.name: tensor for tensor in gguf.GGUFReader(files.model).tensors}
+    for name in ("blk.0.ffn_up.weight", "output.weight"):
+        values = gguf.dequantize(tensors[name].data, tensors[name].tensor_type)
+        assert np.isfinite(values).all()
+        assert abs(values.mean()) < 0.001
+        assert values.std() == pytest.approx(1 / 16, rel=0.4)
+
+
+def test_full_size_has_the_parameters_of_minicpm_v_2_6() -> None:
+    shape = dummy.SHAPES["full"]
+    vocab = make_vocab(full=True)
+    model = list(dummy._model_tensors(shape, len(vocab.tokens), "q4_0"))
+    mmproj = list(dummy._mmproj_tensors(shape))
+    # Qwen2-7B pads its vocabulary to 152064, MiniCPM-V 2.6 does not
+    assert sum(int(np.prod(tensor.shape)) for tensor in model) == 7_615_616_512 - (152_064 - 151_666) * 3584 * 2
+    # llama.cpp counts as many in the real file: "type f32: 141 tensors, type f16: 198 tensors" (ollama issue 9528)
+    assert sum(tensor.kind == "f32" for tensor in model) == 141
+    assert len(model) == 141 + 198
+    assert sum(tensor.nbytes for tensor in mmproj) / 1e9 == pytest.approx(1.04, abs=0.01)
+    assert sum(tensor.nbytes for tensor in model) / 1e9 == pytest.approx(4.43, abs=0.01)
+
+
+def test_the_full_vocabulary_has_the_sizes_and_places_of_minicpm_v_2_6() -> None:
+    vocab = make_vocab(full=True)
+    # n_vocab and n_merges as llama.cpp prints them for the real file (ollama issue 9528)
+    assert len(vocab.tokens) == len(vocab.types) == len(set(vocab.tokens)) == 151_666
+    assert len(vocab.merges) == 151_387
+    assert vocab.tokens[151_643:151_648] == ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<image>", "</image>"]
+    assert vocab.tokens[151_656:151_658] == ["<slice>", "</slice>"]
+    assert vocab.tokens[FULL_UNKNOWN] == "<unk>"
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_every_merge_joins_two_tokens_into_one_that_exists(full: bool) -> None:
+    vocab = make_vocab(full=full)
+    known = set(vocab.tokens) | {vocab.merges[FULL_UNKNOWN - 256].replace(" ", "")} if full else set(vocab.tokens)
+    for merge in vocab.merges:
+        left, right = merge.split(" ")
+        assert {left, right, left + right} <= known
+
+
+def test_the_byte_alphabet_is_gpt_2s() -> None:
+    alphabet = byte_alphabet()
+    assert len(set(alphabet)) == 256
+    assert alphabet[0] == "!"
+    assert {"Ġ", "Ċ"} <= set(alphabet)  # space and new line
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_a_tensor_has_as_many_bytes_as_it_says_however_it_is_cut(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.inference.dummy_weights.CHUNK_BYTES", 1000)
+    tensor = Tensor("t", (6, 512), kind)
+    assert sum(chunk.nbytes for chunk in tensor.chunks(0)) == tensor.nbytes
+    assert tensor.nbytes == 6 * 512 // KINDS[kind][0] * KINDS[kind][1]
+
+
+def test_progress_ends_at_the_total(tmp_path: Path) -> None:
+    calls: list[tuple[int, int]] = []
+    write_dummy(tmp_path, progress=lambda done, total: calls.append((done, total)))
+    assert [done for done, _ in calls] == sorted(done for done, _ in calls)
+    assert calls[-1][0] == calls[-1][1]
+
+
+def test_a_crash_leaves_no_half_file(tmp_path: Path) -> None:
+    def crash(_done: int, _total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_dummy(tmp_path, progress=crash)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_choices_name_their_flag(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--size: 'huge'"):
+        write_dummy(tmp_path, "huge")  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="--quant: 'q2'"):
+        write_dummy(tmp_path, "tiny", "q2")  # type: ignore[arg-type]
+
+
+def test_a_folder_that_cannot_be_made_is_a_model_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ModelError, match=r"--output .*file/x: cannot write"):
+        write_dummy(tmp_path / "file" / "x")
+
+
+def test_names_differ_by_size_type_and_seed(tmp_path: Path) -> None:
+    names = {
+        dummy_files(tmp_path, size, quant, seed).model.name
+        for size in ("tiny", "full")
+        for quant in ("f16", "q4_0")
+        for seed in (0, 1)
+    }
+    assert len(names) == 8
+
+
+def test_importing_the_seam_does_not_import_llama_cpp() -> None:
+    import subprocess
+
+    code = (
+        "import sys, s2a_bench.inference.models, s2a_bench.cli.model; print(set(sys.modules) & {'llama_cpp', 'gguf'})"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "set()"

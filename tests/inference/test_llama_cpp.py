@@ -1,0 +1,227 @@
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from s2a_bench.errors import EngineError, ModelError
+from s2a_bench.inference import Engine, EngineConfig, open_engine
+from s2a_bench.inference.dummy import write_dummy
+from s2a_bench.inference.llama_cpp import LlamaCppEngine
+from s2a_bench.inference.llama_gbnf import GrammarSampler
+from s2a_bench.types import Frame, Request
+from tests.conformance.engine import EngineSuite, ask, rgb_frame
+
+PLAN = r"""
+root ::= "[" skill ("," skill){2} "]"
+skill ::= "{\"skill\":\"" ("stop" | "go" | "turn") "\",\"s\":" [1-9] "." [0-9] "}"
+"""
+
+
+@pytest.fixture(scope="module")
+def shared(tiny: EngineConfig) -> Iterator[LlamaCppEngine]:
+    engine = LlamaCppEngine(tiny)
+    yield engine
+    engine.close()
+
+
+class TestLlamaCpp(EngineSuite):
+    @pytest.fixture
+    def engine(self, shared: LlamaCppEngine) -> Engine:
+        return shared
+
+    @pytest.fixture
+    def fresh_engine(self, tiny: EngineConfig) -> Engine:
+        return open_engine(tiny)
+
+
+def text(engine: Engine, **request: object) -> str:
+    return "".join(token.text for token in ask(engine, **request))  # type: ignore[arg-type]
+
+
+def test_a_dummy_always_writes_max_tokens(shared: LlamaCppEngine) -> None:
+    for seed in range(4):
+        assert len(ask(shared, max_tokens=100, seed=seed)) == 100
+
+
+def test_seeds_differ(shared: LlamaCppEngine) -> None:
+    assert len({text(shared, seed=seed, max_tokens=16) for seed in range(4)}) == 4
+
+
+def test_the_grammar_is_obeyed_and_ends_the_answer(shared: LlamaCppEngine) -> None:
+    skill = r'\{"skill":"(stop|go|turn)","s":[1-9]\.[0-9]\}'
+    answers = {text(shared, seed=seed, max_tokens=200, grammar=PLAN) for seed in range(4)}
+    assert all(re.fullmatch(rf"\[{skill}(,{skill}){{2}}\]", answer) for answer in answers)
+    assert len(answers) > 1
+
+
+def test_a_grammar_that_allows_what_the_model_says_costs_no_second_look(
+    shared: LlamaCppEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seed, said = next((seed, said) for seed in range(99) if (said := text(shared, seed=seed, max_tokens=1)).isalnum())
+    looks: list[int] = []
+    monkeypatch.setattr(GrammarSampler, "_among_allowed", lambda *_: looks.append(1) or 0)
+    assert text(shared, seed=seed, max_tokens=1, grammar=f'root ::= "{said}"') == said
+    assert looks == []
+    ask(shared, seed=seed, max_tokens=1, grammar='root ::= "!" | "?"')
+    assert looks == [1]
+
+
+def test_a_grammar_works_with_a_picture(shared: LlamaCppEngine) -> None:
+    assert text(shared, images=(rgb_frame(),), max_tokens=200, grammar=PLAN).endswith("}]")
+
+
+@pytest.mark.parametrize(
+    ("grammar", "reason"),
+    [
+        ("root ::= [a", "unexpected end of input"),
+        ('other ::= "a"', "root"),
+        ("root ::= missing", "missing"),
+        ("??", ""),
+    ],
+)
+def test_a_bad_grammar_is_named_and_the_next_request_works(
+    shared: LlamaCppEngine, grammar: str, reason: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for _ in range(2):
+        with pytest.raises(EngineError, match=f"grammar of request r is not valid GBNF: .*{reason}"):
+            ask(shared, grammar=grammar)
+    assert ask(shared)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_repeated_frame_is_evaluated_in_full_again(shared: LlamaCppEngine) -> None:
+    counts = []
+    for _ in range(3):
+        ask(shared, images=(rgb_frame(5, 640, 480),))
+        counts.append(shared.facts["prompt_n"])
+    assert counts[0] > 3 * 64  # an overview and at least two slices of 64 tokens
+    assert counts == [counts[0]] * 3
+
+
+def test_facts_tell_what_the_last_request_cost(shared: LlamaCppEngine) -> None:
+    ask(shared, max_tokens=5)
+    facts = dict(shared.facts)
+    assert set(facts) == {"prompt_n", "prompt_ms", "predicted_n", "predicted_ms"}
+    assert facts["predicted_n"] == 5
+    assert facts["prompt_n"] > 10
+    assert min(facts["prompt_ms"], facts["predicted_ms"]) > 0
+
+
+def test_the_bitmap_holds_exactly_the_pixels(shared: LlamaCppEngine) -> None:
+    mtmd = shared._handler._mtmd_cpp
+    for frame in (
+        rgb_frame(3, 31, 17),
+        replace(rgb_frame(4, 40, 30), width=20, data=rgb_frame(4, 40, 30).data[:, ::2]),
+    ):
+        bitmap = shared._handler._create_bitmap_from_bytes(frame)
+        size = mtmd.mtmd_bitmap_get_n_bytes(bitmap)
+        pixels = np.ctypeslib.as_array(mtmd.mtmd_bitmap_get_data(bitmap), (size,)).copy()
+        assert (mtmd.mtmd_bitmap_get_nx(bitmap), mtmd.mtmd_bitmap_get_ny(bitmap)) == (frame.width, frame.height)
+        mtmd.mtmd_bitmap_free(bitmap)
+        np.testing.assert_array_equal(pixels, frame.data.reshape(-1))
+
+
+def test_what_is_in_the_picture_and_in_the_prompt_matters(shared: LlamaCppEngine) -> None:
+    frame = rgb_frame(1)
+    swapped = replace(frame, data=frame.data[:, :, ::-1])
+    answers = [text(shared, images=images, max_tokens=24) for images in ((), (frame,), (swapped,), (rgb_frame(2),))]
+    answers.append(text(shared, prompt="other", images=(frame,), max_tokens=24))
+    assert len(set(answers)) == len(answers)
+
+
+def test_the_order_of_two_pictures_matters(shared: LlamaCppEngine) -> None:
+    one, two = rgb_frame(1), rgb_frame(2)
+    assert text(shared, images=(one, two), max_tokens=24) != text(shared, images=(two, one), max_tokens=24)
+
+
+def test_pictures_of_another_encoding_are_refused(shared: LlamaCppEngine) -> None:
+    with pytest.raises(EngineError, match="bgr8 picture; engines take rgb8"):
+        ask(shared, images=(replace(rgb_frame(), encoding="bgr8"),))
+
+
+def test_pictures_smaller_than_they_say_are_refused(shared: LlamaCppEngine) -> None:
+    with pytest.raises(EngineError, match=r"640x480 whose data are uint8 of shape \(48, 64, 3\)"):
+        ask(shared, images=(replace(rgb_frame(), width=640, height=480),))
+
+
+def test_a_request_longer_than_the_context_says_so(tiny: EngineConfig) -> None:
+    engine = LlamaCppEngine(replace(tiny, context=256))
+    with pytest.raises(EngineError, match=r"does not fit the context of 256 tokens \(the prompt alone"):
+        ask(engine, "word " * 500)
+    with pytest.raises(EngineError, match=r"does not fit .* answer of up to 250\); shorten it or raise --context"):
+        ask(engine, max_tokens=250)
+    with pytest.raises(EngineError, match="the prompt alone"):
+        ask(engine, images=tuple(rgb_frame(index) for index in range(4)))
+    assert ask(engine)
+    engine.close()
+
+
+def test_a_prompt_with_the_marker_of_a_picture_is_refused_not_misread(shared: LlamaCppEngine) -> None:
+    with pytest.raises(EngineError, match="request r was refused"):
+        ask(shared, "look at <__media__>")
+    assert ask(shared)
+
+
+def test_a_later_request_ends_an_earlier_one(shared: LlamaCppEngine) -> None:
+    early = shared.generate(Request("early", "go", max_tokens=6))
+    next(early)
+    assert ask(shared)
+    with pytest.raises(EngineError, match="one request at a time"):
+        next(early)
+
+
+def test_it_describes_model_and_build(shared: LlamaCppEngine, tiny: EngineConfig) -> None:
+    facts = shared.describe()
+    assert facts["dummy"] is True
+    assert facts["architecture"] == "qwen2"
+    assert facts["model"] == str(tiny.model)
+    assert facts["threads"] == 1
+    assert len(str(facts["model_sha256"])) == len(str(facts["mmproj_sha256"])) == 64
+    assert facts["parameters"] == 3_293_952
+    assert facts["quantisation"] == "F16"
+    assert isinstance(facts["gpu_offload_supported"], bool)
+
+
+@pytest.mark.parametrize("quant", ["q8_0", "q4_0"])
+def test_quantised_dummies_load_and_answer(tmp_path: Path, quant: str) -> None:
+    model, mmproj = write_dummy(tmp_path, "tiny", quant)  # type: ignore[arg-type]
+    engine = LlamaCppEngine(EngineConfig(model=model, mmproj=mmproj, threads=1))
+    assert len(ask(engine, images=(rgb_frame(),))) == 6
+    engine.close()
+
+
+def damaged(path: Path, target: Path, old: bytes, new: bytes) -> Path:
+    data = path.read_bytes()
+    assert old in data
+    target.write_bytes(data.replace(old, new))
+    return target
+
+
+def test_what_only_llama_cpp_can_tell_is_a_model_error(
+    tiny: EngineConfig, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert tiny.model is not None
+    assert tiny.mmproj is not None
+    strange = damaged(tiny.model, tmp_path / "model.gguf", b"blk.3.ffn_up.weight", b"blk.3.ffn_xx.weight")
+    with pytest.raises(ModelError, match=r"--model .*model.gguf: llama.cpp: .*blk.3.ffn_up.weight"):
+        LlamaCppEngine(replace(tiny, model=strange))
+    strange = damaged(tiny.mmproj, tmp_path / "mmproj.gguf", b"resampler.query", b"resampler.xuery")
+    with pytest.raises(ModelError, match=r"--mmproj .*mmproj.gguf: llama.cpp: .*resampler.query"):
+        LlamaCppEngine(replace(tiny, mmproj=strange))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_nothing_is_printed(tiny: EngineConfig, capfd: pytest.CaptureFixture[str]) -> None:
+    engine = LlamaCppEngine(tiny)
+    ask(engine, images=(rgb_frame(1, 640, 480),), grammar=PLAN, max_tokens=200)
+    engine.close()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_frame_is_not_kept_after_the_request(shared: LlamaCppEngine) -> None:
+    frame: Frame = rgb_frame()
+    ask(shared, images=(frame,))
+    assert shared._handler.frames == ()
