@@ -114,7 +114,7 @@ def _show(folder: Path, progress: RunProgress, *, as_json: bool, against_paper: 
 
     from s2a_bench.report.figures import write_figures
     from s2a_bench.report.machine import to_json
-    from s2a_bench.report.tables import write_tables
+    from s2a_bench.report.table_files import write_tables
     from s2a_bench.report.terminal import renderables
     from s2a_bench.store.run import read_run
 

@@ -54,7 +54,7 @@ class Cell:
 
     def values_ms(self, metric: str) -> Floats:
         """Return the values of a stage, or of another column less ``_ns``, in ms."""
-        return _numbers(self.good[f"{metric}_ns"]) / _NS_PER_MS
+        return numbers_ms(self.good[f"{metric}_ns"])
 
     def group_ms(self, group: str) -> Floats:
         """Return the sums, in ms, of the stages of a group; a sample without such stages has none."""
@@ -82,6 +82,11 @@ class Cell:
         for block, value in zip(there["block"], there[f"{metric}_ns"], strict=True):
             blocks.setdefault(int(block), []).append(float(value) / _NS_PER_MS)
         return blocks
+
+
+def numbers_ms(column: pd.Series[Any]) -> Floats:
+    """Return a column of ns in ms, the missing values left out."""
+    return _numbers(column) / _NS_PER_MS
 
 
 def summary_of(values: Floats) -> Summary | None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from s2a_bench.errors import StoreError
 from s2a_bench.report.cells import (
     RESIDUAL_LIMIT,
     Cell,
@@ -18,7 +16,6 @@ from s2a_bench.report.cells import (
     stages_present,
     summary_of,
 )
-from s2a_bench.report.full import csv_texts
 from s2a_bench.trace import STAGES
 
 if TYPE_CHECKING:
@@ -147,22 +144,6 @@ def to_latex(table: TextTable) -> str:
     for place, row in enumerate(table.rows):
         lines += [*(["\\midrule"] if place in table.rules else []), _latex_row(row)]
     return "\n".join([*lines, "\\bottomrule", "\\end{tabular}"]) + "\n"
-
-
-def write_tables(run: Run) -> list[Path]:
-    """Write ``tables/``: stages and summaries as .md and .tex, and stages, summary and ratios in full as .csv."""
-    tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
-    texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
-    texts |= {f"{name}.tex": to_latex(table) for name, table in tables.items()}
-    texts |= csv_texts(run)
-    folder = run.path / "tables"
-    try:
-        folder.mkdir(exist_ok=True)
-        for name, text in texts.items():
-            (folder / name).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StoreError(f"cannot write {folder}: {error.strerror}; the samples are kept") from error
-    return [folder / name for name in texts]
 
 
 def _decimals(value: float) -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pkgutil import resolve_name
 from typing import Any, Literal, Protocol, TypeAlias
 
-from s2a_bench.errors import UsageError
+from s2a_bench.errors import TransportError, UsageError
 
 Tuning: TypeAlias = Literal["tuned", "default"]
 
@@ -89,5 +89,12 @@ def open_middleware(name: str = "cyclonedds", *, domain_id: int = 0, tuning: Tun
     """Join a ROS 2 domain; raises UsageError for an unknown name, TransportError when it cannot be joined."""
     if name not in MIDDLEWARES:
         raise UsageError(f"middleware: '{name}' is none of {', '.join(MIDDLEWARES)}")
-    middleware: Middleware = resolve_name(MIDDLEWARES[name])(domain_id, tuning)
+    try:
+        implementation = resolve_name(MIDDLEWARES[name])
+    except ModuleNotFoundError as error:
+        raise TransportError(
+            f"middleware {name} is not installed ({error}); cyclonedds has wheels for x86-64 only: "
+            "build it from source, or leave ros out of --transport"
+        ) from error
+    middleware: Middleware = implementation(domain_id, tuning)
     return middleware

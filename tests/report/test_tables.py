@@ -10,6 +10,7 @@ from rich.console import Console
 
 from s2a_bench.errors import StoreError
 from s2a_bench.report.full import csv_texts
+from s2a_bench.report.table_files import write_tables
 from s2a_bench.report.tables import (
     group_table,
     interval,
@@ -19,7 +20,6 @@ from s2a_bench.report.tables import (
     summary_table,
     to_latex,
     to_markdown,
-    write_tables,
 )
 from s2a_bench.report.terminal import renderables
 from s2a_bench.stats import Ratio, Summary

@@ -1,0 +1,32 @@
+"""The tables of a run as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from s2a_bench.errors import StoreError
+from s2a_bench.report.frame_path import frame_table
+from s2a_bench.report.full import csv_texts
+from s2a_bench.report.tables import stage_table, summary_table, to_latex, to_markdown
+
+if TYPE_CHECKING:
+    from s2a_bench.store.run import Run
+
+
+def write_tables(run: Run) -> list[Path]:
+    """Write ``tables/``: the text tables as .md and .tex, and stages, summary and ratios in full as .csv."""
+    tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
+    if frames := frame_table(run):
+        tables["frames"] = frames
+    texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
+    texts |= {f"{name}.tex": to_latex(table) for name, table in tables.items()}
+    texts |= csv_texts(run)
+    folder = run.path / "tables"
+    try:
+        folder.mkdir(exist_ok=True)
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"cannot write {folder}: {error.strerror}; the samples are kept") from error
+    return [folder / name for name in texts]

@@ -1,0 +1,107 @@
+"""What every middleware promises: subclass `MiddlewareContract` and say how to join a domain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.ros import Middleware, Publisher, QoS, Subscription
+from s2a_bench.ros import messages as ros
+from s2a_bench.types import Frame
+
+Join = Callable[[], Middleware]
+STRING = "std_msgs/msg/String"
+
+
+def text(value: str) -> Any:
+    """A std_msgs/String."""
+    return ros.message(STRING, data=value)
+
+
+def wait_matched(publisher: Publisher, subscription: Subscription) -> None:
+    """Wait until each knows the other."""
+    deadline = now_ns() + 20_000_000_000
+    while not (publisher.matched() and subscription.matched()):
+        assert now_ns() < deadline, "publisher and subscription did not find each other"
+        subscription.take(0.01)
+
+
+class MiddlewareContract:
+    """Run by every implementation."""
+
+    @pytest.fixture
+    def join(self) -> Join:
+        raise NotImplementedError
+
+    def pair(self, join: Join, topic: str, type_name: str, qos: QoS) -> tuple[Publisher, Subscription]:
+        """A publisher and a subscription of two participants, matched."""
+        publisher = join().publisher(topic, type_name, qos)
+        subscription = join().subscription(topic, type_name, qos)
+        wait_matched(publisher, subscription)
+        return publisher, subscription
+
+    def test_messages_arrive_in_order(self, join: Join) -> None:
+        publisher, subscription = self.pair(join, "/test/order", STRING, QoS(0))
+        sent = [f"message {number}" + "é" * number for number in range(50)]
+        for value in sent:
+            publisher.send(publisher.pack(text(value)))
+        got = [subscription.unpack(subscription.take(5)).data for _ in sent]
+        assert got == sent
+
+    @pytest.mark.parametrize(("width", "height"), [(640, 480), (1920, 1080)])
+    def test_a_raw_image_arrives_unchanged(self, join: Join, width: int, height: int) -> None:
+        publisher, subscription = self.pair(join, "/test/image", ros.IMAGE, QoS(1))
+        pixels = np.random.default_rng(1).integers(0, 256, (height, width, 3), np.uint8)
+        message = ros.image_message(Frame(0, 0, width, height, "bgr8", pixels), 5_000_000_001, "camera")
+        publisher.send(publisher.pack(message))
+        got = ros.frame_of_image(subscription.unpack(subscription.take(10)))
+        np.testing.assert_array_equal(got.data, pixels)
+        assert got.stamp_ns == 5_000_000_001
+
+    def test_received_pixels_outlive_the_middleware(self, join: Join) -> None:
+        middleware = join()
+        subscription = middleware.subscription("/test/outlive", ros.IMAGE, QoS(1))
+        publisher = join().publisher("/test/outlive", ros.IMAGE, QoS(1))
+        wait_matched(publisher, subscription)
+        pixels = np.full((48, 64, 3), 77, np.uint8)
+        publisher.send(publisher.pack(ros.image_message(Frame(0, 0, 64, 48, "bgr8", pixels), 0, "c")))
+        got = ros.frame_of_image(subscription.unpack(subscription.take(5))).data
+        middleware.close()
+        del middleware, subscription
+        np.testing.assert_array_equal(got, pixels)
+
+    def test_nothing_to_take_is_none(self, join: Join) -> None:
+        assert join().subscription("/test/silence", STRING, QoS()).take(0.01) is None
+
+    def test_an_interrupt_ends_a_blocked_take_and_later_ones(self, join: Join) -> None:
+        subscription = join().subscription("/test/interrupt", STRING, QoS())
+        got: list[Any] = [1]
+        thread = Thread(target=lambda: got.append(subscription.take(60)))
+        thread.start()
+        subscription.interrupt()
+        thread.join(20)
+        assert not thread.is_alive()
+        assert got == [1, None]
+        assert subscription.take(60) is None
+
+    def test_topics_do_not_mix(self, join: Join) -> None:
+        publisher, subscription = self.pair(join, "/test/one", STRING, QoS())
+        other = join().subscription("/test/two", STRING, QoS())
+        publisher.send(publisher.pack(text("x")))
+        assert subscription.unpack(subscription.take(5)).data == "x"
+        assert other.take(0.05) is None
+
+    def test_it_describes_itself_in_plain_data(self, join: Join) -> None:
+        described = join().describe()
+        assert {"middleware", "version", "domain_id"} <= set(described)
+        assert all(isinstance(value, (str, int)) for value in described.values())
+
+    def test_closing_twice_does_no_harm(self, join: Join) -> None:
+        middleware = join()
+        middleware.close()
+        middleware.close()

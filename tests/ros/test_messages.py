@@ -1,0 +1,98 @@
+"""ROS 2 messages: types, hashes, CDR, and frames as images."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import messages as ros
+from s2a_bench.types import Frame
+
+RECORDED = json.loads((Path(__file__).parent.parent / "data" / "ros2_type_hashes.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "name", ["sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "std_msgs/msg/Header", "std_msgs/msg/String"]
+)
+def test_type_hashes_are_those_of_a_real_ros(name: str) -> None:
+    assert ros.type_hash(name) == RECORDED[name]
+
+
+def request(**fields: Any) -> Any:
+    whole = {"id": "a", "prompt": "p", "grammar": "", "max_tokens": 1, "seed": 0, "images": [], "compressed_images": []}
+    return ros.message(ros.REQUEST, **(whole | fields))
+
+
+def test_cdr_of_a_string_message_by_hand() -> None:
+    cdr = ros.serialise(ros.message("std_msgs/msg/String", data="hey"), "std_msgs/msg/String")
+    assert cdr.hex() == "00010000" + "04000000" + b"hey\0".hex()
+
+
+def test_cdr_is_padded_to_four_and_says_by_how_much() -> None:
+    cdr = ros.serialise(ros.message("std_msgs/msg/String", data="hello"), "std_msgs/msg/String")
+    assert cdr.hex() == "00010002" + "06000000" + b"hello\0".hex() + "0000"
+
+
+@given(
+    prompt=st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])),
+    pixels=hnp.arrays(np.uint8, st.tuples(st.integers(1, 5), st.integers(1, 5), st.just(3))),
+)
+def test_any_request_survives_cdr(prompt: str, pixels: np.ndarray) -> None:
+    height, width, _ = pixels.shape
+    frame = Frame(3, 5, width, height, "bgr8", pixels)
+    sent = request(prompt=prompt, images=[ros.image_message(frame, 7_000_000_009, "camera")])
+    got = ros.deserialise(memoryview(ros.serialise(sent, ros.REQUEST)), ros.REQUEST)
+    assert got.prompt == prompt
+    received = ros.frame_of_image(got.images[0])
+    assert (received.width, received.height, received.encoding) == (width, height, "bgr8")
+    assert received.stamp_ns == 7_000_000_009
+    np.testing.assert_array_equal(received.data, pixels)
+
+
+def test_received_pixels_are_a_view_not_a_copy() -> None:
+    frame = Frame(0, 0, 4, 2, "rgb8", np.zeros((2, 4, 3), np.uint8))
+    cdr = ros.serialise(request(images=[ros.image_message(frame, 0, "c")]), ros.REQUEST)
+    image = ros.frame_of_image(ros.deserialise(memoryview(cdr), ros.REQUEST).images[0])
+    assert np.shares_memory(image.data, np.frombuffer(cdr, np.uint8))
+
+
+def image(**fields: Any) -> Any:
+    frame = Frame(0, 0, 4, 2, "bgr8", np.arange(24, dtype=np.uint8).reshape(2, 4, 3))
+    message = ros.image_message(frame, 0, "c")
+    for name, value in fields.items():
+        setattr(message, name, value)
+    return message
+
+
+def test_rows_may_be_padded() -> None:
+    padded = np.zeros((2, 16), np.uint8)
+    padded[:, :12] = np.arange(24, dtype=np.uint8).reshape(2, 12)
+    got = ros.frame_of_image(image(step=16, data=padded.reshape(-1)))
+    np.testing.assert_array_equal(got.data, np.arange(24, dtype=np.uint8).reshape(2, 4, 3))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"encoding": "bayer_rggb8"}, "'bayer_rggb8' is none of yuv422_yuy2, bgr8"),
+        ({"height": 3}, "image of 4x3 bgr8 has 24 bytes"),
+        ({"step": 6}, "image of 4x2 bgr8"),
+    ],
+)
+def test_an_impossible_image_is_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(TransportError, match=message):
+        ros.frame_of_image(image(**fields))
+
+
+@pytest.mark.parametrize("cdr", [b"", b"\0\1\0\0", b"\0\1\0\0\xff\xff\xff\x7f", bytes(64)])
+def test_foreign_bytes_are_refused(cdr: bytes) -> None:
+    with pytest.raises(TransportError, match="no s2a_msgs/msg/Request"):
+        ros.deserialise(memoryview(cdr), ros.REQUEST)

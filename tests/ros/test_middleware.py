@@ -1,0 +1,62 @@
+"""Every middleware keeps the contract, and Cyclone speaks ROS 2's names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.ros import MIDDLEWARES, Middleware, QoS, open_middleware
+from s2a_bench.ros.messages import type_hash
+from tests.conformance.middleware import Join, MiddlewareContract
+
+cyclonedds = pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
+
+
+class TestCyclone(MiddlewareContract):
+    @pytest.fixture
+    def join(self, dds_domain: int) -> Iterator[Join]:
+        with ExitStack() as stack:
+
+            def join() -> Middleware:
+                middleware = open_middleware("cyclonedds", domain_id=dds_domain)
+                stack.callback(middleware.close)
+                return middleware
+
+            yield join
+
+
+def test_endpoints_look_like_those_of_ros(dds_domain: int) -> None:
+    from cyclonedds.core import Policy
+
+    middleware = open_middleware(domain_id=dds_domain)
+    writer = middleware.publisher("/camera/image_raw", "sensor_msgs/msg/Image", QoS(1))._writer  # type: ignore[attr-defined]
+    try:
+        assert writer.topic.name == "rt/camera/image_raw"
+        assert writer.topic.typename == "sensor_msgs::msg::dds_::Image_"
+        qos = writer.get_qos()
+        assert Policy.Reliability.Reliable(2**63 - 1) in qos
+        assert Policy.History.KeepLast(1) in qos
+        assert Policy.Durability.Volatile in qos
+        assert bytes(qos[Policy.Userdata].data) == f"typehash={type_hash('sensor_msgs/msg/Image')};".encode()
+    finally:
+        middleware.close()
+
+
+def test_a_domain_takes_one_configuration_per_process(dds_domain: int) -> None:
+    open_middleware(domain_id=dds_domain).close()
+    with pytest.raises(TransportError, match="already configured otherwise"):
+        open_middleware(domain_id=dds_domain, tuning="default")
+
+
+def test_an_unknown_middleware_is_named() -> None:
+    with pytest.raises(UsageError, match="'zenoh' is none of cyclonedds"):
+        open_middleware("zenoh")
+
+
+def test_a_missing_package_is_named_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(MIDDLEWARES, "cyclonedds", "s2a_bench.ros.no_such_module:X")
+    with pytest.raises(TransportError, match="cyclonedds is not installed.*--transport"):
+        open_middleware("cyclonedds")

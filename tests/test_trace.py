@@ -1,0 +1,95 @@
+"""Marks, stages and the closed budget."""
+
+from __future__ import annotations
+
+import timeit
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from s2a_bench.clock import clock_id, now_ns
+from s2a_bench.trace import GROUPS, RESIDUAL, STAGES, Remote, Trace, budget, mark_cost_ns
+
+names = st.sampled_from([RESIDUAL, *STAGES])
+chains = st.lists(st.tuples(names, st.integers(0, 10**9)), max_size=40).map(
+    lambda steps: [(name, sum(step for _, step in steps[: place + 1])) for place, (name, _) in enumerate(steps)]
+)
+
+
+@given(chains)
+def test_stages_and_residual_sum_to_the_whole(chain: list[tuple[str, int]]) -> None:
+    spent = budget(chain)
+    assert sum(spent.stages_ns.values()) + spent.residual_ns == spent.e2e_ns
+    assert spent.e2e_ns == (chain[-1][1] - chain[0][1] if chain else 0)
+    assert sum(spent.groups_ns().values()) == sum(spent.stages_ns.values())
+
+
+def test_a_chain_by_hand() -> None:
+    chain = [
+        ("", 100),
+        ("capture", 110),
+        ("convert", 140),
+        ("", 145),
+        ("network", 200),
+        ("inference", 900),
+        ("return", 950),
+    ]
+    spent = budget(chain)
+    assert spent.stages_ns == {"capture": 10, "convert": 30, "network": 55, "inference": 700, "return": 50}
+    assert spent.residual_ns == 5
+    assert spent.e2e_ns == 850
+    assert spent.e2e_without_inference_ns == 150
+    assert spent.residual_share == pytest.approx(5 / 150)
+    assert spent.groups_ns() == {"capture": 10, "encode": 30, "network": 55, "inference": 700, "return": 50}
+
+
+def test_a_stage_marked_twice_is_the_sum() -> None:
+    assert budget([("", 0), ("image_decode", 5), ("", 6), ("image_decode", 9)]).stages_ns == {"image_decode": 8}
+
+
+def test_without_inference_there_is_no_e2e_without_it() -> None:
+    spent = budget([("", 0), ("server", 7)])
+    assert spent.e2e_without_inference_ns is None
+    assert spent.residual_share is None
+
+
+def test_an_unknown_stage_is_a_mistake() -> None:
+    with pytest.raises(KeyError):
+        budget([("", 0), ("teleport", 1)])
+
+
+def test_the_groups_are_the_cards_seven_and_those_the_design_adds() -> None:
+    assert GROUPS == (
+        "capture",
+        "encode",
+        "pack",
+        "network",
+        "ingest",
+        "parse",
+        "decode",
+        "queue",
+        "inference",
+        "server",
+        "return",
+    )
+
+
+def test_both_sides_join_in_order_of_time() -> None:
+    trace = Trace()
+    trace.marks = [("", 10), ("json_pack", 20), ("return", 90)]
+    trace.receive(Remote(clock_id(), [("network", 40), ("inference", 80)], facts={"prompt_n": 3.0}))
+    assert [name for name, _ in trace.chain()] == ["", "json_pack", "network", "inference", "return"]
+    assert trace.facts == {"prompt_n": 3.0}
+
+
+def test_marks_of_another_clock_are_not_mixed_in() -> None:
+    trace = Trace()
+    trace.marks = [("", 10), ("return", 90)]
+    trace.receive(Remote("another host", [("network", 40)]))
+    assert trace.chain() == [("", 10), ("return", 90)]
+
+
+def test_a_mark_costs_a_few_readings_of_the_clock() -> None:
+    reading = min(timeit.repeat(now_ns, number=10_000, repeat=5)) / 10_000 * 1e9
+    assert min(mark_cost_ns() for _ in range(5)) < 20 * reading
