@@ -67,6 +67,8 @@ class LatencyConfig:
 
     def check(self) -> None:
         """Raise UsageError, naming the flag, for a value or combination that makes no sense."""
+        if not self.transports:
+            raise UsageError(f"--transport: name at least one of {', '.join(TRANSPORTS)}")
         _one_of("--transport", self.transports, tuple(TRANSPORTS))
         _one_of("--http", self.http, HTTP_VARIANTS)
         _one_of("--payload", [self.payload], PAYLOADS)

@@ -54,7 +54,7 @@ def main() -> None:
         hint = f" (see '{context.command_path} --help')" if context else ""
         code = _say(f"error: {error.format_message()}{hint}", error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        code = _say("interrupted", INTERRUPTED)
+        code = INTERRUPTED
     except BrokenPipeError:  # the reader of our output has gone, as with `| head`
         sys.stderr.close()
         code = 1

@@ -100,9 +100,10 @@ def latency(
     with RunProgress() as progress:
         try:
             folder = run_latency(config, output, progress)
-        except (S2AError, KeyboardInterrupt):
+        except (S2AError, KeyboardInterrupt) as end:
+            what = "interrupted; " if isinstance(end, KeyboardInterrupt) else ""
             if progress.folder is not None:
-                progress.console.print(f"samples so far: {progress.folder}", highlight=False, soft_wrap=True)
+                progress.console.print(f"{what}samples so far: {progress.folder}", highlight=False, soft_wrap=True)
             raise
         progress.stage("drawing")
         _show(folder, progress, as_json=json_, against_paper=against == "paper", verbose=verbose)

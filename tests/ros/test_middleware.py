@@ -58,5 +58,5 @@ def test_an_unknown_middleware_is_named() -> None:
 
 def test_a_missing_package_is_named_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(MIDDLEWARES, "cyclonedds", "s2a_bench.ros.no_such_module:X")
-    with pytest.raises(TransportError, match="cyclonedds is not installed.*--transport"):
+    with pytest.raises(TransportError, match=r"cyclonedds is not installed.*--transport"):
         open_middleware("cyclonedds")

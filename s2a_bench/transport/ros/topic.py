@@ -34,6 +34,8 @@ CAMERA_QOS = QoS(depth=1)
 
 POLL_S = 0.5
 MATCH_TIMEOUT_S = 15.0
+SETTLE_S = 0.3
+"""Time to discover a server that is there already."""
 
 
 def _join(route: Route) -> Middleware:
@@ -50,6 +52,21 @@ def picture_message(frame: Frame, wire: str, offset_ns: int, trace: Trace) -> tu
     if wire == "yuyv" and frame.encoding != "yuv422_yuy2":
         raise RequestFailed(f"--wire yuyv: this source delivers {frame.encoding}; use --wire bgr")
     return ros.IMAGE, ros.image_message(bgr_of(frame, trace) if wire == "bgr" else frame, stamp_ns, FRAME_ID)
+
+
+def _refuse_company(route: Route, namespace: str) -> None:
+    """Raise TransportError if another server listens under ``namespace``: both would answer every request."""
+    probe = _join(route)
+    try:
+        publisher = probe.publisher(namespace + "/request", ros.REQUEST, REQUEST_QOS)
+        probe.subscription(namespace + "/token", ros.TOKEN, READER_QOS).take(SETTLE_S)
+        if publisher.matched():
+            raise TransportError(
+                f"another server answers under {namespace} in DDS domain {route.domain_id}: stop it, "
+                "or choose another domain with ROS_DOMAIN_ID or another --namespace"
+            )
+    finally:
+        probe.close()
 
 
 class CameraPublisher:
@@ -98,18 +115,13 @@ class TopicClient:
             raise
 
     def _wait_until_matched(self, namespace: str) -> None:
-        """Wait until requests reach exactly one server and its tokens reach us: volatile messages are else lost."""
+        """Wait until requests reach the server and its tokens reach us: volatile messages are else lost."""
         deadline = now_ns() + int(MATCH_TIMEOUT_S * 1e9)
         ends = (self._publisher, self._subscription, self.camera)
         while not all(end.matched() for end in ends):
             if now_ns() > deadline or not self._alive():
                 raise ServerDied(f"no server appeared under {namespace} in DDS domain {self._route.domain_id}")
             self._subscription.take(0.02)
-        if self._publisher.matched() > 1:
-            raise TransportError(
-                f"several servers answer under {namespace} in DDS domain {self._route.domain_id}: "
-                "stop the others, or choose another domain with ROS_DOMAIN_ID"
-            )
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Publish the request, with its frames if it has any, and yield its tokens."""
@@ -136,7 +148,9 @@ class TopicClient:
         while True:
             token = self._next(request.id)
             if token.index != expected:
-                raise MessagesLost(f"{token.index - expected} token messages were lost before index {token.index}")
+                raise MessagesLost(
+                    f"token {token.index} came instead of {expected}: messages were lost, or two servers answer"
+                )
             if token.last:
                 break
             if not expected:
@@ -181,6 +195,7 @@ class TopicServer:
         """Join the domain and create the topics."""
         self.address = route.address or DEFAULT_NAMESPACE
         self._handler = handler
+        _refuse_company(route, self.address)
         self.middleware = _join(route)
         self._requests = self.middleware.subscription(self.address + "/request", ros.REQUEST, READER_QOS)
         self._tokens = self.middleware.publisher(self.address + "/token", ros.TOKEN, TOKEN_QOS)

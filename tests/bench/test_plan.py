@@ -1,0 +1,81 @@
+"""What a latency run is asked to do."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from s2a_bench.bench.plan import LatencyConfig, plan_cells
+from s2a_bench.errors import UsageError
+from s2a_bench.inference import EngineConfig
+
+ADDRESSES = {"http": "http://127.0.0.1:1", "ros": "/s2a_bench", "loopback": "loopback-0"}
+
+
+def names(config: LatencyConfig) -> list[str]:
+    config.check()
+    return [cell.name for cell in plan_cells(config, ADDRESSES)]
+
+
+def test_all_http_variants_and_ros_are_shown_unless_told() -> None:
+    assert names(LatencyConfig()) == ["http/as-deployed", "http/best-effort", "http/binary", "ros/topic"]
+
+
+def test_cells_follow_the_flags() -> None:
+    config = LatencyConfig(transports=("loopback", "http"), http=("binary",), payload="raw", connection="per-request")
+    loopback, http = plan_cells(config, ADDRESSES)
+    assert (loopback.name, loopback.payload) == ("loopback", "")
+    assert (http.name, http.payload, http.route.payload) == ("http/binary", "raw", "raw")
+    assert http.route.connection == "per-request"
+
+
+def test_a_black_box_is_asked_without_the_binary_variant() -> None:
+    config = LatencyConfig(url="http://localhost:8080")
+    assert names(config) == ["http/as-deployed", "http/best-effort", "ros/topic"]
+    assert plan_cells(config, ADDRESSES)[0].route.black_box
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"transports": ("http", "pigeon")}, "--transport: 'pigeon' is none of http, ros, loopback"),
+        ({"transports": ()}, "--transport: name at least one of http, ros, loopback"),
+        ({"http": ("fast",)}, "--http: 'fast' is none of as-deployed"),
+        ({"payload": "gif"}, "--payload: 'gif' is none of jpeg"),
+        ({"wire": "rgb"}, "--wire: 'rgb' is none of bgr"),
+        ({"connection": "x"}, "--connection: 'x'"),
+        ({"engine": EngineConfig("gpt")}, "--engine: 'gpt' is none of llama, echo"),
+        ({"mode": "x"}, "--mode: 'x'"),
+        ({"dds_tuning": "x"}, "--dds-tuning: 'x'"),
+        ({"runs": 0}, "--runs: 0 is too few"),
+        ({"warmup": -1}, "--warmup: -1"),
+        ({"max_tokens": 0}, "--max-tokens: 0"),
+        ({"fps": 0.0}, "--fps: 0.0"),
+        ({"width": 641}, "--size: 641x480"),
+        ({"width": 8, "height": 8}, "--size: 8x8"),
+        ({"namespace": "robot"}, "--namespace: 'robot' should look like /name"),
+        ({"url": "localhost:1"}, "--url: 'localhost:1' should start with http"),
+        ({"url": "http://x", "llama_server": Path("y")}, "--url and --llama-server"),
+        ({"url": "http://x", "payload": "raw"}, "--payload raw needs our own server; with --url"),
+        ({"url": "http://x", "http": ("binary",)}, "--http binary needs our own server"),
+        ({"url": "http://x", "transports": ("ros",)}, "--url needs http among --transport"),
+        ({"llama_server": Path("x"), "engine": EngineConfig("echo")}, "--llama-server runs a model"),
+        ({"mode": "stream", "payload": "jpeg-preencoded"}, "jpeg-preencoded has no meaning in --mode stream"),
+    ],
+)
+def test_what_makes_no_sense_is_named(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError) as error:
+        replace(LatencyConfig(), **fields).check()
+    assert message in str(error.value)
+
+
+def test_the_manifest_holds_the_whole_configuration_as_json() -> None:
+    config = LatencyConfig(engine=EngineConfig("llama", Path("m.gguf")))
+    kept = json.loads(json.dumps(config.to_manifest(), default=str))
+    assert kept["size"] == "640x480"
+    assert kept["http"] == ["as-deployed", "best-effort", "binary"]
+    assert kept["engine"]["model"] == "m.gguf"

@@ -1,0 +1,311 @@
+"""`s2a-bench latency` as a user runs it: real servers in processes of their own, the echo engine."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import jsonschema
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.report.cells import cells_of
+from s2a_bench.store.run import Run, read_run
+from s2a_bench.trace import budget
+
+ROOT = Path(__file__).parent.parent.parent
+SMALL = ["--engine", "echo", "--size", "64x48", "--runs", "4", "--warmup", "1", "--max-tokens", "3"]
+
+
+def command(*arguments: str, output: Path) -> list[str]:
+    return [sys.executable, "-m", "s2a_bench", "latency", *arguments, "--output", str(output)]
+
+
+def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(command(*arguments, output=output), capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def only_run(output: Path) -> Run:
+    (folder,) = output.iterdir()
+    return read_run(folder)
+
+
+def test_one_run_compares_all_pipelines(tmp_path: Path) -> None:
+    done = run(*SMALL, "--transport", "http,ros,loopback", "--verbose", output=tmp_path)
+    kept = only_run(tmp_path)
+    names = {"http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "loopback"}
+    assert kept.manifest["state"] == "finished"
+    assert set(kept.samples["cell"]) == names
+    assert all(name in done.stdout for name in ("as-deployed", "topic", "loopback", "residual", "a mark costs"))
+    assert str(kept.path) in done.stdout
+    for name in ("samples.csv", "samples.parquet", "tokens.parquet", "manifest.json"):
+        assert (kept.path / name).stat().st_size > 0
+    assert len(list((kept.path / "figures").glob("*.png"))) == 3
+    assert len(list((kept.path / "figures").glob("*.pdf"))) == 3
+
+
+def test_blocks_hold_every_cell_once_in_changing_order(tmp_path: Path) -> None:
+    run(*SMALL, "--transport", "http,loopback", "--runs", "8", output=tmp_path)
+    samples = only_run(tmp_path).samples
+    orders = []
+    for block, rows in samples.groupby("block"):
+        ordered = rows.sort_values("position")
+        assert list(ordered["position"]) == [0, 1, 2, 3]
+        assert len(set(ordered["cell"])) == 4
+        assert set(ordered["warmup"]) == {block < 1}
+        orders.append(tuple(ordered["cell"]))
+    assert len(set(orders)) > 1
+    assert len(samples) == 9 * 4
+
+
+def test_the_same_seed_gives_the_same_order_and_frames(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        run(*SMALL, "--transport", "http", "--seed", "5", output=tmp_path / name)
+    first, second = only_run(tmp_path / "a").samples, only_run(tmp_path / "b").samples
+    assert list(first["cell"]) == list(second["cell"])
+    assert list(first["frame_index"]) == list(second["frame_index"])
+
+
+def test_every_sample_closes_its_budget(tmp_path: Path) -> None:
+    run(*SMALL, "--transport", "http,ros,loopback", "--runs", "10", output=tmp_path)
+    samples = only_run(tmp_path).samples
+    assert (samples["error"] == "").all()
+    for row in samples.itertuples():
+        spent = budget([tuple(mark) for mark in json.loads(str(row.marks))])
+        assert sum(spent.stages_ns.values()) + spent.residual_ns == spent.e2e_ns == row.e2e_ns
+
+
+def test_every_token_has_its_two_times(tmp_path: Path) -> None:
+    run(*SMALL, "--transport", "http,ros", output=tmp_path)
+    kept = only_run(tmp_path)
+    assert Counter(kept.tokens.groupby(["request_id"]).size()) == {3: len(kept.samples)}
+    assert (kept.tokens["client_ns"] > kept.tokens["engine_ns"]).all()
+
+
+def test_json_is_the_only_thing_on_standard_output(tmp_path: Path) -> None:
+    done = run(*SMALL, "--transport", "http,ros,loopback", "--json", output=tmp_path)
+    whole: dict[str, Any] = json.loads(done.stdout)
+    jsonschema.validate(whole, json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text()))
+    assert whole["command"] == "latency"
+    assert [cell["n"] for cell in whole["cells"]] == [4] * 5
+    compared = {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]}
+    assert ("http/as-deployed", "ros/topic") in compared
+    assert ("ros/topic", "loopback") in compared
+
+
+def test_stream_mode_knows_the_age_of_the_frame(tmp_path: Path) -> None:
+    done = run(*SMALL, "--transport", "http,ros", "--mode", "stream", "--fps", "60", output=tmp_path)
+    assert "Frame path" in done.stdout
+    kept = only_run(tmp_path)
+    assert (kept.samples["error"] == "").all()
+    assert (kept.samples["frame_age_ns"] > 0).all()
+    used = kept.frames[(kept.frames["used_by"] != "") & (kept.frames["cell"] == "ros/topic")]
+    assert len(used) == 5
+    assert (
+        used[["capture_ns", "convert_ns", "cdr_pack_ns", "network_ns", "cdr_parse_ns", "channel_swap_ns"]]
+        .notna()
+        .all()
+        .all()
+    )
+    ros = kept.samples[kept.samples["cell"] == "ros/topic"]
+    assert ros["convert_ns"].isna().all()
+
+
+@pytest.mark.parametrize("wire", ["yuyv", "compressed"])
+def test_other_wire_formats_have_their_stages(tmp_path: Path, wire: str) -> None:
+    run(*SMALL, "--transport", "ros", "--wire", wire, output=tmp_path)
+    samples = only_run(tmp_path).samples
+    assert (samples["error"] == "").all()
+    stage = {"yuyv": "yuv_decode_ns", "compressed": "image_decode_ns"}[wire]
+    assert samples[stage].notna().all()
+
+
+def test_a_preencoded_jpeg_leaves_only_base64_to_encode(tmp_path: Path) -> None:
+    run(*SMALL, "--transport", "http", "--http", "as-deployed", "--payload", "jpeg-preencoded", output=tmp_path)
+    samples = only_run(tmp_path).samples
+    assert samples["base64_encode_ns"].notna().all()
+    assert samples[["convert_ns", "image_encode_ns"]].isna().all().all()
+
+
+def test_the_untuned_case_is_recorded_as_such(tmp_path: Path) -> None:
+    run(*SMALL, "--transport", "ros", "--dds-tuning", "default", output=tmp_path)
+    manifest = only_run(tmp_path).manifest
+    assert manifest["tuning"] == {"dds": "default", "malloc_keeps_large_blocks": False}
+    assert "FragmentSize" not in manifest["servers"]["ros"]["transport"]["configuration"]
+
+
+def test_the_manifest_tells_the_machine(tmp_path: Path) -> None:
+    run(*SMALL, "--transport", "ros", output=tmp_path)
+    manifest = only_run(tmp_path).manifest
+    assert manifest["tuning"]["dds"] == "tuned"
+    assert "65000B" in manifest["servers"]["ros"]["transport"]["configuration"]
+    assert {"cpu", "kernel", "python", "packages", "load", "rmem_max", "affinity"} <= set(manifest["environment"])
+    assert manifest["mark_cost_ns"] > 0
+    assert manifest["seeds"]["order"] == 0
+    assert manifest["argv"][1:3] == ["latency", "--engine"]
+
+
+def start_long(output: Path, *arguments: str) -> tuple[subprocess.Popen[str], Path]:
+    """Start a run that would take very long and wait until it has some samples."""
+    process = subprocess.Popen(
+        command(*SMALL, "--runs", "1000000", *arguments, output=output),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = now_ns() + 120_000_000_000
+    while now_ns() < deadline and process.poll() is None:
+        for file in output.glob("*/samples.csv"):
+            if file.read_text().count("\n") > 30:
+                return process, file.parent
+        Event().wait(0.02)
+    process.kill()
+    raise AssertionError(process.communicate()[1])
+
+
+def check_kept(folder: Path, state: str) -> Run:
+    kept = read_run(folder)
+    assert kept.manifest["state"] == state
+    assert len(kept.samples) >= 29
+    assert (folder / "samples.parquet").exists()
+    return kept
+
+
+@pytest.mark.parametrize("transport", ["http", "ros"])
+def test_a_killed_server_ends_the_run_with_every_sample_kept(tmp_path: Path, transport: str) -> None:
+    process, folder = start_long(tmp_path, "--transport", transport)
+    os.kill(read_run(folder).manifest["servers"][transport]["pid"], signal.SIGKILL)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 1
+    (line,) = (line for line in said.splitlines() if line.startswith("error:"))
+    assert f"the {transport} server" in line
+    assert "killed by signal 9" in line
+    assert f"samples so far: {folder}" in said
+    assert "Traceback" not in said
+    kept = check_kept(folder, "failed")
+    assert (kept.samples["error"] == "").all()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_keeps_the_samples_and_stops_the_servers(tmp_path: Path, number: signal.Signals) -> None:
+    process, folder = start_long(tmp_path, "--transport", "http,ros")
+    servers = [server["pid"] for server in read_run(folder).manifest["servers"].values()]
+    process.send_signal(number)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "interrupted" in said
+    assert "Traceback" not in said
+    check_kept(folder, "interrupted")
+    for pid in servers:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+def test_a_killed_harness_takes_its_servers_along_and_leaves_a_readable_run(tmp_path: Path) -> None:
+    process, folder = start_long(tmp_path, "--transport", "http,ros")
+    servers = [server["pid"] for server in read_run(folder).manifest["servers"].values()]
+    process.kill()
+    process.communicate(timeout=60)
+    assert len(read_run(folder).samples) >= 29
+    deadline = now_ns() + 60_000_000_000
+    while any(Path(f"/proc/{pid}/cmdline").exists() for pid in servers):
+        assert now_ns() < deadline, "the servers outlived the harness"
+        Event().wait(0.02)
+
+
+def test_two_servers_of_one_namespace_are_noticed(tmp_path: Path) -> None:
+    process, _ = start_long(tmp_path / "first", "--transport", "ros")
+    try:
+        said = run(*SMALL, "--transport", "ros", output=tmp_path / "second", code=1).stderr
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+    assert "another server answers under /s2a_bench" in said
+    assert "ROS_DOMAIN_ID" in said
+
+
+def test_a_port_in_use_is_one_clear_line(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        said = run(*SMALL, "--transport", "http", "--port", str(port), output=tmp_path, code=1).stderr
+    assert f"error: --port: {port} is in use" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--source", "v4l2:/dev/video99"], "/dev/video99"),
+        (["--source", "video:/no/such.mp4"], "/no/such.mp4"),
+        (["--source", "images:/no/such"], "/no/such"),
+        (["--url", "http://127.0.0.1:9", "--transport", "http"], "nothing answers at http://127.0.0.1:9"),
+        (["--engine", "llama", "--model", "/no/such.gguf"], "/no/such.gguf"),
+    ],
+)
+def test_what_is_missing_is_one_clear_line(tmp_path: Path, arguments: list[str], message: str) -> None:
+    said = run(*SMALL, *arguments, output=tmp_path, code=1).stderr
+    (line,) = (line for line in said.splitlines() if line.startswith("error:"))
+    assert message in line
+
+
+def test_a_source_that_is_missing_leaves_no_empty_run(tmp_path: Path) -> None:
+    run(*SMALL, "--source", "v4l2:/dev/video99", output=tmp_path / "results", code=1)
+    assert not (tmp_path / "results").exists()
+
+
+def test_an_output_that_is_a_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    said = run(*SMALL, output=tmp_path / "file", code=1).stderr
+    assert f"--output {tmp_path / 'file'}" in said
+
+
+def test_a_video_is_a_source(tmp_path: Path) -> None:
+    import cv2
+    import numpy as np
+
+    path = tmp_path / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48))
+    for shade in range(12):
+        writer.write(np.full((48, 64, 3), 20 * shade, np.uint8))
+    writer.release()
+    run(*SMALL, "--source", f"video:{path}", "--transport", "http,ros", output=tmp_path / "results")
+    kept = only_run(tmp_path / "results")
+    assert (kept.samples["error"] == "").all()
+    assert kept.samples["convert_ns"].isna().all()
+
+
+def test_a_repeated_frame_is_a_warning(tmp_path: Path) -> None:
+    import cv2
+    import numpy as np
+
+    (tmp_path / "pictures").mkdir()
+    cv2.imwrite(str(tmp_path / "pictures" / "one.png"), np.zeros((48, 64, 3), np.uint8))
+    said = run(
+        *SMALL, "--source", f"images:{tmp_path / 'pictures'}", "--transport", "http", output=tmp_path / "results"
+    ).stderr
+    assert "warning [duplicate-frames]" in said
+
+
+def test_a_real_model_answers_over_both_pipelines(tmp_path: Path) -> None:
+    grammar = tmp_path / "yes.gbnf"
+    grammar.write_text('root ::= "yes" | "no"\n')
+    few = ["--runs", "2", "--warmup", "1", "--max-tokens", "5", "--threads", "1"]
+    run(*few, "--grammar", str(grammar), "--transport", "http,ros", "--http", "as-deployed", output=tmp_path / "r")
+    kept = only_run(tmp_path / "r")
+    assert kept.manifest["model"]["dummy"] is True
+    answers = kept.tokens.groupby("request_id")["text"].apply("".join)
+    assert set(answers) <= {"yes", "no"}
+    assert len(answers) == 6
+    assert {cell.about["engine"] for cell in cells_of(kept)} == {"llama"}
