@@ -21,6 +21,7 @@ from s2a_bench.bench.warnings import Counters, SampleGuard, before_run
 from s2a_bench.errors import ServerDied, TransportError
 from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.inference import open_engine
+from s2a_bench.inference.models import load_headers, resolve
 from s2a_bench.store.run import RunWriter
 from s2a_bench.trace import mark_cost_ns
 from s2a_bench.transport import Route, open_client, open_server
@@ -89,7 +90,10 @@ class ServerSet:
             self.addresses[transport] = config.url
             return
         if transport == "http" and config.llama_server:
-            process = LlamaServer(config.llama_server, config.engine, config.port, log)
+            files = load_headers(config.engine)
+            process = LlamaServer(
+                config.llama_server, config.engine, config.port, log, ignore_end=files.dummy and not config.grammar
+            )
         else:
             address = f"127.0.0.1:{config.port}" if transport == "http" else config.namespace
             route = Route(transport, address=address, dds_tuning=config.dds_tuning, domain_id=config.domain_id)
@@ -133,8 +137,6 @@ def run_latency(config: LatencyConfig, output: Path, progress: Progress) -> Path
 
 def _with_model(config: LatencyConfig, progress: Progress) -> LatencyConfig:
     """Find or make the model files, so that every server gets the same."""
-    from s2a_bench.inference.models import resolve
-
     progress.stage("looking for the model" if config.engine.model else "making the tiny dummy model on first use")
     model, mmproj = resolve(config.engine)
     return replace(config, engine=replace(config.engine, model=model, mmproj=mmproj))

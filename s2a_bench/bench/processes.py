@@ -19,6 +19,7 @@ from s2a_bench.bench.serving import ServerJob
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import EngineError, PortInUse, ServerDied, UsageError
 from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.models import load_headers, sha256
 
 READY_TIMEOUT_S = 600.0
 """A model of several GB may have to come from a slow disk."""
@@ -123,8 +124,11 @@ class LlamaServer(ServerProcess):
 
     _speaks_json = False
 
-    def __init__(self, binary: Path, engine: EngineConfig, port: int, log: Path) -> None:
-        """Start the binary on ``port``, or any free one for 0; raises UsageError when it cannot be run."""
+    def __init__(self, binary: Path, engine: EngineConfig, port: int, log: Path, *, ignore_end: bool) -> None:
+        """Start the binary on ``port``, or any free one for 0; raises UsageError when it cannot be run.
+
+        ``ignore_end`` keeps dummy weights, which end at random, going to the token limit, as our own engine does.
+        """
         if not (binary.is_file() and os.access(binary, os.X_OK)):
             raise UsageError(f"--llama-server: {binary} is no program that can be run")
         port = port or _free_port()
@@ -134,9 +138,11 @@ class LlamaServer(ServerProcess):
             command += ["--threads", str(engine.threads)]
         if engine.gpu_layers:
             command += ["--gpu-layers", str(engine.gpu_layers) if engine.gpu_layers > 0 else "999"]
+        if ignore_end:
+            command.append("--ignore-eos")
         super().__init__("llama-server", command, log)
         self.address = f"http://127.0.0.1:{port}"
-        self.facts = {"command": command}
+        self.facts = {"command": command, "engine": {"engine": "llama-server", **described(engine)}}
 
     def wait_ready(self) -> None:
         """Poll ``/health`` until the model is loaded."""
@@ -152,6 +158,18 @@ class LlamaServer(ServerProcess):
                 pass  # it does not listen yet
             clock.sleep_until_ns(now_ns() + 100_000_000)
         raise ServerDied(f"llama-server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
+
+
+def described(engine: EngineConfig) -> dict[str, Any]:
+    """Return what the manifest says about the model files of a server that says nothing itself."""
+    files = load_headers(engine)
+    return {
+        "model": str(files.model.path),
+        "mmproj": str(files.mmproj.path),
+        "model_sha256": sha256(files.model.path),
+        "mmproj_sha256": sha256(files.mmproj.path),
+        "dummy": files.dummy,
+    }
 
 
 def _free_port() -> int:

@@ -26,10 +26,16 @@ Quant: TypeAlias = Literal["f16", "q8_0", "q4_0"]
 Progress: TypeAlias = Callable[[int, int], None]
 """Called with (bytes written, bytes in all)."""
 
-REVISION = 1
+REVISION = 2
 """Part of the file names; raise it when the bytes change, so that old files in caches are not used."""
 
 DUMMY_KEY = "s2a_bench.dummy"
+_CHAT_TEMPLATE = (  # Qwen2's, with its system message: the same prompt in llama-server as in our engine
+    "{% for message in messages %}{% if loop.first and messages[0]['role'] != 'system' %}"
+    "{{ '<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n' }}{% endif %}"
+    "{{'<|im_start|>' + message['role'] + '\n' + message['content'] + '<|im_end|>' + '\n'}}{% endfor %}"
+    "{% if add_generation_prompt %}{{ '<|im_start|>assistant\n' }}{% endif %}"
+)
 _POSITIONS = 70 * 70
 _PATCH = 14
 _QUERIES = 64
@@ -197,6 +203,7 @@ def _model_keys(writer: GGUFWriter, shape: Shape, size: Size, quant: Quant, voca
     writer.add_pad_token_id(vocab.pad)
     writer.add_unk_token_id(vocab.unknown)
     writer.add_add_bos_token(value=False)
+    writer.add_chat_template(_CHAT_TEMPLATE)
 
 
 def _model_tensors(shape: Shape, n_vocab: int, quant: Quant) -> Iterator[Tensor]:

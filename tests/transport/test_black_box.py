@@ -170,6 +170,17 @@ def test_misbehaviour_is_a_failed_request_that_says_what(serve: Serve, script: S
         ask(serve(script))
 
 
+def test_a_connection_that_the_server_closed_is_opened_again(serve: Serve) -> None:
+    """llama-server promises keep-alive and closes after each stream; the race with its closing is ours to mend."""
+    head = LLAMA_SERVER[0].replace(b"Connection: close\r\n\r\n", b"Keep-Alive: timeout=5, max=100\r\n")
+    whole = b"".join(LLAMA_SERVER[1:])
+    chunked = [head + b"Transfer-Encoding: chunked\r\n\r\n", b"%x\r\n%s\r\n0\r\n\r\n" % (len(whole), whole)]
+    client = open_client(Route("http", "as-deployed", serve(chunked), black_box=True))
+    for number in range(20):
+        assert len(list(client.request(Request(str(number), "plan"), Trace()))) == 2
+    client.close()
+
+
 def test_nobody_listening_is_a_dead_server() -> None:
     with pytest.raises(ServerDied, match=r"nothing answers at http://127\.0\.0\.1:9/"):
         ask("http://127.0.0.1:9")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import httpx
@@ -56,10 +56,8 @@ class HttpClient:
             trace.mark("connect")
         packed_ns = trace.marks[-1][1]
         try:
-            with (
-                _translated(self._alive, self._url),
-                client.stream("POST", self._url, content=body, headers=headers) as response,
-            ):
+            with _translated(self._alive, self._url), ExitStack() as stack:
+                response = self._send(client, body, headers, stack, trace)
                 headers_ns = now_ns()
                 streams = response.headers.get("content-type", "").startswith("text/event-stream")
                 if response.status_code != httpx.codes.OK or not streams:
@@ -69,6 +67,21 @@ class HttpClient:
         finally:
             if client is not self._client:
                 client.close()
+
+    def _send(
+        self, client: httpx.Client, body: bytes, headers: dict[str, str], stack: ExitStack, trace: Trace
+    ) -> httpx.Response:
+        """Send the request; once more if the server had just closed the kept connection, as HTTP clients do.
+
+        llama-server announces keep-alive and yet closes after every streamed answer.
+        """
+        try:
+            return stack.enter_context(client.stream("POST", self._url, content=body, headers=headers))
+        except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
+            if self._route.connection != "keep-alive":
+                raise
+            trace.facts["reconnects"] = 1.0
+            return stack.enter_context(client.stream("POST", self._url, content=body, headers=headers))
 
     def _pack(self, request: Request, trace: Trace) -> tuple[bytes, dict[str, str]]:
         """Build the body, marking each stage."""

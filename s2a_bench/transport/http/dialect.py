@@ -83,7 +83,8 @@ def parameters(request: Request, model: str, *, black_box: bool) -> dict[str, An
         "stream": True,
         "stream_options": {"include_usage": True},
         "max_tokens": request.max_tokens,
-        "temperature": 0.0,
+        "temperature": 0.7,  # as our own llama engine samples
+        "top_p": 0.8,
         "seed": request.seed,
     }
     if request.grammar:

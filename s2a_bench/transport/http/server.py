@@ -256,6 +256,7 @@ class HttpServer:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind((host or "127.0.0.1", int(port)))
+            self._socket.listen()  # only now is the port ours
         except OSError as error:
             self._socket.close()
             if error.errno == errno.EADDRINUSE:
