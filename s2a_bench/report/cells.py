@@ -56,6 +56,11 @@ class Cell:
         """Return the values of a stage, or of another column less ``_ns``, in ms."""
         return numbers_ms(self.good[f"{metric}_ns"])
 
+    @property
+    def has_ingest(self) -> bool:
+        """Tell whether the server is a llama-server, seen from outside."""
+        return bool(self.values_ms("ingest").size)
+
     def group_ms(self, group: str) -> Floats:
         """Return the sums, in ms, of the stages of a group; a sample without such stages has none."""
         names = [f"{stage}_ns" for stage, of in STAGES.items() if of == group]
@@ -116,7 +121,13 @@ def ratios(cells: list[Cell], seed: int) -> Iterator[tuple[str, Cell, Cell, Rati
 
 
 def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | None:
-    """Divide the medians of two cells; block by block where both have the same number of samples in each block."""
+    """Divide the medians of two cells; block by block where both have the same number of samples in each block.
+
+    None where they cannot be compared: a llama-server's `ingest` slices and resizes the picture, which our engine
+    counts as inference, so that only e2e means the same on both sides.
+    """
+    if metric == "e2e_without_inference" and cell.has_ingest != base.has_ingest:
+        return None
     above, below = cell.by_block(metric), base.by_block(metric)
     if not above or not below:
         return None

@@ -182,6 +182,10 @@ def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
         notes.append(f"{', '.join(sizes)}; payload: {', '.join(payloads) or 'none'}.")
     if note := engine_note(run, cells):
         notes.append(f"{note[0].upper()}{note[1:]}.")
+    if any(cell.has_ingest for cell in cells):
+        notes.append(
+            "A llama-server's ingest slices and resizes the picture, which our engine counts as inference: compare e2e."
+        )
     if flagged := sum(cell.flagged() for cell in cells):
         notes.append(
             f"{flagged} of {sum(cell.n for cell in cells)} samples have a residual above {RESIDUAL_LIMIT:.0%}"

@@ -103,6 +103,12 @@ def test_cells_of_which_one_lacks_a_sample_are_compared_without_pairs(
     assert first[3].low == 3.0
 
 
+def test_a_llama_server_is_compared_end_to_end_only(make_run: MakeRun) -> None:
+    server = {"capture": 0.1, "json_pack": 0.3, "ingest": 20.0, "inference": 95.0}
+    cells = cells_of(make_run({"http/as-deployed": server, "ros/topic": HAND["ros/topic"]}, n=3))
+    assert [metric for metric, *_ in ratios(cells, 0)] == ["e2e"]
+
+
 def test_a_black_box_has_no_ratio_without_inference(make_run: MakeRun, black_box: Any) -> None:
     run = make_run({"http/black-box": black_box, "ros/topic": HAND["ros/topic"]}, n=3)
     assert [metric for metric, *_ in ratios(cells_of(run), seed=0)] == ["e2e"]
