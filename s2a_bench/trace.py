@@ -22,6 +22,9 @@ Mark: TypeAlias = tuple[str, int]
 RESIDUAL = ""
 """The name of a stretch that belongs to no stage."""
 
+RESIDUAL_LIMIT = 0.05
+"""A sample whose residual is a larger share of its e2e without inference is flagged."""
+
 STAGES: dict[str, str] = {
     "capture": "capture",
     "convert": "encode",

@@ -58,6 +58,15 @@ def compiler() -> str | None:
     return next((name for name in names if shutil.which(name.split()[0])), None)
 
 
+def has_pip() -> bool:
+    """Tell whether the environment is whole: one whose making was interrupted has no pip."""
+    try:
+        probe = [str(PYTHON), "-m", "pip", "--version"]
+        return subprocess.run(probe, capture_output=True, check=False).returncode == 0  # noqa: S603
+    except OSError:
+        return False
+
+
 def has_llama() -> bool:
     """Tell whether llama-cpp-python of the pinned version is in the environment."""
     wanted = requirement("llama-cpp-python").partition("==")[2]
@@ -115,9 +124,11 @@ def main() -> int:
         if stamp.exists() and stamp.read_text() == fingerprint() and PYTHON.exists():
             return 0
         check_machine()
-        if not PYTHON.exists():
+        if not has_pip():
             print(f"making {VENV}", flush=True)
-            subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=True)  # noqa: S603 - our own interpreter
+            venv = [sys.executable, "-m", "venv", "--clear", str(VENV)]
+            if subprocess.run(venv, check=False).returncode:  # noqa: S603 - our own interpreter
+                raise SetupError(f"cannot make a virtual environment in {VENV}; is the folder writable?")
         LOG.write_text("")
         if not has_llama():
             print("installing llama-cpp-python: compiled for this machine in 5 to 10 minutes, once", flush=True)

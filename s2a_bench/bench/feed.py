@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from random import Random
 from threading import Condition, Thread
@@ -14,6 +13,7 @@ from s2a_bench.errors import S2AError, SourceError
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.convert import encode_jpeg, to_bgr
 from s2a_bench.trace import RESIDUAL, Mark, Trace
+from s2a_bench.transport import CameraSink
 from s2a_bench.transport.pictures import JPEG_QUALITY, bgr_of
 from s2a_bench.types import Frame
 
@@ -66,9 +66,14 @@ class StreamedFrame:
     captured_ns: int
     intended_ns: int
     marks: list[Mark]
-    stamp_ns: int
+    stamp_ns: int = -1
     """ROS-time stamp if it was published, else -1."""
     used_by: str = ""
+
+    @property
+    def key(self) -> int:
+        """Return what names the frame: its ROS-time stamp, or its tick where it was not published."""
+        return self.stamp_ns if self.stamp_ns >= 0 else self.intended_ns
 
 
 class Camera:
@@ -83,7 +88,7 @@ class Camera:
         self._period_ns = int(1e9 / fps)
         self._clock = clock or SystemClock()
         self._changed = Condition()
-        self._publish: Callable[[Frame, Trace], int] | None = None
+        self._sink: CameraSink | None = None
         self._newest: tuple[StreamedFrame, Frame] | None = None
         self._frames: list[StreamedFrame] = []
         self._stopped = False
@@ -100,11 +105,11 @@ class Camera:
         if self._thread.is_alive():
             self._thread.join()
 
-    def use(self, publish: Callable[[Frame, Trace], int] | None) -> None:
-        """Publish every frame from now on, or with None just keep the newest, converted to BGR."""
+    def use(self, sink: CameraSink | None) -> None:
+        """Give every frame to ``sink`` from now on, or with None just keep the newest, converted to BGR."""
         with self._changed:
-            if self._publish is not publish:
-                self._publish, self._newest, self._frames = publish, None, []
+            if self._sink is not sink:
+                self._sink, self._newest, self._frames = sink, None, []
 
     def next_frame(self, after: int, timeout_s: float = 10.0) -> int:
         """Wait for a frame whose index is above ``after`` and return its index; raises what the source raised."""
@@ -113,10 +118,10 @@ class Camera:
             return self._failure is not None or (self._newest is not None and self._newest[0].index > after)
 
         with self._changed:
-            self._changed.wait_for(is_there, timeout_s)
+            came = self._changed.wait_for(is_there, timeout_s)
             if self._failure is not None:
                 raise self._failure
-            if self._newest is None:
+            if not came or self._newest is None:
                 raise SourceError(f"--source: the camera delivered nothing for {timeout_s:.0f} s")
             return self._newest[0].index
 
@@ -145,33 +150,33 @@ class Camera:
             intended_ns += self._period_ns
 
     def _step(self, intended_ns: int) -> None:
-        publish = self._publish
+        sink = self._sink
         trace = Trace()
         trace.mark(RESIDUAL)
         frame = self._source.read()
         trace.mark("capture")
-        stamp_ns = -1
-        if publish is not None:
-            stamp_ns = publish(frame, trace)
-        else:
+        record = StreamedFrame(frame.index, frame.stamp_ns, intended_ns, trace.marks)
+        if sink is None:
             frame = bgr_of(frame, trace)
+        else:
+            record.stamp_ns = sink.stamp_ns(frame)
+            with self._changed:  # before it is sent: an answer may name the frame before `publish` returns
+                self._frames += [record] if sink is self._sink else []
+            sink.publish(frame, trace)
         with self._changed:
-            if publish is self._publish:
-                record = StreamedFrame(frame.index, frame.stamp_ns, intended_ns, trace.marks, stamp_ns)
+            if sink is self._sink:
+                self._frames += [record] if sink is None else []
                 self._newest = record, frame
-                self._frames.append(record)
                 self._changed.notify_all()
 
 
 class StreamFeed:
     """Prompts about the camera's newest frame, at a random moment between two frames."""
 
-    def __init__(
-        self, camera: Camera, publish: Callable[[Frame, Trace], int] | None, period_ns: int, random: Random
-    ) -> None:
-        """Use ``publish`` for pipelines whose server keeps the newest frame itself."""
+    def __init__(self, camera: Camera, sink: CameraSink | None, period_ns: int, random: Random) -> None:
+        """Use ``sink`` for pipelines whose server keeps the newest frame itself."""
         self._camera = camera
-        self._publish = publish
+        self.sink = sink
         self._period_ns = period_ns
         self._random = random
         self._clock = SystemClock()
@@ -179,7 +184,7 @@ class StreamFeed:
 
     def get_ready(self) -> None:
         """Wait for two new frames, so that the server has one, and then for a random part of the period."""
-        self._camera.use(self._publish)
+        self._camera.use(self.sink)
         newest = self._camera.newest()
         first = self._camera.next_frame(newest[0].index if newest else -1)
         self._camera.next_frame(first)
@@ -196,4 +201,4 @@ class StreamFeed:
         if newest is None:
             return None
         self.last = newest[0]
-        return newest[1] if self._publish is None else None
+        return newest[1] if self.sink is None else None

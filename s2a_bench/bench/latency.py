@@ -23,9 +23,11 @@ from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.inference import open_engine
 from s2a_bench.inference.models import load_headers, resolve
 from s2a_bench.store.run import RunWriter
+from s2a_bench.store.schema import FrameRow
 from s2a_bench.trace import mark_cost_ns
 from s2a_bench.transport import Route, open_client, open_server
 
+LAST_MOMENT_S = 1.0
 GIVE_UP_AFTER = 5
 """Failures of one cell in a row, after which the run ends."""
 
@@ -96,7 +98,8 @@ class ServerSet:
             )
         else:
             address = f"127.0.0.1:{config.port}" if transport == "http" else config.namespace
-            route = Route(transport, address=address, dds_tuning=config.dds_tuning, domain_id=config.domain_id)
+            variant = "topic" if transport == "ros" else ""
+            route = Route(transport, variant, address=address, dds_tuning=config.dds_tuning, domain_id=config.domain_id)
             process = OwnServer(ServerJob(route, config.engine, tuned=config.dds_tuning == "tuned"), log)
         self._processes[transport] = self._stack.enter_context(process)
 
@@ -110,10 +113,10 @@ class ServerSet:
         process = self._processes.get(transport)
         return process.alive if process else lambda: True
 
-    def raise_if_dead(self, transport: str) -> None:
-        """Raise ServerDied with the whole story if the process has ended."""
+    def raise_if_dead(self, transport: str, *, suspect: bool = False) -> None:
+        """Raise ServerDied with the whole story if the process has ended; a suspect is given a moment to end."""
         process = self._processes.get(transport)
-        if process is not None and not process.alive():
+        if process is not None and process.ends_within(LAST_MOMENT_S if suspect else 0):
             raise process.death()
 
 
@@ -137,7 +140,7 @@ def run_latency(config: LatencyConfig, output: Path, progress: Progress) -> Path
 
 def _with_model(config: LatencyConfig, progress: Progress) -> LatencyConfig:
     """Find or make the model files, so that every server gets the same."""
-    progress.stage("looking for the model" if config.engine.model else "making the tiny dummy model on first use")
+    progress.stage("reading the model's headers" if config.engine.model else "the tiny dummy model, made on first use")
     model, mmproj = resolve(config.engine)
     return replace(config, engine=replace(config.engine, model=model, mmproj=mmproj))
 
@@ -206,9 +209,8 @@ def _sessions(config: LatencyConfig, servers: ServerSet, sources: _Sources, stac
         stack.callback(client.close)
         feed: Feed
         if camera is not None:
-            publisher = getattr(client, "camera", None)
             random = Random(config.seed)  # noqa: S311 - phases, not secrets
-            feed = StreamFeed(camera, publisher and publisher.publish, int(1e9 / config.fps), random)
+            feed = StreamFeed(camera, client.camera, int(1e9 / config.fps), random)
         else:
             feed = RequestFeed(sources.open(), preencoded=cell.payload == "jpeg-preencoded")
         yield Session(cell, client, feed, config)
@@ -224,28 +226,30 @@ def _blocks(
 ) -> None:
     """Measure every cell once a block, in a new random order each time."""
     random = Random(config.seed)  # noqa: S311 - an order, not a secret
-    failures = dict.fromkeys((session.cell.name for session in sessions), 0)
     for block in range(config.warmup + config.runs):
         progress.stage("warming up" if block < config.warmup else "measuring")
         for position, session in enumerate(random.sample(sessions, len(sessions))):
-            with _death_explained(servers, session.cell):
-                measured = session.measure(Place(block, position, block < config.warmup))
+            measured = session.measure(Place(block, position, block < config.warmup))
             writer.sample(measured.sample)
             writer.tokens(measured.tokens)
-            if isinstance(session.feed, StreamFeed):
-                for row in session.remember(session.feed.drain()):
-                    writer.frame(row)
+            _write_frames(writer, session.frames())
             guard.see(measured.sample, measured.fingerprint)
-            name, error = session.cell.name, measured.sample.error
-            failures[name] = failures[name] + 1 if error else 0
-            if error:
-                servers.raise_if_dead(session.cell.route.transport)
-            if failures[name] >= GIVE_UP_AFTER:
+            servers.raise_if_dead(session.cell.route.transport, suspect=measured.fatal is not None)
+            if measured.fatal is not None:
+                raise measured.fatal
+            if guard.failures_in_a_row(session.cell.name) >= GIVE_UP_AFTER:
+                name, error = session.cell.name, measured.sample.error
                 raise TransportError(f"{name} failed {GIVE_UP_AFTER} times in a row, at last with {error}")
             progress.advance()
     for session in sessions:
-        for row in session.finish():
-            writer.frame(row)
+        _write_frames(writer, session.frames(keep=0))
+        if not guard.successes(session.cell.name):
+            raise TransportError(f"no request of {session.cell.name} succeeded; {writer.path / 'samples.csv'} says why")
+
+
+def _write_frames(writer: RunWriter, rows: list[FrameRow]) -> None:
+    for row in rows:
+        writer.frame(row)
 
 
 @contextmanager
@@ -254,5 +258,5 @@ def _death_explained(servers: ServerSet, cell: Cell) -> Iterator[None]:
     try:
         yield
     except ServerDied:
-        servers.raise_if_dead(cell.route.transport)
+        servers.raise_if_dead(cell.route.transport, suspect=True)
         raise

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import re
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import ENGINES, EngineConfig
-from s2a_bench.transport import TRANSPORTS, Route
+from s2a_bench.transport import CONNECTIONS, HTTP_VARIANTS, NAMES, PAYLOADS, WIRES, Route
 
-HTTP_VARIANTS = ("as-deployed", "best-effort", "binary")
-PAYLOADS = ("jpeg", "jpeg-preencoded", "png", "raw")
-WIRES = ("bgr", "yuyv", "compressed")
-CONNECTIONS = ("keep-alive", "per-request", "client-per-request")
+LARGEST = 16_384
+ROS_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+"""ROS 2's rules for an absolute name."""
 MODES = ("request", "stream")
 TUNINGS = ("tuned", "default")
 
@@ -38,6 +39,8 @@ class LatencyConfig:
     wire: str = "bgr"
     connection: str = "keep-alive"
     url: str = ""
+    served_model: str = "default"
+    """The model's name in requests to a black box."""
     llama_server: Path | None = None
     port: int = 0
     dds_tuning: str = "tuned"
@@ -68,8 +71,8 @@ class LatencyConfig:
     def check(self) -> None:
         """Raise UsageError, naming the flag, for a value or combination that makes no sense."""
         if not self.transports:
-            raise UsageError(f"--transport: name at least one of {', '.join(TRANSPORTS)}")
-        _one_of("--transport", self.transports, tuple(TRANSPORTS))
+            raise UsageError(f"--transport: name at least one of {', '.join(NAMES)}")
+        _one_of("--transport", self.transports, NAMES)
         _one_of("--http", self.http, HTTP_VARIANTS)
         _one_of("--payload", [self.payload], PAYLOADS)
         _one_of("--wire", [self.wire], WIRES)
@@ -77,19 +80,25 @@ class LatencyConfig:
         _one_of("--engine", [self.engine.name], tuple(ENGINES))
         _one_of("--mode", [self.mode], MODES)
         _one_of("--dds-tuning", [self.dds_tuning], TUNINGS)
-        for flag, value, least in (
-            ("--runs", self.runs, 1),
-            ("--warmup", self.warmup, 0),
-            ("--max-tokens", self.max_tokens, 1),
-            ("--timeout", self.timeout_s, 0.1),
-            ("--fps", self.fps, 0.1),
+        for flag, value, least, most in (
+            ("--runs", self.runs, 1, 10**9),
+            ("--warmup", self.warmup, 0, 10**9),
+            ("--max-tokens", self.max_tokens, 1, 2**20),
+            ("--seed", self.seed, 0, 2**31 - 1),
+            ("--timeout", self.timeout_s, 0.1, 86_400),
+            ("--fps", self.fps, 0.1, 1_000),
         ):
-            if value < least:
-                raise UsageError(f"{flag}: {value} is too few, {least} is the least")
-        if self.width < 16 or self.height < 16 or self.width % 2:  # noqa: PLR2004
-            raise UsageError(f"--size: {self.width}x{self.height} should be at least 16x16, of even width")
-        if not self.namespace.startswith("/") or self.namespace.endswith("/"):
-            raise UsageError(f"--namespace: '{self.namespace}' should look like /name")
+            if not least <= value <= most:
+                raise UsageError(f"{flag}: {value} is not between {least} and {most}")
+        if not (16 <= self.width <= LARGEST and 16 <= self.height <= LARGEST) or self.width % 2:  # noqa: PLR2004
+            raise UsageError(
+                f"--size: {self.width}x{self.height} should be 16x16 to {LARGEST}x{LARGEST}, of even width"
+            )
+        if not ROS_NAME.fullmatch(self.namespace):
+            raise UsageError(f"--namespace: '{self.namespace}' should look like /name: letters, digits, underscores")
+        for flag, text in (("--prompt", self.prompt), ("--grammar", self.grammar)):
+            if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
+                raise UsageError(f"{flag}: the text is not valid UTF-8, or has a NUL")
         self._check_black_box()
         self._check_stream()
 
@@ -101,8 +110,8 @@ class LatencyConfig:
         flag = "--url" if self.url else "--llama-server"
         if "http" not in self.transports:
             raise UsageError(f"{flag} needs http among --transport")
-        if self.url and not self.url.startswith(("http://", "https://")):
-            raise UsageError(f"--url: '{self.url}' should start with http:// or https://")
+        if self.url and not _is_url(self.url):
+            raise UsageError(f"--url: '{self.url}' should start with http:// or https:// and name a host")
         if self.payload == "raw":
             raise UsageError(f"--payload raw needs our own server; with {flag} use jpeg, jpeg-preencoded or png")
         if "binary" in self.http:
@@ -116,9 +125,16 @@ class LatencyConfig:
 
     def to_manifest(self) -> dict[str, Any]:
         """Return the settings as plain data."""
-        from dataclasses import asdict
-
         return {**asdict(self), "http": list(self.http_variants), "size": f"{self.width}x{self.height}"}
+
+
+def _is_url(text: str) -> bool:
+    """Tell whether a text names an HTTP server."""
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in {"http", "https"} and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        return False
 
 
 def _one_of(flag: str, values: tuple[str, ...] | list[str], known: tuple[str, ...]) -> None:
@@ -147,6 +163,7 @@ def plan_cells(config: LatencyConfig, addresses: dict[str, str]) -> list[Cell]:
         dds_tuning=config.dds_tuning,
         domain_id=config.domain_id,
         timeout_s=config.timeout_s,
+        model=config.served_model,
     )
     cells = []
     for transport in config.transports:

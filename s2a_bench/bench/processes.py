@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
 from abc import ABC, abstractmethod
+from contextlib import suppress
 from pathlib import Path
 from selectors import EVENT_READ, DefaultSelector
 from typing import IO, Any
@@ -38,6 +41,7 @@ class ServerProcess(ABC):
         self._log: IO[bytes] = log.open("wb")
         self._process = subprocess.Popen(  # noqa: S603 - the command is ours or the user's own llama-server
             command,
+            preexec_fn=_die_with_parent,  # noqa: PLW1509 - calls one C function, resolved before the fork
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE if self._speaks_json else self._log,
             stderr=self._log,
@@ -59,6 +63,14 @@ class ServerProcess(ABC):
         """Tell whether the process still runs."""
         return self._process.poll() is None
 
+    def ends_within(self, timeout_s: float) -> bool:
+        """Give a process whose connections broke a moment to be seen as ended."""
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
     def death(self) -> ServerDied:
         """Describe how the process ended, with the last line it wrote."""
         code = self._process.poll()
@@ -68,19 +80,22 @@ class ServerProcess(ABC):
         return ServerDied(f"the {self.name} server (pid {self.pid}) died, {how}{last}; its log is {self.log}")
 
     def stop(self) -> None:
-        """Ask the process to stop, then make it."""
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                pipe.close()
-        for end in (None, self._process.terminate, self._process.kill):
-            if end is not None:
-                end()
-            try:
-                self._process.wait(STOP_TIMEOUT_S)
-                break
-            except subprocess.TimeoutExpired:
-                continue
-        self._log.close()
+        """Ask the process to stop, then make it; an impatient second Ctrl-C makes it at once."""
+        try:
+            self._ask_to_stop()
+            self._process.wait(STOP_TIMEOUT_S)
+        except (subprocess.TimeoutExpired, KeyboardInterrupt):
+            self._process.kill()
+            self._process.wait()
+        finally:
+            for pipe in (self._process.stdin, self._process.stdout):
+                if pipe is not None:
+                    pipe.close()
+            self._log.close()
+
+    def _ask_to_stop(self) -> None:
+        """Ask in the way that this server understands."""
+        self._process.terminate()
 
     def __enter__(self) -> ServerProcess:  # noqa: PYI034 - Self is typing's since 3.11
         return self
@@ -99,6 +114,11 @@ class OwnServer(ServerProcess):
         self._process.stdin.write(job.to_json().encode() + b"\n")
         self._process.stdin.flush()
 
+    def _ask_to_stop(self) -> None:
+        """End its standard input."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+
     def wait_ready(self) -> None:
         """Read the one line it answers."""
         stdout = self._process.stdout
@@ -109,7 +129,10 @@ class OwnServer(ServerProcess):
                 raise ServerDied(f"the {self.name} server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
         line = stdout.readline()
         if not line:
-            self._process.wait(STOP_TIMEOUT_S)
+            with suppress(subprocess.TimeoutExpired):  # dumping core, perhaps
+                self._process.wait(STOP_TIMEOUT_S)
+            self._process.kill()
+            self._process.wait()
             raise self.death()
         answer = json.loads(line)
         if "error" in answer:
@@ -131,13 +154,14 @@ class LlamaServer(ServerProcess):
         """
         if not (binary.is_file() and os.access(binary, os.X_OK)):
             raise UsageError(f"--llama-server: {binary} is no program that can be run")
-        port = port or _free_port()
+        port = _free_port(port)
         command = [str(binary), "--model", str(engine.model), "--mmproj", str(engine.mmproj)]
         command += ["--host", "127.0.0.1", "--port", str(port), "--ctx-size", str(engine.context), "--parallel", "1"]
-        if engine.threads:
-            command += ["--threads", str(engine.threads)]
-        if engine.gpu_layers:
-            command += ["--gpu-layers", str(engine.gpu_layers) if engine.gpu_layers > 0 else "999"]
+        # what our own engine does: every CPU this process may use, and nothing on a GPU unless told
+        command += ["--threads", str(engine.threads or len(os.sched_getaffinity(0)))]
+        command += ["--gpu-layers", str(engine.gpu_layers if engine.gpu_layers >= 0 else 999)]
+        if engine.gpu_layers == 0:
+            command.append("--no-mmproj-offload")
         if ignore_end:
             command.append("--ignore-eos")
         super().__init__("llama-server", command, log)
@@ -152,7 +176,7 @@ class LlamaServer(ServerProcess):
             if not self.alive():
                 raise self.death()
             try:
-                if httpx.get(self.address + "/health", trust_env=False).is_success:
+                if httpx.get(self.address + "/health", trust_env=False).is_success and self.alive():
                     return
             except httpx.TransportError:
                 pass  # it does not listen yet
@@ -172,12 +196,25 @@ def described(engine: EngineConfig) -> dict[str, Any]:
     }
 
 
-def _free_port() -> int:
-    """Find a port that is free now."""
+def _free_port(wanted: int) -> int:
+    """Return ``wanted``, or any port for 0, if it is free now; raises PortInUse."""
     with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind(("127.0.0.1", 0))
+            probe.bind(("127.0.0.1", wanted))
+            probe.listen()
         except OSError as error:
-            raise PortInUse(f"--port: no free port on 127.0.0.1: {error.strerror}") from error
+            raise PortInUse(
+                f"--port: {wanted} cannot be had on 127.0.0.1 ({error.strerror}); choose another, or 0 for any free one"
+            ) from error
         port: int = probe.getsockname()[1]
         return port
+
+
+_prctl = ctypes.CDLL(None, use_errno=True).prctl
+PR_SET_PDEATHSIG = 1
+
+
+def _die_with_parent() -> None:
+    """Have the kernel end the child when the harness is gone, however it went."""
+    _prctl(PR_SET_PDEATHSIG, signal.SIGTERM)

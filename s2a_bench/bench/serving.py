@@ -11,7 +11,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Lock, Thread
@@ -30,7 +30,7 @@ def engine_handler(engine: Engine) -> Handler:
     """Make the handler that lets one request at a time into the engine and marks `queue` and `inference`."""
     free = Lock()
 
-    def handle(request: Request, trace: Trace) -> Iterator[Token]:
+    def handle(request: Request, trace: Trace) -> Generator[Token, None, None]:
         trace.mark(RESIDUAL)
         if not free.acquire(blocking=False):
             free.acquire()
@@ -42,7 +42,7 @@ def engine_handler(engine: Engine) -> Handler:
                     trace.marks.append(("inference", now))
                 trace.token_ns.append(now)
                 yield token
-            trace.facts.update(getattr(engine, "facts", {}))
+            trace.facts.update(engine.facts)
         finally:
             free.release()
 
@@ -78,18 +78,17 @@ def main() -> int:
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints belongs in the log
     try:
-        if job.tuned:
-            keep_large_blocks()
+        keeps = job.tuned and keep_large_blocks()
         engine = open_engine(job.engine)
         server = open_server(job.route, engine_handler(engine))
     except S2AError as error:
         print(json.dumps({"error": str(error), "kind": type(error).__name__}), file=answers, flush=True)
         return error.exit_code
-    middleware = getattr(server, "middleware", None)
     ready = {
         "address": server.address,
         "engine": engine.describe(),
-        "transport": middleware.describe() if middleware else {},
+        "transport": server.describe(),
+        "malloc_keeps_large_blocks": keeps,
     }
 
     def stop_at_end_of_input() -> None:

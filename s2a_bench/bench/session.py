@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from s2a_bench.bench.feed import Feed, StreamedFrame, StreamFeed, fingerprint
@@ -29,11 +29,16 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """The rows of one request; ``fingerprint`` tells its picture from others."""
+    """The rows of one request; ``fingerprint`` tells its picture from others, ``fatal`` ends the run."""
 
     sample: SampleRow
     tokens: list[TokenRow]
     fingerprint: int
+    fatal: S2AError | None = None
+
+
+KEPT_FRAMES = 90
+"""Frames kept until an answer may name them: three seconds at 30 Hz."""
 
 
 class Session:
@@ -45,28 +50,27 @@ class Session:
         self.client = client
         self.feed = feed
         self._config = config
-        self._published: dict[int, StreamedFrame] = {}
+        self._frames: dict[int, StreamedFrame] = {}
 
     def measure(self, place: Place) -> Measured:
-        """Make one request; a failure that concerns only it becomes a row with its error."""
+        """Make one request; a failure becomes a row with its error, and says whether it is the run's end."""
         self.feed.get_ready()
         request_id = f"{self.cell.name}-{place.block}"
         seen: list[tuple[Token, int]] = []
         trace = Trace()
-        error = ""
+        error, fatal = "", None
         frame = self.feed.capture(trace)
         images = () if frame is None else (frame,)
         config = self._config
         request = Request(request_id, config.prompt, images, config.max_tokens, config.grammar, config.seed)
         try:
             seen.extend((token, now_ns()) for token in self.client.request(request, trace))
-        except FATAL:
-            raise
         except S2AError as failure:
             error = f"{type(failure).__name__}: {failure}"
+            fatal = failure if isinstance(failure, FATAL) else None
         if not error and not seen:
             error = "RequestFailed: the answer was empty"
-        return self._rows(place, request_id, frame, trace, seen, error)
+        return replace(self._rows(place, request_id, frame, trace, seen, error), fatal=fatal)
 
     def _rows(
         self,
@@ -86,6 +90,8 @@ class Session:
             index, captured_ns, picture = frame.index, frame.stamp_ns, fingerprint(frame)
         else:
             index, captured_ns, picture = -1, -1, place.block
+        if isinstance(self.feed, StreamFeed) and streamed is None:
+            error = error or "RequestFailed: the server knew no frame of this camera"
         started_ns = inference_start_ns(trace)
         sample = SampleRow(
             cell=self.cell.name,
@@ -131,36 +137,23 @@ class Session:
         """Find the camera frame that the answer is about, and complete its marks with the server's."""
         if not isinstance(self.feed, StreamFeed):
             return None
+        self._frames.update((frame.key, frame) for frame in self.feed.drain())
         used = self.feed.last
-        if trace.remote is not None and trace.remote.frame_stamp_ns >= 0:
-            used = self._published.get(trace.remote.frame_stamp_ns, used)
-            if used is not None and not used.used_by:
+        if self.feed.sink is not None:
+            used = self._frames.get(trace.remote.frame_stamp_ns) if trace.remote else None
+            if used is not None and trace.remote is not None and not used.used_by:
                 used.marks = [*used.marks, *trace.remote.frame_marks]
         if used is not None:
             used.used_by = request_id
         return used
 
-    def remember(self, frames: list[StreamedFrame]) -> list[FrameRow]:
-        """Take the camera's frames since the last call; return the rows of those before the newest few."""
-        for frame in frames:
-            self._published[frame.stamp_ns if frame.stamp_ns >= 0 else frame.intended_ns] = frame
+    def frames(self, keep: int = KEPT_FRAMES) -> list[FrameRow]:
+        """Return the rows of the camera's frames so far, the newest ``keep`` held back as an answer may name them."""
         rows = []
-        while len(self._published) > KEPT_FRAMES:
-            rows.append(self._row(self._published.pop(next(iter(self._published)))))
+        while len(self._frames) > keep:
+            frame = self._frames.pop(next(iter(self._frames)))
+            rows.append(FrameRow(self.cell.name, frame.index, frame.intended_ns, frame.marks, frame.used_by))
         return rows
-
-    def finish(self) -> list[FrameRow]:
-        """Return the rows of the frames that are left."""
-        rows = [self._row(frame) for frame in self._published.values()]
-        self._published.clear()
-        return rows
-
-    def _row(self, frame: StreamedFrame) -> FrameRow:
-        return FrameRow(self.cell.name, frame.index, frame.intended_ns, frame.marks, frame.used_by)
-
-
-KEPT_FRAMES = 90
-"""Frames kept until an answer may name them: three seconds at 30 Hz."""
 
 
 def inference_start_ns(trace: Trace) -> int | None:

@@ -7,8 +7,10 @@ import os
 
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
-KEEP_BYTES = 1 << 30
-"""Blocks up to this size stay with the process. Without it glibc returns every frame's memory to the kernel and each
+KEEP_BYTES = (1 << 30, 1 << 25)
+"""The first that glibc takes: older ones refuse a threshold above 32 MiB.
+
+Blocks up to this size stay with the process. Without it glibc returns every frame's memory to the kernel and each
 new frame faults its pages in again, 2.6 us a page (shared/LIMITS.md)."""
 
 SINGLE_THREADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -19,8 +21,8 @@ def keep_large_blocks() -> bool:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:
         return False
-    # mallopt takes ints: half of 2 GiB is the largest power of two that fits
-    return bool(mallopt(M_MMAP_THRESHOLD, KEEP_BYTES)) and bool(mallopt(M_TRIM_THRESHOLD, KEEP_BYTES))
+    trims = bool(mallopt(M_TRIM_THRESHOLD, KEEP_BYTES[0]))
+    return any(mallopt(M_MMAP_THRESHOLD, size) for size in KEEP_BYTES) and trims
 
 
 def limit_threads() -> None:

@@ -10,9 +10,8 @@ from pathlib import Path
 
 from s2a_bench.clock import realtime_offset_ns
 from s2a_bench.store.schema import SampleRow
-from s2a_bench.trace import budget
+from s2a_bench.trace import RESIDUAL_LIMIT, budget
 
-RESIDUAL_LIMIT = 0.05
 RMEM_WANTED = 4 << 20
 CLOCK_STEP_NS = 50_000_000
 
@@ -113,20 +112,33 @@ class SampleGuard:
     _cached: dict[str, int] = field(default_factory=dict)
     _residual: dict[str, int] = field(default_factory=dict)
     _failed: dict[str, int] = field(default_factory=dict)
+    _in_a_row: dict[str, int] = field(default_factory=dict)
+    _succeeded: dict[str, int] = field(default_factory=dict)
     _lost: dict[str, int] = field(default_factory=dict)
 
     def see(self, row: SampleRow, fingerprint: int) -> None:
         """Look at one sample and the fingerprint of its picture."""
         if self._frames.setdefault((row.cell, fingerprint), row.request_id) != row.request_id:
             _count(self._repeated, row.cell)
+        self._in_a_row[row.cell] = self._in_a_row.get(row.cell, 0) + 1 if row.error else 0
         if row.error:
             _count(self._lost if row.error.startswith("MessagesLost") else self._failed, row.cell)
             return
         if row.cache_n:
             _count(self._cached, row.cell)
+        if not row.warmup:
+            _count(self._succeeded, row.cell)
         share = budget(row.marks).residual_share
         if not row.warmup and share is not None and share > RESIDUAL_LIMIT:
             _count(self._residual, row.cell)
+
+    def failures_in_a_row(self, cell: str) -> int:
+        """Count a cell's failures since its last success."""
+        return self._in_a_row.get(cell, 0)
+
+    def successes(self, cell: str) -> int:
+        """Count a cell's samples that took part in its numbers."""
+        return self._succeeded.get(cell, 0)
 
     def doubts(self) -> list[Doubt]:
         """Say what was seen."""

@@ -44,9 +44,12 @@ def _interrupt(*_: Any) -> None:
 
 def main() -> None:
     """Run the command line and exit: 0 done, 1 failed, 2 wrongly used, 130 interrupted."""
-    signal.signal(signal.SIGTERM, _interrupt)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _interrupt)
     try:
         code = app(standalone_mode=False)
+        if code == INTERRUPTED:  # newer typer turns Ctrl-C into this code itself
+            _say("interrupted", INTERRUPTED)
     except S2AError as error:
         code = _say(f"error: {error}", error.exit_code)
     except ParseError as error:
@@ -54,7 +57,7 @@ def main() -> None:
         hint = f" (see '{context.command_path} --help')" if context else ""
         code = _say(f"error: {error.format_message()}{hint}", error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        code = INTERRUPTED
+        code = _say("interrupted", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output has gone, as with `| head`
         sys.stderr.close()
         code = 1

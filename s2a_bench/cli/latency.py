@@ -31,6 +31,7 @@ def latency(
     ] = "",
     wire: Annotated[str, typer.Option(help="ROS picture: bgr, yuyv, compressed")] = "bgr",
     url: Annotated[str, typer.Option(help="an OpenAI-compatible server that runs already (a black box)")] = "",
+    served_model: Annotated[str, typer.Option(help="the model's name at --url")] = "default",
     llama_server: Annotated[
         Path | None, typer.Option(help="start this llama.cpp server on the same model files (a black box)")
     ] = None,
@@ -80,6 +81,7 @@ def latency(
         wire=wire,
         connection=connection,
         url=url,
+        served_model=served_model,
         llama_server=llama_server,
         port=port,
         dds_tuning=dds_tuning,
@@ -100,13 +102,12 @@ def latency(
     with RunProgress() as progress:
         try:
             folder = run_latency(config, output, progress)
-        except (S2AError, KeyboardInterrupt) as end:
-            what = "interrupted; " if isinstance(end, KeyboardInterrupt) else ""
+            progress.stage("drawing")
+            _show(folder, progress, as_json=json_, against_paper=against == "paper", verbose=verbose)
+        except (S2AError, KeyboardInterrupt):
             if progress.folder is not None:
-                progress.console.print(f"{what}samples so far: {progress.folder}", highlight=False, soft_wrap=True)
+                progress.say(f"samples so far: {progress.folder}")
             raise
-        progress.stage("drawing")
-        _show(folder, progress, as_json=json_, against_paper=against == "paper", verbose=verbose)
 
 
 def _show(folder: Path, progress: RunProgress, *, as_json: bool, against_paper: bool, verbose: bool) -> None:
@@ -123,9 +124,7 @@ def _show(folder: Path, progress: RunProgress, *, as_json: bool, against_paper: 
     write_tables(run)
     write_figures(run, against_paper=against_paper)
     for doubt in run.manifest["warnings"]:
-        progress.console.print(
-            f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}", markup=False, soft_wrap=True
-        )
+        progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
     if as_json:
         json.dump(to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
         sys.stdout.write("\n")
@@ -137,7 +136,7 @@ def _show(folder: Path, progress: RunProgress, *, as_json: bool, against_paper: 
     if verbose:
         console.print(f"a mark costs {run.manifest['mark_cost_ns']} ns")
         console.print_json(data=run.manifest["environment"])
-    console.print(f"run folder: {folder}", highlight=False, soft_wrap=True)
+    console.print(f"run folder: {folder}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _listed(text: str) -> tuple[str, ...]:

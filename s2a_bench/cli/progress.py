@@ -7,6 +7,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
+from s2a_bench.clock import now_ns
+
 PLAIN_STEPS = 5
 """Without a terminal, progress is told this often."""
 
@@ -31,6 +33,7 @@ class RunProgress:
         self._total = 0
         self._done = 0
         self._said = ""
+        self._started_ns = now_ns()
 
     def __enter__(self) -> RunProgress:  # noqa: PYI034 - Self is typing's since 3.11
         self._bar.start()
@@ -38,6 +41,10 @@ class RunProgress:
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
+
+    def say(self, line: str) -> None:
+        """Print one line, above the bar."""
+        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def opened(self, folder: Path) -> None:
         """Remember where the results go."""
@@ -47,12 +54,13 @@ class RunProgress:
         """Show what is being done."""
         self._bar.update(self._task, description=text)
         if self._bar.disable and text != self._said:
-            self.console.print(text, highlight=False)
+            self.say(text)
         self._said = text
 
     def expect(self, samples: int) -> None:
         """Start counting."""
         self._total = samples
+        self._started_ns = now_ns()
         self._bar.update(self._task, total=samples)
 
     def advance(self) -> None:
@@ -61,4 +69,5 @@ class RunProgress:
         self._bar.advance(self._task)
         step = max(1, self._total // PLAIN_STEPS)
         if self._bar.disable and self._done % step == 0:
-            self.console.print(f"  {self._done} of {self._total} samples", highlight=False)
+            left_s = (now_ns() - self._started_ns) / 1e9 / self._done * (self._total - self._done)
+            self.say(f"  {self._done} of {self._total} samples, about {left_s:.0f} s left")

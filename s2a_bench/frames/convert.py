@@ -94,7 +94,10 @@ def _convert(data: Pixels, channels: int, code: int, out: Pixels | None) -> Pixe
         raise ValueError(f"YUYV holds pixels in pairs: the width cannot be {data.shape[1]}")
     if out is not None and (out.shape != (*data.shape[:2], 3) or out.dtype != np.uint8):
         raise ValueError(f"out should be uint8 of shape {(*data.shape[:2], 3)}, not {out.dtype} {out.shape}")
-    return cast("Pixels", cv2.cvtColor(data, code, dst=out))
+    try:
+        return cast("Pixels", cv2.cvtColor(data, code, dst=out))
+    except cv2.error as error:
+        raise ValueError(f"OpenCV cannot convert pixels of shape {data.shape}: {error}") from error
 
 
 def _encode(suffix: str, bgr: Pixels, parameters: list[int]) -> Pixels:

@@ -15,6 +15,9 @@ from s2a_bench.types import Request, Token
 class Engine(Protocol):
     """A model, or something that behaves like one. One request at a time; not thread-safe."""
 
+    facts: dict[str, float]
+    """What the engine says about the last request, as llama.cpp's ``timings``: prompt_n, prompt_ms, ..."""
+
     def generate(self, request: Request) -> Iterator[Token]:
         """Yield the answer's tokens, at most ``request.max_tokens``; closing the iterator cancels the rest.
 

@@ -15,6 +15,7 @@ class EchoEngine:
 
     def __init__(self, config: EngineConfig) -> None:
         """Take the settings for their name only."""
+        self.facts: dict[str, float] = {}
         self._config = config
         self._closed = False
 

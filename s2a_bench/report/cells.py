@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from s2a_bench.stats import Ratio, Summary, ratio_of_medians, summarise
-from s2a_bench.trace import GROUPS, STAGES
+from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT, STAGES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
     Floats: TypeAlias = NDArray[np.float64]
-
-RESIDUAL_LIMIT = 0.05
-"""A sample whose residual is a larger share of its e2e without inference is flagged."""
 
 RATIO_METRICS = ("e2e_without_inference", "e2e")
 """What cells are compared by: columns of the samples, less the unit."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from s2a_bench.report.cells import (
-    RESIDUAL_LIMIT,
     Cell,
     cells_of,
     engine_note,
@@ -16,7 +15,7 @@ from s2a_bench.report.cells import (
     stages_present,
     summary_of,
 )
-from s2a_bench.trace import STAGES
+from s2a_bench.trace import RESIDUAL_LIMIT, STAGES
 
 if TYPE_CHECKING:
     from s2a_bench.report.cells import Floats

@@ -6,12 +6,14 @@ Honoured when set: CYCLONEDDS_URI (replaces everything here), ROS_AUTOMATIC_DISC
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from xml.sax.saxutils import quoteattr
 
 from s2a_bench.errors import UsageError
 from s2a_bench.ros import Tuning
 
+PEER = re.compile(r"[A-Za-z0-9._:%-]+")
 RANGES = ("OFF", "LOCALHOST", "SUBNET", "SYSTEM_DEFAULT")
 
 TUNED_GENERAL = "<MaxMessageSize>65500B</MaxMessageSize><FragmentSize>65000B</FragmentSize>"
@@ -36,6 +38,9 @@ def configuration(environ: Mapping[str, str], tuning: Tuning) -> str | None:
     if reach not in RANGES:
         raise UsageError(f"ROS_AUTOMATIC_DISCOVERY_RANGE: '{reach}' is none of {', '.join(RANGES)}")
     peers = [peer for peer in environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
+    for peer in peers:
+        if not PEER.fullmatch(peer):
+            raise UsageError(f"ROS_STATIC_PEERS: '{peer}' is no host name or address; separate several with ';'")
     local = reach in {"OFF", "LOCALHOST"} and not peers
     if local or reach == "LOCALHOST":
         peers.insert(0, "127.0.0.1")

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pkgutil import resolve_name
 from typing import Protocol, TypeAlias
 
 from s2a_bench.errors import UsageError
 from s2a_bench.trace import Trace
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Frame, Request, Token
 
-Handler: TypeAlias = Callable[[Request, Trace], Iterator[Token]]
+HTTP_VARIANTS = ("as-deployed", "best-effort", "binary")
+ROS_VARIANTS = ("topic",)
+PAYLOADS = ("jpeg", "jpeg-preencoded", "png", "raw")
+WIRES = ("bgr", "yuyv", "compressed")
+CONNECTIONS = ("keep-alive", "per-request", "client-per-request")
+
+Handler: TypeAlias = Callable[[Request, Trace], Generator[Token, None, None]]
 """What a server does with a request whose pictures are ``rgb8``: it yields tokens and marks the trace.
 
 A handler marks `queue` if it waited for a free engine, `inference` at the first token, and appends the time of
@@ -19,8 +25,23 @@ every token to ``trace.token_ns``. Transports know handlers, never engines.
 """
 
 
+class CameraSink(Protocol):
+    """Where a running camera's frames go when the server is to keep the newest itself (stream mode)."""
+
+    def stamp_ns(self, frame: Frame) -> int:
+        """Return the ROS-time stamp that will name this frame in the server's marks."""
+        ...
+
+    def publish(self, frame: Frame, trace: Trace) -> None:
+        """Convert, pack and send one frame, marking each stage."""
+        ...
+
+
 class Client(Protocol):
     """One side of one pipeline. Not thread-safe; one request at a time."""
+
+    camera: CameraSink | None
+    """None where the newest frame goes with the prompt instead."""
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Send a request with its frames as captured, yield tokens as they arrive, mark every stage.
@@ -40,6 +61,10 @@ class Server(Protocol):
 
     address: str
     """Where a client of the same transport finds it, known once the server exists."""
+
+    def describe(self) -> dict[str, str | int]:
+        """Say what carries the requests, for the manifest."""
+        ...
 
     def serve(self) -> None:
         """Serve until `stop` is called from another thread or a signal handler."""
@@ -67,7 +92,7 @@ class Route:
     """http: keep-alive, per-request (a new connection), client-per-request (a new client object)."""
     black_box: bool = False
     """http: the server is not ours, so it sends no marks."""
-    model: str = "s2a"
+    model: str = "default"
     """http: the model's name in the request."""
     dds_tuning: str = "tuned"
     domain_id: int = 0
@@ -77,17 +102,22 @@ class Route:
 
 TRANSPORTS: dict[str, tuple[str, str]] = {
     "http": ("s2a_bench.transport.http.client:HttpClient", "s2a_bench.transport.http.server:HttpServer"),
-    "ros": ("s2a_bench.transport.ros.topic:TopicClient", "s2a_bench.transport.ros.topic:TopicServer"),
+    "ros/topic": ("s2a_bench.transport.ros.topic:TopicClient", "s2a_bench.transport.ros.server:RosServer"),
     "loopback": ("s2a_bench.transport.loopback:LoopbackClient", "s2a_bench.transport.loopback:LoopbackServer"),
 }
-"""Name -> (client class, built as ``Client(route, alive)``; server class, built as ``Server(route, handler)``)."""
+"""Transport or transport/variant -> (client class, built as ``Client(route, alive)``; server class, built as
+``Server(route, handler)``)."""
+
+NAMES = tuple(dict.fromkeys(name.partition("/")[0] for name in TRANSPORTS))
+"""The transports, without their variants."""
 
 
 def _implementation(route: Route, side: int) -> Callable[..., object]:
-    if route.transport not in TRANSPORTS:
-        raise UsageError(f"--transport: '{route.transport}' is none of {', '.join(TRANSPORTS)}")
-    found: Callable[..., object] = resolve_name(TRANSPORTS[route.transport][side])
-    return found
+    for name in (f"{route.transport}/{route.variant}", route.transport):
+        if name in TRANSPORTS:
+            found: Callable[..., object] = resolve_name(TRANSPORTS[name][side])
+            return found
+    raise UsageError(f"--transport: '{route.transport}' is none of {', '.join(NAMES)}")
 
 
 def open_client(route: Route, alive: Callable[[], bool] = lambda: True) -> Client:

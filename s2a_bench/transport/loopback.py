@@ -31,6 +31,10 @@ class LoopbackServer:
         self._stopped = Event()
         _servers[self.address] = self
 
+    def describe(self) -> dict[str, str | int]:
+        """Say that nothing carries anything."""
+        return {"transport": "in process"}
+
     def serve(self) -> None:
         """Wait for `stop`; requests run on their clients' threads."""
         self._stopped.wait()
@@ -47,6 +51,7 @@ class LoopbackClient:
     def __init__(self, route: Route, alive: Callable[[], bool]) -> None:
         """Remember the address; the server is looked up for each request."""
         del alive  # a server in this process lives as long as it is registered
+        self.camera = None
         self._address = route.address
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:

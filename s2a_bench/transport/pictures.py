@@ -33,18 +33,24 @@ def bgr_of(frame: Frame, trace: Trace) -> Frame:
 
 
 def rgb_of(frame: Frame, trace: Trace) -> Frame:
-    """Turn any raw frame into the ``rgb8`` an engine wants; marks `channel_swap` or `yuv_decode`."""
+    """Turn any raw frame into the ``rgb8`` an engine wants; marks `channel_swap` or `yuv_decode`.
+
+    Raises RequestFailed for pixels that do not fit their encoding.
+    """
     if frame.encoding == "rgb8":
         return frame
-    if frame.encoding == "bgr8":
-        data = bgr_to_rgb(frame.data)
-        trace.mark("channel_swap")
-    elif frame.encoding == "yuv422_yuy2":
-        data = yuyv_to_rgb(frame.data)
-        trace.mark("yuv_decode")
-    else:
-        data = bgr_to_rgb(to_bgr(frame))
-        trace.mark("image_decode")
+    try:
+        if frame.encoding == "bgr8":
+            data = bgr_to_rgb(frame.data)
+            trace.mark("channel_swap")
+        elif frame.encoding == "yuv422_yuy2":
+            data = yuyv_to_rgb(frame.data)
+            trace.mark("yuv_decode")
+        else:
+            data = bgr_to_rgb(to_bgr(frame))
+            trace.mark("image_decode")
+    except ValueError as error:
+        raise RequestFailed(f"a {frame.width}x{frame.height} {frame.encoding} picture cannot be: {error}") from error
     return replace(frame, encoding="rgb8", data=data)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from threading import Event
-
 import cv2
 import numpy as np
 import pytest
@@ -42,6 +40,17 @@ class Source:
         pass
 
 
+class Sink:
+    """Packs, and names frames by their index."""
+
+    def stamp_ns(self, frame: Frame) -> int:
+        return 1_000 + frame.index
+
+    def publish(self, frame: Frame, trace: Trace) -> None:
+        del frame
+        trace.mark("cdr_pack")
+
+
 def run(frames: int, slow: dict[int, int] | None = None) -> Camera:
     """Run a camera at 10 Hz to its source's end."""
     clock = VirtualClock()
@@ -69,9 +78,16 @@ def test_frames_are_drained_once() -> None:
     assert camera.drain() == []
 
 
+def test_a_camera_that_stalls_is_an_error_not_an_old_frame() -> None:
+    clock = VirtualClock()
+    camera = Camera(Source(clock, 0), 10.0, clock)  # type: ignore[arg-type]  # never started
+    with pytest.raises(SourceError, match="delivered nothing"):
+        camera.next_frame(-1, timeout_s=0.01)
+
+
 def test_changing_the_sink_forgets_the_frames_of_the_other() -> None:
     camera = run(3)
-    camera.use(lambda frame, trace: frame.index + len(trace.marks))
+    camera.use(Sink())
     assert camera.newest() is None
     assert camera.drain() == []
 
@@ -79,14 +95,7 @@ def test_changing_the_sink_forgets_the_frames_of_the_other() -> None:
 def test_a_published_frame_has_its_stamp() -> None:
     clock = VirtualClock()
     camera = Camera(Source(clock, 2), 10.0, clock)  # type: ignore[arg-type]
-    published = Event()
-
-    def publish(frame: Frame, trace: Trace) -> int:
-        trace.mark("cdr_pack")
-        published.set()
-        return 1_000 + frame.index
-
-    camera.use(publish)
+    camera.use(Sink())
     camera.start()
     camera._thread.join(20)
     frames = camera.drain()

@@ -20,7 +20,7 @@ class Engine:
     """Yields two tokens, the second when `go` is set."""
 
     def __init__(self) -> None:
-        self.facts = {"prompt_n": 4.0}
+        self.facts: dict[str, float] = {"prompt_n": 4.0}
         self.go = Event()
         self.closed = 0
         self.fail = False
@@ -73,7 +73,7 @@ def test_a_request_left_early_frees_the_engine() -> None:
     handle = engine_handler(engine)
     tokens = handle(Request("a", "1"), Trace())
     next(tokens)
-    tokens.close()  # type: ignore[attr-defined]  # it is a generator
+    tokens.close()
     assert engine.closed == 1
     assert next(handle(Request("b", "2"), Trace())).text == "2"
 

@@ -77,6 +77,15 @@ def test_counters_that_rise_are_doubts(after: Counters, code: str) -> None:
     assert [doubt.code for doubt in after.doubts_since(before)] == [code]
 
 
+def test_failures_in_a_row_end_with_a_success() -> None:
+    guard = SampleGuard()
+    for number, error in enumerate(["x", "x", "", "x"]):
+        guard.see(row(str(number), error=error), number)
+    assert guard.failures_in_a_row("ros/topic") == 1
+    assert guard.successes("ros/topic") == 1
+    assert guard.successes("loopback") == 0
+
+
 def test_what_cannot_be_read_is_no_doubt() -> None:
     assert Counters(None, None).doubts_since(Counters(3, 5)) == []
 

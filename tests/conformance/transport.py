@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ class Recorder:
         self.requests: list[Request] = []
         self.fail_at: int | None = None
 
-    def __call__(self, request: Request, trace: Trace) -> Iterator[Token]:
+    def __call__(self, request: Request, trace: Trace) -> Generator[Token, None, None]:
         self.requests.append(request)
         for index, text in enumerate(self.answer):
             if index == self.fail_at:

@@ -47,10 +47,15 @@ def test_a_subnet_is_used_when_asked_for() -> None:
 
 
 def test_static_peers_open_the_network_but_not_multicast() -> None:
-    root = parse({"ROS_STATIC_PEERS": "192.168.0.7;robot<1>"})
+    root = parse({"ROS_STATIC_PEERS": "192.168.0.7;robot-1.lan"})
     assert root.find(".//NetworkInterface") is None
     assert root.findtext(".//AllowMulticast") == "false"
-    assert peers(root) == ["127.0.0.1", "192.168.0.7", "robot<1>"]
+    assert peers(root) == ["127.0.0.1", "192.168.0.7", "robot-1.lan"]
+
+
+def test_a_peer_that_is_none_is_named() -> None:
+    with pytest.raises(UsageError, match="ROS_STATIC_PEERS: 'not a host'"):
+        configuration({"ROS_STATIC_PEERS": "not a host"}, "tuned")
 
 
 def test_an_unknown_range_is_named() -> None:

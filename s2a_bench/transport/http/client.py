@@ -23,7 +23,6 @@ from s2a_bench.transport.http import dialect
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Request, Token
 
-CONNECTIONS = ("keep-alive", "per-request", "client-per-request")
 FACTS = ("cache_n", "prompt_n", "prompt_ms", "predicted_n", "predicted_ms")
 """What of llama-server's ``timings`` is kept."""
 
@@ -33,6 +32,7 @@ class HttpClient:
 
     def __init__(self, route: Route, alive: Callable[[], bool]) -> None:
         """Prepare to ask the server at ``route.address``; nothing is sent yet."""
+        self.camera = None
         self._route = route
         self._alive = alive
         self._codec = dialect.CODECS[route.variant]
@@ -45,7 +45,9 @@ class HttpClient:
 
     def _new_client(self) -> httpx.Client:
         """Build the client; its TLS context alone takes about 20 ms, which is why it is normally built once."""
-        return httpx.Client(timeout=self._route.timeout_s, trust_env=False)
+        # a kept connection stays kept, however long a turn of the other cells takes
+        limits = httpx.Limits(keepalive_expiry=None)
+        return httpx.Client(timeout=self._route.timeout_s, trust_env=False, limits=limits)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Encode and send the request and yield the streamed tokens."""
@@ -169,11 +171,11 @@ def _translated(alive: Callable[[], bool], url: str) -> Iterator[None]:
         raise ServerDied(f"nothing answers at {url}: {error}") from error
     except httpx.TimeoutException as error:
         raise RequestFailed(f"{url} was silent for too long: {type(error).__name__}") from error
-    except httpx.TransportError as error:
+    except httpx.RequestError as error:
         if not alive():
             raise ServerDied(f"the server at {url} is gone: {error}") from error
         raise RequestFailed(f"{url} broke the connection: {error}") from error
-    except (json.JSONDecodeError, KeyError, AttributeError) as error:  # orjson's error is a JSONDecodeError
+    except (ValueError, KeyError, TypeError, AttributeError) as error:  # JSON errors are ValueErrors
         raise RequestFailed(f"{url} does not speak the OpenAI dialect: {error!r}") from error
     except httpx.InvalidURL as error:
         raise TransportError(f"--url: '{url}' is no URL: {error}") from error

@@ -17,9 +17,10 @@ import orjson
 import pybase64
 
 from s2a_bench.trace import Remote
+from s2a_bench.transport import HTTP_VARIANTS
 from s2a_bench.types import Request
 
-AS_DEPLOYED, BEST_EFFORT, BINARY = VARIANTS = ("as-deployed", "best-effort", "binary")
+AS_DEPLOYED, BEST_EFFORT, BINARY = HTTP_VARIANTS
 
 PATHS = {
     AS_DEPLOYED: "/v1/chat/completions",

@@ -28,6 +28,9 @@ from s2a_bench.transport.http import dialect
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.types import Frame, Request, Token
 
+KEEP_ALIVE_S = 3600
+"""A client that waits for its turn in an interleaved run keeps its connection."""
+
 
 class ImageUrl(BaseModel):
     """Where a picture is: a data URI."""
@@ -271,8 +274,13 @@ class HttpServer:
             access_log=False,
             lifespan="off",
             timeout_graceful_shutdown=1,
+            timeout_keep_alive=KEEP_ALIVE_S,
         )
         self._server = uvicorn.Server(config)
+
+    def describe(self) -> dict[str, str | int]:
+        """Say what serves."""
+        return {"server": "uvicorn", "version": uvicorn.__version__, "loop": "uvloop", "http": "httptools"}
 
     def serve(self) -> None:
         """Serve until stopped."""

@@ -1,98 +1,25 @@
-"""The ROS variant `topic`: a request message goes to ``<namespace>/request``, tokens return on ``<namespace>/token``.
-
-The camera is a plain ``sensor_msgs/Image`` (or CompressedImage) topic, so any ROS 2 subscriber sees it; in stream
-mode the server keeps its newest frame, converted already, for requests that carry none.
-"""
+"""The ROS variant `topic`: requests go to ``<namespace>/request``, tokens return on ``<namespace>/token``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from threading import Lock, Thread
 from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, TransportError
-from s2a_bench.ros import Middleware, QoS, Tuning, open_middleware
+from s2a_bench.ros import Middleware, QoS
 from s2a_bench.ros import messages as ros
-from s2a_bench.trace import Mark, Remote, Trace
-from s2a_bench.transport import Handler, Route
-from s2a_bench.transport.pictures import bgr_of, decoded, encoded, rgb_of
-from s2a_bench.types import Frame, Request, Token
-
-WIRES = ("bgr", "yuyv", "compressed")
-DEFAULT_NAMESPACE = "/s2a_bench"
-CAMERA = "/camera/image_raw"
-COMPRESSED_CAMERA = "/camera/image_raw/compressed"
-FRAME_ID = "camera"
+from s2a_bench.trace import Remote, Trace
+from s2a_bench.transport import Route
+from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
+from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join
+from s2a_bench.types import Request, Token
 
 REQUEST_QOS = QoS(depth=10)
 READER_QOS = QoS(depth=0)
 """Our readers keep all: history is local, and a burst of tokens overruns ROS's default of 10."""
 TOKEN_QOS = QoS(depth=1000)
-CAMERA_QOS = QoS(depth=1)
-
-POLL_S = 0.5
 MATCH_TIMEOUT_S = 15.0
-SETTLE_S = 0.3
-"""Time to discover a server that is there already."""
-
-
-def _join(route: Route) -> Middleware:
-    tuning: Tuning = "default" if route.dds_tuning == "default" else "tuned"
-    return open_middleware(domain_id=route.domain_id, tuning=tuning)
-
-
-def picture_message(frame: Frame, wire: str, offset_ns: int, trace: Trace) -> tuple[str, Any]:
-    """Return (ROS type, message) of a frame for a wire format; ``offset_ns`` turns its stamp into ROS time."""
-    stamp_ns = frame.stamp_ns + offset_ns
-    if wire == "compressed":
-        _, data = encoded(frame, "jpeg", trace)
-        return ros.COMPRESSED_IMAGE, ros.compressed_image_message(data, stamp_ns, FRAME_ID)
-    if wire == "yuyv" and frame.encoding != "yuv422_yuy2":
-        raise RequestFailed(f"--wire yuyv: this source delivers {frame.encoding}; use --wire bgr")
-    return ros.IMAGE, ros.image_message(bgr_of(frame, trace) if wire == "bgr" else frame, stamp_ns, FRAME_ID)
-
-
-def _refuse_company(route: Route, namespace: str) -> None:
-    """Raise TransportError if another server listens under ``namespace``: both would answer every request."""
-    probe = _join(route)
-    try:
-        publisher = probe.publisher(namespace + "/request", ros.REQUEST, REQUEST_QOS)
-        probe.subscription(namespace + "/token", ros.TOKEN, READER_QOS).take(SETTLE_S)
-        if publisher.matched():
-            raise TransportError(
-                f"another server answers under {namespace} in DDS domain {route.domain_id}: stop it, "
-                "or choose another domain with ROS_DOMAIN_ID or another --namespace"
-            )
-    finally:
-        probe.close()
-
-
-class CameraPublisher:
-    """Publishes frames as a ROS 2 camera does."""
-
-    def __init__(self, middleware: Middleware, namespace: str, wire: str) -> None:
-        """Create the one topic that ``wire`` needs."""
-        self._wire = wire
-        self._offset_ns = realtime_offset_ns()
-        if wire == "compressed":
-            topic, type_name = namespace + COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE
-        else:
-            topic, type_name = namespace + CAMERA, ros.IMAGE
-        self._publisher = middleware.publisher(topic, type_name, CAMERA_QOS)
-
-    def publish(self, frame: Frame, trace: Trace) -> int:
-        """Convert, pack and send one frame; return its ROS-time stamp, by which the server names it."""
-        _, message = picture_message(frame, self._wire, self._offset_ns, trace)
-        packed = self._publisher.pack(message)
-        trace.mark("cdr_pack")
-        self._publisher.send(packed)
-        return frame.stamp_ns + self._offset_ns
-
-    def matched(self) -> int:
-        """Count the subscriptions."""
-        return self._publisher.matched()
 
 
 class TopicClient:
@@ -103,7 +30,7 @@ class TopicClient:
         self._route = route
         self._alive = alive
         self._offset_ns = realtime_offset_ns()
-        self.middleware = _join(route)
+        self.middleware = join(route)
         namespace = route.address or DEFAULT_NAMESPACE
         self._publisher = self.middleware.publisher(namespace + "/request", ros.REQUEST, REQUEST_QOS)
         self._subscription = self.middleware.subscription(namespace + "/token", ros.TOKEN, READER_QOS)
@@ -158,7 +85,7 @@ class TopicClient:
             yield Token(token.index, token.text, token.token)
             expected += 1
         if token.marks:
-            trace.receive(_remote_of(token.marks[0]))
+            trace.receive(remote_of(token.marks[0]))
         if token.error:
             raise RequestFailed(f"the server broke off: {token.error}")
 
@@ -180,99 +107,30 @@ class TopicClient:
         self.middleware.close()
 
 
-@dataclass(frozen=True, slots=True)
-class _CachedFrame:
-    """The newest camera frame, ready for the engine, and its way through this process."""
+class TopicFront:
+    """The server's side of the variant: receives requests and turns each into a job for the engine's thread."""
 
-    frame: Frame
-    marks: list[Mark]
+    def __init__(self, middleware: Middleware, namespace: str, cache: CameraCache) -> None:
+        """Create the topics."""
+        self._cache = cache
+        self._requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
+        self._tokens = middleware.publisher(namespace + "/token", ros.TOKEN, TOKEN_QOS)
 
-
-class TopicServer:
-    """Answers requests one after the other on the thread that calls `serve`; the camera has a thread of its own."""
-
-    def __init__(self, route: Route, handler: Handler) -> None:
-        """Join the domain and create the topics."""
-        self.address = route.address or DEFAULT_NAMESPACE
-        self._handler = handler
-        _refuse_company(route, self.address)
-        self.middleware = _join(route)
-        self._requests = self.middleware.subscription(self.address + "/request", ros.REQUEST, READER_QOS)
-        self._tokens = self.middleware.publisher(self.address + "/token", ros.TOKEN, TOKEN_QOS)
-        cameras = ((CAMERA, ros.IMAGE), (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE))
-        self._cameras = [
-            self.middleware.subscription(self.address + topic, type_name, CAMERA_QOS) for topic, type_name in cameras
-        ]
-        self._newest: _CachedFrame | None = None
-        self._closing = Lock()
-        self._stopped = False
-
-    def serve(self) -> None:
-        """Serve until stopped."""
-        threads = [Thread(target=self._watch, args=(camera,), daemon=True) for camera in self._cameras]
-        for thread in threads:
-            thread.start()
-        while not self._stopped:
-            packed = self._requests.take(POLL_S)
-            if packed is not None:
-                trace = Trace()
-                trace.mark("network")
-                self._answer(packed, trace)
-                del packed  # gives the received bytes back before the next wait
-        for thread in threads:
-            thread.join()
-        self.middleware.close()
-
-    def stop(self) -> None:
-        """Wake all threads."""
-        with self._closing:
-            if not self._stopped:
-                self._stopped = True
-                for subscription in (self._requests, *self._cameras):
-                    subscription.interrupt()
-
-    def _watch(self, camera: Any) -> None:
-        """Keep the newest frame of one camera topic, already as RGB."""
-        while not self._stopped:
-            packed = camera.take(POLL_S)
-            if packed is None:
-                continue
-            trace = Trace()
-            trace.mark("network")
-            try:
-                message = camera.unpack(packed)
-                trace.mark("cdr_parse")
-                self._newest = _CachedFrame(_picture(message, trace), trace.marks)
-            except S2AError:  # a frame nobody can read is no reason to stop: the next may be better
-                continue
-
-    def _answer(self, packed: Any, trace: Trace) -> None:
-        """Answer one request; what goes wrong goes back to who asked."""
+    def next_job(self, timeout_s: float) -> TopicJob | None:
+        """Wait for the next request and prepare it; None on timeout, after `interrupt`, or for what is none."""
+        packed = self._requests.take(timeout_s)
+        if packed is None:
+            return None
+        trace = Trace()
+        trace.mark("network")
         try:
             message = self._requests.unpack(packed)
         except S2AError:  # nobody to answer to
-            return
+            return None
         trace.mark("cdr_parse")
-        index = 0
-        error = ""
-        tokens: Iterator[Token] = iter(())
-        try:
-            images = tuple(_picture(image, trace) for image in (*message.images, *message.compressed_images))
-            if not images and self._newest is not None:
-                newest = self._newest
-                images = (newest.frame,)
-                trace.frame_stamp_ns, trace.frame_marks = newest.frame.stamp_ns, newest.marks
-            tokens = self._handler(
-                Request(message.id, message.prompt, images, message.max_tokens, message.grammar, message.seed), trace
-            )
-            for token in tokens:
-                self._send(message.id, token, [])
-                index += 1
-        except S2AError as failure:
-            error = str(failure)
-        self._send(message.id, Token(index, "", -1), [_marks_message(message.id, trace.to_remote())], error)
+        return TopicJob(self, message, trace, self._cache)
 
-    def _send(self, request_id: str, token: Token, marks: list[Any], error: str = "") -> None:
+    def send(self, request_id: str, token: Token, marks: list[Any], error: str = "") -> None:
         """Publish one token, or with marks the end of the answer."""
         self._tokens.send(
             self._tokens.pack(
@@ -289,16 +147,43 @@ class TopicServer:
             )
         )
 
-
-def _picture(message: Any, trace: Trace) -> Frame:
-    """Turn a received image message into an RGB frame; its stamp is ROS time."""
-    if hasattr(message, "format"):
-        frame = decoded("image/jpeg", message.data, trace)
-        return replace(frame, stamp_ns=ros.stamp_of(message.header))
-    return rgb_of(ros.frame_of_image(message), trace)
+    def interrupt(self) -> None:
+        """Make `next_job` return; callable from any thread."""
+        self._requests.interrupt()
 
 
-def _marks_message(request_id: str, remote: Remote) -> Any:
+class TopicJob:
+    """One request of the topic variant."""
+
+    def __init__(self, front: TopicFront, message: Any, trace: Trace, cache: CameraCache) -> None:
+        """Decode the pictures, or borrow the camera's newest frame where there are none."""
+        self.trace = trace
+        self.request: Request | None = None
+        self._front = front
+        self._id: str = message.id
+        self._error = ""
+        self._sent = 0
+        try:
+            images = tuple(picture_of(image, trace) for image in (*message.images, *message.compressed_images))
+        except S2AError as error:
+            self._error = str(error)
+            return
+        images = images or cache.lend(trace)
+        self.request = Request(message.id, message.prompt, images, message.max_tokens, message.grammar, message.seed)
+
+    def token(self, token: Token) -> bool:
+        """Publish a token; return whether more are wanted, which this variant cannot tell."""
+        self._front.send(self._id, token, [])
+        self._sent += 1
+        return True
+
+    def end(self, error: str = "") -> None:
+        """Publish the end of the answer, with the marks."""
+        marks = marks_message(self._id, self.trace.to_remote())
+        self._front.send(self._id, Token(self._sent, "", -1), [marks], error or self._error)
+
+
+def marks_message(request_id: str, remote: Remote) -> Any:
     """Turn a server's marks into s2a_msgs/Marks."""
     return ros.message(
         ros.MARKS,
@@ -315,7 +200,7 @@ def _marks_message(request_id: str, remote: Remote) -> Any:
     )
 
 
-def _remote_of(marks: Any) -> Remote:
+def remote_of(marks: Any) -> Remote:
     """Read a server's marks from s2a_msgs/Marks."""
     return Remote(
         clock=marks.clock,

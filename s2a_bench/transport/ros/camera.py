@@ -1,0 +1,127 @@
+"""The camera on ROS 2: frames as ``sensor_msgs`` messages, a publisher of them, and a server's cache of the newest.
+
+The topics are plain ``sensor_msgs/Image`` and CompressedImage, so any ROS 2 subscriber sees them and any ROS 2
+camera feeds the cache.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from threading import Thread
+from typing import Any
+
+from s2a_bench.clock import realtime_offset_ns
+from s2a_bench.errors import RequestFailed, S2AError
+from s2a_bench.ros import Middleware, QoS, Subscription
+from s2a_bench.ros import messages as ros
+from s2a_bench.trace import Mark, Trace
+from s2a_bench.transport.pictures import bgr_of, decoded, encoded, rgb_of
+from s2a_bench.types import Frame
+
+CAMERA = "/camera/image_raw"
+COMPRESSED_CAMERA = "/camera/image_raw/compressed"
+FRAME_ID = "camera"
+CAMERA_QOS = QoS(depth=1)
+POLL_S = 0.5
+
+
+def picture_message(frame: Frame, wire: str, offset_ns: int, trace: Trace) -> tuple[str, Any]:
+    """Return (ROS type, message) of a frame for a wire format; ``offset_ns`` turns its stamp into ROS time."""
+    stamp_ns = frame.stamp_ns + offset_ns
+    if wire == "compressed":
+        _, data = encoded(frame, "jpeg", trace)
+        return ros.COMPRESSED_IMAGE, ros.compressed_image_message(data, stamp_ns, FRAME_ID)
+    if wire == "yuyv" and frame.encoding != "yuv422_yuy2":
+        raise RequestFailed(f"--wire yuyv: this source delivers {frame.encoding}; use --wire bgr")
+    return ros.IMAGE, ros.image_message(bgr_of(frame, trace) if wire == "bgr" else frame, stamp_ns, FRAME_ID)
+
+
+def picture_of(message: Any, trace: Trace) -> Frame:
+    """Turn a received image message into an RGB frame; its stamp is ROS time. Raises TransportError."""
+    if hasattr(message, "format"):
+        return replace(decoded("image/jpeg", message.data, trace), stamp_ns=ros.stamp_of(message.header))
+    return rgb_of(ros.frame_of_image(message), trace)
+
+
+class CameraPublisher:
+    """Publishes frames as a ROS 2 camera does."""
+
+    def __init__(self, middleware: Middleware, namespace: str, wire: str) -> None:
+        """Create the one topic that ``wire`` needs."""
+        self._wire = wire
+        self._offset_ns = realtime_offset_ns()
+        topic, type_name = (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE) if wire == "compressed" else (CAMERA, ros.IMAGE)
+        self._publisher = middleware.publisher(namespace + topic, type_name, CAMERA_QOS)
+
+    def stamp_ns(self, frame: Frame) -> int:
+        """Return the ROS-time stamp by which the server names the frame."""
+        return frame.stamp_ns + self._offset_ns
+
+    def publish(self, frame: Frame, trace: Trace) -> None:
+        """Convert, pack and send one frame."""
+        _, message = picture_message(frame, self._wire, self._offset_ns, trace)
+        packed = self._publisher.pack(message)
+        trace.mark("cdr_pack")
+        self._publisher.send(packed)
+
+    def matched(self) -> int:
+        """Count the subscriptions."""
+        return self._publisher.matched()
+
+
+@dataclass(frozen=True, slots=True)
+class CachedFrame:
+    """The newest camera frame, ready for the engine, and its way through this process."""
+
+    frame: Frame
+    marks: list[Mark]
+
+
+class CameraCache:
+    """Keeps the newest frame of both camera topics, already as RGB, each topic on a thread of its own."""
+
+    def __init__(self, middleware: Middleware, namespace: str) -> None:
+        """Subscribe; `start` starts the threads."""
+        topics = ((CAMERA, ros.IMAGE), (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE))
+        self._cameras = [middleware.subscription(namespace + topic, kind, CAMERA_QOS) for topic, kind in topics]
+        self._threads = [Thread(target=self._watch, args=(camera,), daemon=True) for camera in self._cameras]
+        self._newest: CachedFrame | None = None
+        self._stopped = False
+
+    def start(self) -> None:
+        """Start watching."""
+        for thread in self._threads:
+            thread.start()
+
+    def interrupt(self) -> None:
+        """Make the threads end; callable from any thread."""
+        self._stopped = True
+        for camera in self._cameras:
+            camera.interrupt()
+
+    def join(self) -> None:
+        """Wait for the threads' end."""
+        for thread in self._threads:
+            thread.join()
+
+    def lend(self, trace: Trace) -> tuple[Frame, ...]:
+        """Return the newest frame for a request that carries none, and say in its trace which it is."""
+        newest = self._newest
+        if newest is None:
+            return ()
+        trace.frame_stamp_ns, trace.frame_marks = newest.frame.stamp_ns, newest.marks
+        return (newest.frame,)
+
+    def _watch(self, camera: Subscription) -> None:
+        while not self._stopped:
+            packed = camera.take(POLL_S)
+            if packed is None:
+                continue
+            trace = Trace()
+            trace.mark("network")
+            try:
+                message = camera.unpack(packed)
+                trace.mark("cdr_parse")
+                self._newest = CachedFrame(picture_of(message, trace), trace.marks)
+            except S2AError:  # a frame nobody can read is no reason to stop: the next may be better
+                continue

@@ -1,0 +1,33 @@
+"""Joining the DDS domain of a route, alone under its namespace where that matters."""
+
+from __future__ import annotations
+
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import Middleware, QoS, Tuning, open_middleware
+from s2a_bench.ros import messages as ros
+from s2a_bench.transport import Route
+
+DEFAULT_NAMESPACE = "/s2a_bench"
+SETTLE_S = 0.3
+"""Time to discover a server that is there already."""
+
+
+def join(route: Route) -> Middleware:
+    """Join the route's domain with its tuning."""
+    tuning: Tuning = "default" if route.dds_tuning == "default" else "tuned"
+    return open_middleware(domain_id=route.domain_id, tuning=tuning)
+
+
+def refuse_company(route: Route, namespace: str) -> None:
+    """Raise TransportError if another server listens under ``namespace``: both would answer every request."""
+    probe = join(route)
+    try:
+        publisher = probe.publisher(namespace + "/request", ros.REQUEST, QoS())
+        probe.subscription(namespace + "/token", ros.TOKEN, QoS()).take(SETTLE_S)
+        if publisher.matched():
+            raise TransportError(
+                f"another server answers under {namespace} in DDS domain {route.domain_id}: stop it, "
+                "or choose another domain with ROS_DOMAIN_ID or another --namespace"
+            )
+    finally:
+        probe.close()

@@ -1,0 +1,38 @@
+"""What the transports may cost at most, as ratios within one interleaved run of the echo engine.
+
+The limits are those of the project's issue on the main job; measured medians lie at about half of them.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+LIMITS = {
+    "raw": {"http/as-deployed": 70, "http/best-effort": 18, "http/binary": 12, "ros/topic": 7},
+    "jpeg": {"http/as-deployed": 32, "http/best-effort": 18, "http/binary": 12, "ros/topic": 7},
+}
+"""Payload -> cell -> most times loopback's median end to end without inference, at 640x480."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("payload", ["raw", "jpeg"])
+def test_no_pipeline_is_a_straw_man_and_the_budget_closes(tmp_path: Path, payload: str) -> None:
+    arguments = ["latency", "--engine", "echo", "--transport", "http,ros,loopback", "--payload", payload]
+    done = subprocess.run(
+        [sys.executable, "-m", "s2a_bench", *arguments, "--runs", "100", "--json", "--output", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=300,
+    )
+    whole: dict[str, Any] = json.loads(done.stdout)
+    medians = {cell["cell"]: cell["e2e_without_inference_ms"]["median"] for cell in whole["cells"]}
+    ratios = {name: medians[name] / medians["loopback"] for name in LIMITS[payload]}
+    assert {name: ratio for name, ratio in ratios.items() if ratio > LIMITS[payload][name]} == {}
+    assert [cell["cell"] for cell in whole["cells"] if cell["residual_share"]["median"] > 0.05] == []

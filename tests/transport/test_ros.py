@@ -1,0 +1,139 @@
+"""The ROS server beyond the contract: the camera's cache, the queue, and being alone."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import QoS, open_middleware
+from s2a_bench.ros import messages as ros
+from s2a_bench.trace import RESIDUAL, Trace, budget
+from s2a_bench.transport import Client, Handler, Route, open_client, open_server
+from s2a_bench.transport.ros.camera import CAMERA
+from s2a_bench.types import Frame, Request, Token
+from tests.conformance.transport import Recorder, ask, yuyv_frame
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as whole:
+        yield whole
+
+
+def serve(stack: ExitStack, route: Route, handler: Handler) -> Any:
+    server = open_server(route, handler)
+    thread = Thread(target=server.serve)
+    thread.start()
+    stack.callback(thread.join)
+    stack.callback(server.stop)
+    return server
+
+
+def connect(stack: ExitStack, route: Route) -> Client:
+    client = open_client(route)
+    stack.callback(client.close)
+    return client
+
+
+@pytest.fixture
+def route(dds_domain: int) -> Route:
+    return Route("ros", "topic", "/test_ros", domain_id=dds_domain, timeout_s=20)
+
+
+def ask_until_seen(client: Client, handler: Recorder, stamp_ns: int) -> Trace:
+    """Ask without a picture until the server has the frame of a stamp."""
+    deadline = now_ns() + 20_000_000_000
+    while now_ns() < deadline:
+        _, trace = ask(client, Request("a", "plan"))
+        assert trace.remote is not None
+        if trace.remote.frame_stamp_ns == stamp_ns:
+            return trace
+        handler.requests.clear()
+    raise AssertionError("the server never got the frame")
+
+
+@pytest.mark.parametrize("wire", ["bgr", "yuyv", "compressed"])
+def test_a_request_without_a_picture_is_about_the_newest_frame(stack: ExitStack, route: Route, wire: str) -> None:
+    from dataclasses import replace
+
+    import cv2
+
+    handler = Recorder(["x"])
+    serve(stack, route, handler)
+    client = connect(stack, replace(route, wire=wire))
+    assert client.camera is not None
+    for seed in (1, 2):
+        frame, published = yuyv_frame(seed=seed), Trace()
+        published.mark(RESIDUAL)
+        client.camera.publish(frame, published)
+    trace = ask_until_seen(client, handler, client.camera.stamp_ns(frame))
+    (image,) = handler.requests[-1].images
+    if wire != "compressed":
+        np.testing.assert_array_equal(image.data, cv2.cvtColor(frame.data, cv2.COLOR_YUV2RGB_YUY2))
+    assert trace.remote is not None
+    stages = [stage for stage, _ in trace.remote.frame_marks]
+    decoding = {"bgr": "channel_swap", "yuyv": "yuv_decode", "compressed": "image_decode"}[wire]
+    assert stages == ["network", "cdr_parse", decoding]
+    assert decoding not in budget(trace.chain()).stages_ns
+
+
+def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, route: Route, dds_domain: int) -> None:
+    handler = Recorder(["x"])
+    serve(stack, route, handler)
+    client = connect(stack, route)
+    middleware = open_middleware(domain_id=dds_domain)
+    stack.callback(middleware.close)
+    publisher = middleware.publisher("/test_ros" + CAMERA, ros.IMAGE, QoS(1))
+    deadline = now_ns() + 20_000_000_000
+    while not publisher.matched():
+        assert now_ns() < deadline
+    odd = Frame(0, 0, 3, 2, "yuv422_yuy2", np.zeros((2, 3, 2), np.uint8))
+    publisher.send(publisher.pack(ros.image_message(odd, 1, "camera")))
+    assert client.camera is not None
+    frame, trace = yuyv_frame(), Trace()
+    client.camera.publish(frame, trace)
+    ask_until_seen(client, handler, client.camera.stamp_ns(frame))
+
+
+def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, route: Route) -> None:
+    go, started = Event(), Event()
+
+    def handler(request: Request, trace: Trace) -> Generator[Token, None, None]:
+        started.set()
+        assert request.id == "second" or go.wait(20)
+        trace.mark("inference")
+        yield Token(0, request.id)
+
+    server = serve(stack, route, handler)
+    clients = [connect(stack, route) for _ in range(2)]
+    traces: dict[str, Any] = {}
+
+    def run(client: Client, name: str) -> None:
+        _, traces[name] = ask(client, Request(name, "plan"))
+
+    first = Thread(target=run, args=(clients[0], "first"))
+    first.start()
+    assert started.wait(20)
+    second = Thread(target=run, args=(clients[1], "second"))
+    second.start()
+    deadline = now_ns() + 20_000_000_000
+    while server._waiting < 2:
+        assert now_ns() < deadline, "the second request never arrived"
+    go.set()
+    first.join(20)
+    second.join(20)
+    assert "queue" not in budget(traces["first"].chain()).stages_ns
+    assert budget(traces["second"].chain()).stages_ns["queue"] > 0
+
+
+def test_a_second_server_of_a_namespace_is_refused(stack: ExitStack, route: Route) -> None:
+    serve(stack, route, Recorder(["x"]))
+    with pytest.raises(TransportError, match="another server answers under /test_ros"):
+        open_server(route, Recorder(["y"]))
