@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
@@ -27,13 +27,12 @@ def stack() -> Iterator[ExitStack]:
         yield whole
 
 
-def serve(stack: ExitStack, route: Route, handler: Handler) -> Any:
+def serve(stack: ExitStack, route: Route, handler: Handler) -> None:
     server = open_server(route, handler)
     thread = Thread(target=server.serve)
     thread.start()
     stack.callback(thread.join)
     stack.callback(server.stop)
-    return server
 
 
 def connect(stack: ExitStack, route: Route) -> Client:
@@ -103,34 +102,37 @@ def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, route:
 
 
 def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, route: Route) -> None:
-    go, started = Event(), Event()
+    free, go, started, both = Lock(), Event(), Event(), Event()
 
     def handler(request: Request, trace: Trace) -> Generator[Token, None, None]:
+        trace.mark(RESIDUAL)
+        if not free.acquire(blocking=False):
+            both.set()
+            free.acquire()
+            trace.mark("queue")
         started.set()
-        assert request.id == "second" or go.wait(20)
+        assert go.wait(20)
         trace.mark("inference")
+        free.release()
         yield Token(0, request.id)
 
-    server = serve(stack, route, handler)
+    serve(stack, route, handler)
     clients = [connect(stack, route) for _ in range(2)]
     traces: dict[str, Any] = {}
 
     def run(client: Client, name: str) -> None:
         _, traces[name] = ask(client, Request(name, "plan"))
 
-    first = Thread(target=run, args=(clients[0], "first"))
-    first.start()
+    threads = [Thread(target=run, args=(client, name)) for client, name in zip(clients, ("1", "2"), strict=True)]
+    threads[0].start()
     assert started.wait(20)
-    second = Thread(target=run, args=(clients[1], "second"))
-    second.start()
-    deadline = now_ns() + 20_000_000_000
-    while server._waiting < 2:
-        assert now_ns() < deadline, "the second request never arrived"
+    threads[1].start()
+    assert both.wait(20), "the second request never reached the handler while the first was in it"
     go.set()
-    first.join(20)
-    second.join(20)
-    assert "queue" not in budget(traces["first"].chain()).stages_ns
-    assert budget(traces["second"].chain()).stages_ns["queue"] > 0
+    for thread in threads:
+        thread.join(20)
+    assert "queue" not in budget(traces["1"].chain()).stages_ns
+    assert budget(traces["2"].chain()).stages_ns["queue"] > 0
 
 
 def test_a_second_server_of_a_namespace_is_refused(stack: ExitStack, route: Route) -> None:

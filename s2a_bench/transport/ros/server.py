@@ -1,17 +1,17 @@
-"""The ROS server: fronts receive requests, one thread asks the engine, the camera's newest frame is at hand.
+"""The ROS server: fronts receive requests, handlers answer them, the camera's newest frame is at hand.
 
-A front is one variant's way in. Each has a thread that waits for requests and prepares them, so that the time a request
-waits for the engine is its own stage, `queue`, and not taken for network.
+A front is one variant's way in. Its threads take turns in waiting for a request; the one that got it answers it
+while another waits, so that no request changes threads, and one that comes meanwhile waits for the engine (stage
+`queue`), not in the network.
 """
 
 from __future__ import annotations
 
-from queue import SimpleQueue
-from threading import Lock, Thread
-from typing import Protocol
+from threading import Event, Lock, Thread
+from typing import Any, Protocol
 
 from s2a_bench.errors import S2AError
-from s2a_bench.trace import RESIDUAL, Trace
+from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Route
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join, refuse_company
@@ -38,17 +38,25 @@ class Job(Protocol):
 class Front(Protocol):
     """One variant's way in."""
 
-    def next_job(self, timeout_s: float) -> Job | None:
-        """Wait for the next request and prepare it."""
+    def take(self, timeout_s: float) -> Any | None:
+        """Wait for the next request and return it packed; None on timeout or after `interrupt`."""
+        ...
+
+    def job(self, packed: Any, trace: Trace) -> Job | None:
+        """Unpack and prepare a request, marking each stage; None for what is none."""
         ...
 
     def interrupt(self) -> None:
-        """Make `next_job` return, callable from any thread."""
+        """Make `take` return, callable from any thread."""
         ...
 
 
+WORKERS = 4
+"""Threads a front: requests that can wait for the engine at a time, and one that receives."""
+
+
 class RosServer:
-    """Answers the requests of all fronts, one after the other, on the thread that calls `serve`."""
+    """Answers the requests of all fronts."""
 
     def __init__(self, route: Route, handler: Handler) -> None:
         """Join the domain and create all topics; raises TransportError where another server answers already."""
@@ -58,24 +66,16 @@ class RosServer:
         self.middleware = join(route)
         self._cache = CameraCache(self.middleware, self.address)
         self._fronts: list[Front] = [TopicFront(self.middleware, self.address, self._cache)]
-        self._jobs: SimpleQueue[tuple[Job, bool] | None] = SimpleQueue()
-        self._waiting = 0
-        self._lock = Lock()
-        self._stopped = False
+        self._stopped = Event()
 
     def serve(self) -> None:
         """Serve until stopped."""
-        threads = [Thread(target=self._receive, args=(front,), daemon=True) for front in self._fronts]
+        turns = [(front, Lock()) for front in self._fronts]
+        threads = [Thread(target=self._work, args=turn, daemon=True) for turn in turns for _ in range(WORKERS)]
         self._cache.start()
         for thread in threads:
             thread.start()
-        while (item := self._jobs.get()) is not None:
-            job, waited = item
-            job.trace.mark("queue" if waited else RESIDUAL)
-            self._answer(job)
-            with self._lock:
-                self._waiting -= 1
-            del job, item  # gives the received bytes back before the next wait
+        self._stopped.wait()
         for thread in threads:
             thread.join()
         self._cache.join()
@@ -83,8 +83,7 @@ class RosServer:
 
     def stop(self) -> None:
         """Wake all threads."""
-        self._stopped = True
-        self._jobs.put(None)
+        self._stopped.set()
         for front in self._fronts:
             front.interrupt()
         self._cache.interrupt()
@@ -93,16 +92,18 @@ class RosServer:
         """Say what carries the messages."""
         return self.middleware.describe()
 
-    def _receive(self, front: Front) -> None:
-        """Hand one front's requests to the engine's thread."""
-        while not self._stopped:
-            job = front.next_job(POLL_S)
-            if job is not None:
-                with self._lock:
-                    waited = self._waiting > 0
-                    self._waiting += 1
-                self._jobs.put((job, waited))
-                del job
+    def _work(self, front: Front, turn: Lock) -> None:
+        """Wait for a request when it is this thread's turn, and answer it while another thread waits."""
+        while not self._stopped.is_set():
+            with turn:
+                packed = front.take(POLL_S)
+                trace = Trace()
+                trace.mark("network")
+            if packed is not None:
+                job = front.job(packed, trace)
+                if job is not None:
+                    self._answer(job)
+                del job, packed  # gives the received bytes back before the next wait
 
     def _answer(self, job: Job) -> None:
         """Answer one request; what goes wrong goes back to who asked."""

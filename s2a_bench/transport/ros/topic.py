@@ -116,16 +116,15 @@ class TopicFront:
         self._requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
         self._tokens = middleware.publisher(namespace + "/token", ros.TOKEN, TOKEN_QOS)
 
-    def next_job(self, timeout_s: float) -> TopicJob | None:
-        """Wait for the next request and prepare it; None on timeout, after `interrupt`, or for what is none."""
-        packed = self._requests.take(timeout_s)
-        if packed is None:
-            return None
-        trace = Trace()
-        trace.mark("network")
+    def take(self, timeout_s: float) -> Any | None:
+        """Wait for the next request and return it packed; None on timeout or after `interrupt`."""
+        return self._requests.take(timeout_s)
+
+    def job(self, packed: Any, trace: Trace) -> TopicJob | None:
+        """Unpack a request and decode its pictures; None for bytes that are no request: nobody to answer to."""
         try:
             message = self._requests.unpack(packed)
-        except S2AError:  # nobody to answer to
+        except S2AError:
             return None
         trace.mark("cdr_parse")
         return TopicJob(self, message, trace, self._cache)
@@ -148,7 +147,7 @@ class TopicFront:
         )
 
     def interrupt(self) -> None:
-        """Make `next_job` return; callable from any thread."""
+        """Make `take` return; callable from any thread."""
         self._requests.interrupt()
 
 
