@@ -59,8 +59,165 @@ class Subscription(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """The server took the goal; its result has been asked for."""
+
+    goal_id: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """The server refused the goal; nothing more comes."""
+
+    goal_id: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Feedback:
+    """Feedback on a goal of this client, packed."""
+
+    goal_id: bytes
+    packed: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """The end of a goal: ``status`` is an `action.Status`, UNKNOWN (0) for a goal the server does not know."""
+
+    goal_id: bytes
+    status: int
+    packed: Any
+
+
+@dataclass(frozen=True, slots=True)
+class CancelResponse:
+    """The answer to `ActionClient.cancel`: an `action.CancelCode`, and the goals that are being cancelled."""
+
+    goal_id: bytes
+    return_code: int
+    canceling: tuple[bytes, ...]
+
+
+ActionEvent: TypeAlias = "Accepted | Rejected | Feedback | Result | CancelResponse"
+ALL_GOALS = bytes(16)
+"""The goal id that means every goal, in `ActionClient.cancel`."""
+
+
+class ActionClient(Protocol):
+    """Sends goals to one action; one thread takes the events, any thread may send and cancel."""
+
+    def wait_for_server(self, timeout_s: float) -> bool:
+        """Wait until a whole server is matched; False on timeout."""
+        ...
+
+    def server_present(self) -> bool:
+        """Tell whether a whole server is matched now."""
+        ...
+
+    def server_version(self) -> str | None:
+        """Return the interface version whose type hash the server announces; None if it announces none.
+
+        Raises TransportError when the hash is that of no known version.
+        """
+        ...
+
+    def pack(self, goal: Any) -> Any:
+        """Serialise a goal into what `send` takes."""
+        ...
+
+    def send(self, packed: Any, goal_id: bytes | None = None) -> bytes:
+        """Send a goal under a new id, or under ``goal_id`` (16 bytes), and return the id."""
+        ...
+
+    def next_event(self, timeout_s: float) -> ActionEvent | None:
+        """Wait for the next event of any goal of this client; None on timeout or after `interrupt`.
+
+        A goal's events come in the order Accepted, Feedback ..., Result.
+        """
+        ...
+
+    def unpack_feedback(self, packed: Any) -> Any:
+        """Deserialise `Feedback.packed` into the action's feedback; raises TransportError."""
+        ...
+
+    def unpack_result(self, packed: Any) -> Any:
+        """Deserialise `Result.packed` into the action's result; raises TransportError."""
+        ...
+
+    def cancel(self, goal_id: bytes, stamp_ns: int = 0) -> None:
+        """Ask to cancel a goal, `ALL_GOALS`, or with a stamp (ROS time) also all accepted until then."""
+        ...
+
+    def get_result(self, goal_id: bytes) -> None:
+        """Ask for a result (again); after acceptance this happens by itself."""
+        ...
+
+    def interrupt(self) -> None:
+        """Make a blocked `next_event`, and every later one, return None; callable from any thread."""
+        ...
+
+
+class ServerGoal(Protocol):
+    """A goal on the server, callable from any thread; TransportError for a step its state does not allow."""
+
+    @property
+    def id(self) -> bytes:
+        """The goal's 16 bytes."""
+        ...
+
+    @property
+    def cancel_requested(self) -> bool:
+        """Whether a client has asked to cancel this goal."""
+        ...
+
+    def unpack(self) -> Any:
+        """Deserialise the goal; arrays may be views of the received buffer. Raises TransportError."""
+        ...
+
+    def accept(self) -> None:
+        """Take the goal: the client is told, then the status published."""
+        ...
+
+    def reject(self) -> None:
+        """Refuse the goal: the client is told, and nothing is kept."""
+        ...
+
+    def executing(self) -> bool:
+        """Start; False if a cancel came first (then end it with `canceled`)."""
+        ...
+
+    def feedback(self, message: Any) -> None:
+        """Pack and publish one feedback."""
+        ...
+
+    def succeed(self, result: Any) -> None:
+        """End the goal as SUCCEEDED."""
+        ...
+
+    def abort(self, result: Any) -> None:
+        """End the goal as ABORTED."""
+        ...
+
+    def canceled(self, result: Any) -> None:
+        """End the goal as CANCELED; only after a cancel was requested."""
+        ...
+
+
+class ActionServer(Protocol):
+    """Offers one action; cancels and results are served by a thread of its own."""
+
+    def next_goal(self, timeout_s: float) -> ServerGoal | None:
+        """Wait for the next goal, to accept or reject; None on timeout or after `interrupt`. One thread at a time."""
+        ...
+
+    def interrupt(self) -> None:
+        """Make a blocked `next_goal`, and every later one, return None; callable from any thread."""
+        ...
+
+
 class Middleware(Protocol):
-    """One participant in a ROS 2 domain. Action client and server join the contract with the action interface."""
+    """One node in a ROS 2 domain."""
 
     def publisher(self, topic: str, type_name: str, qos: QoS) -> Publisher:
         """Publish messages of ROS type ``pkg/msg/Name`` on the absolute ROS topic name ``/x``."""
@@ -68,6 +225,16 @@ class Middleware(Protocol):
 
     def subscription(self, topic: str, type_name: str, qos: QoS) -> Subscription:
         """Subscribe to the absolute ROS topic name ``/x``."""
+        ...
+
+    def action_client(self, name: str, type_name: str, version: str = "6.0") -> ActionClient:
+        """Call the action ``/x`` of ROS type ``pkg/action/Name``; ``version`` as in `messages.VERSIONS`."""
+        ...
+
+    def action_server(
+        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = "6.0"
+    ) -> ActionServer:
+        """Offer the action ``/x``; results are kept for ``result_timeout_s`` after a goal ended."""
         ...
 
     def describe(self) -> dict[str, str | int]:
@@ -82,11 +249,16 @@ class Middleware(Protocol):
 MIDDLEWARES: dict[str, str] = {
     "cyclonedds": "s2a_bench.ros.cyclone:CycloneMiddleware",
 }
-"""Name -> class, built as ``Class(domain_id, tuning)``."""
+"""Name -> class, built as ``Class(domain_id, tuning, node_name)``."""
 
 
-def open_middleware(name: str = "cyclonedds", *, domain_id: int = 0, tuning: Tuning = "tuned") -> Middleware:
-    """Join a ROS 2 domain; raises UsageError for an unknown name, TransportError when it cannot be joined."""
+def open_middleware(
+    name: str = "cyclonedds", *, domain_id: int = 0, tuning: Tuning = "tuned", node_name: str = "/s2a_bench"
+) -> Middleware:
+    """Join a ROS 2 domain as the node ``node_name``, its namespace included.
+
+    Raises UsageError for an unknown name, TransportError when the domain cannot be joined.
+    """
     if name not in MIDDLEWARES:
         raise UsageError(f"middleware: '{name}' is none of {', '.join(MIDDLEWARES)}")
     try:
@@ -96,5 +268,5 @@ def open_middleware(name: str = "cyclonedds", *, domain_id: int = 0, tuning: Tun
             f"middleware {name} is not installed ({error}); cyclonedds has wheels for x86-64 only: "
             "build it from source, or leave ros out of --transport"
         ) from error
-    middleware: Middleware = implementation(domain_id, tuning)
+    middleware: Middleware = implementation(domain_id, tuning, node_name)
     return middleware

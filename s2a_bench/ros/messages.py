@@ -1,6 +1,7 @@
 """ROS 2 message classes, their CDR, and the frames of this project as ``sensor_msgs`` images.
 
-Types and CDR are rosbags'; this module registers ``s2a_msgs`` and keeps the traps of serialising in one place.
+Types and CDR are rosbags'; this module registers ``s2a_msgs``, ``llama_msgs`` and what actions need, and keeps the
+traps of serialising in one place.
 """
 
 from __future__ import annotations
@@ -14,9 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
 
-from s2a_bench.errors import TransportError
+from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.ros.definitions import Defaults, char_as_uint8, read_package
 from s2a_bench.types import Frame, Pixels
 
 if TYPE_CHECKING:
@@ -33,37 +36,93 @@ CHANNELS: dict[str, int] = {"yuv422_yuy2": 2, "bgr8": 3, "rgb8": 3, "mono8": 1}
 """Bytes per pixel of the raw encodings (``sensor_msgs/image_encodings.hpp``)."""
 
 
+VERSIONS = {"6.0": "llama_msgs-6.0.9", "4.4": "llama_msgs-4.4.1"}
+"""Version of llama_msgs -> its folder in ``interfaces``; one type store knows one version."""
+DEFAULT_VERSION = "6.0"
+ZEROS: dict[str, Any] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
+"""The zero of each basic type that is not an integer."""
+
+
 @cache
-def typestore() -> Typestore:
-    """Return the message types of this ROS distribution (Jazzy without one), ``s2a_msgs`` included."""
+def _types(version: str) -> tuple[Typestore, Defaults]:
+    """Build a type store, and collect the defaults of the types that came from files."""
+    if version not in VERSIONS:
+        raise UsageError(f"llama_msgs version '{version}' is none of {', '.join(VERSIONS)}")
     humble = os.environ.get("ROS_DISTRO") == "humble"
     store = get_typestore(Stores.ROS2_HUMBLE if humble else Stores.ROS2_JAZZY)
-    folder = files("s2a_bench.ros") / "s2a_msgs" / "msg"
-    types = {}
-    for entry in folder.iterdir():
-        if entry.name.endswith(".msg"):
-            types.update(get_types_from_msg(entry.read_text(), f"s2a_msgs/msg/{entry.name.removesuffix('.msg')}"))
-    store.register(types)
-    return store
+    for name, (constants, fields) in store.fielddefs.items():
+        store.fielddefs[name] = (constants, [(field, char_as_uint8(kind)) for field, kind in fields])
+    root = files("s2a_bench.ros")
+    folders = {
+        "s2a_msgs": root / "s2a_msgs",
+        "action_msgs": root / "interfaces" / "action_msgs",
+        "llama_msgs": root / "interfaces" / VERSIONS[version],
+    }
+    defaults: Defaults = {}
+    for package, folder in folders.items():
+        definitions, given = read_package(folder, package)
+        store.register(definitions)
+        defaults |= given
+    return store, defaults
 
 
-def message(type_name: str, **fields: Any) -> Any:
-    """Build a message; every field must be given, because rosbags has no defaults."""
+def typestore(version: str = DEFAULT_VERSION) -> Typestore:
+    """Return the message types of this ROS distribution (Jazzy without one), ours and a version of llama_msgs included.
+
+    Raises UsageError for a version that is none of `VERSIONS`.
+    """
+    return _types(version)[0]
+
+
+def message(type_name: str, /, **fields: Any) -> Any:
+    """Build a message of the default version; every field must be given: `default` fills them."""
     return typestore().types[type_name](**fields)
 
 
+def default(type_name: str, version: str = DEFAULT_VERSION, /, **fields: Any) -> Any:
+    """Build a message as ROS initialises it, the defaults of its interface file or zeros; ``fields`` replace them."""
+    store, defaults = _types(version)
+    given = defaults.get(type_name, {}) | fields
+    for name, description in store.fielddefs[type_name][1]:
+        if name not in given:
+            given[name] = _zero(description, version)
+        elif isinstance(given[name], Iterable) and not isinstance(given[name], str):
+            given[name] = _sequence(description, given[name])
+    return store.types[type_name](**given)
+
+
+def _zero(description: Any, version: str) -> Any:
+    """Return what ROS initialises a field without a default to."""
+    node, detail = description
+    if node == Nodetype.BASE:
+        return ZEROS.get(detail[0], 0)
+    if node == Nodetype.NAME:
+        return default(detail, version)
+    inner, count = detail
+    length = count if node == Nodetype.ARRAY else 0
+    return _sequence(description, [_zero(inner, version) for _ in range(length)])
+
+
+def _sequence(description: Any, values: Iterable[Any]) -> Any:
+    """Return a sequence as rosbags wants it: an array of numbers, a list of anything else."""
+    inner = description[1][0]
+    if inner[0] == Nodetype.NAME or inner[1][0] == "string":
+        return list(values)
+    return np.asarray(values, {"byte": "uint8"}.get(inner[1][0], inner[1][0]))
+
+
 @cache
-def type_hash(type_name: str) -> str:
+def type_hash(type_name: str, version: str = DEFAULT_VERSION) -> str:
     """Return the type's REP-2016 hash, ``RIHS01_`` and 64 hex digits."""
-    return str(typestore().hash_rihs01(type_name))
+    return str(typestore(version).hash_rihs01(type_name))
 
 
-def serialise(value: Any, type_name: str) -> bytearray:
+def serialise(value: Any, type_name: str, version: str = DEFAULT_VERSION) -> bytearray:
     """Write a message as little-endian CDR (XCDR1), padded to a multiple of 4 as Cyclone DDS sends it.
 
     The buffer is zeroed first because rosbags skips NULs and padding. Header ``00 01 00 pp``, pp = bytes of padding.
     """
-    store = typestore()
+    store = typestore(version)
     definition = store.get_msgdef(type_name)
     size = CDR_HEADER + definition.getsize_cdr(0, value, store)
     padding = -size % 4
@@ -73,10 +132,10 @@ def serialise(value: Any, type_name: str) -> bytearray:
     return buffer
 
 
-def deserialise(cdr: memoryview, type_name: str) -> Any:
+def deserialise(cdr: memoryview, type_name: str, version: str = DEFAULT_VERSION) -> Any:
     """Read a message from CDR; arrays are views of ``cdr``. Raises TransportError for what is not that type."""
     try:
-        return typestore().deserialize_cdr(cdr, type_name)
+        return typestore(version).deserialize_cdr(cdr, type_name)
     except Exception as error:  # rosbags' generated code raises whatever its parsing runs into
         raise TransportError(f"received bytes that are no {type_name}: {error}") from error
 

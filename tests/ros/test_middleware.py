@@ -32,7 +32,7 @@ def test_endpoints_look_like_those_of_ros(dds_domain: int) -> None:
     from cyclonedds.core import Policy
 
     middleware = open_middleware(domain_id=dds_domain)
-    writer = middleware.publisher("/camera/image_raw", "sensor_msgs/msg/Image", QoS(1))._writer  # type: ignore[attr-defined]
+    writer = middleware.publisher("/camera/image_raw", "sensor_msgs/msg/Image", QoS(1)).entity  # type: ignore[attr-defined]
     try:
         assert writer.topic.name == "rt/camera/image_raw"
         assert writer.topic.typename == "sensor_msgs::msg::dds_::Image_"

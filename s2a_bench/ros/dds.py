@@ -1,0 +1,228 @@
+"""Readers and writers of ready CDR on Cyclone DDS from PyPI, under ROS 2 names and types.
+
+cyclonedds' own IDL serialisation of ``sequence<uint8>`` is pure Python (35 ms for a VGA image), so every ROS type
+is an *empty* IdlStruct of the right name and its CDR is made by rosbags: ROS 2 matches by name, and the C layer
+checks no more than the declared prefix. Two functions go to the C library by ctypes: `dds_write`, which takes any
+buffer and releases the GIL, and `dds_takecdr`, which lends the received bytes without a copy.
+"""
+
+from __future__ import annotations
+
+import ctypes as ct
+import types
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from cyclonedds.core import (
+    DDSException,
+    GuardCondition,
+    InstanceState,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.internal import DDS, dds_c_t
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import QoS
+
+FOREVER_NS = 2**63 - 1
+ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
+WAIT_SLICE_NS = 500_000_000
+"""A blocked wait returns to Python this often, so that Ctrl-C acts."""
+
+
+class _Outgoing(ct.Structure):
+    """What the raw sertype takes as a sample: a buffer of CDR and its length."""
+
+    _fields_ = (("buffer", ct.c_void_p), ("size", ct.c_size_t))
+
+
+class _Slice(ct.Structure):
+    """Cyclone's ``ddsrt_iovec_t``."""
+
+    _fields_ = (("base", ct.c_void_p), ("size", ct.c_size_t))
+
+
+@cache
+def _library() -> ct.CDLL:
+    """Load libddsc under a handle of our own: argtypes are shared per handle, and cyclonedds sets its own."""
+    library = ct.CDLL(DDS._dll_handle._name)  # noqa: SLF001 - the one place that knows which libddsc is loaded
+    library.dds_write.argtypes = [ct.c_int32, ct.c_void_p]
+    library.dds_write.restype = ct.c_int32
+    library.dds_takecdr.argtypes = [ct.c_int32, ct.c_void_p, ct.c_uint32, ct.c_void_p, ct.c_uint32]
+    library.dds_takecdr.restype = ct.c_int32
+    library.ddsi_serdata_size.argtypes = [ct.c_void_p]
+    library.ddsi_serdata_size.restype = ct.c_uint32
+    library.ddsi_serdata_to_ser_ref.argtypes = [ct.c_void_p, ct.c_size_t, ct.c_size_t, ct.c_void_p]
+    library.ddsi_serdata_to_ser_ref.restype = ct.c_void_p
+    library.ddsi_serdata_to_ser_unref.argtypes = [ct.c_void_p, ct.c_void_p]
+    library.ddsi_serdata_to_ser_unref.restype = None
+    library.ddsi_serdata_unref.argtypes = [ct.c_void_p]
+    library.ddsi_serdata_unref.restype = None
+    return library
+
+
+class _Loan:
+    """Keeps a received sample alive as long as a view of it lives."""
+
+    __slots__ = ("_referenced", "_serdata", "_slice")
+
+    def __init__(self, serdata: int) -> None:
+        self._serdata = serdata
+        self._slice = _Slice()
+        size = _library().ddsi_serdata_size(serdata)
+        self._referenced = _library().ddsi_serdata_to_ser_ref(serdata, 0, size, ct.byref(self._slice))
+
+    def view(self) -> memoryview:
+        """Return the sample's CDR, header included, read-only."""
+        array = (ct.c_ubyte * self._slice.size).from_address(self._slice.base)
+        array.loan = self  # ties the loan's life to the view's
+        return memoryview(array).cast("B").toreadonly()
+
+    def __del__(self) -> None:
+        _library().ddsi_serdata_to_ser_unref(self._referenced, ct.byref(self._slice))
+        _library().ddsi_serdata_unref(self._serdata)
+
+
+def dds_type_name(type_name: str) -> str:
+    """Turn ``pkg/msg/Name`` into ROS 2's DDS type name ``pkg::msg::dds_::Name_``."""
+    package, kind, name = type_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+@cache
+def _raw_type(type_name: str) -> type:
+    """Make the empty IdlStruct that stands for a ROS type."""
+    name = "Raw_" + type_name.replace("/", "_")
+    return dataclass(types.new_class(name, (IdlStruct,), {"typename": dds_type_name(type_name)}))
+
+
+def dds_qos(qos: QoS, user_data: str, *, transient_local: bool = False) -> Qos:
+    """Translate to DDS as rmw_cyclonedds does."""
+    reliability = Policy.Reliability.Reliable(FOREVER_NS) if qos.reliable else Policy.Reliability.BestEffort
+    history = Policy.History.KeepLast(qos.depth) if qos.depth else Policy.History.KeepAll
+    lasting = (Policy.DurabilityService(0, history, -1, -1, -1),) if transient_local else ()
+    return Qos(
+        reliability,
+        history,
+        Policy.Durability.TransientLocal if transient_local else Policy.Durability.Volatile,
+        *lasting,
+        Policy.WriterDataLifecycle(autodispose=False),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.Userdata(user_data.encode()),
+    )
+
+
+def user_data(endpoint: Any) -> dict[str, str]:
+    """Read the ``key=value;`` pairs that a DcpsEndpoint announces in USER_DATA."""
+    if Policy.Userdata not in endpoint.qos:
+        return {}
+    text = bytes(endpoint.qos[Policy.Userdata].data).decode("utf-8", "replace")
+    return dict(item.split("=", 1) for item in text.split(";") if "=" in item)
+
+
+class RawWriter:
+    """A DataWriter that sends ready CDR; callable from any thread."""
+
+    def __init__(self, participant: DomainParticipant, topic: str, type_name: str, qos: Qos) -> None:
+        """Create the writer on a DDS topic name, prefix included."""
+        self._type_name = type_name
+        self.entity = DataWriter(participant, Topic(participant, topic, _raw_type(type_name)), qos=qos)
+        self._reference = self.entity._ref  # noqa: SLF001 - the handle ctypes needs
+        self._write = _library().dds_write
+
+    def send(self, packed: bytearray) -> None:
+        """Write without holding the GIL; Cyclone copies the buffer."""
+        outgoing = _Outgoing(ct.addressof(ct.c_char.from_buffer(packed)), len(packed))
+        if code := self._write(self._reference, ct.byref(outgoing)):
+            raise TransportError(f"DDS write of {self._type_name} failed: {DDSException(code)}")
+
+    def matched(self) -> int:
+        """Count matched readers."""
+        return len(self.entity.get_matched_subscriptions())
+
+    def peers(self) -> Iterator[dict[str, str]]:
+        """Yield what each matched reader announces in USER_DATA."""
+        for handle in self.entity.get_matched_subscriptions():
+            endpoint = self.entity.get_matched_subscription_data(handle)
+            yield {} if endpoint is None else user_data(endpoint)
+
+
+class RawReader:
+    """A DataReader that lends the received CDR; one thread at a time takes."""
+
+    def __init__(self, participant: DomainParticipant, topic: str, type_name: str, qos: Qos) -> None:
+        """Create the reader on a DDS topic name, prefix included."""
+        self._type_name = type_name
+        self.entity = DataReader(participant, Topic(participant, topic, _raw_type(type_name)), qos=qos)
+        self._reference = self.entity._ref  # noqa: SLF001 - the handle ctypes needs
+        self._serdata = ct.c_void_p()
+        self._info = dds_c_t.sample_info()
+        self._take = _library().dds_takecdr
+
+    def take(self) -> memoryview | None:
+        """Return the next sample's CDR if there is one, without waiting."""
+        while True:
+            taken = self._take(self._reference, ct.byref(self._serdata), 1, ct.byref(self._info), ANY_STATE)
+            if taken < 0:
+                raise TransportError(f"DDS take of {self._type_name} failed: {DDSException(taken)}")
+            if not taken:
+                return None
+            loan = _Loan(self._serdata.value or 0)
+            if self._info.valid_data:  # else the notice that a writer has left
+                return loan.view()
+
+    def sender(self) -> int:
+        """Return the handle of the writer whose sample was taken last."""
+        return int(self._info.publication_handle)
+
+    def matched(self) -> int:
+        """Count matched writers."""
+        return len(self.entity.get_matched_publications())
+
+    def peers(self) -> Iterator[dict[str, str]]:
+        """Yield what each matched writer announces in USER_DATA."""
+        for handle in self.entity.get_matched_publications():
+            yield self.peer(handle) or {}
+
+    def peer(self, handle: int) -> dict[str, str] | None:
+        """Return what one matched writer announces in USER_DATA; None if it has left."""
+        endpoint = self.entity.get_matched_publication_data(handle)
+        return None if endpoint is None else user_data(endpoint)
+
+
+class Waiter:
+    """Waits for any of some readers on the calling thread, which is the fastest way that does not spin."""
+
+    def __init__(self, participant: DomainParticipant, readers: Sequence[RawReader]) -> None:
+        """Attach the readers and a condition of our own."""
+        self._guard = GuardCondition(participant)
+        self._conditions = [ReadCondition(reader.entity, ANY_STATE) for reader in readers]
+        self._waitset = WaitSet(participant)
+        for condition in (*self._conditions, self._guard):
+            self._waitset.attach(condition)
+        self.interrupted = False
+
+    def wait_until(self, deadline_ns: int) -> bool:
+        """Return after data, a time slice or an interrupt; False once the deadline or an interrupt has come."""
+        left_ns = deadline_ns - now_ns()
+        if left_ns <= 0 or self.interrupted:
+            return False
+        self._waitset.wait(min(left_ns, WAIT_SLICE_NS))
+        return not self.interrupted
+
+    def interrupt(self) -> None:
+        """End a wait under way and every later one; callable from any thread."""
+        self.interrupted = True
+        self._guard.set(True)

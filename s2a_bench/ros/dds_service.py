@@ -1,0 +1,164 @@
+"""The two ends of a ROS 2 service as rmw_cyclonedds_cpp sends it: a header before the body, ids in USER_DATA.
+
+Every client receives every reply and keeps those whose header carries its own guid; the ids in USER_DATA say which
+request and reply endpoints belong together.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from itertools import count
+from threading import Lock
+from typing import Any
+
+from cyclonedds.domain import DomainParticipant
+
+from s2a_bench.clock import now_ns
+from s2a_bench.ros import QoS
+from s2a_bench.ros.dds import RawReader, RawWriter, dds_qos
+from s2a_bench.ros.messages import deserialise, serialise, type_hash
+
+HEADER = struct.Struct("<Qq")
+"""guid of the client and number of its request, after the 4 bytes of CDR header."""
+HEADER_AT = 4
+BODY_AT = 20
+
+WRITER_QOS = QoS(depth=10)
+READER_QOS = QoS(depth=0)
+"""Our readers keep all, whatever ROS does: history is local, and a burst overruns ROS's default of 10."""
+
+REPLY_READER_TIMEOUT_NS = 100_000_000
+REPLY_READER_POLL_S = 0.01
+REMEMBERED_CLIENTS = 64
+
+_numbers = count(8)
+
+
+def endpoint_id(prefix: bytes, number: int) -> str:
+    """Write an id as rmw_cyclonedds does: GUID prefix and number as hex bytes without zeros, the first padded."""
+    data = prefix + number.to_bytes(4, "big")
+    return f"{data[0]:2x}" + "".join(f".{byte:x}" for byte in data[1:])
+
+
+class _End:
+    """What client and server have in common."""
+
+    def __init__(
+        self, participant: DomainParticipant, name: str, type_name: str, version: str, role: tuple[str, str]
+    ) -> None:
+        own, self._peer_key = role
+        self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
+        self._version = version
+        identity = endpoint_id(participant.get_guid().bytes[:12], next(_numbers))
+        request, reply = ("rq" + name + "Request", self.request_type), ("rr" + name + "Reply", self.reply_type)
+        sent, received = (request, reply) if own == "clientid" else (reply, request)
+
+        def user_data(type_name: str) -> str:
+            return f"{own}={identity};typehash={type_hash(type_name, version)};"
+
+        self.writer = RawWriter(participant, *sent, dds_qos(WRITER_QOS, user_data(sent[1])))
+        self.reader = RawReader(participant, *received, dds_qos(READER_QOS, user_data(received[1])))
+
+    def matched(self) -> bool:
+        """Tell whether both endpoints of one peer are matched."""
+        ids = [{peer[self._peer_key] for peer in end.peers() if self._peer_key in peer} for end in self.ends()]
+        return bool(ids[0] & ids[1])
+
+    def ends(self) -> tuple[RawWriter, RawReader]:
+        """Return both endpoints."""
+        return self.writer, self.reader
+
+    def peer_type_hash(self) -> str:
+        """Return the type hash a peer announces for what it reads; empty without one."""
+        return next((peer["typehash"] for peer in self.writer.peers() if "typehash" in peer), "")
+
+
+class ServiceClient(_End):
+    """Sends requests and finds the replies that are its own."""
+
+    def __init__(self, participant: DomainParticipant, name: str, type_name: str, version: str) -> None:
+        """Create both endpoints of the service ``/name``."""
+        super().__init__(participant, name, type_name, version, ("clientid", "serviceid"))
+        self._guid = self.writer.entity.get_instance_handle() % 2**64
+        self._numbers = count(1)
+        self._pending: dict[int, bytes] = {}
+        self._lock = Lock()
+
+    def pack(self, body: Any) -> bytearray:
+        """Serialise a request; `call` fills its header in."""
+        wire = self.request_type + "__wire"
+        return serialise(_Wire(0, 0, body), wire, self._version)
+
+    def call(self, packed: bytearray, goal_id: bytes) -> None:
+        """Send a request that concerns ``goal_id``."""
+        with self._lock:
+            number = next(self._numbers)
+            self._pending[number] = goal_id
+            HEADER.pack_into(packed, HEADER_AT, self._guid, number)
+            self.writer.send(packed)
+
+    def reply(self) -> tuple[bytes, memoryview] | None:
+        """Take the next reply to a request of ours: (goal id, CDR)."""
+        while (packed := self.reader.take()) is not None:
+            if len(packed) <= BODY_AT:
+                continue
+            guid, number = HEADER.unpack_from(packed, HEADER_AT)
+            if guid == self._guid and (goal_id := self._pending.pop(number, None)) is not None:
+                return goal_id, packed
+        return None
+
+    def unpack(self, packed: memoryview) -> Any:
+        """Deserialise a reply's body; raises TransportError."""
+        return deserialise(packed, self.reply_type + "__wire", self._version).body
+
+
+class ServiceServer(_End):
+    """Takes requests and sends replies to who asked."""
+
+    def __init__(self, participant: DomainParticipant, name: str, type_name: str, version: str) -> None:
+        """Create both endpoints of the service ``/name``."""
+        super().__init__(participant, name, type_name, version, ("serviceid", "clientid"))
+        self._reachable: set[int] = set()
+
+    def pack(self, body: Any) -> bytearray:
+        """Serialise a reply; `reply` fills its header in."""
+        return serialise(_Wire(0, 0, body), self.reply_type + "__wire", self._version)
+
+    def reply(self, packed: bytearray, header: tuple[int, int]) -> None:
+        """Send a reply under the header of its request."""
+        HEADER.pack_into(packed, HEADER_AT, *header)
+        self.writer.send(packed)
+
+    def unpack(self, packed: memoryview) -> Any:
+        """Deserialise a request's body; raises TransportError."""
+        return deserialise(packed, self.request_type + "__wire", self._version).body
+
+    def await_client(self, sender: int) -> bool:
+        """Wait, 100 ms at most, until replies reach the client whose request came from writer ``sender``.
+
+        A reply is volatile: sent before the client's reader is matched, it is lost. False if the client has left.
+        """
+        if sender in self._reachable:
+            return True
+        deadline_ns = now_ns() + REPLY_READER_TIMEOUT_NS
+        while (peer := self.reader.peer(sender)) is not None:
+            client = peer.get("clientid")
+            if client is None or any(reader.get("clientid") == client for reader in self.writer.peers()):
+                if len(self._reachable) >= REMEMBERED_CLIENTS:
+                    self._reachable.intersection_update(self.reader.entity.get_matched_publications())
+                self._reachable.add(sender)
+                return True
+            if now_ns() > deadline_ns:
+                return True  # as rmw_cyclonedds: send, whoever may hear it
+            time.sleep(REPLY_READER_POLL_S)
+        return False
+
+
+class _Wire:
+    """A body behind its header, as the ``__wire`` types want it."""
+
+    __slots__ = ("body", "guid", "seq")
+
+    def __init__(self, guid: int, seq: int, body: Any) -> None:
+        self.guid, self.seq, self.body = guid, seq, body

@@ -1,0 +1,243 @@
+"""Actions on Cyclone DDS: the contract, what is announced as ROS announces it, and what a stranger may send."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.ros import Accepted, Feedback, Middleware, Rejected, Result, llama, open_middleware
+from s2a_bench.ros import messages as ros
+from tests.conformance.action import NAME, ActionContract, event, offer, receive, send, start, text_of
+from tests.conformance.middleware import Join
+
+pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
+
+WIRE = json.loads((Path(__file__).parent.parent / "data" / "action_wire.json").read_text())
+RECORDED = {(end["kind"], end["topic"]): end for end in WIRE["endpoints"] if "generate" in end["topic"]}
+DISCOVERY = "ros_discovery_info"
+OURS = {
+    ("reader", r"rq/generate/.*Request|rr/generate/.*Reply|rt/generate/_action/feedback"): "Policy.History.KeepAll",
+    ("writer", r"rt/generate/_action/feedback"): "Policy.History.KeepLast(depth=1000)",
+}
+"""Where our history, which is local and matches any other, is deeper than ROS's."""
+
+
+@pytest.fixture
+def join(dds_domain: int) -> Iterator[Join]:
+    with ExitStack() as stack:
+
+        def join() -> Middleware:
+            middleware = open_middleware("cyclonedds", domain_id=dds_domain)
+            stack.callback(middleware.close)
+            return middleware
+
+        yield join
+
+
+class TestCycloneActions(ActionContract):
+    @pytest.fixture
+    def join(self, join: Join) -> Join:
+        return join
+
+
+def announced(domain: int, wanted: set[tuple[str, str]]) -> dict[tuple[str, str], Any]:
+    """What a third participant discovers of these (kind, topic)."""
+    from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
+    from cyclonedds.domain import DomainParticipant
+
+    observer = DomainParticipant(domain)
+    readers = {
+        "writer": BuiltinDataReader(observer, BuiltinTopicDcpsPublication),
+        "reader": BuiltinDataReader(observer, BuiltinTopicDcpsSubscription),
+    }
+    found: dict[tuple[str, str], Any] = {}
+    deadline = now_ns() + 20_000_000_000
+    while not wanted <= found.keys():
+        assert now_ns() < deadline, f"not discovered: {wanted - found.keys()}"
+        for kind, reader in readers.items():
+            found |= {(kind, end.topic_name): end for end in reader.take(N=100)}
+    return found
+
+
+def test_endpoints_are_announced_as_ros_announces_them(join: Join, dds_domain: int) -> None:
+    from cyclonedds.core import Policy
+
+    ends = (
+        join().action_server("/generate", llama.GENERATE_RESPONSE, version="4.4"),
+        join().action_client("/generate", llama.GENERATE_RESPONSE, version="4.4"),
+    )
+    assert len(RECORDED) == 16
+    found = announced(dds_domain, set(RECORDED))
+    del ends  # unreferenced, a client leaves
+    for (kind, topic), recorded in RECORDED.items():
+        ours = found[kind, topic]
+        history = next(
+            (ours for (of, name), ours in OURS.items() if of == kind and re.fullmatch(name, topic)),
+            recorded["history"],
+        )
+        assert ours.type_name == recorded["type"]
+        assert repr(ours.qos[Policy.Reliability]) == recorded["reliability"]
+        assert repr(ours.qos[Policy.Durability]) == recorded["durability"]
+        assert repr(ours.qos[Policy.History]) == history
+        assert repr(ours.qos[Policy.DataRepresentation]) == recorded["repr"]
+        identity = r"((?:clientid|serviceid)=)[ 0-9a-f][0-9a-f](?:\.[0-9a-f]{1,2}){15};"
+        user_data = repr(ours.qos[Policy.Userdata])
+        assert re.sub(identity, r"\1;", user_data) == re.sub(identity, r"\1;", recorded["userdata"])
+
+
+def test_request_and_reply_endpoints_of_a_service_share_an_id(join: Join, dds_domain: int) -> None:
+    from s2a_bench.ros.dds import user_data
+
+    middleware = join()
+    middleware.action_server("/generate", llama.GENERATE_RESPONSE)
+    services = [f"/generate/_action/{name}" for name in ("send_goal", "cancel_goal", "get_result")]
+    pairs = [(("reader", f"rq{name}Request"), ("writer", f"rr{name}Reply")) for name in services]
+    found = announced(dds_domain, {end for pair in pairs for end in pair})
+    ids = [{user_data(found[end])["serviceid"] for end in pair} for pair in pairs]
+    assert [len(of_one) for of_one in ids] == [1, 1, 1]
+    assert len(set.union(*ids)) == 3
+
+
+def test_an_id_is_written_as_recorded() -> None:
+    from s2a_bench.ros.dds_service import endpoint_id
+
+    prefix = bytes.fromhex(WIRE["participants"][1]["guid"].replace("-", ""))[:12]
+    assert (
+        f"clientid={endpoint_id(prefix, 8)};" in RECORDED["writer", "rq/generate/_action/send_goalRequest"]["userdata"]
+    )
+
+
+def test_a_node_is_listed_by_name_with_its_endpoints(dds_domain: int) -> None:
+    from s2a_bench.ros import QoS
+    from s2a_bench.ros.dds import RawReader, Waiter, dds_qos
+    from s2a_bench.ros.graph import PARTICIPANT_ENTITIES
+
+    listening = open_middleware(domain_id=dds_domain)
+    named = open_middleware(domain_id=dds_domain, node_name="/llama/llama_node")
+    try:
+        publisher = named.publisher("/x", "std_msgs/msg/String", QoS())
+        named.action_server(NAME, llama.GENERATE_RESPONSE)
+        participant = listening._participant  # type: ignore[attr-defined]
+        reader = RawReader(participant, DISCOVERY, PARTICIPANT_ENTITIES, dds_qos(QoS(0), "", transient_local=True))
+        waiter = Waiter(participant, [reader])
+        deadline = now_ns() + 20_000_000_000
+        nodes: dict[str, Any] = {}
+        while not (node := nodes.get("llama_node")) or len(node.writer_gid_seq) < 6:
+            packed = reader.take()
+            if packed is None:
+                assert waiter.wait_until(deadline), "not announced"
+                continue
+            for node in ros.deserialise(packed, PARTICIPANT_ENTITIES).node_entities_info_seq:
+                nodes[node.node_name] = node
+        assert node.node_namespace == "/llama"
+        assert publisher.entity.get_guid().bytes in [gid.data.tobytes()[:16] for gid in node.writer_gid_seq]  # type: ignore[attr-defined]
+        assert len(node.reader_gid_seq) == 3
+    finally:
+        named.close()
+        listening.close()
+
+
+def test_what_is_no_node_name_is_refused(dds_domain: int) -> None:
+    with pytest.raises(UsageError, match="node name 'my node'"):
+        open_middleware(domain_id=dds_domain, node_name="my node")
+
+
+def test_a_client_tells_the_version_a_server_speaks(join: Join) -> None:
+    join().action_server(NAME, llama.GENERATE_RESPONSE, version="4.4")
+    client = join().action_client(NAME, llama.GENERATE_RESPONSE)
+    assert client.wait_for_server(20)
+    assert client.server_version() == "4.4"
+
+
+def test_a_goal_of_version_4_4_makes_the_round(join: Join) -> None:
+    server = join().action_server(NAME, llama.GENERATE_RESPONSE, version="4.4")
+    client = join().action_client(NAME, llama.GENERATE_RESPONSE, version="4.4")
+    assert client.wait_for_server(20)
+    client.send(client.pack(llama.generate_goal("p", version="4.4", grammar="root ::= x")))
+    goal = receive(server)
+    goal.accept()
+    assert goal.unpack().sampling_config.grammar == "root ::= x"
+    assert llama.goal_images(goal.unpack()) == []
+    goal.executing()
+    goal.succeed(llama.text_result("x", version="4.4"))
+    event(client, Accepted)
+    assert client.unpack_result(event(client, Result).packed).response.text == "x"
+
+
+def test_replies_to_other_clients_are_ignored(join: Join) -> None:
+    from s2a_bench.ros.dds_service import HEADER, HEADER_AT
+
+    action = offer(join)
+    sent = send(action.client)
+    goal: Any = receive(action.server)
+    service = goal._server.send_goal
+    guid, number = HEADER.unpack_from(goal._packed, HEADER_AT)
+    response = ros.default(service.reply_type, accepted=False)
+    service.reply(service.pack(response), (guid ^ 1, number))
+    service.reply(service.pack(response), (guid, number + 7))
+    goal.accept()
+    assert event(action.client, Accepted).goal_id == sent
+
+
+def test_malformed_requests_leave_the_server_up(join: Join, caplog: pytest.LogCaptureFixture) -> None:
+    action = offer(join)
+    client: Any = action.client
+    for service in (client._goals, client._cancels, client._results):
+        service.writer.send(bytearray.fromhex("00010000") + bytes(16))
+    damaged = client.pack(llama.generate_goal("p"))
+    damaged[36:40] = b"\xff\xff\xff\x7f"  # the prompt's length
+    client.send(damaged)
+    goal = receive(action.server)
+    with pytest.raises(TransportError, match="received bytes that are no llama_msgs/action/GenerateResponse_SendGoal"):
+        goal.unpack()
+    goal.reject()
+    event(client, Rejected)
+    start(action).succeed(llama.text_result("x"))
+    event(client, Result)
+    assert [record.getMessage()[: len(NAME) + 10] for record in caplog.records] == [NAME + ": dropped "] * 3
+
+
+SERVER_PROCESS = """
+import sys
+from s2a_bench.ros import llama, open_middleware
+middleware = open_middleware(domain_id=int(sys.argv[1]))
+server = middleware.action_server(sys.argv[2], llama.GENERATE_RESPONSE)
+goal = server.next_goal(60)
+goal.accept()
+words = goal.unpack().prompt.split()
+goal.executing()
+for number, word in enumerate(words):
+    goal.feedback(llama.token_feedback(word, number))
+goal.succeed(llama.text_result(" ".join(words)))
+sys.stdin.read()
+middleware.close()
+"""
+
+
+def test_client_and_server_are_two_processes(join: Join, dds_domain: int) -> None:
+    client = join().action_client(NAME, llama.GENERATE_RESPONSE)
+    command = [sys.executable, "-c", SERVER_PROCESS, str(dds_domain), NAME]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        assert client.wait_for_server(30)
+        words = [f"word{number}" for number in range(200)]
+        sent = send(client, " ".join(words))
+        assert event(client, Accepted).goal_id == sent
+        assert [text_of(client, event(client, Feedback)) for _ in words] == words
+        assert client.unpack_result(event(client, Result).packed).response.text == " ".join(words)
+        assert process.stdin is not None
+        process.stdin.close()
+    assert process.returncode == 0
+    deadline = now_ns() + 20_000_000_000
+    while client.server_present() and now_ns() < deadline:
+        client.next_event(0.01)
+    assert not client.server_present()
