@@ -34,6 +34,7 @@ STAGES: dict[str, str] = {
     "cdr_pack": "pack",
     "connect": "network",
     "network": "network",
+    "accept": "network",
     "ingest": "ingest",
     "json_parse": "parse",
     "cdr_parse": "parse",
@@ -47,6 +48,7 @@ STAGES: dict[str, str] = {
     "return": "return",
 }
 """Fine stage -> group, in the order of the path. `connect` appears where a client is built per request,
+`accept` where a ROS action's goal has to be accepted before work starts,
 `ingest` where the server is a llama-server (last byte packed -> slot started: network, parse, decode and queue), and
 `server` where it is a black box that tells nothing (last byte packed -> first token)."""
 

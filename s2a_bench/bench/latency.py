@@ -88,8 +88,9 @@ class ServerSet:
             Thread(target=server.serve, daemon=True).start()
             self.addresses[transport] = server.address
             return
-        if transport == "http" and config.url:
-            self.addresses[transport] = config.url
+        foreign = {"http": config.url, "ros": config.action}.get(transport)
+        if foreign:
+            self.addresses[transport] = config.url if transport == "http" else config.namespace
             return
         if transport == "http" and config.llama_server:
             files = load_headers(config.engine)
@@ -98,8 +99,15 @@ class ServerSet:
             )
         else:
             address = f"127.0.0.1:{config.port}" if transport == "http" else config.namespace
-            variant = "topic" if transport == "ros" else ""
-            route = Route(transport, variant, address=address, dds_tuning=config.dds_tuning, domain_id=config.domain_id)
+            route = Route(
+                transport,
+                config.ros[0] if transport == "ros" else "",
+                address=address,
+                dds_tuning=config.dds_tuning,
+                domain_id=config.domain_id,
+                max_tokens=config.max_tokens,
+                result_timeout_s=config.result_timeout_s,
+            )
             process = OwnServer(ServerJob(route, config.engine, tuned=config.dds_tuning == "tuned"), log)
         self._processes[transport] = self._stack.enter_context(process)
 

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import ENGINES, EngineConfig
-from s2a_bench.transport import CONNECTIONS, HTTP_VARIANTS, NAMES, PAYLOADS, WIRES, Route
+from s2a_bench.transport import CONNECTIONS, HTTP_VARIANTS, NAMES, PAYLOADS, ROS_VARIANTS, WIRES, Route
 
 LARGEST = 16_384
 ROS_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -32,6 +32,10 @@ class LatencyConfig:
     transports: tuple[str, ...] = ("http", "ros")
     http: tuple[str, ...] = ()
     """Variants; empty: all that the server speaks."""
+    ros: tuple[str, ...] = ("topic",)
+    action: str = ""
+    """The full name of somebody else's action, as a llama_ros node's; then no ROS server is started."""
+    result_timeout_s: float = 60.0
     source: str = "synthetic"
     width: int = 640
     height: int = 480
@@ -74,6 +78,7 @@ class LatencyConfig:
             raise UsageError(f"--transport: name at least one of {', '.join(NAMES)}")
         _one_of("--transport", self.transports, NAMES)
         _one_of("--http", self.http, HTTP_VARIANTS)
+        _one_of("--ros", self.ros, ROS_VARIANTS)
         _one_of("--payload", [self.payload], PAYLOADS)
         _one_of("--wire", [self.wire], WIRES)
         _one_of("--connection", [self.connection], CONNECTIONS)
@@ -86,6 +91,7 @@ class LatencyConfig:
             ("--max-tokens", self.max_tokens, 1, 2**20),
             ("--seed", self.seed, 0, 2**31 - 1),
             ("--timeout", self.timeout_s, 0.1, 86_400),
+            ("--result-timeout", self.result_timeout_s, 0, 86_400),
             ("--fps", self.fps, 0.1, 1_000),
         ):
             if not least <= value <= most:
@@ -100,6 +106,7 @@ class LatencyConfig:
             if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
                 raise UsageError(f"{flag}: the text is not valid UTF-8, or has a NUL")
         self._check_black_box()
+        self._check_action()
         self._check_stream()
 
     def _check_black_box(self) -> None:
@@ -118,6 +125,19 @@ class LatencyConfig:
             raise UsageError(f"--http binary needs our own server; leave it out with {flag}")
         if self.llama_server and self.engine.name != "llama":
             raise UsageError(f"--llama-server runs a model; leave out --engine {self.engine.name}")
+
+    def _check_action(self) -> None:
+        if "ros" in self.transports and not self.ros:
+            raise UsageError(f"--ros: name at least one of {', '.join(ROS_VARIANTS)}")
+        if self.action:
+            if not ROS_NAME.fullmatch(self.action):
+                raise UsageError(f"--action: '{self.action}' should look like /llama/generate_response")
+            if "ros" not in self.transports:
+                raise UsageError("--action needs ros among --transport")
+            if self.mode == "stream":
+                raise UsageError("--action: --mode stream needs our own server, which keeps the camera's newest frame")
+        if self.wire == "compressed" and self.mode == "request" and (self.action or "action" in self.ros):
+            raise UsageError("--wire compressed: a goal carries sensor_msgs/Image; use --wire bgr, or --ros topic")
 
     def _check_stream(self) -> None:
         if self.mode == "stream" and self.payload == "jpeg-preencoded":
@@ -174,7 +194,9 @@ def plan_cells(config: LatencyConfig, addresses: dict[str, str]) -> list[Cell]:
                 for variant in config.http_variants
             ]
         elif transport == "ros":
-            cells.append(Cell("ros/topic", replace(route, variant="topic"), config.wire))
+            variants = ("action",) if config.action else config.ros
+            route = replace(route, action=config.action, black_box=bool(config.action))
+            cells += [Cell(f"ros/{variant}", replace(route, variant=variant), config.wire) for variant in variants]
         else:
             cells.append(Cell(transport, route, ""))
     return cells

@@ -29,6 +29,11 @@ def latency(
     http: Annotated[
         str, typer.Option(help="as-deployed, best-effort, binary; several with commas [default: all]")
     ] = "",
+    ros: Annotated[str, typer.Option(help="topic, action; several with commas")] = "topic",
+    action: Annotated[
+        str, typer.Option(help="an action that runs already, as /llama/generate_response of llama_ros (a black box)")
+    ] = "",
+    result_timeout: Annotated[float, typer.Option(help="seconds an action's result is kept")] = 60.0,
     wire: Annotated[str, typer.Option(help="ROS picture: bgr, yuyv, compressed")] = "bgr",
     url: Annotated[str, typer.Option(help="an OpenAI-compatible server that runs already (a black box)")] = "",
     served_model: Annotated[str, typer.Option(help="the model's name at --url")] = "default",
@@ -74,6 +79,9 @@ def latency(
     config = LatencyConfig(
         transports=_listed(transport),
         http=_listed(http),
+        ros=_listed(ros),
+        action=action,
+        result_timeout_s=result_timeout,
         source=source,
         width=width,
         height=height,

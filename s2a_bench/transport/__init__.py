@@ -12,7 +12,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.types import Frame, Request, Token
 
 HTTP_VARIANTS = ("as-deployed", "best-effort", "binary")
-ROS_VARIANTS = ("topic",)
+ROS_VARIANTS = ("topic", "action")
 PAYLOADS = ("jpeg", "jpeg-preencoded", "png", "raw")
 WIRES = ("bgr", "yuyv", "compressed")
 CONNECTIONS = ("keep-alive", "per-request", "client-per-request")
@@ -91,11 +91,19 @@ class Route:
     connection: str = "keep-alive"
     """http: keep-alive, per-request (a new connection), client-per-request (a new client object)."""
     black_box: bool = False
-    """http: the server is not ours, so it sends no marks."""
+    """The server is not ours, so it sends no marks."""
     model: str = "default"
     """http: the model's name in the request."""
     dds_tuning: str = "tuned"
     domain_id: int = 0
+    action: str = ""
+    """ros client: the full name of an action that is not under the namespace, as of a llama_ros node."""
+    max_tokens: int = 512
+    """ros server: the most tokens of a goal, which cannot say itself how many it wants."""
+    result_timeout_s: float = 60.0
+    """ros server: how long a goal's result is kept."""
+    publish_tokens: bool = False
+    """ros server: whether the tokens of goals also go to the topic ``token``, for plotting."""
     timeout_s: float = 300.0
     """The longest silence before a request counts as failed."""
 
@@ -103,6 +111,7 @@ class Route:
 TRANSPORTS: dict[str, tuple[str, str]] = {
     "http": ("s2a_bench.transport.http.client:HttpClient", "s2a_bench.transport.http.server:HttpServer"),
     "ros/topic": ("s2a_bench.transport.ros.topic:TopicClient", "s2a_bench.transport.ros.server:RosServer"),
+    "ros/action": ("s2a_bench.transport.ros.action:GenerateClient", "s2a_bench.transport.ros.server:RosServer"),
     "loopback": ("s2a_bench.transport.loopback:LoopbackClient", "s2a_bench.transport.loopback:LoopbackServer"),
 }
 """Transport or transport/variant -> (client class, built as ``Client(route, alive)``; server class, built as

@@ -33,6 +33,16 @@ def test_cells_follow_the_flags() -> None:
     assert http.route.connection == "per-request"
 
 
+def test_a_foreign_action_is_the_only_ros_cell() -> None:
+    config = LatencyConfig(transports=("ros",), ros=("topic", "action"), action="/llama/generate_response")
+    (cell,) = plan_cells(config, ADDRESSES)
+    assert (cell.name, cell.route.action, cell.route.black_box) == ("ros/action", "/llama/generate_response", True)
+
+
+def test_both_ros_variants_are_measured_in_one_run() -> None:
+    assert names(LatencyConfig(transports=("ros",), ros=("topic", "action"))) == ["ros/topic", "ros/action"]
+
+
 def test_a_black_box_is_asked_without_the_binary_variant() -> None:
     config = LatencyConfig(url="http://localhost:8080")
     assert names(config) == ["http/as-deployed", "http/best-effort", "ros/topic"]
@@ -63,6 +73,12 @@ def test_a_black_box_is_asked_without_the_binary_variant() -> None:
         ({"namespace": "/a b"}, "--namespace: '/a b'"),
         ({"width": 200_000, "height": 200_000}, "--size: 200000x200000"),
         ({"url": "http://[::1"}, "--url: 'http://[::1'"),
+        ({"ros": ("service",)}, "--ros: 'service' is none of topic, action"),
+        ({"ros": ()}, "--ros: name at least one of topic, action"),
+        ({"action": "generate"}, "--action: 'generate' should look like /llama/generate_response"),
+        ({"action": "/x", "transports": ("http",)}, "--action needs ros among --transport"),
+        ({"action": "/x", "mode": "stream"}, "--action: --mode stream needs our own server"),
+        ({"ros": ("action",), "wire": "compressed"}, "--wire compressed: a goal carries sensor_msgs/Image"),
         ({"width": 641}, "--size: 641x480"),
         ({"width": 8, "height": 8}, "--size: 8x8"),
         ({"namespace": "robot"}, "--namespace: 'robot' should look like /name"),

@@ -60,7 +60,15 @@ class TestHttpConnections(TransportContract):
         yield from connector(Route("http", "best-effort", payload="raw", connection=connection))
 
 
-class TestRos(TransportContract):
+class TestRosTopic(TransportContract):
     @pytest.fixture
     def connect(self, dds_domain: int) -> Iterator[Connect]:
         yield from connector(Route("ros", "topic", domain_id=dds_domain))
+
+
+class TestRosAction(TransportContract):
+    carries_id_and_limit = False  # llama_msgs goals have neither
+
+    @pytest.fixture
+    def connect(self, dds_domain: int) -> Iterator[Connect]:
+        yield from connector(Route("ros", "action", domain_id=dds_domain, max_tokens=2000))

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from s2a_bench.errors import S2AError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Route
+from s2a_bench.transport.ros.action import ActionFront
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join, refuse_company
 from s2a_bench.transport.ros.topic import TopicFront
@@ -65,7 +66,10 @@ class RosServer:
         refuse_company(route, self.address)
         self.middleware = join(route)
         self._cache = CameraCache(self.middleware, self.address)
-        self._fronts: list[Front] = [TopicFront(self.middleware, self.address, self._cache)]
+        self._fronts: list[Front] = [
+            TopicFront(self.middleware, self.address, self._cache),
+            ActionFront(self.middleware, route, self._cache),
+        ]
         self._stopped = Event()
 
     def serve(self) -> None:

@@ -1,0 +1,273 @@
+"""The ROS variant `action`: ``llama_msgs/action/GenerateResponse``, as llama_ros speaks it, tokens as feedback.
+
+Our own server also publishes its marks on ``<namespace>/marks``, keyed by the goal's id; a plain llama_ros node does
+not, and then everything between packing and the first token is the stage `server`. A goal has no token limit, so the
+client cancels it after the last token that it wants; our own server has a limit of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from threading import Lock
+from typing import Any
+
+from s2a_bench.clock import now_ns, realtime_offset_ns
+from s2a_bench.errors import RequestFailed, S2AError, ServerDied, TransportError, UsageError
+from s2a_bench.ros import (
+    ActionClient,
+    Feedback,
+    Middleware,
+    QoS,
+    Rejected,
+    Result,
+    ServerGoal,
+)
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.action import Status
+from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
+from s2a_bench.trace import Trace
+from s2a_bench.transport import CameraSink, Route
+from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
+from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join
+from s2a_bench.transport.ros.topic import marks_message, remote_of
+from s2a_bench.types import Request, Token
+
+ACTION = "/generate_response"
+MARKS = "/marks"
+MARKS_QOS = QoS(depth=0)
+MEDIA_MARKER = "<__media__>"
+"""Where a picture goes in a llama_ros prompt."""
+MATCH_TIMEOUT_S = 15.0
+MARKS_TIMEOUT_S = 2.0
+NO_SEED = 2**32 - 1
+"""SamplingConfig.seed of a client that does not care."""
+
+
+class GenerateClient:
+    """Sends goals and collects the feedback, from our own server or a llama_ros node."""
+
+    def __init__(self, route: Route, alive: Callable[[], bool]) -> None:
+        """Join the domain and wait for the action; raises ServerDied if it does not appear."""
+        self._route = route
+        self._alive = alive
+        self._offset_ns = realtime_offset_ns()
+        self.middleware = join(route)
+        namespace = route.address or DEFAULT_NAMESPACE
+        self._name = route.action or namespace + ACTION
+        self.camera: CameraSink | None = None
+        try:
+            self._client, self._version = self._connect()
+            self._marks = None
+            if not route.black_box:
+                self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, MARKS_QOS)
+                camera = CameraPublisher(self.middleware, namespace, route.wire)
+                self.camera = camera
+                self._wait(lambda: bool(camera.matched()))
+                self._wait(lambda: bool(self._marks and self._marks.matched()))
+        except TransportError:
+            self.close()
+            raise
+
+    def _connect(self) -> tuple[ActionClient, str]:
+        """Find the server and speak the version of llama_msgs that its type hash shows, ours where it shows none."""
+        version = ros.DEFAULT_VERSION
+        client = self.middleware.action_client(self._name, GENERATE_RESPONSE, version)
+        self._wait(lambda: client.wait_for_server(0.1))
+        spoken = client.server_version() or version
+        if spoken != version:
+            client = self.middleware.action_client(self._name, GENERATE_RESPONSE, spoken)
+            self._wait(lambda: client.wait_for_server(0.1))
+        return client, spoken
+
+    def _wait(self, arrived: Callable[[], bool]) -> None:
+        deadline = now_ns() + int(MATCH_TIMEOUT_S * 1e9)
+        while not arrived():
+            if now_ns() > deadline or not self._alive():
+                raise ServerDied(
+                    f"no action server appeared at {self._name} in DDS domain {self._route.domain_id}; "
+                    "is ROS_DOMAIN_ID the same on both sides?"
+                )
+
+    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
+        """Send a goal and yield its tokens."""
+        if request.images and self._route.wire == "compressed":
+            raise UsageError("--wire compressed: a goal carries sensor_msgs/Image; use bgr, or --mode stream")
+        images = [picture_message(frame, self._route.wire, self._offset_ns, trace)[1] for frame in request.images]
+        sampling: dict[str, Any] = {"grammar": request.grammar}
+        if self._version != "4.4":
+            sampling["seed"] = request.seed
+        prompt = MEDIA_MARKER * len(images) + request.prompt
+        packed = self._client.pack(generate_goal(prompt, images, version=self._version, **sampling))
+        trace.mark("cdr_pack")
+        goal_id = self._client.send(packed)
+        trace.facts["payload_bytes"] = len(packed)
+        yield from self._tokens(goal_id, request.max_tokens, trace)
+        if self._marks is not None:
+            self._receive_marks(goal_id.hex(), trace)
+
+    def _tokens(self, goal_id: bytes, limit: int, trace: Trace) -> Iterator[Token]:
+        """Yield the tokens of a goal; it is cancelled after ``limit``, or when the caller leaves early."""
+        count = 0
+        ended = False
+        try:
+            while not ended:
+                event = self._next(goal_id)
+                if isinstance(event, Feedback) and count < limit:
+                    partial = self._client.unpack_feedback(event.packed).partial_response
+                    if not count:
+                        trace.mark("server" if self._marks is None else "return")
+                    yield Token(count, partial.text, partial.token)
+                    count += 1
+                    if count == limit and self._marks is None:
+                        self._client.cancel(goal_id)  # our own server knows the limit
+                elif isinstance(event, Rejected):
+                    ended = True
+                    raise RequestFailed("the server rejected the goal")
+                elif isinstance(event, Result):
+                    ended = True
+                    self._check(event)
+        finally:
+            if not ended:
+                self._client.cancel(goal_id)
+
+    def _check(self, result: Result) -> None:
+        if result.status not in {Status.SUCCEEDED, Status.CANCELED}:
+            text = self._client.unpack_result(result.packed).response.text
+            raise RequestFailed(f"the server broke off: {text or 'the goal ended with status ' + str(result.status)}")
+
+    def _next(self, goal_id: bytes) -> Any:
+        """Wait for the next event of this goal."""
+        deadline = now_ns() + int(self._route.timeout_s * 1e9)
+        while now_ns() < deadline:
+            event = self._client.next_event(POLL_S)
+            if event is not None and event.goal_id == goal_id:
+                return event
+            if event is None and not (self._alive() and self._client.server_present()):
+                raise ServerDied(f"the action server {self._name} is gone")
+        raise RequestFailed(f"no feedback for {self._route.timeout_s:.0f} s")
+
+    def _receive_marks(self, goal_id: str, trace: Trace) -> None:
+        """Take the server's marks of this goal; they were sent before its result."""
+        deadline = now_ns() + int(MARKS_TIMEOUT_S * 1e9)
+        while self._marks is not None and now_ns() < deadline:
+            packed = self._marks.take(POLL_S)
+            if packed is not None:
+                marks = self._marks.unpack(packed)
+                if marks.id == goal_id:
+                    trace.receive(remote_of(marks))
+                    return
+        raise RequestFailed("the server's marks did not arrive")
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self.middleware.close()
+
+
+class ActionFront:
+    """The server's side of the variant."""
+
+    def __init__(self, middleware: Middleware, route: Route, cache: CameraCache) -> None:
+        """Offer the action and create the topics."""
+        namespace = route.address or DEFAULT_NAMESPACE
+        self.cache = cache
+        self.max_tokens = route.max_tokens
+        self._server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE, route.result_timeout_s)
+        self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, MARKS_QOS)
+        self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if route.publish_tokens else None
+        self._active = 0
+        self._lock = Lock()
+
+    def take(self, timeout_s: float) -> ServerGoal | None:
+        """Wait for the next goal."""
+        return self._server.next_goal(timeout_s)
+
+    def job(self, packed: ServerGoal, trace: Trace) -> GenerateJob | None:
+        """Accept a goal and decode its pictures; one that cannot be read is rejected."""
+        try:
+            goal = packed.unpack()
+        except S2AError:
+            packed.reject()
+            return None
+        trace.mark("cdr_parse")
+        packed.accept()
+        trace.mark("accept")
+        with self._lock:
+            self._active += 1
+            alone = self._active == 1
+        return GenerateJob(self, packed, goal, trace, at_once=alone)
+
+    def plot(self, goal_id: str, token: Token) -> None:
+        """Publish a token for whoever plots, where that is wanted."""
+        if self._plot is not None:
+            fields = {"id": goal_id, "index": token.index, "text": token.text, "token": token.id}
+            message = ros.message(ros.TOKEN, **fields, last=False, error="", marks=[])
+            self._plot.send(self._plot.pack(message))
+
+    def ended(self, goal_id: str, trace: Trace) -> None:
+        """Send a goal's marks, before its result."""
+        self._marks.send(self._marks.pack(marks_message(goal_id, trace.to_remote())))
+        with self._lock:
+            self._active -= 1
+
+    def interrupt(self) -> None:
+        """Make `take` return; callable from any thread."""
+        self._server.interrupt()
+
+
+class GenerateJob:
+    """One goal. It is EXECUTING at once where no other is, else when its first token comes."""
+
+    def __init__(self, front: ActionFront, goal: ServerGoal, message: Any, trace: Trace, *, at_once: bool) -> None:
+        """Decode the pictures, or borrow the camera's newest frame where there are none."""
+        self.trace = trace
+        self.request: Request | None = None
+        self._front = front
+        self._goal = goal
+        self._id = goal.id.hex()
+        self._stop = [text for text in message.stop if text]
+        self._tokens: list[Token] = []
+        self._error = ""
+        self._started = at_once and goal.executing()
+        try:
+            images = tuple(picture_of(image, trace) for image in goal_images(message))
+        except S2AError as error:
+            self._error = str(error)
+            return
+        sampling = message.sampling_config
+        seed = getattr(sampling, "seed", NO_SEED)
+        self.request = Request(
+            id=self._id,
+            prompt=message.prompt.replace(MEDIA_MARKER, ""),
+            images=images or front.cache.lend(trace),
+            max_tokens=front.max_tokens,
+            grammar=sampling.grammar,
+            seed=0 if seed == NO_SEED else seed,
+        )
+
+    def token(self, token: Token) -> bool:
+        """Send a token as feedback; return False after a cancel or a stop word."""
+        self._started = self._started or self._goal.executing()
+        if not self._started or self._goal.cancel_requested:
+            return False
+        self._goal.feedback(token_feedback(token.text, token.id))
+        self._front.plot(self._id, token)
+        self._tokens.append(token)
+        return not (self._stop and self._stopped())
+
+    def _stopped(self) -> bool:
+        text = "".join(token.text for token in self._tokens)
+        return any(stop in text for stop in self._stop)
+
+    def end(self, error: str = "") -> None:
+        """Send marks and result."""
+        error = error or self._error
+        self._front.ended(self._id, self.trace)
+        text = error or "".join(token.text for token in self._tokens)
+        result = text_result(text, [token.id for token in self._tokens])
+        started = self._started or self._goal.executing()
+        if self._goal.cancel_requested:
+            self._goal.canceled(result)
+        elif error or not started:
+            self._goal.abort(result)
+        else:
+            self._goal.succeed(result)
