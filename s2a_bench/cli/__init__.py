@@ -12,7 +12,7 @@ from typing import Any
 import typer
 
 from s2a_bench import __version__
-from s2a_bench.cli import latency, model
+from s2a_bench.cli import latency, model, serve
 from s2a_bench.errors import S2AError
 
 INTERRUPTED = 130
@@ -29,6 +29,7 @@ app = typer.Typer(
 )
 app.command("latency")(latency.latency)
 app.add_typer(model.app, name="model", help="Make and inspect model files.")
+app.add_typer(serve.app, name="serve", help="Serve a model over HTTP, or as a ROS 2 node.")
 
 
 @app.callback(invoke_without_command=True)

@@ -1,0 +1,167 @@
+"""`s2a-bench serve`: the servers of the harness as long-running programs, for a robot's own clients."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from s2a_bench.errors import UsageError
+
+if TYPE_CHECKING:
+    from s2a_bench.inference import EngineConfig
+    from s2a_bench.transport import Route
+
+app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, add_completion=False)
+
+DEFAULTS: dict[str, Any] = {
+    "engine": "llama",
+    "model": "",
+    "mmproj": "",
+    "threads": 0,
+    "gpu-layers": 0,
+    "context": 4096,
+    "host": "127.0.0.1",
+    "port": 8080,
+    "namespace": "/llama",
+    "dds-tuning": "tuned",
+    "max-tokens": 512,
+    "result-timeout": 60.0,
+}
+"""What holds where neither a flag nor the TOML file says otherwise; the file's keys are these."""
+
+Engine = Annotated[str | None, typer.Option(help="llama, echo [default: llama]")]
+Model = Annotated[str | None, typer.Option(help="GGUF model [default: the tiny dummy]")]
+Mmproj = Annotated[str | None, typer.Option(help="GGUF vision tower that goes with --model")]
+Threads = Annotated[int | None, typer.Option(min=0, help="CPU threads of the model; 0: all")]
+GpuLayers = Annotated[int | None, typer.Option(min=-1, help="model layers on the GPU; -1: all")]
+Context = Annotated[int | None, typer.Option(min=256, help="context length in tokens")]
+Config = Annotated[Path | None, typer.Option(help="TOML file with these flags as keys; a flag wins over it")]
+
+
+@app.command("http")
+def http(
+    engine: Engine = None,
+    model: Model = None,
+    mmproj: Mmproj = None,
+    threads: Threads = None,
+    gpu_layers: GpuLayers = None,
+    context: Context = None,
+    host: Annotated[str | None, typer.Option(help="address to bind [default: 127.0.0.1]")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="0: any free one [default: 8080]")] = None,
+    config: Config = None,
+) -> None:
+    """Serve the OpenAI dialect (chat/completions with image data URIs, streamed) until interrupted."""
+    from s2a_bench.transport import Route
+
+    given = {"engine": engine, "model": model, "mmproj": mmproj, "threads": threads, "gpu-layers": gpu_layers}
+    settings = _settings({**given, "context": context, "host": host, "port": port}, config)
+    route = Route("http", address=f"{settings['host']}:{settings['port']}")
+    _run(route, settings, lambda address: f"serving at {address}/v1/chat/completions")
+
+
+@app.command("ros")
+def ros(
+    engine: Engine = None,
+    model: Model = None,
+    mmproj: Mmproj = None,
+    threads: Threads = None,
+    gpu_layers: GpuLayers = None,
+    context: Context = None,
+    namespace: Annotated[str | None, typer.Option(help="of the action and the topics [default: /llama]")] = None,
+    dds_tuning: Annotated[str | None, typer.Option(help="tuned, default")] = None,
+    max_tokens: Annotated[int | None, typer.Option(min=1, help="most tokens of a goal [default: 512]")] = None,
+    result_timeout: Annotated[float | None, typer.Option(min=0, help="seconds a result is kept [default: 60]")] = None,
+    config: Config = None,
+) -> None:
+    """Serve the action generate_response (llama_msgs) with the camera's newest frame at hand, until interrupted."""
+    from s2a_bench.bench.plan import ROS_NAME, TUNINGS
+    from s2a_bench.ros.config import domain_id
+    from s2a_bench.transport import Route
+
+    given = {"engine": engine, "model": model, "mmproj": mmproj, "threads": threads, "gpu-layers": gpu_layers}
+    given |= {"context": context, "namespace": namespace, "dds-tuning": dds_tuning, "max-tokens": max_tokens}
+    settings = _settings({**given, "result-timeout": result_timeout}, config)
+    if not ROS_NAME.fullmatch(settings["namespace"]):
+        raise UsageError(f"--namespace: '{settings['namespace']}' should look like /name: letters, digits, underscores")
+    if settings["dds-tuning"] not in TUNINGS:
+        raise UsageError(f"--dds-tuning: '{settings['dds-tuning']}' is none of {', '.join(TUNINGS)}")
+    route = Route(
+        "ros",
+        "action",
+        address=settings["namespace"],
+        domain_id=domain_id(os.environ),
+        dds_tuning=settings["dds-tuning"],
+        max_tokens=settings["max-tokens"],
+        result_timeout_s=settings["result-timeout"],
+        publish_tokens=True,
+    )
+    _run(
+        route,
+        settings,
+        lambda address: (
+            f"serving action {address}/generate_response, camera {address}/camera/image_raw, "
+            f"in DDS domain {route.domain_id}"
+        ),
+    )
+
+
+def _settings(flags: dict[str, Any], config: Path | None) -> dict[str, Any]:
+    """Join defaults, file and flags; raises UsageError for a key or value that the file should not have."""
+    from_file = _read(config) if config else {}
+    known = {key: value for key, value in DEFAULTS.items() if key in flags}
+    for key, value in from_file.items():
+        if key not in known:
+            raise UsageError(f"--config {config}: '{key}' is none of {', '.join(known)}")
+        wanted = (int, float) if isinstance(known[key], float) else type(known[key])
+        if not isinstance(value, wanted) or isinstance(value, bool):
+            raise UsageError(f"--config {config}: {key} = {value!r} should be like {known[key]!r}")
+    return known | from_file | {key: value for key, value in flags.items() if value is not None}
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        import tomli as tomllib
+    try:
+        return tomllib.loads(path.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"--config: cannot read {path}: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"--config: {path} is no TOML: {error}") from error
+
+
+def _engine(settings: dict[str, Any]) -> EngineConfig:
+    from s2a_bench.inference import EngineConfig
+
+    model, mmproj = (Path(settings[key]) if settings[key] else None for key in ("model", "mmproj"))
+    return EngineConfig(
+        settings["engine"], model, mmproj, settings["threads"], settings["gpu-layers"], settings["context"]
+    )
+
+
+def _run(route: Route, settings: dict[str, Any], ready: Callable[[str], str]) -> None:
+    """Serve until SIGINT or SIGTERM, then end cleanly with exit code 0."""
+    from s2a_bench.bench.serving import engine_handler
+    from s2a_bench.bench.tuning import keep_large_blocks, limit_threads
+    from s2a_bench.inference import open_engine
+    from s2a_bench.transport import open_server
+
+    limit_threads()
+    if settings.get("dds-tuning", "tuned") == "tuned":
+        keep_large_blocks()
+    engine = open_engine(_engine(settings))
+    try:
+        server = open_server(route, engine_handler(engine))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda *_: server.stop())
+        typer.echo(f"{ready(server.address)}; engine {engine.describe()['engine']}; Ctrl-C ends it")
+        server.serve()
+    finally:
+        engine.close()

@@ -1,0 +1,107 @@
+"""`s2a-bench serve`: the two servers as a robot's clients meet them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import httpx
+import pytest
+
+from s2a_bench.ros import QoS, open_middleware
+from s2a_bench.ros import messages as ros
+from s2a_bench.transport import Route, open_client
+from s2a_bench.types import Request
+from tests.conformance.transport import ask, yuyv_frame
+
+Start = Callable[..., tuple["subprocess.Popen[str]", str]]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Start a server and return it with its first line; it is ended afterwards."""
+    with ExitStack() as stack:
+
+        def run(*arguments: str) -> tuple[subprocess.Popen[str], str]:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "s2a_bench", "serve", *arguments],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            stack.callback(process.communicate)
+            stack.callback(process.kill)
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line, process.communicate()[1]
+            return process, line
+
+        yield run
+
+
+def test_http_speaks_the_openai_dialect(start: Start) -> None:
+    process, line = start("http", "--engine", "echo", "--port", "0")
+    url = line.split()[2]
+    body = {"messages": [{"role": "user", "content": "hello robot"}], "max_tokens": 2}
+    answer = httpx.post(url.rstrip(";"), json=body).json()
+    assert answer["choices"][0]["message"]["content"] == "hello robot"
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) in {0, -signal.SIGTERM}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ros_answers_goals_and_publishes_tokens(start: Start, dds_domain: int, number: signal.Signals) -> None:
+    process, line = start("ros", "--engine", "echo", "--namespace", "/robot_llama", "--max-tokens", "5")
+    assert "/robot_llama/generate_response" in line
+    middleware = open_middleware(domain_id=dds_domain)
+    plotted = middleware.subscription("/robot_llama/token", ros.TOKEN, QoS(0))
+    client = open_client(Route("ros", "action", "/robot_llama", domain_id=dds_domain, timeout_s=20))
+    try:
+        while not plotted.matched():
+            plotted.take(0.01)
+        tokens, trace = ask(client, Request("a", "go to the kitchen", (yuyv_frame(),)))
+        assert "".join(token.text for token in tokens) == "go to the kitchen go"
+        assert trace.remote is not None
+        words = [plotted.unpack(plotted.take(10)).text for _ in tokens]
+        assert words == [token.text for token in tokens]
+    finally:
+        client.close()
+        middleware.close()
+    process.send_signal(number)
+    assert process.wait(30) == 0
+
+
+def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "node.toml").write_text('engine = "echo"\nnamespace = "/from_file"\nresult-timeout = 5\n')
+    _, line = start("ros", "--config", str(tmp_path / "node.toml"), "--namespace", "/from_flag")
+    assert "/from_flag/generate_response" in line
+    assert "engine echo" in line
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("colour = 1", "'colour' is none of engine, model"),
+        ('threads = "many"', "threads = 'many' should be like 0"),
+        ("threads = true", "threads = True should be like 0"),
+        ("= 1", "is no TOML"),
+    ],
+)
+def test_a_wrong_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "node.toml").write_text(text)
+    done = subprocess.run(
+        [sys.executable, "-m", "s2a_bench", "serve", "ros", "--config", str(tmp_path / "node.toml")],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env=dict(os.environ),
+    )
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
