@@ -15,6 +15,7 @@ import pytest
 
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
+from s2a_bench.store.run import read_run
 from s2a_bench.transport import Route, open_client
 from s2a_bench.types import Request
 from tests.conformance.transport import ask, yuyv_frame
@@ -105,3 +106,17 @@ def test_a_wrong_file_is_one_line(tmp_path: Path, text: str, message: str) -> No
     assert done.returncode == 2
     assert message in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_latency_drives_a_node_that_runs_already(start: Start, tmp_path: Path) -> None:
+    start("ros", "--engine", "echo", "--namespace", "/llama", "--max-tokens", "50")
+    arguments = ["latency", "--transport", "ros", "--action", "/llama/generate_response", "--size", "64x48"]
+    arguments += ["--engine", "echo", "--runs", "3", "--warmup", "1", "--max-tokens", "4", "--output", str(tmp_path)]
+    subprocess.run([sys.executable, "-m", "s2a_bench", *arguments], check=True, timeout=120, capture_output=True)
+    (folder,) = tmp_path.iterdir()
+    samples = read_run(folder).samples
+    assert set(samples["cell"]) == {"ros/action"}
+    assert (samples["error"] == "").all()
+    assert (samples["n_tokens"] == 4).all()
+    assert samples["server_ns"].notna().all()
+    assert samples["e2e_without_inference_ns"].isna().all()

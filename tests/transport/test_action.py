@@ -1,0 +1,208 @@
+"""The ROS variant `action` beyond the contract: llama_ros nodes, limits, cancels, stop words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+
+from s2a_bench.errors import RequestFailed, ServerDied
+from s2a_bench.ros import ActionServer, ServerGoal, open_middleware
+from s2a_bench.ros.action import Status
+from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
+from s2a_bench.trace import budget
+from s2a_bench.transport import Client, Route, open_client, open_server
+from s2a_bench.types import Request
+from tests.conformance.transport import Recorder, ask, yuyv_frame
+
+NODE = "/llama_ros/generate_response"
+Node = Callable[..., list[ServerGoal]]
+
+
+@pytest.fixture
+def foreign(dds_domain: int) -> Route:
+    """A route to somebody else's node."""
+    return Route("ros", "action", action=NODE, domain_id=dds_domain, black_box=True, timeout_s=20)
+
+
+@pytest.fixture
+def node(dds_domain: int) -> Iterator[Node]:
+    """Run a node like llama_ros: it answers every goal with ten tokens, or as told."""
+    with ExitStack() as stack:
+
+        def start(version: str = "6.0", answer: Callable[[ServerGoal], None] | None = None) -> list[ServerGoal]:
+            middleware = open_middleware(domain_id=dds_domain, node_name="/llama_ros/llama_node")
+            server = middleware.action_server(NODE, GENERATE_RESPONSE, version=version)
+            goals: list[ServerGoal] = []
+            thread = Thread(target=serve, args=(server, version, goals, answer))
+            thread.start()
+            stack.callback(middleware.close)
+            stack.callback(thread.join)
+            stack.callback(server.interrupt)
+            return goals
+
+        yield start
+
+
+def serve(
+    server: ActionServer, version: str, goals: list[ServerGoal], answer: Callable[[ServerGoal], None] | None
+) -> None:
+    while (goal := server.next_goal(60)) is not None:
+        goals.append(goal)
+        if answer is not None:
+            answer(goal)
+            continue
+        goal.accept()
+        goal.executing()
+        for number in range(10):
+            if goal.cancel_requested:
+                break
+            goal.feedback(token_feedback(f"t{number} ", number, version))
+        end = goal.canceled if goal.cancel_requested else goal.succeed
+        end(text_result("whole", [1], version))
+
+
+@pytest.mark.parametrize("version", ["6.0", "4.4"])
+def test_a_llama_ros_node_is_driven_in_its_own_version(node: Node, foreign: Route, version: str) -> None:
+    goals = node(version)
+    client = open_client(foreign)
+    frame = yuyv_frame()
+    try:
+        tokens, trace = ask(client, Request("a", "what is this?", (frame,), grammar='root ::= "x"'))
+    finally:
+        client.close()
+    assert [token.text for token in tokens] == [f"t{number} " for number in range(10)]
+    goal = goals[0].unpack()
+    assert goal.prompt == "<__media__>what is this?"
+    assert goal.sampling_config.grammar == 'root ::= "x"'
+    assert goal.sampling_config.top_k == 40
+    (image,) = goal_images(goal)
+    assert (image.encoding, image.width, image.height) == ("bgr8", 64, 48)
+    stages = set(budget(trace.chain()).stages_ns)
+    assert stages == {"convert", "cdr_pack", "server"}
+    assert client.camera is None
+
+
+def test_a_node_without_a_limit_is_cancelled_after_the_last_wanted_token(node: Node, foreign: Route) -> None:
+    ended: list[int] = []
+
+    def endless(goal: ServerGoal) -> None:
+        goal.accept()
+        goal.executing()
+        number = 0
+        while not goal.cancel_requested:
+            goal.feedback(token_feedback("x", number))
+            number += 1
+        goal.canceled(text_result("", []))
+        ended.append(Status.CANCELED)
+
+    node(answer=endless)
+    client = open_client(foreign)
+    try:
+        tokens, _ = ask(client, Request("a", "plan", max_tokens=3))
+    finally:
+        client.close()
+    assert len(tokens) == 3
+    assert ended == [Status.CANCELED]
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda goal: goal.reject(), "rejected the goal"),
+        (lambda goal: (goal.accept(), goal.executing(), goal.abort(text_result("no memory"))), "no memory"),
+        (lambda goal: (goal.accept(), goal.executing(), goal.abort(text_result(""))), "ended with status 6"),
+    ],
+)
+def test_a_refusal_fails_the_request(
+    node: Node, foreign: Route, answer: Callable[[ServerGoal], None], message: str
+) -> None:
+    node(answer=answer)
+    client = open_client(foreign)
+    try:
+        with pytest.raises(RequestFailed, match=message):
+            ask(client, Request("a", "plan"))
+    finally:
+        client.close()
+
+
+def test_a_node_that_leaves_is_noticed(foreign: Route, dds_domain: int) -> None:
+    middleware = open_middleware(domain_id=dds_domain)
+    server = middleware.action_server(NODE, GENERATE_RESPONSE)
+    client = open_client(foreign)
+    left = Event()
+
+    def accept_and_leave() -> None:
+        goal = server.next_goal(20)
+        assert goal is not None
+        goal.accept()
+        middleware.close()
+        left.set()
+
+    thread = Thread(target=accept_and_leave)
+    thread.start()
+    try:
+        with pytest.raises(ServerDied, match="/llama_ros/generate_response is gone"):
+            ask(client, Request("a", "plan"))
+    finally:
+        thread.join()
+        client.close()
+    assert left.is_set()
+
+
+def test_no_node_is_said_so(foreign: Route) -> None:
+    with pytest.raises(ServerDied, match="no action server appeared at /llama_ros/generate_response"):
+        open_client(foreign, lambda: False)
+
+
+def test_our_server_stops_at_a_stop_word_and_borrows_no_seed(dds_domain: int) -> None:
+    handler = Recorder(["one ", "two ", "three ", "four "])
+    route = Route("ros", "action", "/test_stop", domain_id=dds_domain)
+    server = open_server(route, handler)
+    thread = Thread(target=server.serve)
+    thread.start()
+    middleware = open_middleware(domain_id=dds_domain)
+    try:
+        client = middleware.action_client("/test_stop/generate_response", GENERATE_RESPONSE)
+        assert client.wait_for_server(20)
+        client.send(client.pack(generate_goal("count", stop=["three"])))
+        events = [client.next_event(20) for _ in range(5)]
+        result = client.unpack_result(events[-1].packed)  # type: ignore[union-attr]
+        assert events[-1].status == Status.SUCCEEDED  # type: ignore[union-attr]
+        assert result.response.text == "one two three "
+        np.testing.assert_array_equal(result.response.tokens, [7, 8, 9])
+        assert handler.requests[0].seed == 0
+    finally:
+        middleware.close()
+        server.stop()
+        thread.join()
+
+
+def test_goals_of_two_clients_are_answered_one_after_the_other(dds_domain: int) -> None:
+    route = Route("ros", "action", "/test_two", domain_id=dds_domain, max_tokens=100, timeout_s=20)
+    handler = Recorder([f"t{number}" for number in range(100)])
+    server = open_server(route, handler)
+    thread = Thread(target=server.serve)
+    thread.start()
+    clients = [open_client(replace(route, address="/test_two")) for _ in range(2)]
+    counts: list[int] = []
+
+    def count(client: Client) -> None:
+        counts.append(len(ask(client, Request("a", "plan", max_tokens=100))[0]))
+
+    try:
+        threads = [Thread(target=count, args=(client,)) for client in clients]
+        for each in threads:
+            each.start()
+        for each in threads:
+            each.join(30)
+    finally:
+        for client in clients:
+            client.close()
+        server.stop()
+        thread.join()
+    assert counts == [100, 100]
