@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from random import Random
 from threading import Condition, Thread
@@ -82,11 +83,18 @@ class Camera:
     The ticks are fixed beforehand, so a late frame does not delay the ones after it, and its lateness shows.
     """
 
-    def __init__(self, source: FrameSource, fps: float, clock: Clock | None = None) -> None:
-        """Prepare; `start` starts."""
+    def __init__(
+        self,
+        source: FrameSource,
+        fps: float,
+        clock: Clock | None = None,
+        on_frame: Callable[[Frame], None] | None = None,
+    ) -> None:
+        """Prepare; `start` starts. ``on_frame`` is told every frame after it was sent."""
         self._source = source
         self._period_ns = int(1e9 / fps)
         self._clock = clock or SystemClock()
+        self._on_frame = on_frame
         self._changed = Condition()
         self._sink: CameraSink | None = None
         self._newest: tuple[StreamedFrame, Frame] | None = None
@@ -155,6 +163,7 @@ class Camera:
         trace.mark(RESIDUAL)
         frame = self._source.read()
         trace.mark("capture")
+        captured = frame
         record = StreamedFrame(frame.index, frame.stamp_ns, intended_ns, trace.marks)
         if sink is None:
             frame = bgr_of(frame, trace)
@@ -168,6 +177,8 @@ class Camera:
                 self._frames += [record] if sink is None else []
                 self._newest = record, frame
                 self._changed.notify_all()
+        if self._on_frame is not None:
+            self._on_frame(captured)
 
 
 class StreamFeed:

@@ -14,6 +14,7 @@ from s2a_bench.bench import environment
 from s2a_bench.bench.feed import Camera, Feed, RequestFeed, StreamFeed
 from s2a_bench.bench.plan import Cell, LatencyConfig, plan_cells
 from s2a_bench.bench.processes import LlamaServer, OwnServer, ServerProcess
+from s2a_bench.bench.recording import RunRecorder
 from s2a_bench.bench.serving import ServerJob, engine_handler
 from s2a_bench.bench.session import Place, Session
 from s2a_bench.bench.tuning import keep_large_blocks, limit_threads
@@ -205,10 +206,13 @@ def _measure(config: LatencyConfig, sources: _Sources, writer: RunWriter, progre
 
 
 def _sessions(config: LatencyConfig, servers: ServerSet, sources: _Sources, stack: ExitStack) -> Iterator[Session]:
-    """Open a client and a feed for each cell."""
+    """Open a client and a feed for each cell, and the recording if one is wanted."""
+    recorder: RunRecorder | None = None
+    if config.record is not None:
+        recorder = stack.enter_context(RunRecorder(config.record, config.namespace, live=config.mode == "stream"))
     camera: Camera | None = None
     if config.mode == "stream":
-        camera = Camera(sources.open(), config.fps)
+        camera = Camera(sources.open(), config.fps, on_frame=recorder.frame if recorder else None)
         camera.start()
         stack.callback(camera.stop)
     for cell in plan_cells(config, servers.addresses):
@@ -221,7 +225,7 @@ def _sessions(config: LatencyConfig, servers: ServerSet, sources: _Sources, stac
             feed = StreamFeed(camera, client.camera, int(1e9 / config.fps), random)
         else:
             feed = RequestFeed(sources.open(), preencoded=cell.payload == "jpeg-preencoded")
-        yield Session(cell, client, feed, config)
+        yield Session(cell, client, feed, config, recorder)
 
 
 def _blocks(

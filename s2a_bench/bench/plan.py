@@ -36,6 +36,8 @@ class LatencyConfig:
     action: str = ""
     """The full name of somebody else's action, as a llama_ros node's; then no ROS server is started."""
     result_timeout_s: float = 60.0
+    record: Path | None = None
+    """Where what travelled is recorded as MCAP."""
     source: str = "synthetic"
     width: int = 640
     height: int = 480
@@ -140,6 +142,8 @@ class LatencyConfig:
             raise UsageError("--wire compressed: a goal carries sensor_msgs/Image; use --wire bgr, or --ros topic")
 
     def _check_stream(self) -> None:
+        if self.record is not None and self.record.exists():
+            raise UsageError(f"--record: {self.record} exists already and is not overwritten; name another")
         if self.mode == "stream" and self.payload == "jpeg-preencoded":
             raise UsageError("--payload jpeg-preencoded has no meaning in --mode stream; use jpeg")
 

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 from s2a_bench.bench.feed import Feed, StreamedFrame, StreamFeed, fingerprint
 from s2a_bench.bench.plan import Cell, LatencyConfig
+from s2a_bench.bench.recording import RunRecorder
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, S2AError, ServerDied, SourceError, UsageError
 from s2a_bench.store.schema import FrameRow, SampleRow, TokenRow
@@ -44,12 +45,15 @@ KEPT_FRAMES = 90
 class Session:
     """The client side of one cell."""
 
-    def __init__(self, cell: Cell, client: Client, feed: Feed, config: LatencyConfig) -> None:
-        """Measure ``cell`` with an open client."""
+    def __init__(
+        self, cell: Cell, client: Client, feed: Feed, config: LatencyConfig, recorder: RunRecorder | None = None
+    ) -> None:
+        """Measure ``cell`` with an open client, recording what travels if there is a recorder."""
         self.cell = cell
         self.client = client
         self.feed = feed
         self._config = config
+        self._recorder = recorder
         self._frames: dict[int, StreamedFrame] = {}
 
     def measure(self, place: Place) -> Measured:
@@ -70,6 +74,11 @@ class Session:
             fatal = failure if isinstance(failure, FATAL) else None
         if not error and not seen:
             error = "RequestFailed: the answer was empty"
+        if self._recorder is not None:
+            if frame is not None and config.mode == "request":  # in stream mode the camera records its frames
+                self._recorder.frame(frame)
+            self._recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
+            self._recorder.flush()
         return replace(self._rows(place, request_id, frame, trace, seen, error), fatal=fatal)
 
     def _rows(

@@ -23,7 +23,7 @@ FULL = {"runs": 50, "warmup": 5, "max_tokens": 32}
 
 def latency(
     transport: Annotated[str, typer.Option(help="http, ros, loopback; several with commas")] = "http,ros",
-    source: Annotated[str, typer.Option(help="synthetic, video:FILE, images:DIR, v4l2:/dev/video0")] = "synthetic",
+    source: Annotated[str, typer.Option(help="synthetic, video:FILE, images:DIR, bag:FILE, v4l2:DEVICE")] = "synthetic",
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the frames")] = "640x480",
     payload: Annotated[str, typer.Option(help="HTTP picture: jpeg, jpeg-preencoded, png, raw")] = "jpeg",
     http: Annotated[
@@ -59,6 +59,9 @@ def latency(
     grammar: Annotated[Path | None, typer.Option(help="GBNF file that every answer obeys")] = None,
     seed: Annotated[int, typer.Option(help="seed of the order, the source and the sampling")] = 0,
     timeout: Annotated[float, typer.Option(help="longest silence of a server, in seconds")] = 300.0,
+    record: Annotated[
+        Path | None, typer.Option(help="also record frames, requests and tokens, as run.mcap (rosbag2)")
+    ] = None,
     output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
     against: Annotated[str, typer.Option(help="paper: draw the paper's figures beside ours")] = "",
     quick: Annotated[bool, typer.Option("--quick", help="fewer samples: a first look")] = False,
@@ -81,6 +84,7 @@ def latency(
         http=_listed(http),
         ros=_listed(ros),
         action=action,
+        record=record,
         result_timeout_s=result_timeout,
         source=source,
         width=width,

@@ -31,6 +31,7 @@ SOURCES: dict[str, str] = {
     "video": "s2a_bench.frames.video:VideoFile",
     "images": "s2a_bench.frames.images:ImageFolder",
     "v4l2": "s2a_bench.frames.v4l2:V4L2Camera",
+    "bag": "s2a_bench.frames.bag:Recording",
 }
 """Scheme of ``--source scheme[:where]`` -> class, built as ``Class(where, width, height, fps=..., seed=...)``."""
 
@@ -42,7 +43,7 @@ def open_source(spec: str, width: int, height: int, *, fps: float = 30.0, seed: 
     """
     scheme, _, where = spec.partition(":")
     if scheme not in SOURCES:
-        raise UsageError(f"--source: '{spec}' is none of synthetic, video:FILE, images:DIR, v4l2:DEVICE")
+        raise UsageError(f"--source: '{spec}' is none of synthetic, video:FILE, images:DIR, v4l2:DEVICE, bag:FILE")
     if bool(where) == (scheme == "synthetic"):
         raise UsageError(f"--source: '{spec}' should be " + (f"{scheme}:PATH" if not where else "plain 'synthetic'"))
     source: FrameSource = resolve_name(SOURCES[scheme])(where, width, height, fps=fps, seed=seed)

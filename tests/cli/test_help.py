@@ -40,7 +40,7 @@ def test_help_names_the_commands_that_exist() -> None:
 def test_every_flag_of_latency_is_explained() -> None:
     text = run("latency", "--help").stdout
     flags = "transport source size payload http wire url llama-server dds-tuning quick connection engine model mmproj"
-    flags += " runs warmup mode fps max-tokens seed output json verbose against"
+    flags += " runs warmup mode fps max-tokens seed output record ros action json verbose against"
     for flag in flags.split():
         assert f"--{flag}" in text
 

@@ -288,6 +288,30 @@ def test_a_video_is_a_source(tmp_path: Path) -> None:
     assert kept.samples["convert_ns"].isna().all()
 
 
+@pytest.mark.parametrize("mode", ["request", "stream"])
+def test_a_run_is_recorded_and_its_frames_are_a_source(tmp_path: Path, mode: str) -> None:
+    from rosbags.highlevel import AnyReader
+
+    bag = tmp_path / "run.mcap"
+    few = ["--transport", "http,ros", "--http", "binary", "--mode", mode, "--record", str(bag)]
+    run(*SMALL, *few, output=tmp_path / "results")
+    kept = only_run(tmp_path / "results")
+    with AnyReader([bag]) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        tokens = [
+            reader.deserialize(raw, connection.msgtype)
+            for connection, _, raw in reader.messages()
+            if connection.topic == "/s2a_bench/ros/topic/token"
+        ]
+    assert counts["/s2a_bench/http/binary/request"] == counts["/s2a_bench/ros/topic/request"] == 5
+    assert counts["/s2a_bench/http/binary/token"] == 15
+    assert counts["/s2a_bench/camera/image_raw"] >= 10
+    seen = kept.tokens[kept.tokens["cell"] == "ros/topic"]
+    assert [token.text for token in tokens] == list(seen["text"])
+    run(*SMALL, "--source", f"bag:{bag}", "--transport", "http", output=tmp_path / "again")
+    assert (only_run(tmp_path / "again").samples["error"] == "").all()
+
+
 def test_a_repeated_frame_is_a_warning(tmp_path: Path) -> None:
     import cv2
     import numpy as np

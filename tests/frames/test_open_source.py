@@ -29,7 +29,7 @@ def test_an_unknown_scheme_lists_those_there_are(spec: str) -> None:
     assert all(scheme in message for scheme in SOURCES)
 
 
-@pytest.mark.parametrize("scheme", ["video", "images", "v4l2"])
+@pytest.mark.parametrize("scheme", ["video", "images", "v4l2", "bag"])
 def test_a_scheme_without_its_path_is_refused(scheme: str) -> None:
     with pytest.raises(UsageError, match=f"--source: '{scheme}' should be {scheme}:PATH"):
         open_source(scheme, 64, 48)
@@ -40,7 +40,7 @@ def test_a_path_for_the_synthetic_camera_is_refused() -> None:
         open_source("synthetic:x", 64, 48)
 
 
-@pytest.mark.parametrize("scheme", ["video", "images", "v4l2"])
+@pytest.mark.parametrize("scheme", ["video", "images", "v4l2", "bag"])
 def test_a_path_that_is_missing_is_named(scheme: str, tmp_path: Path) -> None:
     path = tmp_path / "with:colon"
     with pytest.raises(SourceError) as caught:

@@ -1,0 +1,166 @@
+"""Frames of a ROS 2 recording (rosbag2 folder, ``.mcap`` or ``.db3`` file), over and over."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import SourceError, UsageError
+from s2a_bench.frames import check_size
+from s2a_bench.frames.convert import bgr_to_rgb, decode_image, resize, yuyv_to_bgr
+from s2a_bench.types import Encoding, Frame
+
+if TYPE_CHECKING:
+    from s2a_bench.types import Pixels
+
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CHANNELS = {"yuv422_yuy2": 2, "bgr8": 3, "rgb8": 3, "mono8": 1}
+TOPIC_KEY = "?topic="
+
+
+class Recording:
+    """A recorded image topic as a camera, in its own encoding; CompressedImage is decoded to ``bgr8``.
+
+    ``where`` is the recording's path, then ``?topic=/name`` unless its first image topic is meant. Pictures of
+    another size are scaled; YUYV, which cannot be, is converted to ``bgr8`` then. After the last picture comes the
+    first again. read() reads the file as it goes and never waits for the recorded rate; ``fps`` and ``seed`` change
+    nothing. Stamps are those of reading, as from any camera. Raises SourceError for a recording that is missing,
+    damaged, or without such a topic.
+    """
+
+    def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
+        """Open the recording and look at its first picture."""
+        check_size(width, height)
+        self._path, key, topic = where.partition(TOPIC_KEY)
+        if key and not topic.startswith("/"):
+            raise UsageError(f"--source: 'bag:{where}' should end with the absolute name of a topic, {TOPIC_KEY}/name")
+        self.name = f"bag:{where}"
+        self.width, self.height = width, height
+        self._types = get_typestore(Stores.ROS2_JAZZY)  # Humble's images are the same
+        self._reader: Any = _open(self._path)
+        try:
+            self._connection = _connection(self._reader.connections, self._path, topic)
+            self._messages = self._start()
+            self._ahead: Any = self._next()
+            self.encoding: Encoding = self._delivered(self._ahead)
+            if self.encoding == "yuv422_yuy2":
+                check_size(width, height, even=True)
+        except BaseException:
+            self.close()
+            raise
+        self._index = 0
+
+    def read(self) -> Frame:
+        """Return the next picture, after the last one the first; SourceError once closed."""
+        stamp_ns = now_ns()
+        if self._reader is None:
+            raise SourceError(f"--source: {self.name} was closed, it has no more frames")
+        message, self._ahead = self._ahead or self._next(), None
+        if self._delivered(message) != self.encoding:
+            raise SourceError(
+                f"--source: {self.name} changes from {self.encoding} at {self.width}x{self.height} to "
+                f"{message.encoding} at {message.width}x{message.height}; a source has one format, cut the recording"
+            )
+        try:
+            data = self._pixels(message)
+        except ValueError as error:
+            raise SourceError(f"--source: {self._path}: picture {self._index} cannot be read: {error}") from error
+        frame = Frame(self._index, stamp_ns, self.width, self.height, self.encoding, data)
+        self._index += 1
+        return frame
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._reader is not None:
+            with suppress(Exception):  # a damaged file may not even close
+                self._reader.close()
+        self._reader = None
+
+    def _start(self) -> Iterator[tuple[Any, int, bytes]]:
+        """Go to the first picture."""
+        return cast("Iterator[tuple[Any, int, bytes]]", self._reader.messages([self._connection]))
+
+    def _next(self) -> Any:
+        """Deserialise the next message, starting over once."""
+        try:
+            found = next(self._messages, None)
+            if found is None:
+                self._messages = self._start()
+                found = next(self._messages, None)
+            if found is not None:
+                return self._types.deserialize_cdr(found[2], self._connection.msgtype)
+        except Exception as error:  # rosbags raises whatever its parsing of a damaged file runs into
+            raise SourceError(f"--source: {_unreadable(self._path, error)}") from error
+        raise SourceError(f"--source: {self._path} holds no picture on {self._connection.topic}; record some")
+
+    def _delivered(self, message: Any) -> Encoding:
+        """Say in which encoding this source delivers such a message."""
+        if not hasattr(message, "encoding"):
+            return "bgr8"
+        if message.encoding not in CHANNELS:
+            raise SourceError(
+                f"--source: {self._path}: {self._connection.topic} has encoding '{message.encoding}', which is "
+                f"none of {', '.join(CHANNELS)}"
+            )
+        if message.encoding == "yuv422_yuy2" and (message.width, message.height) != (self.width, self.height):
+            return "bgr8"
+        return cast("Encoding", message.encoding)
+
+    def _pixels(self, message: Any) -> Pixels:
+        """Make the picture of a message an array of its own, of the size asked for; ValueError if it is none."""
+        if not hasattr(message, "encoding"):
+            return resize(bgr_to_rgb(decode_image(message.data)), self.width, self.height)
+        channels = CHANNELS[message.encoding]
+        if message.step < message.width * channels or message.data.size < message.step * message.height:
+            raise ValueError(
+                f"{message.width}x{message.height} {message.encoding} in {message.data.size} bytes, step {message.step}"
+            )
+        rows = message.data[: message.step * message.height].reshape(message.height, message.step)
+        shape = (message.height, message.width) if channels == 1 else (message.height, message.width, channels)
+        data = cast("Pixels", rows[:, : message.width * channels].reshape(shape))
+        if message.encoding != self.encoding:
+            data = yuyv_to_bgr(data)
+        resized = resize(data, self.width, self.height)
+        return resized.copy() if resized.base is not None else resized
+
+
+def _open(path: str) -> Any:
+    """Open a recording with rosbags, every way of failing made one line."""
+    if not Path(path).exists():
+        raise SourceError(f"--source: no recording at {path}")
+    try:
+        reader = Reader(path)
+        reader.open()
+    except Exception as error:  # rosbags raises whatever its parsing of a damaged file runs into
+        raise SourceError(f"--source: {_unreadable(path, error)}") from error
+    return reader
+
+
+def _connection(connections: list[Any], path: str, topic: str) -> Any:
+    """Choose the image topic to read."""
+    images = [connection for connection in connections if connection.msgtype in {IMAGE, COMPRESSED_IMAGE}]
+    chosen = [connection for connection in images if topic in {"", connection.topic}]
+    if chosen:
+        return chosen[0]
+    names = sorted({connection.topic for connection in images})
+    if names:
+        raise SourceError(f"--source: {path} has no image topic {topic}; it has {', '.join(names)}")
+    types = sorted({connection.msgtype for connection in connections})
+    raise SourceError(
+        f"--source: {path} has no topic of type {IMAGE} or {COMPRESSED_IMAGE}, only {', '.join(types) or 'none at all'}"
+    )
+
+
+def _unreadable(path: str, error: Exception) -> str:
+    """Say that a recording cannot be read, and what may help."""
+    return (
+        f"{path} is no recording that can be read ({error or type(error).__name__}); it should be a rosbag2 folder, "
+        "a .mcap or a .db3 file. `mcap recover` repairs an .mcap that was cut short, `ros2 bag reindex` a folder"
+    )

@@ -1,0 +1,146 @@
+"""The tree builds in a ROS 2 workspace, as far as that shows without ROS."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from s2a_bench import __version__
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = {"s2a_bench": ROOT / "colcon", "s2a_msgs": ROOT / "s2a_msgs"}
+BESIDE = Path(sys.executable).with_name("colcon")
+COLCON = str(BESIDE) if BESIDE.exists() else shutil.which("colcon")
+needs_colcon = pytest.mark.skipif(COLCON is None, reason="colcon is not installed: pip install -e .[dev]")
+
+
+def colcon(folder: Path, *arguments: str) -> str:
+    command = [str(COLCON), "--log-base", str(folder / "log"), *arguments]
+    environ = os.environ | {"COLCON_HOME": str(folder / "home")}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environ, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def manifest(package: str) -> ET.Element:
+    return ET.parse(PACKAGES[package] / "package.xml").getroot()  # noqa: S314 - our own file
+
+
+@pytest.mark.parametrize("package", list(PACKAGES))
+def test_manifests_carry_our_name_version_and_licence(package: str) -> None:
+    root = manifest(package)
+    assert root.get("format") == "3"
+    assert [root.findtext(tag) for tag in ("name", "version", "license")] == [package, __version__, "Apache-2.0"]
+
+
+def test_the_interface_package_generates_every_message() -> None:
+    listed = re.findall(r'"(msg/\w+\.msg)"', (PACKAGES["s2a_msgs"] / "CMakeLists.txt").read_text())
+    assert listed == sorted(f"msg/{path.name}" for path in (PACKAGES["s2a_msgs"] / "msg").iterdir())
+
+
+@needs_colcon
+def test_a_workspace_with_our_tree_has_two_packages(tmp_path: Path) -> None:
+    (tmp_path / "src").mkdir()
+    (tmp_path / "src" / "s2a-bench").symlink_to(ROOT)
+    assert colcon(tmp_path, "list").splitlines() == [
+        "s2a_bench\tsrc/s2a-bench/colcon\t(ros.ament_python)",
+        "s2a_msgs\tsrc/s2a-bench/s2a_msgs\t(ros.ament_cmake)",
+    ]
+    order = colcon(tmp_path, "list", "--topological-order", "--names-only").split()
+    assert order == ["s2a_msgs", "s2a_bench"]
+
+
+@needs_colcon
+@pytest.mark.slow
+@pytest.mark.parametrize("flags", [[], ["--symlink-install"]])
+def test_ros2_run_finds_the_program_and_it_has_its_files(tmp_path: Path, flags: list[str]) -> None:
+    colcon(tmp_path, "build", "--base-paths", str(PACKAGES["s2a_bench"]), *flags)
+    prefix = tmp_path / "install" / "s2a_bench"
+    assert (prefix / "share/ament_index/resource_index/packages/s2a_bench").is_file()
+    assert (prefix / "share/s2a_bench/launch/s2a_bench.launch.py").is_file()
+    assert (prefix / "share/s2a_bench/package.xml").is_file()
+    script = f"""
+        . install/local_setup.sh
+        install/s2a_bench/lib/s2a_bench/s2a-bench --version || exit 1
+        {sys.executable} -c "import s2a_bench; print(s2a_bench.__file__)"
+    """
+    # the program takes the first Python on PATH, as in a virtual environment
+    environ = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    command = ["sh", "-c", script]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environ, check=False)
+    assert done.returncode == 0, done.stderr
+    version, where = done.stdout.splitlines()
+    assert version == __version__
+    installed = Path(where).parent
+    assert installed.is_relative_to(tmp_path)
+    package = ROOT / "s2a_bench"
+    files = [path for path in package.glob("**/*.*") if path.is_file() and path.suffix != ".pyc"]
+    names = [str(path.relative_to(package)) for path in files]
+    names += [f"ros/s2a_msgs/msg/{path.name}" for path in (ROOT / "s2a_msgs" / "msg").iterdir()]
+    assert [name for name in names if not (installed / name).is_file()] == []
+
+
+class Recorded:
+    """Stands for any class of ROS's launch: keeps what it was made of."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.args, self.kwargs = args, kwargs
+
+
+def test_the_launch_file_starts_a_camera_and_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = {
+        "launch": ["LaunchDescription"],
+        "launch.actions": ["DeclareLaunchArgument", "ExecuteProcess", "Shutdown"],
+        "launch.conditions": ["IfCondition"],
+        "launch.substitutions": ["LaunchConfiguration", "PythonExpression"],
+        "launch_ros": [],
+        "launch_ros.actions": ["Node"],
+        "launch_ros.substitutions": ["ExecutableInPackage"],
+    }
+    for module, classes in names.items():
+        fake = ModuleType(module)
+        for name in classes:
+            setattr(fake, name, type(name, (Recorded,), {}))
+        monkeypatch.setitem(sys.modules, module, fake)
+    scope: dict[str, Any] = {}
+    path = PACKAGES["s2a_bench"] / "launch" / "s2a_bench.launch.py"
+    exec(compile(path.read_text(), str(path), "exec"), scope)  # noqa: S102 - as ros2 launch does
+    (actions,) = scope["generate_launch_description"]().args
+    *declared, v4l2, test, node = actions
+    assert {action.args[0]: action.kwargs["default_value"] for action in declared} == {
+        "camera": "v4l2",
+        "device": "/dev/video0",
+        "namespace": "/llama",
+        "engine": "llama",
+        "arguments": "",
+    }
+    assert [(camera.kwargs["package"], camera.kwargs["executable"]) for camera in (v4l2, test)] == [
+        ("v4l2_camera", "v4l2_camera_node"),
+        ("image_tools", "cam2image"),
+    ]
+
+    def text(part: Any) -> str:
+        if isinstance(part, str):
+            return part
+        parts = part if isinstance(part, list) else part.args
+        joined = "".join(text(piece) for piece in parts)
+        return f"<{joined}>" if type(part).__name__ == "LaunchConfiguration" else joined
+
+    for camera, name, topic in ((v4l2, "v4l2", "image_raw"), (test, "test", "image")):
+        assert [(source, text(target)) for source, target in camera.kwargs["remappings"]] == [
+            (topic, "<namespace>/camera/image_raw")
+        ]
+        assert text(camera.kwargs["condition"]) == f"'<camera>' == '{name}'"
+    ((command,),) = (node.kwargs["cmd"],)
+    program, *rest = command[1:]
+    assert program.args == ("s2a-bench", "s2a_bench")
+    assert "".join(map(text, rest)) == " serve ros --namespace <namespace> --engine <engine> <arguments>"
