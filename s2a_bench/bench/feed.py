@@ -70,6 +70,8 @@ class StreamedFrame:
     stamp_ns: int = -1
     """ROS-time stamp if it was published, else -1."""
     used_by: str = ""
+    sequence: int = 0
+    """How many frames had been published with this one."""
 
     @property
     def key(self) -> int:
@@ -99,6 +101,7 @@ class Camera:
         self._sink: CameraSink | None = None
         self._newest: tuple[StreamedFrame, Frame] | None = None
         self._frames: list[StreamedFrame] = []
+        self.published = 0
         self._stopped = False
         self._failure: S2AError | None = None
         self._thread = Thread(target=self._run, name="camera", daemon=True)
@@ -169,6 +172,8 @@ class Camera:
             frame = bgr_of(frame, trace)
         else:
             record.stamp_ns = sink.stamp_ns(frame)
+            self.published += 1
+            record.sequence = self.published
             with self._changed:  # before it is sent: an answer may name the frame before `publish` returns
                 self._frames += [record] if sink is self._sink else []
             sink.publish(frame, trace)

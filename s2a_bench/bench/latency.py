@@ -104,6 +104,8 @@ class ServerSet:
                 transport,
                 config.ros[0] if transport == "ros" else "",
                 address=address,
+                middleware=config.middleware,
+                qos=config.qos,
                 dds_tuning=config.dds_tuning,
                 domain_id=config.domain_id,
                 max_tokens=config.max_tokens,

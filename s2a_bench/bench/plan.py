@@ -10,7 +10,8 @@ from urllib.parse import urlsplit
 
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import ENGINES, EngineConfig
-from s2a_bench.transport import CONNECTIONS, HTTP_VARIANTS, NAMES, PAYLOADS, ROS_VARIANTS, WIRES, Route
+from s2a_bench.ros import MIDDLEWARES
+from s2a_bench.transport import CONNECTIONS, HTTP_VARIANTS, NAMES, PAYLOADS, QOS_PROFILES, ROS_VARIANTS, WIRES, Route
 
 LARGEST = 16_384
 ROS_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -49,6 +50,8 @@ class LatencyConfig:
     """The model's name in requests to a black box."""
     llama_server: Path | None = None
     port: int = 0
+    middleware: str = ""
+    qos: str = "reliable"
     dds_tuning: str = "tuned"
     domain_id: int = 0
     namespace: str = "/s2a_bench"
@@ -81,6 +84,8 @@ class LatencyConfig:
         _one_of("--transport", self.transports, NAMES)
         _one_of("--http", self.http, HTTP_VARIANTS)
         _one_of("--ros", self.ros, ROS_VARIANTS)
+        _one_of("--qos", [self.qos], QOS_PROFILES)
+        _one_of("--middleware", [self.middleware] if self.middleware else [], tuple(MIDDLEWARES))
         _one_of("--payload", [self.payload], PAYLOADS)
         _one_of("--wire", [self.wire], WIRES)
         _one_of("--connection", [self.connection], CONNECTIONS)
@@ -184,6 +189,8 @@ def plan_cells(config: LatencyConfig, addresses: dict[str, str]) -> list[Cell]:
         payload=config.payload,
         wire=config.wire,
         connection=config.connection,
+        middleware=config.middleware,
+        qos=config.qos,
         dds_tuning=config.dds_tuning,
         domain_id=config.domain_id,
         timeout_s=config.timeout_s,

@@ -150,8 +150,11 @@ class Session:
         used = self.feed.last
         if self.feed.sink is not None:
             used = self._frames.get(trace.remote.frame_stamp_ns) if trace.remote else None
-            if used is not None and trace.remote is not None and not used.used_by:
-                used.marks = [*used.marks, *trace.remote.frame_marks]
+            if used is not None and trace.remote is not None:
+                used.marks = used.marks if used.used_by else [*used.marks, *trace.remote.frame_marks]
+                if "camera_frames" in trace.facts:
+                    trace.facts["frames_published"] = used.sequence
+                    trace.facts["frames_lost"] = used.sequence - trace.facts["camera_frames"]
         if used is not None:
             used.used_by = request_id
         return used

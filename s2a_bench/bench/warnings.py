@@ -112,6 +112,7 @@ class SampleGuard:
     _cached: dict[str, int] = field(default_factory=dict)
     _residual: dict[str, int] = field(default_factory=dict)
     _failed: dict[str, int] = field(default_factory=dict)
+    _frames_lost: dict[str, int] = field(default_factory=dict)
     _in_a_row: dict[str, int] = field(default_factory=dict)
     _succeeded: dict[str, int] = field(default_factory=dict)
     _lost: dict[str, int] = field(default_factory=dict)
@@ -120,6 +121,8 @@ class SampleGuard:
         """Look at one sample and the fingerprint of its picture."""
         if self._frames.setdefault((row.cell, fingerprint), row.request_id) != row.request_id:
             _count(self._repeated, row.cell)
+        if lost := row.facts.get("frames_lost"):
+            self._frames_lost[row.cell] = int(lost)
         self._in_a_row[row.cell] = self._in_a_row.get(row.cell, 0) + 1 if row.error else 0
         if row.error:
             _count(self._lost if row.error.startswith("MessagesLost") else self._failed, row.cell)
@@ -160,6 +163,12 @@ class SampleGuard:
                 "residual",
                 f"samples have more than {RESIDUAL_LIMIT:.0%} of their time outside every stage",
                 "look at the machine's load; single samples do no harm to a median",
+            ),
+            *_told(
+                self._frames_lost,
+                "lost-frames",
+                "camera frames were published and never reached the server",
+                f"--qos reliable, --dds-tuning tuned, and sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
             ),
             *_told(self._lost, "lost-messages", "requests lost messages on the way", "--dds-tuning tuned"),
             *_told(self._failed, "failed-samples", "requests failed", "see the column error of samples.csv"),

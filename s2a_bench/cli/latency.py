@@ -42,6 +42,10 @@ def latency(
     ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port of the HTTP server; 0: any free one")] = 0,
     dds_tuning: Annotated[str, typer.Option(help="tuned, default")] = "tuned",
+    middleware: Annotated[
+        str, typer.Option(help="cyclonedds, rclpy [default: rclpy in a sourced ROS 2 environment]")
+    ] = "",
+    qos: Annotated[str, typer.Option(help="the camera topic's: reliable, sensor_data (best effort)")] = "reliable",
     namespace: Annotated[str, typer.Option(help="ROS namespace of the topics")] = "/s2a_bench",
     connection: Annotated[str, typer.Option(help="HTTP: keep-alive, per-request, client-per-request")] = "keep-alive",
     engine: Annotated[str, typer.Option(help="llama (a real model), echo (no model: transport alone)")] = "llama",
@@ -96,6 +100,8 @@ def latency(
         served_model=served_model,
         llama_server=llama_server,
         port=port,
+        middleware=middleware,
+        qos=qos,
         dds_tuning=dds_tuning,
         domain_id=domain_id(os.environ),
         namespace=namespace,

@@ -29,7 +29,10 @@ DEFAULTS: dict[str, Any] = {
     "host": "127.0.0.1",
     "port": 8080,
     "namespace": "/llama",
+    "middleware": "",
+    "qos": "sensor_data",  # matches reliable cameras as well as best-effort ones
     "dds-tuning": "tuned",
+    "feedback-interval": 0.002,
     "max-tokens": 512,
     "result-timeout": 60.0,
 }
@@ -74,7 +77,12 @@ def ros(
     gpu_layers: GpuLayers = None,
     context: Context = None,
     namespace: Annotated[str | None, typer.Option(help="of the action and the topics [default: /llama]")] = None,
+    middleware: Annotated[str | None, typer.Option(help="cyclonedds, rclpy")] = None,
+    qos: Annotated[str | None, typer.Option(help="the camera topics': sensor_data, reliable")] = None,
     dds_tuning: Annotated[str | None, typer.Option(help="tuned, default")] = None,
+    feedback_interval: Annotated[
+        float | None, typer.Option(min=0, help="seconds: faster tokens share a feedback [default: 0.002]")
+    ] = None,
     max_tokens: Annotated[int | None, typer.Option(min=1, help="most tokens of a goal [default: 512]")] = None,
     result_timeout: Annotated[float | None, typer.Option(min=0, help="seconds a result is kept [default: 60]")] = None,
     config: Config = None,
@@ -82,21 +90,32 @@ def ros(
     """Serve the action generate_response (llama_msgs) with the camera's newest frame at hand, until interrupted."""
     from s2a_bench.bench.plan import ROS_NAME, TUNINGS
     from s2a_bench.ros.config import domain_id
-    from s2a_bench.transport import Route
+    from s2a_bench.transport import QOS_PROFILES, Route
 
-    given = {"engine": engine, "model": model, "mmproj": mmproj, "threads": threads, "gpu-layers": gpu_layers}
-    given |= {"context": context, "namespace": namespace, "dds-tuning": dds_tuning, "max-tokens": max_tokens}
+    given: dict[str, Any] = {"engine": engine, "model": model, "mmproj": mmproj, "threads": threads}
+    given |= {
+        "gpu-layers": gpu_layers,
+        "context": context,
+        "namespace": namespace,
+        "dds-tuning": dds_tuning,
+        "max-tokens": max_tokens,
+    }
+    given |= {"middleware": middleware, "qos": qos, "feedback-interval": feedback_interval}
     settings = _settings({**given, "result-timeout": result_timeout}, config)
     if not ROS_NAME.fullmatch(settings["namespace"]):
         raise UsageError(f"--namespace: '{settings['namespace']}' should look like /name: letters, digits, underscores")
-    if settings["dds-tuning"] not in TUNINGS:
-        raise UsageError(f"--dds-tuning: '{settings['dds-tuning']}' is none of {', '.join(TUNINGS)}")
+    for key, values in (("dds-tuning", TUNINGS), ("qos", QOS_PROFILES)):
+        if settings[key] not in values:
+            raise UsageError(f"--{key}: '{settings[key]}' is none of {', '.join(values)}")
     route = Route(
         "ros",
         "action",
         address=settings["namespace"],
         domain_id=domain_id(os.environ),
+        middleware=settings["middleware"],
+        qos=settings["qos"],
         dds_tuning=settings["dds-tuning"],
+        feedback_interval_s=settings["feedback-interval"],
         max_tokens=settings["max-tokens"],
         result_timeout_s=settings["result-timeout"],
         publish_tokens=True,

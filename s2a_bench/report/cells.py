@@ -77,6 +77,11 @@ class Cell:
         ordered = tokens.sort_values(["request_id", "index"])
         return _numbers(ordered.groupby("request_id")["client_ns"].diff()) / _NS_PER_MS
 
+    def token_delay_ms(self) -> Floats:
+        """Return the times from a token's leaving the engine to the client's seeing it, of all requests, in ms."""
+        tokens = self.tokens[self.tokens["request_id"].isin(self.good["request_id"])]
+        return numbers_ms(tokens["client_ns"] - tokens["engine_ns"])
+
     def by_block(self, metric: str) -> dict[int, list[float]]:
         """Return the values of a metric in ms by the block in which they were taken."""
         blocks: dict[int, list[float]] = {}

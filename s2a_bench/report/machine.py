@@ -62,7 +62,13 @@ def _cell(cell: Cell, manifest: dict[str, Any]) -> dict[str, Any]:
     }
     metrics = ("e2e", "e2e_without_inference", "ttft", "frame_age")
     whole |= _summaries((f"{metric}_ms", cell.values_ms(metric)) for metric in metrics)
-    return whole | _summaries([("itl_ms", cell.itl_ms()), ("residual_share", cell.residual_shares())])
+    return whole | _summaries(
+        [
+            ("itl_ms", cell.itl_ms()),
+            ("token_delay_ms", cell.token_delay_ms()),
+            ("residual_share", cell.residual_shares()),
+        ]
+    )
 
 
 def _summaries(metrics: Iterable[tuple[str, Floats]]) -> dict[str, Any]:

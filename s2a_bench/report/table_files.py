@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from s2a_bench.errors import StoreError
 from s2a_bench.report.frame_path import frame_table
 from s2a_bench.report.full import csv_texts
-from s2a_bench.report.tables import stage_table, summary_table, to_latex, to_markdown
+from s2a_bench.report.tables import stage_table, summary_table, to_latex, to_markdown, token_table
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 def write_tables(run: Run) -> list[Path]:
     """Write ``tables/``: the text tables as .md and .tex, and stages, summary and ratios in full as .csv."""
     tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
+    if tokens := token_table(run):
+        tables["tokens"] = tokens
     if frames := frame_table(run):
         tables["frames"] = frames
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}

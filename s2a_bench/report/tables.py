@@ -128,6 +128,21 @@ def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
     return TextTable(title, header, rows, 1, notes=_notes(run, cells))
 
 
+def token_table(run: Run) -> TextTable | None:
+    """Lay out what happens to every token after it left the engine; None where no server tells when that was."""
+    cells = [cell for cell in cells_of(run) if cell.token_delay_ms().size]
+    if not cells:
+        return None
+    rows = []
+    for cell in cells:
+        delay, gap = summary_of(cell.token_delay_ms()), summary_of(cell.itl_ms())
+        row = [number(value) for value in (delay.median, delay.p90, delay.p99)] if delay else [ABSENT] * 3
+        row += [number(value) for value in (gap.median, gap.p99)] if gap else [ABSENT] * 2
+        rows.append((cell.name, *row))
+    header = ("cell", "delay median", "p90", "p99", "gap median", "gap p99")
+    return TextTable("Tokens in ms: engine to client (delay), and from one to the next (gap)", header, rows, 1)
+
+
 def to_markdown(table: TextTable) -> str:
     """Write a table as Markdown, its title and notes around it."""
     rule = ["---"] * table.left + ["---:"] * (len(table.header) - table.left)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.report.cells import cells_of
 from s2a_bench.report.frame_path import frame_table
-from s2a_bench.report.tables import TextTable, group_table, stage_table, summary_table
+from s2a_bench.report.tables import TextTable, group_table, stage_table, summary_table, token_table
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -30,6 +30,8 @@ def renderables(run: Run) -> list[RenderableType]:
         shown.append(summary_table(run))
     if any(cell.about["engine"] != "echo" or not cell.values_ms("e2e_without_inference").size for cell in cells):
         shown.append(summary_table(run, "e2e"))
+    if tokens := token_table(run):
+        shown.append(tokens)
     if frames := frame_table(run):
         shown.append(frames)
     return [*(_lay_out(table) for table in shown), " ".join(stages.notes)]

@@ -6,7 +6,10 @@ Packing and sending are two calls, and so are taking and unpacking, because the 
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pkgutil import resolve_name
 from typing import Any, Literal, Protocol, TypeAlias
 
@@ -248,25 +251,34 @@ class Middleware(Protocol):
 
 MIDDLEWARES: dict[str, str] = {
     "cyclonedds": "s2a_bench.ros.cyclone:CycloneMiddleware",
+    "rclpy": "s2a_bench.ros.rclpy_middleware:RclpyMiddleware",
 }
 """Name -> class, built as ``Class(domain_id, tuning, node_name)``."""
+WAYS_OUT = {
+    "cyclonedds": "cyclonedds has wheels for x86-64 only: build it from source, or leave ros out of --transport",
+    "rclpy": "it comes with ROS 2: source /opt/ros/<distribution>/setup.bash, or use --middleware cyclonedds",
+}
+
+
+def default_middleware(environ: Mapping[str, str]) -> str:
+    """Choose rclpy inside a sourced ROS 2 environment whose rclpy this Python finds, else cyclonedds."""
+    sourced = environ.get("ROS_DISTRO") and environ.get("AMENT_PREFIX_PATH")
+    return "rclpy" if sourced and find_spec("rclpy") else "cyclonedds"
 
 
 def open_middleware(
-    name: str = "cyclonedds", *, domain_id: int = 0, tuning: Tuning = "tuned", node_name: str = "/s2a_bench"
+    name: str = "", *, domain_id: int = 0, tuning: Tuning = "tuned", node_name: str = "/s2a_bench"
 ) -> Middleware:
-    """Join a ROS 2 domain as the node ``node_name``, its namespace included.
+    """Join a ROS 2 domain as the node ``node_name``, its namespace included; `default_middleware` without a name.
 
     Raises UsageError for an unknown name, TransportError when the domain cannot be joined.
     """
+    name = name or default_middleware(os.environ)
     if name not in MIDDLEWARES:
         raise UsageError(f"middleware: '{name}' is none of {', '.join(MIDDLEWARES)}")
     try:
         implementation = resolve_name(MIDDLEWARES[name])
     except ModuleNotFoundError as error:
-        raise TransportError(
-            f"middleware {name} is not installed ({error}); cyclonedds has wheels for x86-64 only: "
-            "build it from source, or leave ros out of --transport"
-        ) from error
+        raise TransportError(f"middleware {name} is not installed ({error}); {WAYS_OUT[name]}") from error
     middleware: Middleware = implementation(domain_id, tuning, node_name)
     return middleware

@@ -15,6 +15,7 @@ HTTP_VARIANTS = ("as-deployed", "best-effort", "binary")
 ROS_VARIANTS = ("topic", "action")
 PAYLOADS = ("jpeg", "jpeg-preencoded", "png", "raw")
 WIRES = ("bgr", "yuyv", "compressed")
+QOS_PROFILES = ("reliable", "sensor_data")
 CONNECTIONS = ("keep-alive", "per-request", "client-per-request")
 
 Handler: TypeAlias = Callable[[Request, Trace], Generator[Token, None, None]]
@@ -94,6 +95,10 @@ class Route:
     """The server is not ours, so it sends no marks."""
     model: str = "default"
     """http: the model's name in the request."""
+    middleware: str = ""
+    """ros: cyclonedds or rclpy; empty: rclpy in a sourced ROS 2 environment, else cyclonedds."""
+    qos: str = "reliable"
+    """ros: the camera's quality of service, by its ROS 2 profile: reliable, sensor_data."""
     dds_tuning: str = "tuned"
     domain_id: int = 0
     action: str = ""
@@ -102,6 +107,8 @@ class Route:
     """ros server: the most tokens of a goal, which cannot say itself how many it wants."""
     result_timeout_s: float = 60.0
     """ros server: how long a goal's result is kept."""
+    feedback_interval_s: float = 0.0
+    """ros server: the least time between two feedbacks; tokens that come faster share one. 0: a feedback a token."""
     publish_tokens: bool = False
     """ros server: whether the tokens of goals also go to the topic ``token``, for plotting."""
     timeout_s: float = 300.0

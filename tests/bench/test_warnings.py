@@ -38,6 +38,7 @@ def test_good_samples_raise_no_doubt() -> None:
         (row("b"), 1, "duplicate-frames"),
         (row("b", cache_n=7), 2, "prompt-cache"),
         (row("b", marks=LOOSE), 2, "residual"),
+        (row("b", facts={"frames_lost": 2.0}), 2, "lost-frames"),
         (row("b", error="MessagesLost: 3", marks=[]), 2, "lost-messages"),
         (row("b", error="RequestFailed: x", marks=[]), 2, "failed-samples"),
     ],

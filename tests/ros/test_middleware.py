@@ -31,7 +31,7 @@ class TestCyclone(MiddlewareContract):
 def test_endpoints_look_like_those_of_ros(dds_domain: int) -> None:
     from cyclonedds.core import Policy
 
-    middleware = open_middleware(domain_id=dds_domain)
+    middleware = open_middleware("cyclonedds", domain_id=dds_domain)
     writer = middleware.publisher("/camera/image_raw", "sensor_msgs/msg/Image", QoS(1)).entity  # type: ignore[attr-defined]
     try:
         assert writer.topic.name == "rt/camera/image_raw"
@@ -46,9 +46,9 @@ def test_endpoints_look_like_those_of_ros(dds_domain: int) -> None:
 
 
 def test_a_domain_takes_one_configuration_per_process(dds_domain: int) -> None:
-    open_middleware(domain_id=dds_domain).close()
+    open_middleware("cyclonedds", domain_id=dds_domain).close()
     with pytest.raises(TransportError, match="already configured otherwise"):
-        open_middleware(domain_id=dds_domain, tuning="default")
+        open_middleware("cyclonedds", domain_id=dds_domain, tuning="default")
 
 
 def test_an_unknown_middleware_is_named() -> None:

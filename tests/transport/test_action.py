@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
+from random import Random
 from threading import Event, Thread
 
 import numpy as np
 import pytest
 
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied
-from s2a_bench.ros import ActionServer, ServerGoal, open_middleware
+from s2a_bench.ros import ActionServer, Result, ServerGoal, open_middleware
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
 from s2a_bench.trace import budget
@@ -93,10 +97,11 @@ def test_a_node_without_a_limit_is_cancelled_after_the_last_wanted_token(node: N
     def endless(goal: ServerGoal) -> None:
         goal.accept()
         goal.executing()
-        number = 0
-        while not goal.cancel_requested:
+        for number in range(3):
             goal.feedback(token_feedback("x", number))
-            number += 1
+        deadline = now_ns() + 20_000_000_000
+        while not goal.cancel_requested and now_ns() < deadline:
+            Event().wait(0.001)
         goal.canceled(text_result("", []))
         ended.append(Status.CANCELED)
 
@@ -180,6 +185,54 @@ def test_our_server_stops_at_a_stop_word_and_borrows_no_seed(dds_domain: int) ->
         middleware.close()
         server.stop()
         thread.join()
+
+
+def test_tokens_faster_than_the_interval_share_a_feedback_and_none_is_lost(dds_domain: int) -> None:
+    words = [f"t{number} " for number in range(200)]
+    route = Route("ros", "action", "/test_pace", domain_id=dds_domain, max_tokens=200, feedback_interval_s=0.02)
+    server = open_server(route, Recorder(words))
+    thread = Thread(target=server.serve)
+    thread.start()
+    client = open_client(replace(route, timeout_s=20))
+    try:
+        tokens, _ = ask(client, Request("a", "plan", max_tokens=200))
+    finally:
+        client.close()
+        server.stop()
+        thread.join()
+    assert "".join(token.text for token in tokens) == "".join(words)
+    assert len(tokens) < 100
+
+
+@pytest.mark.slow
+def test_ten_thousand_goals_with_random_cancels_leak_nothing(dds_domain: int) -> None:
+    random = Random(1)
+    route = Route("ros", "action", "/test_soak", domain_id=dds_domain, max_tokens=4, result_timeout_s=0.5)
+    server = open_server(route, Recorder(["a", "b", "c", "d"]))
+    thread = Thread(target=server.serve)
+    thread.start()
+    middleware = open_middleware(domain_id=dds_domain)
+    client = middleware.action_client("/test_soak/generate_response", GENERATE_RESPONSE)
+    resident: list[int] = []
+    ended = {Status.SUCCEEDED: 0, Status.CANCELED: 0}
+    try:
+        assert client.wait_for_server(20)
+        for number in range(10_000):
+            goal_id = client.send(client.pack(generate_goal("go")))
+            if random.random() < 0.3:
+                client.cancel(goal_id)
+            while not isinstance(event := client.next_event(20), Result):
+                assert event is not None, f"goal {number} never ended"
+            ended[Status(event.status)] += 1
+            if number in {3_000, 9_999}:
+                resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096)
+    finally:
+        middleware.close()
+        server.stop()
+        thread.join()
+    assert sum(ended.values()) == 10_000
+    assert resident[1] - resident[0] < 16 << 20
+    assert threading.active_count() < 20
 
 
 def test_goals_of_two_clients_are_answered_one_after_the_other(dds_domain: int) -> None:

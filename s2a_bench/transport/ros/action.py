@@ -51,7 +51,7 @@ class GenerateClient:
         self._route = route
         self._alive = alive
         self._offset_ns = realtime_offset_ns()
-        self.middleware = join(route)
+        self.middleware = join(route, "client")
         namespace = route.address or DEFAULT_NAMESPACE
         self._name = route.action or namespace + ACTION
         self.camera: CameraSink | None = None
@@ -60,7 +60,7 @@ class GenerateClient:
             self._marks = None
             if not route.black_box:
                 self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, MARKS_QOS)
-                camera = CameraPublisher(self.middleware, namespace, route.wire)
+                camera = CameraPublisher(self.middleware, namespace, route.wire, route.qos)
                 self.camera = camera
                 self._wait(lambda: bool(camera.matched()))
                 self._wait(lambda: bool(self._marks and self._marks.matched()))
@@ -171,6 +171,7 @@ class ActionFront:
         namespace = route.address or DEFAULT_NAMESPACE
         self.cache = cache
         self.max_tokens = route.max_tokens
+        self.feedback_interval_ns = int(route.feedback_interval_s * 1e9)
         self._server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE, route.result_timeout_s)
         self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, MARKS_QOS)
         self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if route.publish_tokens else None
@@ -190,7 +191,6 @@ class ActionFront:
             return None
         trace.mark("cdr_parse")
         packed.accept()
-        trace.mark("accept")
         with self._lock:
             self._active += 1
             alone = self._active == 1
@@ -226,8 +226,11 @@ class GenerateJob:
         self._id = goal.id.hex()
         self._stop = [text for text in message.stop if text]
         self._tokens: list[Token] = []
+        self._held: list[str] = []
+        self._fed_ns = 0
         self._error = ""
         self._started = at_once and goal.executing()
+        trace.mark("accept")
         try:
             images = tuple(picture_of(image, trace) for image in goal_images(message))
         except S2AError as error:
@@ -249,10 +252,19 @@ class GenerateJob:
         self._started = self._started or self._goal.executing()
         if not self._started or self._goal.cancel_requested:
             return False
-        self._goal.feedback(token_feedback(token.text, token.id))
-        self._front.plot(self._id, token)
+        self._held.append(token.text)
         self._tokens.append(token)
+        self._front.plot(self._id, token)
+        if now_ns() - self._fed_ns >= self._front.feedback_interval_ns:
+            self._feed()
         return not (self._stop and self._stopped())
+
+    def _feed(self) -> None:
+        """Send what is held as one feedback: one token, or several that came faster than ROS clients' queues hold."""
+        if self._held:
+            self._goal.feedback(token_feedback("".join(self._held), self._tokens[-1].id))
+            self._held.clear()
+            self._fed_ns = now_ns()
 
     def _stopped(self) -> bool:
         text = "".join(token.text for token in self._tokens)
@@ -261,6 +273,8 @@ class GenerateJob:
     def end(self, error: str = "") -> None:
         """Send marks and result."""
         error = error or self._error
+        if self._started and not self._goal.cancel_requested:
+            self._feed()
         self._front.ended(self._id, self.trace)
         text = error or "".join(token.text for token in self._tokens)
         result = text_result(text, [token.id for token in self._tokens])

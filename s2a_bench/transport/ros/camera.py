@@ -21,7 +21,8 @@ from s2a_bench.types import Frame
 CAMERA = "/camera/image_raw"
 COMPRESSED_CAMERA = "/camera/image_raw/compressed"
 FRAME_ID = "camera"
-CAMERA_QOS = QoS(depth=1)
+CAMERA_QOS = {"reliable": QoS(depth=1), "sensor_data": QoS(depth=5, reliable=False)}
+"""By the names of ROS 2's profiles; a reliable subscription does not match a best-effort publisher."""
 POLL_S = 0.5
 
 
@@ -46,12 +47,12 @@ def picture_of(message: Any, trace: Trace) -> Frame:
 class CameraPublisher:
     """Publishes frames as a ROS 2 camera does."""
 
-    def __init__(self, middleware: Middleware, namespace: str, wire: str) -> None:
+    def __init__(self, middleware: Middleware, namespace: str, wire: str, qos: str) -> None:
         """Create the one topic that ``wire`` needs."""
         self._wire = wire
         self._offset_ns = realtime_offset_ns()
         topic, type_name = (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE) if wire == "compressed" else (CAMERA, ros.IMAGE)
-        self._publisher = middleware.publisher(namespace + topic, type_name, CAMERA_QOS)
+        self._publisher = middleware.publisher(namespace + topic, type_name, CAMERA_QOS[qos])
 
     def stamp_ns(self, frame: Frame) -> int:
         """Return the ROS-time stamp by which the server names the frame."""
@@ -75,17 +76,20 @@ class CachedFrame:
 
     frame: Frame
     marks: list[Mark]
+    count: int
+    """How many frames had arrived with this one."""
 
 
 class CameraCache:
     """Keeps the newest frame of both camera topics, already as RGB, each topic on a thread of its own."""
 
-    def __init__(self, middleware: Middleware, namespace: str) -> None:
+    def __init__(self, middleware: Middleware, namespace: str, qos: str) -> None:
         """Subscribe; `start` starts the threads."""
         topics = ((CAMERA, ros.IMAGE), (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE))
-        self._cameras = [middleware.subscription(namespace + topic, kind, CAMERA_QOS) for topic, kind in topics]
+        self._cameras = [middleware.subscription(namespace + topic, kind, CAMERA_QOS[qos]) for topic, kind in topics]
         self._threads = [Thread(target=self._watch, args=(camera,), daemon=True) for camera in self._cameras]
         self._newest: CachedFrame | None = None
+        self._count = 0
         self._stopped = False
 
     def start(self) -> None:
@@ -110,6 +114,7 @@ class CameraCache:
         if newest is None:
             return ()
         trace.frame_stamp_ns, trace.frame_marks = newest.frame.stamp_ns, newest.marks
+        trace.facts["camera_frames"] = newest.count
         return (newest.frame,)
 
     def _watch(self, camera: Subscription) -> None:
@@ -122,6 +127,7 @@ class CameraCache:
             try:
                 message = camera.unpack(packed)
                 trace.mark("cdr_parse")
-                self._newest = CachedFrame(picture_of(message, trace), trace.marks)
+                self._count += 1
+                self._newest = CachedFrame(picture_of(message, trace), trace.marks, self._count)
             except S2AError:  # a frame nobody can read is no reason to stop: the next may be better
                 continue

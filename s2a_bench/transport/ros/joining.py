@@ -12,15 +12,16 @@ SETTLE_S = 0.3
 """Time to discover a server that is there already."""
 
 
-def join(route: Route) -> Middleware:
-    """Join the route's domain with its tuning."""
+def join(route: Route, role: str) -> Middleware:
+    """Join the route's domain as the node ``<namespace>/<role>``."""
     tuning: Tuning = "default" if route.dds_tuning == "default" else "tuned"
-    return open_middleware(domain_id=route.domain_id, tuning=tuning)
+    name = f"{route.address or DEFAULT_NAMESPACE}/{role}"
+    return open_middleware(route.middleware, domain_id=route.domain_id, tuning=tuning, node_name=name)
 
 
 def refuse_company(route: Route, namespace: str) -> None:
     """Raise TransportError if another server listens under ``namespace``: both would answer every request."""
-    probe = join(route)
+    probe = join(route, "probe")
     try:
         publisher = probe.publisher(namespace + "/request", ros.REQUEST, QoS())
         probe.subscription(namespace + "/token", ros.TOKEN, QoS()).take(SETTLE_S)

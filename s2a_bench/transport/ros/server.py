@@ -7,6 +7,7 @@ while another waits, so that no request changes threads, and one that comes mean
 
 from __future__ import annotations
 
+import sys
 from threading import Event, Lock, Thread
 from typing import Any, Protocol
 
@@ -64,8 +65,8 @@ class RosServer:
         self.address = route.address or DEFAULT_NAMESPACE
         self._handler = handler
         refuse_company(route, self.address)
-        self.middleware = join(route)
-        self._cache = CameraCache(self.middleware, self.address)
+        self.middleware = join(route, "server")
+        self._cache = CameraCache(self.middleware, self.address, route.qos)
         self._fronts: list[Front] = [
             TopicFront(self.middleware, self.address, self._cache),
             ActionFront(self.middleware, route, self._cache),
@@ -104,10 +105,14 @@ class RosServer:
                 trace = Trace()
                 trace.mark("network")
             if packed is not None:
-                job = front.job(packed, trace)
-                if job is not None:
-                    self._answer(job)
-                del job, packed  # gives the received bytes back before the next wait
+                try:
+                    job = front.job(packed, trace)
+                    if job is not None:
+                        self._answer(job)
+                    del job
+                except S2AError as error:  # the middleware's own trouble with one request; the next may fare better
+                    print(f"request not answered: {error}", file=sys.stderr, flush=True)  # noqa: T201 - a node's log
+                del packed  # gives the received bytes back before the next wait
 
     def _answer(self, job: Job) -> None:
         """Answer one request; what goes wrong goes back to who asked."""

@@ -30,11 +30,11 @@ class TopicClient:
         self._route = route
         self._alive = alive
         self._offset_ns = realtime_offset_ns()
-        self.middleware = join(route)
+        self.middleware = join(route, "client")
         namespace = route.address or DEFAULT_NAMESPACE
         self._publisher = self.middleware.publisher(namespace + "/request", ros.REQUEST, REQUEST_QOS)
         self._subscription = self.middleware.subscription(namespace + "/token", ros.TOKEN, READER_QOS)
-        self.camera = CameraPublisher(self.middleware, namespace, route.wire)
+        self.camera = CameraPublisher(self.middleware, namespace, route.wire, route.qos)
         try:
             self._wait_until_matched(namespace)
         except TransportError:

@@ -1,0 +1,192 @@
+"""The action client on rclpy.
+
+rclpy tells a goal's acceptance, feedback and result by callbacks, newest first where several are due, and takes one
+message of each kind at a time; so a result can overtake feedback. `_DrainingClient` takes all that has arrived and
+keeps the seam's order. It overrides two methods of rclpy's Waitable interface, the same in Humble and Jazzy.
+
+One lock covers sending and receiving: without it rclpy may receive an answer before it has noted the request, and
+drops it (ros2/rclpy issue 1123, in Humble and in Jazzy up to autumn 2025).
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from threading import RLock
+from typing import Any
+
+from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
+from rclpy.serialization import deserialize_message
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import Accepted, ActionEvent, CancelResponse, Feedback, QoS, Rejected, Result
+from s2a_bench.ros.messages import serialise
+from s2a_bench.ros.rclpy_node import Inbox, SpinningNode, qos_profile
+from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class
+
+MATCH_POLL_S = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class _Packed:
+    """A goal of the generated class; `len` is the size of its CDR."""
+
+    goal: Any
+    size: int
+
+    def __len__(self) -> int:
+        return self.size
+
+
+class _DrainingClient(ActionClient):  # type: ignore[misc]
+    """rclpy's client; its futures and its feedback go to ``owner`` in the order of the seam."""
+
+    def __init__(self, owner: RclpyActionClient, *arguments: Any, **keywords: Any) -> None:
+        self._owner = owner
+        super().__init__(*arguments, **keywords)
+
+    def take_data(self) -> list[dict[str, Any]]:
+        """Take until nothing is left; a kind that was not ready when the wait ended may be so by now."""
+        self._is_goal_response_ready = self._is_feedback_ready = True
+        batches = []
+        with self._owner.lock:
+            while batch := super().take_data():
+                batches.append(batch)
+        return batches
+
+    async def execute(self, taken_data: list[dict[str, Any]]) -> None:
+        """Let rclpy settle its futures, and tell the owner."""
+        feedback = [batch.pop("feedback") for batch in taken_data if "feedback" in batch]
+        with self._owner.lock:
+            for batch in taken_data:
+                await super().execute(batch)
+            self._owner.tell(feedback)
+
+
+class RclpyActionClient:
+    """Events are taken on the consuming thread; sending and cancelling may happen on any."""
+
+    def __init__(self, node: SpinningNode, name: str, type_name: str, version: str) -> None:
+        """Create the client of the action ``/name``."""
+        self._node, self._type, self._version = node, type_name, version
+        self._action = interface_class(type_name)
+        self._installed = installed_version(self._action, type_name)
+        self._uuid = interface_class("unique_identifier_msgs/msg/UUID")
+        self._cancel_goal = interface_class("action_msgs/srv/CancelGoal")
+        self.lock = RLock()
+        self._asked: list[tuple[bytes, Any]] = []
+        self._results: list[tuple[bytes, Any]] = []
+        """Goals, and the futures of what was asked about them."""
+        self._active: set[bytes] = set()
+        self._early: dict[bytes, list[Feedback]] = {}
+        """Feedback on goals whose acceptance is still under way."""
+        self._inbox: Inbox[ActionEvent] = Inbox()
+        self.next_event = self._inbox.get
+        self.interrupt = self._inbox.interrupt
+        self._client = _DrainingClient(
+            self, node.node, self._action, name, feedback_sub_qos_profile=qos_profile(QoS(depth=0))
+        )
+        self._canceller = node.node.create_client(self._cancel_goal, name + "/_action/cancel_goal")
+        """rclpy's action client can cancel one goal or all, but not those until a stamp."""
+
+    def destroy(self) -> None:
+        """Destroy the waitable, which the node does not."""
+        self._client.destroy()
+
+    def wait_for_server(self, timeout_s: float) -> bool:
+        """Look every 10 ms; rclpy's own waiting looks four times a second."""
+        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        while not self.server_present():
+            if now_ns() > deadline_ns or self._inbox.interrupted:
+                return False
+            time.sleep(MATCH_POLL_S)
+        return True
+
+    def server_present(self) -> bool:
+        """Ask rclpy, for its client and for ours."""
+        return not self._node.closed and bool(self._client.server_is_ready() and self._canceller.service_is_ready())
+
+    def server_version(self) -> str:
+        """Return the version this workspace has: no other can be spoken here, whatever the server announces."""
+        return self._installed
+
+    def pack(self, goal: Any) -> _Packed:
+        """Fill a goal of the generated class."""
+        if self._version != self._installed:
+            raise TransportError(f"this workspace has llama_msgs {self._installed}, not {self._version}")
+        cdr = bytes(serialise(goal, self._type + "_Goal", self._version))
+        return _Packed(deserialize_message(cdr, self._action.Goal), len(cdr))
+
+    def send(self, packed: _Packed, goal_id: bytes | None = None) -> bytes:
+        """Send the goal."""
+        self._node.check_open()
+        goal_id = goal_id or os.urandom(16)
+        with self.lock:
+            self._active.add(goal_id)
+            future = self._client.send_goal_async(packed.goal, goal_uuid=self._uuid(uuid=list(goal_id)))
+            self._asked.append((goal_id, future))
+        return goal_id
+
+    def get_result(self, goal_id: bytes) -> None:
+        """Ask through a goal handle, which rclpy makes only for goals that were accepted."""
+        self._node.check_open()
+        response = self._action.Impl.SendGoalService.Response()
+        handle = ClientGoalHandle(self._client, self._uuid(uuid=list(goal_id)), response)
+        with self.lock:
+            self._results.append((goal_id, handle.get_result_async()))
+
+    def cancel(self, goal_id: bytes, stamp_ns: int = 0) -> None:
+        """Call the cancel service."""
+        self._node.check_open()
+        request = self._cancel_goal.Request()
+        request.goal_info.goal_id.uuid = list(goal_id)
+        request.goal_info.stamp.sec, request.goal_info.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+        future = self._canceller.call_async(request)
+        future.add_done_callback(lambda done: self._inbox.put(_cancel_response(goal_id, done.result())))
+
+    def tell(self, feedback: list[Any]) -> None:
+        """Turn what has arrived into events; on the spinning thread, under the lock."""
+        events: list[ActionEvent] = []
+        for goal_id, handle in _settled(self._asked):
+            if handle.accepted:
+                self.get_result(goal_id)
+                events += [Accepted(goal_id), *self._early.pop(goal_id, [])]
+            else:
+                self._active.discard(goal_id)
+                events.append(Rejected(goal_id))
+        waiting = {goal_id for goal_id, _ in self._asked}
+        for message in feedback:
+            event = Feedback(bytes(message.goal_id.uuid), message.feedback)
+            if event.goal_id in waiting:
+                self._early.setdefault(event.goal_id, []).append(event)
+            elif event.goal_id in self._active:
+                events.append(event)
+        for goal_id, response in _settled(self._results):
+            self._active.discard(goal_id)
+            events.append(Result(goal_id, response.status, response.result))
+        self._inbox.put(*events)
+
+    def unpack_feedback(self, packed: Any) -> Any:
+        """Turn into the rosbags class."""
+        return from_ros(packed, self._type + "_Feedback", self._version)
+
+    def unpack_result(self, packed: Any) -> Any:
+        """Turn into the rosbags class."""
+        return from_ros(packed, self._type + "_Result", self._version)
+
+
+def _settled(asked: list[tuple[bytes, Any]]) -> Iterator[tuple[bytes, Any]]:
+    """Remove from ``asked`` what has been answered, and yield the goals with their answers."""
+    for entry in [entry for entry in asked if entry[1].done()]:
+        asked.remove(entry)
+        yield entry[0], entry[1].result()
+
+
+def _cancel_response(goal_id: bytes, response: Any) -> CancelResponse:
+    """Read an answer to `cancel`."""
+    canceling = tuple(bytes(info.goal_id.uuid) for info in response.goals_canceling)
+    return CancelResponse(goal_id, response.return_code, canceling)

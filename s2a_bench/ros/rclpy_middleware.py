@@ -1,0 +1,137 @@
+"""The middleware on rclpy, for a sourced ROS 2 environment: Jazzy or Humble, whatever DDS its rmw brings.
+
+Topics carry ready CDR through rclpy's raw publish and raw subscriptions, so packing and sending stay apart as with
+Cyclone, and no generated message class is filled. The workspace must know the types all the same.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as package_version
+from typing import Any
+
+import rclpy
+
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import QoS, Tuning
+from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
+from s2a_bench.ros.rclpy_client import RclpyActionClient
+from s2a_bench.ros.rclpy_node import Inbox, SpinningNode, qos_profile
+from s2a_bench.ros.rclpy_server import RclpyActionServer
+from s2a_bench.ros.rclpy_types import message_class
+
+
+class _RclpyPublisher:
+    """Sends messages to a ROS topic."""
+
+    def __init__(self, node: SpinningNode, topic: str, type_name: str, qos: QoS) -> None:
+        self._node = node
+        self._type_name = type_name
+        self._publisher = node.node.create_publisher(message_class(type_name), topic, qos_profile(qos))
+
+    def pack(self, message: Any) -> bytes:
+        """Serialise to CDR; rclpy takes nothing but bytes."""
+        return bytes(serialise(message, self._type_name))
+
+    def send(self, packed: bytes) -> None:
+        """Publish raw."""
+        self._node.check_open()
+        try:
+            self._publisher.publish(packed)
+        except RuntimeError as error:
+            raise TransportError(f"rclpy could not publish on {self._publisher.topic_name}: {error}") from error
+
+    def matched(self) -> int:
+        """Ask rclpy."""
+        return 0 if self._node.closed else int(self._publisher.get_subscription_count())
+
+
+class _RclpySubscription:
+    """Receives messages from a ROS topic; an inbox of its QoS's depth holds what the consumer has not taken."""
+
+    def __init__(self, node: SpinningNode, topic: str, type_name: str, qos: QoS) -> None:
+        self._node = node
+        self._topic = topic
+        self._type_name = type_name
+        self._inbox: Inbox[bytes] = Inbox(qos.depth)
+        self.take = self._inbox.get
+        self.interrupt = self._inbox.interrupt
+        cls = message_class(type_name)
+        self._subscription = node.node.create_subscription(cls, topic, self._receive, qos_profile(qos), raw=True)
+
+    def _receive(self, packed: bytes) -> None:
+        self._inbox.put(packed)
+
+    def unpack(self, packed: bytes) -> Any:
+        """Deserialise; arrays are views of the bytes that rclpy gave."""
+        return deserialise(memoryview(packed), self._type_name)
+
+    def matched(self) -> int:
+        """Count the topic's publishers, those of another QoS too: Humble's subscriptions do not know theirs."""
+        return 0 if self._node.closed else int(self._node.node.count_publishers(self._topic))
+
+
+class RclpyMiddleware:
+    """One node, through the ROS 2 installation's rclpy."""
+
+    def __init__(self, domain_id: int, _tuning: Tuning, node_name: str) -> None:
+        """Join ``domain_id`` as the node ``/namespace/name``; tuning is left to the rmw's own configuration."""
+        self._domain_id = domain_id
+        self._node = SpinningNode(domain_id, node_name)
+        self._destroy: list[Callable[[], None]] = []
+        atexit.register(self.close)
+
+    def publisher(self, topic: str, type_name: str, qos: QoS) -> _RclpyPublisher:
+        """Create a publisher."""
+        return _RclpyPublisher(self._open(), topic, type_name, qos)
+
+    def subscription(self, topic: str, type_name: str, qos: QoS) -> _RclpySubscription:
+        """Create a raw subscription."""
+        return _RclpySubscription(self._open(), topic, type_name, qos)
+
+    def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> RclpyActionClient:
+        """Create an action client."""
+        client = RclpyActionClient(self._open(), name, type_name, version)
+        self._destroy.append(client.destroy)
+        return client
+
+    def action_server(
+        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = DEFAULT_VERSION
+    ) -> RclpyActionServer:
+        """Create an action server."""
+        server = RclpyActionServer(self._open(), name, type_name, result_timeout_s, version)
+        self._destroy.append(server.destroy)
+        return server
+
+    def describe(self) -> dict[str, str | int]:
+        """Say which rclpy on which rmw."""
+        distribution = os.environ.get("ROS_DISTRO", "")
+        try:
+            version = package_version("rclpy")
+        except PackageNotFoundError:
+            version = distribution
+        return {
+            "middleware": "rclpy",
+            "version": version,
+            "distribution": distribution,
+            "rmw": rclpy.get_rmw_implementation_identifier(),
+            "domain_id": self._domain_id,
+            "tuning": "default",
+            "configuration": os.environ.get("CYCLONEDDS_URI", ""),
+        }
+
+    def close(self) -> None:
+        """Stop the thread, then destroy the actions, which a node does not own, then the node."""
+        if not self._node.closed:
+            atexit.unregister(self.close)
+            self._node.stop()
+            for destroy in self._destroy:
+                destroy()
+            self._node.destroy()
+
+    def _open(self) -> SpinningNode:
+        self._node.check_open()
+        return self._node

@@ -1,0 +1,216 @@
+"""The action server on rclpy.
+
+rclpy decides on a goal, executes it and fetches its result in callbacks on the executor's thread; the seam's goals are
+decided and worked on by whoever took them. `_PullingServer` hands a request over instead of deciding, so that nothing
+blocks a thread of the executor and nothing is polled; decisions and ends then run rclpy's own code on that thread. It
+overrides two public methods, the same in Humble and Jazzy, and reads ``_goal_handles``, the goals rclpy remembers.
+"""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import Future
+from threading import Lock
+from typing import Any
+
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import QoS
+from s2a_bench.ros.action import NEXT, Status
+from s2a_bench.ros.rclpy_node import Inbox, SpinningNode, qos_profile
+from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
+
+FEEDBACK_QOS = QoS(depth=1000)
+"""As with Cyclone: deeper than ROS's 10."""
+ENDS = {Status.SUCCEEDED: "succeed", Status.ABORTED: "abort", Status.CANCELED: "canceled"}
+"""How a goal ends -> the method of rclpy's goal handle."""
+
+_log = logging.getLogger(__name__)
+
+
+class RclpyServerGoal:
+    """One goal; rclpy's handle exists once it is accepted."""
+
+    def __init__(self, server: RclpyActionServer, request: Any) -> None:
+        self._server = server
+        self._request = request
+        self._handle: Any = None
+        self.id = bytes(request[1].goal_id.uuid)
+
+    @property
+    def cancel_requested(self) -> bool:
+        """Ask rclpy."""
+        return self._status() == Status.CANCELING
+
+    def unpack(self) -> Any:
+        """Turn into the rosbags class."""
+        return self._server.convert_goal(self._request[1].goal)
+
+    def accept(self) -> None:
+        """Let rclpy store the goal and reply."""
+        self._handle = self._server.decide(self._request, accepted=True)
+
+    def reject(self) -> None:
+        """Let rclpy reply."""
+        self._server.decide(self._request, accepted=False)
+
+    def executing(self) -> bool:
+        """Publish EXECUTING unless a cancel came first."""
+        if self.cancel_requested:
+            return False
+        self._check(Status.EXECUTING)
+        try:
+            self._handle.execute()
+        except RuntimeError as error:  # a cancel came in between
+            _log.info("goal %s: %s", self.id.hex(), error)
+        return not self.cancel_requested
+
+    def feedback(self, message: Any) -> None:
+        """Publish on the feedback topic."""
+        if self._handle is None:
+            raise TransportError(f"goal {self.id.hex()} was not accepted: no feedback can be sent")
+        self._server.publish_feedback(self._handle, message)
+
+    def succeed(self, result: Any) -> None:
+        """End as SUCCEEDED."""
+        self._end(Status.SUCCEEDED, result)
+
+    def abort(self, result: Any) -> None:
+        """End as ABORTED."""
+        self._end(Status.ABORTED, result)
+
+    def canceled(self, result: Any) -> None:
+        """End as CANCELED."""
+        self._end(Status.CANCELED, result)
+
+    def _status(self) -> Status:
+        return Status.UNKNOWN if self._handle is None else Status(self._handle.status)
+
+    def _check(self, status: Status) -> None:
+        """Raise TransportError for a step that the state machine does not allow."""
+        present = self._status()
+        if self._handle is None or status not in NEXT[present]:
+            raise TransportError(f"goal {self.id.hex()} is {present.name} and cannot become {status.name}")
+
+    def _end(self, status: Status, result: Any) -> None:
+        self._check(status)
+        self._server.end(self._handle, status, result)
+
+
+class _PullingServer(ActionServer):  # type: ignore[misc]
+    """rclpy's server; goals go to ``inbox``, and come back decided or ended."""
+
+    def __init__(self, owner: RclpyActionServer, *arguments: Any, **keywords: Any) -> None:
+        self._owner = owner
+        self._verdict = GoalResponse.REJECT
+        super().__init__(
+            *arguments,
+            execute_callback=lambda _: None,  # never called: `notify_execute` gets another
+            goal_callback=lambda _: self._verdict,
+            handle_accepted_callback=lambda _: None,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            **keywords,
+        )
+
+    async def execute(self, taken_data: dict[str, Any]) -> None:
+        """Offer a goal whose id is free; everything else, rejecting a taken id included, is rclpy's own business."""
+        request = taken_data.get("goal")
+        if request and bytes(request[1].goal_id.uuid) not in self._goal_handles and self._owner.offer(request):
+            taken_data = {kind: data for kind, data in taken_data.items() if kind != "goal"}
+        await super().execute(taken_data)
+
+    async def decide(self, request: Any, verdict: Any, outcome: Future[Any]) -> None:
+        """Run rclpy's code for a goal request with this verdict; the outcome is the goal's handle, None if refused."""
+        self._verdict = verdict
+        try:
+            await super().execute({"goal": request})
+        except RuntimeError as error:  # Humble's first releases raise when the client has left
+            _log.warning("goal request: %s", error)
+        finally:
+            self._verdict = GoalResponse.REJECT
+        outcome.set_result(self._goal_handles.get(bytes(request[1].goal_id.uuid)))
+
+    def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:
+        """Schedule nothing when a goal starts: its work is done by whoever took it. Its end has a callback."""
+        if execute_callback is not None:
+            super().notify_execute(goal_handle, execute_callback)
+
+
+class RclpyActionServer:
+    """Goals are taken on the consuming thread; cancels and results are served by the spinning thread."""
+
+    def __init__(self, node: SpinningNode, name: str, type_name: str, result_timeout_s: float, version: str) -> None:
+        """Create the server of the action ``/name``; raises TransportError for a version the workspace lacks."""
+        self._node, self._type, self._version = node, type_name, version
+        self._action = interface_class(type_name)
+        installed = installed_version(self._action, type_name)
+        if installed != version:
+            raise TransportError(f"this workspace has llama_msgs {installed}, not {version}")
+        self._lock = Lock()
+        self._offered: set[bytes] = set()
+        self._inbox: Inbox[RclpyServerGoal] = Inbox()
+        self.next_goal = self._inbox.get
+        self.interrupt = self._inbox.interrupt
+        self._server = _PullingServer(
+            self,
+            node.node,
+            self._action,
+            name,
+            feedback_pub_qos_profile=qos_profile(FEEDBACK_QOS),
+            result_timeout=result_timeout_s,
+        )
+
+    def destroy(self) -> None:
+        """Destroy the waitable, which the node does not."""
+        self._server.destroy()
+
+    def offer(self, request: Any) -> bool:
+        """Queue a goal; False if one of this id waits for its decision."""
+        goal = RclpyServerGoal(self, request)
+        with self._lock:
+            if goal.id in self._offered:
+                return False
+            self._offered.add(goal.id)
+        self._inbox.put(goal)
+        return True
+
+    def decide(self, request: Any, *, accepted: bool) -> Any:
+        """Accept or reject a goal once, and return rclpy's handle of an accepted one."""
+        goal_id = bytes(request[1].goal_id.uuid)
+        with self._lock:
+            if goal_id not in self._offered:
+                raise TransportError(f"goal {goal_id.hex()} was accepted or rejected already")
+            self._offered.remove(goal_id)
+        verdict = GoalResponse.ACCEPT if accepted else GoalResponse.REJECT
+        return self._node.call(self._server.decide, request, verdict)
+
+    def convert_goal(self, goal: Any) -> Any:
+        """Turn a goal into the rosbags class."""
+        return from_ros(goal, self._type + "_Goal", self._version)
+
+    def publish_feedback(self, handle: Any, feedback: Any) -> None:
+        """Publish feedback on a goal, on the calling thread."""
+        message = to_ros(feedback, self._action.Feedback, self._type + "_Feedback", self._version)
+        try:
+            handle.publish_feedback(message)
+        except RuntimeError as error:
+            raise TransportError(f"rclpy could not publish feedback: {error}") from error
+
+    def end(self, handle: Any, status: Status, result: Any) -> None:
+        """End a goal as rclpy's programs do: in an execute callback that sets the state and returns the result."""
+        message = to_ros(result, self._action.Result, self._type + "_Result", self._version)
+        outcome: Future[None] = Future()
+
+        def finish(goal_handle: Any) -> Any:
+            try:
+                getattr(goal_handle, ENDS[status])()
+            except RuntimeError as error:
+                outcome.set_exception(error)
+            else:
+                outcome.set_result(None)
+            return message
+
+        self._node.check_open()
+        self._server.notify_execute(handle, finish)
+        self._node.answer(outcome)
