@@ -15,8 +15,10 @@ from s2a_bench.types import Request, Token
 class Engine(Protocol):
     """A model, or something that behaves like one. One request at a time; not thread-safe."""
 
-    facts: dict[str, float]
-    """What the engine says about the last request, as llama.cpp's ``timings``: prompt_n, prompt_ms, ..."""
+    @property
+    def facts(self) -> dict[str, float]:
+        """Return what it says about the last request, as llama.cpp's ``timings``: prompt_n, prompt_ms, ..."""
+        ...
 
     def generate(self, request: Request) -> Iterator[Token]:
         """Yield the answer's tokens, at most ``request.max_tokens``; closing the iterator cancels the rest.
@@ -53,10 +55,10 @@ class EngineConfig:
 
 
 ENGINES: dict[str, str] = {
-    "llama": "s2a_bench.inference.llama_cpp:LlamaCppEngine",
+    "llama": "s2a_bench.inference.one_thread:llama",
     "echo": "s2a_bench.inference.echo:EchoEngine",
 }
-"""Value of ``--engine`` -> class, built as ``Class(config)``."""
+"""Value of ``--engine`` -> what builds it, called with the config."""
 
 
 def open_engine(config: EngineConfig) -> Engine:

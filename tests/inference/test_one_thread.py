@@ -1,0 +1,95 @@
+"""An engine on one thread behaves as the engine itself, from whichever thread it is asked."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.errors import EngineError, ModelError
+from s2a_bench.inference import Engine, EngineConfig, open_engine
+from s2a_bench.inference.echo import EchoEngine
+from s2a_bench.inference.one_thread import OneThreadEngine
+from s2a_bench.types import Request, Token
+from tests.conformance.engine import EngineSuite
+
+
+class TestOneThread(EngineSuite):
+    @pytest.fixture
+    def engine(self) -> Iterator[Engine]:
+        engine = OneThreadEngine(lambda: EchoEngine(EngineConfig("echo")))
+        yield engine
+        engine.close()
+
+    @pytest.fixture
+    def fresh_engine(self, engine: Engine) -> Engine:
+        return engine
+
+
+class Spy:
+    """Remembers on which threads it was used."""
+
+    def __init__(self) -> None:
+        self.facts = {"prompt_n": 1.0}
+        self.threads = [threading.get_ident()]
+        self.closed_early = False
+
+    def generate(self, request: Request) -> Iterator[Token]:
+        try:
+            for index in range(request.max_tokens):
+                self.threads.append(threading.get_ident())
+                if index == 3:
+                    raise EngineError("enough")
+                yield Token(index, "x")
+        except GeneratorExit:
+            self.closed_early = True
+            raise
+        finally:
+            self.threads.append(threading.get_ident())
+
+    def describe(self) -> dict[str, str | int | float | bool]:
+        self.threads.append(threading.get_ident())
+        return {}
+
+    def close(self) -> None:
+        self.threads.append(threading.get_ident())
+
+
+def test_all_work_is_done_on_one_thread_that_is_not_the_callers() -> None:
+    spy = Spy()
+    engine = OneThreadEngine(lambda: spy)
+    spy.threads.clear()
+
+    def use() -> None:
+        list(engine.generate(Request("a", "b", max_tokens=2)))
+        engine.describe()
+
+    callers = [threading.Thread(target=use) for _ in range(3)]
+    for caller in callers:
+        caller.start()
+        caller.join()
+    engine.close()
+    assert len(set(spy.threads)) == 1
+    assert threading.get_ident() not in spy.threads
+    assert engine.facts == {"prompt_n": 1.0}
+
+
+def test_leaving_early_cancels_the_engine() -> None:
+    spy = Spy()
+    engine = OneThreadEngine(lambda: spy)
+    tokens = engine.generate(Request("a", "b", max_tokens=3))
+    next(tokens)
+    tokens.close()
+    assert spy.closed_early
+    engine.close()
+
+
+def test_errors_come_through() -> None:
+    engine = OneThreadEngine(Spy)
+    with pytest.raises(EngineError, match="enough"):
+        list(engine.generate(Request("a", "b", max_tokens=9)))
+    engine.close()
+    with pytest.raises(ModelError, match="no such file"):
+        open_engine(EngineConfig("llama", model=Path("/no/such.gguf")))
