@@ -20,6 +20,8 @@ from s2a_bench.transport import Route, open_client
 from s2a_bench.types import Request
 from tests.conformance.transport import ask, yuyv_frame
 
+ONE_BY_ONE = ("--feedback-interval", "0")
+"""The echo engine is faster than any model: without this its tokens share feedbacks."""
 Start = Callable[..., tuple["subprocess.Popen[str]", str]]
 
 
@@ -57,7 +59,7 @@ def test_http_speaks_the_openai_dialect(start: Start) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ros_answers_goals_and_publishes_tokens(start: Start, dds_domain: int, number: signal.Signals) -> None:
-    process, line = start("ros", "--engine", "echo", "--namespace", "/robot_llama", "--max-tokens", "5")
+    process, line = start("ros", "--engine", "echo", "--namespace", "/robot_llama", "--max-tokens", "5", *ONE_BY_ONE)
     assert "/robot_llama/generate_response" in line
     middleware = open_middleware(domain_id=dds_domain)
     plotted = middleware.subscription("/robot_llama/token", ros.TOKEN, QoS(0))
@@ -109,7 +111,7 @@ def test_a_wrong_file_is_one_line(tmp_path: Path, text: str, message: str) -> No
 
 
 def test_latency_drives_a_node_that_runs_already(start: Start, tmp_path: Path) -> None:
-    start("ros", "--engine", "echo", "--namespace", "/llama", "--max-tokens", "50")
+    start("ros", "--engine", "echo", "--namespace", "/llama", "--max-tokens", "50", *ONE_BY_ONE)
     arguments = ["latency", "--transport", "ros", "--action", "/llama/generate_response", "--size", "64x48"]
     arguments += ["--engine", "echo", "--runs", "3", "--warmup", "1", "--max-tokens", "4", "--output", str(tmp_path)]
     subprocess.run([sys.executable, "-m", "s2a_bench", *arguments], check=True, timeout=120, capture_output=True)
