@@ -228,6 +228,8 @@ def _sessions(config: LatencyConfig, servers: ServerSet, sources: _Sources, stac
         else:
             feed = RequestFeed(sources.open(), preencoded=cell.payload == "jpeg-preencoded")
         yield Session(cell, client, feed, config, recorder)
+    if camera is not None:
+        stack.callback(camera.stop)  # again, as the first to end: it publishes through the clients
 
 
 def _blocks(

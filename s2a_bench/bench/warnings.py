@@ -167,7 +167,7 @@ class SampleGuard:
             *_told(
                 self._frames_lost,
                 "lost-frames",
-                "camera frames were published and never reached the server",
+                "camera frames did not reach the server, or were overtaken there by the next (over the whole run)",
                 f"--qos reliable, --dds-tuning tuned, and sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
             ),
             *_told(self._lost, "lost-messages", "requests lost messages on the way", "--dds-tuning tuned"),

@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -37,6 +38,11 @@ DEFAULTS: dict[str, Any] = {
     "result-timeout": 60.0,
 }
 """What holds where neither a flag nor the TOML file says otherwise; the file's keys are these."""
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+LEAST = {"threads": 0, "gpu-layers": -1, "context": 256, "port": 0, "max-tokens": 1}
+MOST = {"port": 65_535, "max-tokens": 2**20, "result-timeout": 86_400, "feedback-interval": 60}
+"""Bounds of the numbers, wherever they come from; seconds are 0 at least."""
 
 Engine = Annotated[str | None, typer.Option(help="llama, echo [default: llama]")]
 Model = Annotated[str | None, typer.Option(help="GGUF model [default: the tiny dummy]")]
@@ -140,7 +146,11 @@ def _settings(flags: dict[str, Any], config: Path | None) -> dict[str, Any]:
         wanted = (int, float) if isinstance(known[key], float) else type(known[key])
         if not isinstance(value, wanted) or isinstance(value, bool):
             raise UsageError(f"--config {config}: {key} = {value!r} should be like {known[key]!r}")
-    return known | from_file | {key: value for key, value in flags.items() if value is not None}
+    settings = known | from_file | {key: value for key, value in flags.items() if value is not None}
+    for key, value in settings.items():
+        if not isinstance(value, str) and not LEAST.get(key, 0) <= value <= MOST.get(key, 2**31 - 1):
+            raise UsageError(f"{key}: {value} is not between {LEAST.get(key, 0)} and {MOST.get(key, 2**31 - 1)}")
+    return settings
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -178,8 +188,14 @@ def _run(route: Route, settings: dict[str, Any], ready: Callable[[str], str]) ->
     engine = open_engine(_engine(settings))
     try:
         server = open_server(route, engine_handler(engine))
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda *_: server.stop())
+
+        def stop(*_: Any) -> None:
+            for number in SIGNALS:  # a second one does not wait for the answer under way
+                signal.signal(number, signal.default_int_handler)
+            Thread(target=server.stop).start()  # not here: the signal may have interrupted a lock's holder
+
+        for number in SIGNALS:
+            signal.signal(number, stop)
         typer.echo(f"{ready(server.address)}; engine {engine.describe()['engine']}; Ctrl-C ends it")
         server.serve()
     finally:

@@ -54,6 +54,8 @@ def to_bgr(frame: Frame) -> Pixels:
         case "rgb8":
             return bgr_to_rgb(data)
         case "mono8":
+            if not data.size:
+                raise ValueError("the picture is empty")
             return cast("Pixels", cv2.cvtColor(data, cv2.COLOR_GRAY2BGR))
         case "jpeg" | "png":
             return _decode(data, cv2.IMREAD_COLOR)

@@ -181,6 +181,8 @@ def frame_of_image(image: Any, index: int = -1) -> Frame:
     channels = CHANNELS.get(image.encoding)
     if channels is None:
         raise TransportError(f"image encoding '{image.encoding}' is none of {', '.join(CHANNELS)}")
+    if not (image.width and image.height):
+        raise TransportError(f"image of {image.width}x{image.height} {image.encoding} is empty")
     if image.step < image.width * channels or image.data.size < image.step * image.height:
         raise TransportError(f"image of {image.width}x{image.height} {image.encoding} has {image.data.size} bytes")
     rows = image.data[: image.step * image.height].reshape(image.height, image.step)[:, : image.width * channels]

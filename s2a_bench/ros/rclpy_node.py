@@ -96,7 +96,7 @@ class SpinningNode:
         while not self._closing.is_set():
             try:
                 self._executor.spin_once()
-            except ExternalShutdownException:  # noqa: PERF203 - each callback may fail
+            except ExternalShutdownException:
                 return
             except Exception:  # noqa: BLE001 - whatever a callback raised ends in spin_once
                 _log.exception("a callback of rclpy failed")

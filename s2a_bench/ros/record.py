@@ -50,6 +50,7 @@ class _Item(NamedTuple):
     data: Any
     stamp_ns: int
     size: int
+    raw: bool
 
 
 class Recorder:
@@ -96,11 +97,12 @@ class Recorder:
             raise StoreError(f"--record: {self.path} is closed")
         if self._failure is not None:
             raise self._failure
-        size = len(cdr_or_message) if isinstance(cdr_or_message, bytes | bytearray | memoryview) else -1
+        raw = isinstance(cdr_or_message, bytes | bytearray | memoryview)
+        size = len(cdr_or_message) if raw else getattr(getattr(cdr_or_message, "data", None), "nbytes", 0)
         with self._counting:
-            self._backlog += max(size, 0)
+            self._backlog += size
             full = self._backlog > BACKLOG_BYTES
-        self._queue.put(_Item(topic, type_name, cdr_or_message, stamp_ns, size))
+        self._queue.put(_Item(topic, type_name, cdr_or_message, stamp_ns, size, raw))
         if self._thread is not None:
             self._more.put(True)
         if full:
@@ -150,14 +152,14 @@ class Recorder:
     def _write_down(self, item: _Item) -> None:
         """Hand one message to rosbags, keeping the first failure."""
         with self._counting:
-            self._backlog -= max(item.size, 0)
+            self._backlog -= item.size
         try:
             key = (item.topic, item.type_name)
             connection = self._connections.get(key)
             if connection is None:
                 connection = self._writer.add_connection(*key, typestore=typestore(), offered_qos_profiles=[PLAYED_QOS])
                 self._connections[key] = connection
-            data = serialise(item.data, item.type_name) if item.size < 0 else item.data
+            data = serialise(item.data, item.type_name) if not item.raw else item.data
             self._writer.write(connection, item.stamp_ns, data)
         except Exception as error:  # noqa: BLE001 - an unknown type, a foreign message, a full disk: each ends it
             self._failure = self._failed(error)

@@ -93,6 +93,8 @@ def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -
         ('threads = "many"', "threads = 'many' should be like 0"),
         ("threads = true", "threads = True should be like 0"),
         ("= 1", "is no TOML"),
+        ("max-tokens = 0", "max-tokens: 0 is not between 1 and 1048576"),
+        ("result-timeout = inf", "result-timeout: inf is not between 0 and 86400"),
     ],
 )
 def test_a_wrong_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:

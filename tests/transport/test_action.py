@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, ServerDied
+from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.ros import ActionServer, Result, ServerGoal, open_middleware
+from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
-from s2a_bench.trace import budget
+from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Route, open_client, open_server
-from s2a_bench.types import Request
+from s2a_bench.types import Request, Token
 from tests.conformance.transport import Recorder, ask, yuyv_frame
 
 NODE = "/llama_ros/generate_response"
@@ -233,6 +234,89 @@ def test_ten_thousand_goals_with_random_cancels_leak_nothing(dds_domain: int) ->
     assert sum(ended.values()) == 10_000
     assert resident[1] - resident[0] < 16 << 20
     assert threading.active_count() < 20
+
+
+def test_impossible_goals_end_and_the_node_stays_up(dds_domain: int) -> None:
+    route = Route("ros", "action", "/test_bad", domain_id=dds_domain)
+    server = open_server(route, Recorder(["fine"]))
+    thread = Thread(target=server.serve)
+    thread.start()
+    middleware = open_middleware(domain_id=dds_domain)
+    client = middleware.action_client("/test_bad/generate_response", GENERATE_RESPONSE)
+    frame = yuyv_frame()
+    empty = ros.image_message(replace(frame, encoding="mono8", data=frame.data[:1, :1, 0]), 0, "c")
+    empty.width, empty.height, empty.step = 0, 5, 0
+    odd = ros.image_message(frame, 0, "c")
+    odd.encoding = "bayer_rggb8"
+    ends: list[tuple[int, str]] = []
+    try:
+        assert client.wait_for_server(20)
+        for images in ([empty], [odd], [empty], [odd], [empty], [odd], []):
+            client.send(client.pack(generate_goal("look", images)))
+            while not isinstance(event := client.next_event(20), Result):
+                assert event is not None, "a goal never ended"
+            ends.append((event.status, client.unpack_result(event.packed).response.text))
+    finally:
+        middleware.close()
+        server.stop()
+        thread.join()
+    assert [status for status, _ in ends] == [Status.ABORTED] * 6 + [Status.SUCCEEDED]
+    assert "is empty" in ends[0][1]
+    assert "bayer_rggb8" in ends[1][1]
+    assert ends[-1][1] == "fine"
+
+
+def test_a_handler_that_breaks_fails_its_goal_only(dds_domain: int) -> None:
+    class Broken(Recorder):
+        def __call__(self, request: Request, trace: Trace) -> Generator[Token, None, None]:
+            if request.prompt == "break":
+                raise ZeroDivisionError("a bug")
+            yield from super().__call__(request, trace)
+
+    route = Route("ros", "action", "/test_broken", domain_id=dds_domain, timeout_s=20)
+    server = open_server(route, Broken(["fine"]))
+    thread = Thread(target=server.serve)
+    thread.start()
+    client = open_client(route)
+    try:
+        for _ in range(6):
+            with pytest.raises(RequestFailed, match="a bug"):
+                ask(client, Request("a", "break"))
+        assert len(ask(client, Request("a", "plan"))[0]) == 1
+    finally:
+        client.close()
+        server.stop()
+        thread.join()
+
+
+def test_a_server_that_stops_ends_the_answer_under_way(dds_domain: int) -> None:
+    def endless(request: Request, trace: Trace) -> Generator[Token, None, None]:
+        trace.mark("inference")
+        for index in range(10**9):
+            Event().wait(0.001)
+            yield Token(index, request.prompt)
+
+    route = Route("ros", "action", "/test_stopping", domain_id=dds_domain, timeout_s=20)
+    server = open_server(route, endless)
+    thread = Thread(target=server.serve)
+    thread.start()
+    client = open_client(route)
+    try:
+        tokens = client.request(Request("a", "x", max_tokens=10**9), Trace())
+        next(tokens)
+        server.stop()
+        with pytest.raises(TransportError, match=r"stopping|gone"):
+            list(tokens)
+        thread.join(30)
+        assert not thread.is_alive()
+    finally:
+        client.close()
+
+
+def test_our_server_does_not_join_a_node_that_answers_already(node: Node, dds_domain: int) -> None:
+    node()
+    with pytest.raises(TransportError, match="another server answers under /llama_ros"):
+        open_server(Route("ros", "action", "/llama_ros", domain_id=dds_domain), Recorder(["x"]))
 
 
 def test_goals_of_two_clients_are_answered_one_after_the_other(dds_domain: int) -> None:

@@ -94,7 +94,9 @@ def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, route:
     while not publisher.matched():
         assert now_ns() < deadline
     odd = Frame(0, 0, 3, 2, "yuv422_yuy2", np.zeros((2, 3, 2), np.uint8))
-    publisher.send(publisher.pack(ros.image_message(odd, 1, "camera")))
+    empty = Frame(0, 0, 0, 0, "mono8", np.zeros((0, 0), np.uint8))
+    for bad in (odd, empty):
+        publisher.send(publisher.pack(ros.image_message(bad, 1, "camera")))
     assert client.camera is not None
     frame, trace = yuyv_frame(), Trace()
     client.camera.publish(frame, trace)

@@ -12,7 +12,7 @@ from threading import Lock
 from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
-from s2a_bench.errors import RequestFailed, S2AError, ServerDied, TransportError, UsageError
+from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, TransportError, UsageError
 from s2a_bench.ros import (
     ActionClient,
     Feedback,
@@ -75,6 +75,8 @@ class GenerateClient:
         self._wait(lambda: client.wait_for_server(0.1))
         spoken = client.server_version() or version
         if spoken != version:
+            self.middleware.close()  # a client of the other version would go on collecting what nobody reads
+            self.middleware = join(self._route, "client")
             client = self.middleware.action_client(self._name, GENERATE_RESPONSE, spoken)
             self._wait(lambda: client.wait_for_server(0.1))
         return client, spoken
@@ -108,12 +110,16 @@ class GenerateClient:
     def _tokens(self, goal_id: bytes, limit: int, trace: Trace) -> Iterator[Token]:
         """Yield the tokens of a goal; it is cancelled after ``limit``, or when the caller leaves early."""
         count = 0
+        heard: list[str] = []
         ended = False
         try:
             while not ended:
                 event = self._next(goal_id)
-                if isinstance(event, Feedback) and count < limit:
+                if isinstance(event, Feedback):
                     partial = self._client.unpack_feedback(event.packed).partial_response
+                    heard.append(partial.text)
+                    if count == limit:
+                        continue
                     if not count:
                         trace.mark("server" if self._marks is None else "return")
                     yield Token(count, partial.text, partial.token)
@@ -125,15 +131,19 @@ class GenerateClient:
                     raise RequestFailed("the server rejected the goal")
                 elif isinstance(event, Result):
                     ended = True
-                    self._check(event)
+                    self._check(event, "".join(heard))
         finally:
             if not ended:
                 self._client.cancel(goal_id)
 
-    def _check(self, result: Result) -> None:
+    def _check(self, result: Result, heard: str) -> None:
+        """Raise for a goal that failed, and for feedback that was lost on the way from our own server."""
+        response = self._client.unpack_result(result.packed).response
         if result.status not in {Status.SUCCEEDED, Status.CANCELED}:
-            text = self._client.unpack_result(result.packed).response.text
-            raise RequestFailed(f"the server broke off: {text or 'the goal ended with status ' + str(result.status)}")
+            text = response.text or f"the goal ended with status {result.status}"
+            raise RequestFailed(f"the server broke off: {text}")
+        if self._marks is not None and result.status == Status.SUCCEEDED and heard != response.text:
+            raise MessagesLost(f"of the answer's {len(response.text)} letters {len(heard)} came as feedback")
 
     def _next(self, goal_id: bytes) -> Any:
         """Wait for the next event of this goal."""
@@ -194,7 +204,7 @@ class ActionFront:
         with self._lock:
             self._active += 1
             alone = self._active == 1
-        return GenerateJob(self, packed, goal, trace, at_once=alone)
+        return GenerateJob(self, packed, goal, trace, at_once=alone)  # from here on only `end` ends the goal
 
     def plot(self, goal_id: str, token: Token) -> None:
         """Publish a token for whoever plots, where that is wanted."""
@@ -205,9 +215,9 @@ class ActionFront:
 
     def ended(self, goal_id: str, trace: Trace) -> None:
         """Send a goal's marks, before its result."""
-        self._marks.send(self._marks.pack(marks_message(goal_id, trace.to_remote())))
         with self._lock:
             self._active -= 1
+        self._marks.send(self._marks.pack(marks_message(goal_id, trace.to_remote())))
 
     def interrupt(self) -> None:
         """Make `take` return; callable from any thread."""
@@ -229,12 +239,13 @@ class GenerateJob:
         self._held: list[str] = []
         self._fed_ns = 0
         self._error = ""
-        self._started = at_once and goal.executing()
-        trace.mark("accept")
+        self._started = False
         try:
+            self._started = at_once and goal.executing()
+            trace.mark("accept")
             images = tuple(picture_of(image, trace) for image in goal_images(message))
-        except S2AError as error:
-            self._error = str(error)
+        except Exception as error:  # noqa: BLE001 - the goal is accepted, so it has to end, whatever broke
+            self._error = str(error) or type(error).__name__
             return
         sampling = message.sampling_config
         seed = getattr(sampling, "seed", NO_SEED)
@@ -273,9 +284,12 @@ class GenerateJob:
     def end(self, error: str = "") -> None:
         """Send marks and result."""
         error = error or self._error
-        if self._started and not self._goal.cancel_requested:
-            self._feed()
-        self._front.ended(self._id, self.trace)
+        try:
+            if self._started and not self._goal.cancel_requested:
+                self._feed()
+            self._front.ended(self._id, self.trace)
+        except S2AError as failure:
+            error = error or str(failure)
         text = error or "".join(token.text for token in self._tokens)
         result = text_result(text, [token.id for token in self._tokens])
         started = self._started or self._goal.executing()

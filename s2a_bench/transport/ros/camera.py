@@ -6,12 +6,13 @@ camera feeds the cache.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any
 
 from s2a_bench.clock import realtime_offset_ns
-from s2a_bench.errors import RequestFailed, S2AError
+from s2a_bench.errors import RequestFailed
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Mark, Trace
@@ -90,6 +91,7 @@ class CameraCache:
         self._threads = [Thread(target=self._watch, args=(camera,), daemon=True) for camera in self._cameras]
         self._newest: CachedFrame | None = None
         self._count = 0
+        self._lock = Lock()
         self._stopped = False
 
     def start(self) -> None:
@@ -118,16 +120,27 @@ class CameraCache:
         return (newest.frame,)
 
     def _watch(self, camera: Subscription) -> None:
+        said = ""
         while not self._stopped:
-            packed = camera.take(POLL_S)
-            if packed is None:
-                continue
-            trace = Trace()
-            trace.mark("network")
             try:
-                message = camera.unpack(packed)
-                trace.mark("cdr_parse")
-                self._count += 1
-                self._newest = CachedFrame(picture_of(message, trace), trace.marks, self._count)
-            except S2AError:  # a frame nobody can read is no reason to stop: the next may be better
-                continue
+                packed = camera.take(POLL_S)
+                if packed is not None:
+                    self._keep(camera, packed)
+            except Exception as error:  # noqa: BLE001 - a frame nobody can use is no reason to stop
+                if str(error) != said:  # once a kind of trouble, not thirty times a second
+                    said = str(error)
+                    print(f"camera frame not used: {said}", file=sys.stderr, flush=True)  # noqa: T201 - a node's log
+
+    def _keep(self, camera: Subscription, packed: Any) -> None:
+        """Decode a frame and keep it, unless one that came later is there already."""
+        trace = Trace()
+        trace.mark("network")
+        with self._lock:
+            self._count += 1
+            count = self._count
+        message = camera.unpack(packed)
+        trace.mark("cdr_parse")
+        frame = picture_of(message, trace)
+        with self._lock:
+            if self._newest is None or count > self._newest.count:
+                self._newest = CachedFrame(frame, trace.marks, count)

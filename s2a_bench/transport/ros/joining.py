@@ -5,6 +5,7 @@ from __future__ import annotations
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import Middleware, QoS, Tuning, open_middleware
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.llama import GENERATE_RESPONSE
 from s2a_bench.transport import Route
 
 DEFAULT_NAMESPACE = "/s2a_bench"
@@ -24,8 +25,9 @@ def refuse_company(route: Route, namespace: str) -> None:
     probe = join(route, "probe")
     try:
         publisher = probe.publisher(namespace + "/request", ros.REQUEST, QoS())
+        action = probe.action_client(namespace + "/generate_response", GENERATE_RESPONSE)
         probe.subscription(namespace + "/token", ros.TOKEN, QoS()).take(SETTLE_S)
-        if publisher.matched():
+        if publisher.matched() or action.server_present():
             raise TransportError(
                 f"another server answers under {namespace} in DDS domain {route.domain_id}: stop it, "
                 "or choose another domain with ROS_DOMAIN_ID or another --namespace"

@@ -11,7 +11,6 @@ import sys
 from threading import Event, Lock, Thread
 from typing import Any, Protocol
 
-from s2a_bench.errors import S2AError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Route
 from s2a_bench.transport.ros.action import ActionFront
@@ -100,32 +99,34 @@ class RosServer:
     def _work(self, front: Front, turn: Lock) -> None:
         """Wait for a request when it is this thread's turn, and answer it while another thread waits."""
         while not self._stopped.is_set():
-            with turn:
-                packed = front.take(POLL_S)
-                trace = Trace()
-                trace.mark("network")
-            if packed is not None:
-                try:
-                    job = front.job(packed, trace)
-                    if job is not None:
-                        self._answer(job)
-                    del job
-                except S2AError as error:  # the middleware's own trouble with one request; the next may fare better
-                    print(f"request not answered: {error}", file=sys.stderr, flush=True)  # noqa: T201 - a node's log
-                del packed  # gives the received bytes back before the next wait
+            job = packed = None  # gives the received bytes back before the next wait
+            try:
+                with turn:
+                    packed = front.take(POLL_S)
+                    trace = Trace()
+                    trace.mark("network")
+                job = front.job(packed, trace) if packed is not None else None
+                if job is not None:
+                    self._answer(job)
+            except Exception as error:  # noqa: BLE001 - a node stays up: the next request may fare better
+                said = f"request not answered: {error or type(error).__name__}"
+                print(said, file=sys.stderr, flush=True)  # noqa: T201 - a node's log
 
     def _answer(self, job: Job) -> None:
         """Answer one request; what goes wrong goes back to who asked."""
-        if job.request is None:
-            job.end()
+        if job.request is None or self._stopped.is_set():
+            job.end("the server is stopping" if job.request else "")
             return
+        error = ""
         tokens = self._handler(job.request, job.trace)
         try:
             for token in tokens:
-                if not job.token(token):
-                    tokens.close()
+                if self._stopped.is_set():
+                    error = "the server is stopping"
+                if error or not job.token(token):
                     break
-        except S2AError as error:
-            job.end(str(error))
-        else:
-            job.end()
+        except Exception as failure:  # noqa: BLE001 - who asked must hear of it, whatever broke
+            error = str(failure) or type(failure).__name__
+        finally:
+            tokens.close()
+        job.end(error)

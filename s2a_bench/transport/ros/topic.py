@@ -120,12 +120,9 @@ class TopicFront:
         """Wait for the next request and return it packed; None on timeout or after `interrupt`."""
         return self._requests.take(timeout_s)
 
-    def job(self, packed: Any, trace: Trace) -> TopicJob | None:
-        """Unpack a request and decode its pictures; None for bytes that are no request: nobody to answer to."""
-        try:
-            message = self._requests.unpack(packed)
-        except S2AError:
-            return None
+    def job(self, packed: Any, trace: Trace) -> TopicJob:
+        """Unpack a request and decode its pictures; raises TransportError for bytes that are no request."""
+        message = self._requests.unpack(packed)
         trace.mark("cdr_parse")
         return TopicJob(self, message, trace, self._cache)
 
