@@ -13,11 +13,9 @@ from pathlib import Path
 from s2a_bench.clock import realtime_offset_ns
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.record import Recorder
+from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA, FRAME_ID
+from s2a_bench.transport.ros.topic import request_message, token_message
 from s2a_bench.types import Frame, Request, Token
-
-IMAGE_TOPIC = "/camera/image_raw"
-COMPRESSED_TOPIC = "/camera/image_raw/compressed"
-FRAME_ID = "camera"
 
 
 class RunRecorder:
@@ -34,36 +32,18 @@ class RunRecorder:
         stamp_ns = frame.stamp_ns + self._offset_ns
         if frame.encoding in ros.CHANNELS:
             message = ros.image_message(frame, stamp_ns, FRAME_ID)
-            self._recorder.write(self._namespace + IMAGE_TOPIC, ros.IMAGE, message, stamp_ns)
+            self._recorder.write(self._namespace + CAMERA, ros.IMAGE, message, stamp_ns)
         else:
             message = ros.compressed_image_message(frame.data, stamp_ns, FRAME_ID)
-            self._recorder.write(self._namespace + COMPRESSED_TOPIC, ros.COMPRESSED_IMAGE, message, stamp_ns)
+            self._recorder.write(self._namespace + COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE, message, stamp_ns)
 
     def answer(self, cell: str, request: Request, asked_ns: int, tokens: list[tuple[Token, int]], error: str) -> None:
         """Note a request and its tokens with the times at which the client saw them (CLOCK_MONOTONIC)."""
         topic = f"{self._namespace}/{re.sub('[^A-Za-z0-9/]', '_', cell)}"
-        question = ros.message(
-            ros.REQUEST,
-            id=request.id,
-            prompt=request.prompt,
-            grammar=request.grammar,
-            max_tokens=request.max_tokens,
-            seed=request.seed,
-            images=[],
-            compressed_images=[],
-        )
-        self._recorder.write(topic + "/request", ros.REQUEST, question, asked_ns + self._offset_ns)
+        self._recorder.write(topic + "/request", ros.REQUEST, request_message(request), asked_ns + self._offset_ns)
         for place, (token, seen_ns) in enumerate(tokens, 1):
-            message = ros.message(
-                ros.TOKEN,
-                id=request.id,
-                index=token.index,
-                text=token.text,
-                token=token.id,
-                last=place == len(tokens),
-                error=error if place == len(tokens) else "",
-                marks=[],
-            )
+            last = place == len(tokens)
+            message = token_message(request.id, token, last=last, error=error if last else "")
             self._recorder.write(topic + "/token", ros.TOKEN, message, seen_ns + self._offset_ns)
 
     def flush(self) -> None:

@@ -29,7 +29,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import CameraSink, Route
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join
-from s2a_bench.transport.ros.topic import marks_message, remote_of
+from s2a_bench.transport.ros.topic import marks_message, remote_of, token_message
 from s2a_bench.types import Request, Token
 
 ACTION = "/generate_response"
@@ -209,9 +209,7 @@ class ActionFront:
     def plot(self, goal_id: str, token: Token) -> None:
         """Publish a token for whoever plots, where that is wanted."""
         if self._plot is not None:
-            fields = {"id": goal_id, "index": token.index, "text": token.text, "token": token.id}
-            message = ros.message(ros.TOKEN, **fields, last=False, error="", marks=[])
-            self._plot.send(self._plot.pack(message))
+            self._plot.send(self._plot.pack(token_message(goal_id, token, last=False)))
 
     def ended(self, goal_id: str, trace: Trace) -> None:
         """Send a goal's marks, before its result."""

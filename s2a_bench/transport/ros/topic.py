@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
@@ -56,18 +56,7 @@ class TopicClient:
         for frame in request.images:
             type_name, message = picture_message(frame, self._route.wire, self._offset_ns, trace)
             images[type_name].append(message)
-        packed = self._publisher.pack(
-            ros.message(
-                ros.REQUEST,
-                id=request.id,
-                prompt=request.prompt,
-                grammar=request.grammar,
-                max_tokens=request.max_tokens,
-                seed=request.seed,
-                images=images[ros.IMAGE],
-                compressed_images=images[ros.COMPRESSED_IMAGE],
-            )
-        )
+        packed = self._publisher.pack(request_message(request, images[ros.IMAGE], images[ros.COMPRESSED_IMAGE]))
         trace.mark("cdr_pack")
         self._publisher.send(packed)
         trace.facts["payload_bytes"] = len(packed)
@@ -129,18 +118,7 @@ class TopicFront:
     def send(self, request_id: str, token: Token, marks: list[Any], error: str = "") -> None:
         """Publish one token, or with marks the end of the answer."""
         self._tokens.send(
-            self._tokens.pack(
-                ros.message(
-                    ros.TOKEN,
-                    id=request_id,
-                    index=token.index,
-                    text=token.text,
-                    token=token.id,
-                    last=bool(marks),
-                    error=error,
-                    marks=marks,
-                )
-            )
+            self._tokens.pack(token_message(request_id, token, last=bool(marks), error=error, marks=marks))
         )
 
     def interrupt(self) -> None:
@@ -177,6 +155,34 @@ class TopicJob:
         """Publish the end of the answer, with the marks."""
         marks = marks_message(self._id, self.trace.to_remote())
         self._front.send(self._id, Token(self._sent, "", -1), [marks], error or self._error)
+
+
+def request_message(request: Request, images: Sequence[Any] = (), compressed_images: Sequence[Any] = ()) -> Any:
+    """Turn a request into s2a_msgs/Request, with pictures as messages."""
+    return ros.message(
+        ros.REQUEST,
+        id=request.id,
+        prompt=request.prompt,
+        grammar=request.grammar,
+        max_tokens=request.max_tokens,
+        seed=request.seed,
+        images=images,
+        compressed_images=compressed_images,
+    )
+
+
+def token_message(request_id: str, token: Token, *, last: bool, error: str = "", marks: Sequence[Any] = ()) -> Any:
+    """Turn a token into s2a_msgs/Token; ``last`` ends the answer, with marks or an error."""
+    return ros.message(
+        ros.TOKEN,
+        id=request_id,
+        index=token.index,
+        text=token.text,
+        token=token.id,
+        last=last,
+        error=error,
+        marks=marks,
+    )
 
 
 def marks_message(request_id: str, remote: Remote) -> Any:
