@@ -28,16 +28,14 @@ from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, t
 from s2a_bench.trace import Trace
 from s2a_bench.transport import CameraSink, Route
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
-from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join
-from s2a_bench.transport.ros.topic import marks_message, remote_of, token_message
+from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join, wait_until
+from s2a_bench.transport.ros.topic import READER_QOS, TOKEN_QOS, marks_message, remote_of, token_message
 from s2a_bench.types import Request, Token
 
 ACTION = "/generate_response"
 MARKS = "/marks"
-MARKS_QOS = QoS(depth=0)
 MEDIA_MARKER = "<__media__>"
 """Where a picture goes in a llama_ros prompt."""
-MATCH_TIMEOUT_S = 15.0
 MARKS_TIMEOUT_S = 2.0
 NO_SEED = 2**32 - 1
 """SamplingConfig.seed of a client that does not care."""
@@ -59,7 +57,7 @@ class GenerateClient:
             self._client, self._version = self._connect()
             self._marks = None
             if not route.black_box:
-                self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, MARKS_QOS)
+                self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, READER_QOS)
                 camera = CameraPublisher(self.middleware, namespace, route.wire, route.qos)
                 self.camera = camera
                 self._wait(lambda: bool(camera.matched()))
@@ -72,23 +70,18 @@ class GenerateClient:
         """Find the server and speak the version of llama_msgs that its type hash shows, ours where it shows none."""
         version = ros.DEFAULT_VERSION
         client = self.middleware.action_client(self._name, GENERATE_RESPONSE, version)
-        self._wait(lambda: client.wait_for_server(0.1))
+        self._wait(client.server_present)
         spoken = client.server_version() or version
         if spoken != version:
             self.middleware.close()  # a client of the other version would go on collecting what nobody reads
             self.middleware = join(self._route, "client")
             client = self.middleware.action_client(self._name, GENERATE_RESPONSE, spoken)
-            self._wait(lambda: client.wait_for_server(0.1))
+            self._wait(client.server_present)
         return client, spoken
 
     def _wait(self, arrived: Callable[[], bool]) -> None:
-        deadline = now_ns() + int(MATCH_TIMEOUT_S * 1e9)
-        while not arrived():
-            if now_ns() > deadline or not self._alive():
-                raise ServerDied(
-                    f"no action server appeared at {self._name} in DDS domain {self._route.domain_id}; "
-                    "is ROS_DOMAIN_ID the same on both sides?"
-                )
+        absent = f"no action server appeared at {self._name} in DDS domain {self._route.domain_id}"
+        wait_until(arrived, self._alive, absent)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Send a goal and yield its tokens."""
@@ -183,7 +176,7 @@ class ActionFront:
         self.max_tokens = route.max_tokens
         self.feedback_interval_ns = int(route.feedback_interval_s * 1e9)
         self._server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE, route.result_timeout_s)
-        self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, MARKS_QOS)
+        self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS)
         self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if route.publish_tokens else None
         self._active = 0
         self._lock = Lock()

@@ -12,14 +12,14 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import Route
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
-from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join
+from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join, wait_until
 from s2a_bench.types import Request, Token
 
 REQUEST_QOS = QoS(depth=10)
 READER_QOS = QoS(depth=0)
 """Our readers keep all: history is local, and a burst of tokens overruns ROS's default of 10."""
 TOKEN_QOS = QoS(depth=1000)
-MATCH_TIMEOUT_S = 15.0
+"""Our writers keep the last: one that keeps all blocks for as long as a reader does not read."""
 
 
 class TopicClient:
@@ -35,20 +35,13 @@ class TopicClient:
         self._publisher = self.middleware.publisher(namespace + "/request", ros.REQUEST, REQUEST_QOS)
         self._subscription = self.middleware.subscription(namespace + "/token", ros.TOKEN, READER_QOS)
         self.camera = CameraPublisher(self.middleware, namespace, route.wire, route.qos)
+        ends = (self._publisher, self._subscription, self.camera)  # volatile: what is sent before they match is lost
+        absent = f"no server appeared under {namespace} in DDS domain {route.domain_id}"
         try:
-            self._wait_until_matched(namespace)
+            wait_until(lambda: all(end.matched() for end in ends), alive, absent)
         except TransportError:
             self.close()
             raise
-
-    def _wait_until_matched(self, namespace: str) -> None:
-        """Wait until requests reach the server and its tokens reach us: volatile messages are else lost."""
-        deadline = now_ns() + int(MATCH_TIMEOUT_S * 1e9)
-        ends = (self._publisher, self._subscription, self.camera)
-        while not all(end.matched() for end in ends):
-            if now_ns() > deadline or not self._alive():
-                raise ServerDied(f"no server appeared under {namespace} in DDS domain {self._route.domain_id}")
-            self._subscription.take(0.02)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Publish the request, with its frames if it has any, and yield its tokens."""
