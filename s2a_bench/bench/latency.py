@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from s2a_bench.bench import environment
 from s2a_bench.bench.feed import Camera, Feed, RequestFeed, StreamFeed
-from s2a_bench.bench.plan import Cell, LatencyConfig, plan_cells
+from s2a_bench.bench.plan import Cell, LatencyConfig, plan_cells, route_of
 from s2a_bench.bench.processes import LlamaServer, OwnServer, ServerProcess
 from s2a_bench.bench.recording import RunRecorder
 from s2a_bench.bench.serving import ServerJob, engine_handler
@@ -22,7 +22,7 @@ from s2a_bench.bench.warnings import Counters, SampleGuard, before_run
 from s2a_bench.errors import ServerDied, TransportError
 from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.inference import open_engine
-from s2a_bench.inference.models import load_headers, resolve
+from s2a_bench.inference.models import resolve
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.schema import FrameRow
 from s2a_bench.trace import mark_cost_ns
@@ -94,23 +94,13 @@ class ServerSet:
             self.addresses[transport] = config.url if transport == "http" else config.namespace
             return
         if transport == "http" and config.llama_server:
-            files = load_headers(config.engine)
-            process = LlamaServer(
-                config.llama_server, config.engine, config.port, log, ignore_end=files.dummy and not config.grammar
-            )
+            has_grammar = bool(config.grammar)
+            process = LlamaServer(config.llama_server, config.engine, config.port, log, has_grammar=has_grammar)
         else:
             address = f"127.0.0.1:{config.port}" if transport == "http" else config.namespace
-            route = Route(
-                transport,
-                config.ros[0] if transport == "ros" else "",
-                address=address,
-                middleware=config.middleware,
-                qos=config.qos,
-                dds_tuning=config.dds_tuning,
-                domain_id=config.domain_id,
-                max_tokens=config.max_tokens,
-                result_timeout_s=config.result_timeout_s,
-            )
+            route = route_of(config, transport, address)
+            if transport == "ros":  # one server answers every variant
+                route = replace(route, variant=config.ros[0])
             process = OwnServer(ServerJob(route, config.engine, tuned=config.dds_tuning == "tuned"), log)
         self._processes[transport] = self._stack.enter_context(process)
 
@@ -175,14 +165,17 @@ class _Sources:
     def __init__(self, config: LatencyConfig, stack: ExitStack) -> None:
         self._config = config
         self._stack = stack
-        self._first: FrameSource | None = self.open()  # what is wrong with a source shows before anything starts
+        self._shared = config.source.startswith("v4l2")
+        self._ready: FrameSource | None = self._new()  # what is wrong with a source shows before anything starts
 
     def open(self) -> FrameSource:
-        """Open one more source, or return the shared one."""
+        """Return a source that nobody has yet, or the shared one."""
+        source = self._ready or self._new()
+        self._ready = source if self._shared else None
+        return source
+
+    def _new(self) -> FrameSource:
         config = self._config
-        first = getattr(self, "_first", None)
-        if first is not None and config.source.startswith("v4l2"):
-            return first  # type: ignore[no-any-return]
         source = open_source(config.source, config.width, config.height, fps=config.fps, seed=config.seed)
         self._stack.callback(source.close)
         return source
@@ -212,6 +205,7 @@ def _sessions(config: LatencyConfig, servers: ServerSet, sources: _Sources, stac
     recorder: RunRecorder | None = None
     if config.record is not None:
         recorder = stack.enter_context(RunRecorder(config.record, config.namespace, live=config.mode == "stream"))
+    clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
     camera: Camera | None = None
     if config.mode == "stream":
         camera = Camera(sources.open(), config.fps, on_frame=recorder.frame if recorder else None)
@@ -220,7 +214,7 @@ def _sessions(config: LatencyConfig, servers: ServerSet, sources: _Sources, stac
     for cell in plan_cells(config, servers.addresses):
         with _death_explained(servers, cell):
             client = open_client(cell.route, servers.alive(cell.route.transport))
-        stack.callback(client.close)
+        clients.callback(client.close)
         feed: Feed
         if camera is not None:
             random = Random(config.seed)  # noqa: S311 - phases, not secrets
@@ -228,8 +222,6 @@ def _sessions(config: LatencyConfig, servers: ServerSet, sources: _Sources, stac
         else:
             feed = RequestFeed(sources.open(), preencoded=cell.payload == "jpeg-preencoded")
         yield Session(cell, client, feed, config, recorder)
-    if camera is not None:
-        stack.callback(camera.stop)  # again, as the first to end: it publishes through the clients
 
 
 def _blocks(

@@ -182,10 +182,11 @@ class Cell:
     """What travels: the HTTP payload, the ROS wire format, or nothing for loopback."""
 
 
-def plan_cells(config: LatencyConfig, addresses: dict[str, str]) -> list[Cell]:
-    """List the cells of a run; ``addresses`` maps each transport to where its server is."""
-    common = Route(
-        transport="",
+def route_of(config: LatencyConfig, transport: str, address: str) -> Route:
+    """Return how a transport is wired in a run, for its server and, with a variant added, for its clients."""
+    return Route(
+        transport=transport,
+        address=address,
         payload=config.payload,
         wire=config.wire,
         connection=config.connection,
@@ -193,12 +194,18 @@ def plan_cells(config: LatencyConfig, addresses: dict[str, str]) -> list[Cell]:
         qos=config.qos,
         dds_tuning=config.dds_tuning,
         domain_id=config.domain_id,
+        max_tokens=config.max_tokens,
+        result_timeout_s=config.result_timeout_s,
         timeout_s=config.timeout_s,
         model=config.served_model,
     )
+
+
+def plan_cells(config: LatencyConfig, addresses: dict[str, str]) -> list[Cell]:
+    """List the cells of a run; ``addresses`` maps each transport to where its server is."""
     cells = []
     for transport in config.transports:
-        route = replace(common, transport=transport, address=addresses[transport])
+        route = route_of(config, transport, addresses[transport])
         if transport == "http":
             cells += [
                 Cell(f"http/{variant}", replace(route, variant=variant, black_box=config.black_box), config.payload)

@@ -22,7 +22,7 @@ from s2a_bench.bench.serving import ServerJob
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import EngineError, PortInUse, ServerDied, UsageError
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.models import load_headers, sha256
+from s2a_bench.inference.models import ModelFiles, load_headers, sha256
 
 READY_TIMEOUT_S = 600.0
 """A model of several GB may have to come from a slow disk."""
@@ -147,10 +147,10 @@ class LlamaServer(ServerProcess):
 
     _speaks_json = False
 
-    def __init__(self, binary: Path, engine: EngineConfig, port: int, log: Path, *, ignore_end: bool) -> None:
+    def __init__(self, binary: Path, engine: EngineConfig, port: int, log: Path, *, has_grammar: bool) -> None:
         """Start the binary on ``port``, or any free one for 0; raises UsageError when it cannot be run.
 
-        ``ignore_end`` keeps dummy weights, which end at random, going to the token limit, as our own engine does.
+        Without a grammar dummy weights, which end at random, are kept going to the token limit, as by our own engine.
         """
         if not (binary.is_file() and os.access(binary, os.X_OK)):
             raise UsageError(f"--llama-server: {binary} is no program that can be run")
@@ -162,11 +162,12 @@ class LlamaServer(ServerProcess):
         command += ["--gpu-layers", str(engine.gpu_layers if engine.gpu_layers >= 0 else 999)]
         if engine.gpu_layers == 0:
             command.append("--no-mmproj-offload")
-        if ignore_end:
+        files = load_headers(engine)
+        if files.dummy and not has_grammar:
             command.append("--ignore-eos")
         super().__init__("llama-server", command, log)
         self.address = f"http://127.0.0.1:{port}"
-        self.facts = {"command": command, "engine": {"engine": "llama-server", **described(engine)}}
+        self.facts = {"command": command, "engine": {"engine": "llama-server", **_described(files)}}
 
     def wait_ready(self) -> None:
         """Poll ``/health`` until the model is loaded."""
@@ -184,9 +185,8 @@ class LlamaServer(ServerProcess):
         raise ServerDied(f"llama-server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
 
 
-def described(engine: EngineConfig) -> dict[str, Any]:
+def _described(files: ModelFiles) -> dict[str, Any]:
     """Return what the manifest says about the model files of a server that says nothing itself."""
-    files = load_headers(engine)
     return {
         "model": str(files.model.path),
         "mmproj": str(files.mmproj.path),
