@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from s2a_bench.cli.options import WIDTH, file_text, listed, size_of, text_or_file
 from s2a_bench.errors import S2AError, UsageError
 
 if TYPE_CHECKING:
     from s2a_bench.cli.progress import RunProgress
 
-WIDTH = 100
-"""Columns of the tables where the output is no terminal."""
 QUICK = {"runs": 10, "warmup": 2, "max_tokens": 8}
 FULL = {"runs": 50, "warmup": 5, "max_tokens": 32}
 
@@ -82,11 +81,11 @@ def latency(
     if against not in {"", "paper"}:
         raise UsageError(f"--against: '{against}' should be paper")
     few = QUICK if quick else FULL
-    width, height = _size(size)
+    width, height = size_of(size)
     config = LatencyConfig(
-        transports=_listed(transport),
-        http=_listed(http),
-        ros=_listed(ros),
+        transports=listed(transport),
+        http=listed(http),
+        ros=listed(ros),
         action=action,
         record=record,
         result_timeout_s=result_timeout,
@@ -111,8 +110,8 @@ def latency(
         mode=mode,
         fps=fps,
         max_tokens=few["max_tokens"] if max_tokens is None else max_tokens,
-        prompt=DEFAULT_PROMPT if prompt is None else _text(prompt),
-        grammar=_file(grammar, "--grammar") if grammar else "",
+        prompt=DEFAULT_PROMPT if prompt is None else text_or_file(prompt),
+        grammar=file_text(grammar, "--grammar") if grammar else "",
         seed=seed,
         timeout_s=timeout,
     )
@@ -155,26 +154,3 @@ def _show(folder: Path, progress: RunProgress, *, as_json: bool, against_paper: 
         console.print(f"a mark costs {run.manifest['mark_cost_ns']} ns")
         console.print_json(data=run.manifest["environment"])
     console.print(f"run folder: {folder}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _listed(text: str) -> tuple[str, ...]:
-    """Split at commas, each name once."""
-    return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, cross, height = text.lower().partition("x")
-    if not (cross and width.isdecimal() and height.isdecimal()):
-        raise UsageError(f"--size: '{text}' should look like 640x480")
-    return int(width), int(height)
-
-
-def _text(value: str) -> str:
-    return _file(Path(value[1:]), "--prompt") if value.startswith("@") else value
-
-
-def _file(path: Path, flag: str) -> str:
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{flag}: cannot read {path}: {error}") from error

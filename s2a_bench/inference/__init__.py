@@ -52,6 +52,16 @@ class EngineConfig:
     """Layers on the GPU; -1: all."""
     context: int = 4096
     """Context length in tokens."""
+    batch: int = 512
+    """The most prompt tokens evaluated at once (llama.cpp's ``n_batch`` and ``n_ubatch``)."""
+    kv_type: str = "f16"
+    """Type of the KV cache: f32, f16, q8_0, q4_0."""
+    flash_attention: str = "auto"
+    """auto, on, off."""
+    profile: str = ""
+    """replay: name or path of the hardware profile."""
+    gaps: str = ""
+    """replay: trace (the recorded gaps), parametric, constant; empty: the best that the profile has."""
 
 
 ENGINES: dict[str, str] = {

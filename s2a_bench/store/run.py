@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, final
 from s2a_bench.errors import StoreError
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.files import CsvFile, read_csv, read_parquet, to_pandas, write_parquet
-from s2a_bench.store.schema import FRAMES, SAMPLES, SCHEMA, TOKENS, FrameRow, SampleRow, Table, TokenRow
+from s2a_bench.store.schema import FRAMES, SAMPLES, SCHEMA, TABLES, TOKENS, FrameRow, Row, SampleRow, Table, TokenRow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,13 +40,13 @@ class RunWriter:
         self._manifest = manifest
         self._finished = False
         manifests.write(path, manifest)
-        self._samples = CsvFile(path / "samples.csv", SAMPLES.columns)
-        self._tokens = CsvFile(path / "tokens.csv", TOKENS.columns)
-        self._frames: CsvFile | None = None
+        self._files: dict[str, CsvFile] = {}
 
     @classmethod
-    def create(cls, root: Path, command: str, manifest: dict[str, Any]) -> RunWriter:
-        """Make ``<root>/<UTC time>-<command>-<host>`` and open its files.
+    def create(
+        cls, root: Path, command: str, manifest: dict[str, Any], tables: Iterable[Table[Any]] = (SAMPLES, TOKENS)
+    ) -> RunWriter:
+        """Make ``<root>/<UTC time>-<command>-<host>`` and open the files of ``tables``; others open at their first row.
 
         ``manifest`` may bring ``argv``, ``configuration``, ``environment``, ``warnings``, ``seeds`` and more.
         Raises StoreError, naming ``--output``, where the folder cannot be made.
@@ -74,26 +74,33 @@ class RunWriter:
             "warnings": [],
         }
         manifests.merge(whole, manifest)
-        return cls(path, whole)
+        run = cls(path, whole)
+        for table in tables:
+            run.append(table, [])
+        return run
 
     @property
     def manifest(self) -> dict[str, Any]:
         """The manifest as last written; change it through `update`."""
         return self._manifest
 
+    def append(self, table: Table[Row], rows: Iterable[Row]) -> None:
+        """Append rows to a table in one write; the first call creates its file."""
+        if table.name not in self._files:
+            self._files[table.name] = CsvFile(self.path / f"{table.name}.csv", table.columns)
+        self._files[table.name].append(table, rows)
+
     def sample(self, row: SampleRow) -> None:
         """Append one sample."""
-        self._samples.append(SAMPLES, [row])
+        self.append(SAMPLES, [row])
 
     def tokens(self, rows: Iterable[TokenRow]) -> None:
         """Append the tokens of one request."""
-        self._tokens.append(TOKENS, rows)
+        self.append(TOKENS, rows)
 
     def frame(self, row: FrameRow) -> None:
-        """Append one frame of a stream; the first one creates the file."""
-        if self._frames is None:
-            self._frames = CsvFile(self.path / "frames.csv", FRAMES.columns)
-        self._frames.append(FRAMES, [row])
+        """Append one frame of a stream."""
+        self.append(FRAMES, [row])
 
     def update(self, **facts: Any) -> None:
         """Merge facts into the manifest (mappings key by key) and replace the file."""
@@ -107,14 +114,11 @@ class RunWriter:
         if self._finished:
             return
         self._finished = True
-        for file in (self._samples, self._tokens, self._frames):
-            if file is not None:
-                file.close()
+        for file in self._files.values():
+            file.close()
         try:
-            tables: list[Table[Any]] = [SAMPLES, TOKENS, *([] if self._frames is None else [FRAMES])]
-            for table in tables:
-                rows = read_csv(self.path / f"{table.name}.csv", table.columns)
-                write_parquet(self.path / f"{table.name}.parquet", rows)
+            for name, file in self._files.items():
+                write_parquet(self.path / f"{name}.parquet", read_csv(file.path, TABLES[name].columns))
         finally:
             # The state is written even where there is no room for Parquet, or Ctrl-C comes a second time.
             self.update(state=state, error=error, finished=manifests.utc_now())
@@ -143,9 +147,22 @@ class Run:
 
     path: Path
     manifest: dict[str, Any]
-    samples: pd.DataFrame
-    tokens: pd.DataFrame
-    frames: pd.DataFrame
+    tables: dict[str, pd.DataFrame]
+
+    @property
+    def samples(self) -> pd.DataFrame:
+        """One row a request."""
+        return self.tables["samples"]
+
+    @property
+    def tokens(self) -> pd.DataFrame:
+        """One row a token."""
+        return self.tables["tokens"]
+
+    @property
+    def frames(self) -> pd.DataFrame:
+        """One row a frame of a stream."""
+        return self.tables["frames"]
 
 
 def read_run(path: Path) -> Run:
@@ -155,7 +172,7 @@ def read_run(path: Path) -> Run:
     """
     path = Path(path)
     manifest = manifests.read(path)
-    return Run(path, manifest, _read(path, SAMPLES), _read(path, TOKENS), _read(path, FRAMES))
+    return Run(path, manifest, {name: _read(path, table) for name, table in TABLES.items()})
 
 
 def _read(path: Path, table: Table[Any]) -> pd.DataFrame:

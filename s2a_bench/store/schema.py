@@ -84,7 +84,8 @@ class FrameRow:
     used_by: str = ""
 
 
-Row = TypeVar("Row", SampleRow, TokenRow, FrameRow)
+Row = TypeVar("Row")
+"""The dataclass of a table's rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +98,10 @@ class Table(Generic[Row]):
 
     def values(self, row: Row) -> Iterator[Value]:
         """Yield one value a column, the row's own fields first; lists and dicts become JSON text."""
-        for item in fields(row):
+        for item in fields(row):  # type: ignore[arg-type]  # a row is a dataclass
             yield _stored(getattr(row, item.name))
         derived = self.derive(row)
-        for name in list(self.columns)[len(fields(row)) :]:
+        for name in list(self.columns)[len(fields(row)) :]:  # type: ignore[arg-type]
             yield _stored(derived.get(name))
 
 
@@ -193,3 +194,6 @@ FRAMES: Final[Table[FrameRow]] = Table(
     _derive_frame,
 )
 """One row a frame in stream mode. `latency_ns` counts from the intended time (no coordinated omission)."""
+
+TABLES: Final[dict[str, Table[Any]]] = {table.name: table for table in (SAMPLES, TOKENS, FRAMES)}
+"""Every table a run folder may hold, by its file's name."""

@@ -68,8 +68,8 @@ def open_run(tmp_path: Path) -> Iterator[Callable[..., RunWriter]]:
 
     yield create
     for run in runs:
-        run._samples.close()
-        run._tokens.close()
+        for file in run._files.values():
+            file.close()
 
 
 def test_a_finished_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
@@ -301,12 +301,12 @@ def test_a_full_disk_names_the_file_and_leaves_whole_records(
 ) -> None:
     run = open_run()
     run.sample(sample("r1"))
-    file = run._samples._file
-    monkeypatch.setattr(run._samples, "_file", FullDisk(file))
+    file = run._files["samples"]._file
+    monkeypatch.setattr(run._files["samples"], "_file", FullDisk(file))
     with pytest.raises(StoreError, match=r"samples\.csv: No space left on device"):
         run.sample(sample("r2"))
     assert (run.path / "samples.csv").read_bytes().endswith(b"\n")
-    monkeypatch.setattr(run._samples, "_file", file)
+    monkeypatch.setattr(run._files["samples"], "_file", file)
     run.sample(sample("r3"))
     assert read_run(run.path).samples["request_id"].tolist() == ["r1", "r3"]
 

@@ -1,0 +1,108 @@
+"""When to act: a policy answers when each skill of a plan starts and how long it runs. Pure: time comes in as numbers.
+
+Two forms of every policy give the same result: `Policy.schedule` on arrays, for studies of millions of plans, and
+`Policy.stepper`, an object that is told what has happened so far, for a robot. The words are those of
+docs/policies.md: N skills, M plans, times in seconds from the request.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, TypeAlias
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How long one skill takes: as planned, at least, at most (by time-scaling it)."""
+
+    nominal_s: float
+    least_s: float
+    most_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Start the next skill now.
+
+    It ends after ``duration_s`` if the next skill has arrived by then, or if none follows; else it is held on until
+    the next arrives, but no longer than ``latest_s`` after its start: then the robot stalls.
+    """
+
+    duration_s: float
+    latest_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlanShape:
+    """What is known of a plan before its first token."""
+
+    n_skills: int
+    tokens_per_skill: float
+    """Delimiter included."""
+    expected: Timing
+    """Of a skill whose fragment has not been parsed yet."""
+    expected_cv: float = 0.2
+
+
+class Stepper(Protocol):
+    """One policy following one plan. Times never decrease from call to call."""
+
+    def token(self, at_s: float) -> None:
+        """Learn that a token arrived."""
+        ...
+
+    def fragment(self, at_s: float, timing: Timing) -> None:
+        """Learn that the next skill has been parsed."""
+        ...
+
+    def end(self, at_s: float) -> None:
+        """Learn that the stream has ended: no skill will follow."""
+        ...
+
+    def decide(self, now_s: float) -> Start | float:
+        """Say what to do while no skill runs: start the next one, or when to ask again (inf: when something happens).
+
+        After a Start the policy takes the skill as started at ``now_s``; ask again when it has ended.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Plans:
+    """M plans of N skills each, as arrays of shape (N, M), in seconds from the request."""
+
+    arrival_s: Floats
+    """t_i: when fragment i is complete; non-decreasing along the first axis."""
+    nominal_s: Floats
+    least_s: Floats
+    most_s: Floats
+    token_s: Floats | None = None
+    """When each token arrived, shape (tokens, M), for the policies that learn from tokens."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """What a policy makes of M plans: arrays of shape (N, M), in seconds; durations include holding on."""
+
+    start_s: Floats
+    duration_s: Floats
+
+
+class Policy(Protocol):
+    """A rule for acting."""
+
+    name: str
+
+    def schedule(self, plans: Plans) -> Schedule:
+        """Decide for many plans at once."""
+        ...
+
+    def stepper(self, shape: PlanShape) -> Stepper:
+        """Follow one plan as it arrives."""
+        ...

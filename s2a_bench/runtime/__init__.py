@@ -1,0 +1,1 @@
+"""Acting: an executor carries a policy's decisions out on a clock."""
