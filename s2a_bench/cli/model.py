@@ -1,14 +1,26 @@
-"""`model`: get model files ready."""
+"""`model`: fetch model files, write dummy ones, say what is in them."""
 
 from __future__ import annotations
 
+import json
+import sys
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Get model files ready.")
+from s2a_bench.cli.options import WIDTH
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from s2a_bench.inference.fetch import Fetched
+
+SCHEMA = "s2a-bench-model/1"
+"""Of `--json`; described by ``docs/schema/s2a-bench-model-1.json``."""
+
+app = typer.Typer(no_args_is_help=True, help="Fetch model files, write dummy ones, say what is in them.")
 
 
 class Size(str, Enum):
@@ -28,7 +40,114 @@ class Quant(str, Enum):
 
 @app.callback()
 def model() -> None:
-    """Get model files ready."""
+    """Fetch model files, write dummy ones, say what is in them."""
+
+
+@app.command()
+def fetch(
+    what: Annotated[str, typer.Argument(metavar="NAME", help="minicpm-v-2.6, or ORG/REPO:FILE")],
+    quant: Annotated[
+        str | None, typer.Option(help="quantisation of the language model, as Q8_0  [default: Q4_K_M]")
+    ] = None,
+    mmproj: Annotated[
+        str | None, typer.Option(help="the repository's vision tower to fetch too  [default: the known one, or none]")
+    ] = None,
+    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+) -> None:
+    """Fetch a model from the hub: resumed where it broke off, checked against the hub's SHA-256."""
+    from s2a_bench.inference.fetch import fetch as fetch_files
+    from s2a_bench.inference.fetch import wanted
+    from s2a_bench.inference.gguf_file import read_header
+
+    want = wanted(what, quant, mmproj)
+    with _bytes_bar() as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def show(name: str, there: int, total: int) -> None:
+            if name not in tasks:
+                tasks[name] = bar.add_task(name)
+            bar.update(tasks[name], completed=there, total=total)
+
+        done = fetch_files(want, show)
+    for file in done.files:
+        read_header(file.path, "model fetch")
+    command = _latency_command(done)
+    if json_:
+        _print_json(_fetched_json(done, command))
+        return
+    for file in done.files:
+        typer.echo(file.path)
+    if command:
+        typer.echo(command)
+
+
+def _latency_command(done: Fetched) -> str | None:
+    """Return the command that measures with these files; None where they are no language model with its mmproj."""
+    from shlex import join
+
+    from s2a_bench.errors import ModelError
+    from s2a_bench.inference import EngineConfig
+    from s2a_bench.inference.models import load_headers
+
+    model, *mmproj = (file.path for file in done.files)
+    try:
+        files = load_headers(EngineConfig(model=model, mmproj=mmproj[0] if mmproj else None))
+    except ModelError as error:
+        typer.echo(f"note: {error}", err=True)
+        return None
+    return join(["s2a-bench", "latency", "--model", str(files.model.path), "--mmproj", str(files.mmproj.path)])
+
+
+def _fetched_json(done: Fetched, command: str | None) -> dict[str, Any]:
+    files = [
+        {"path": str(file.path), "bytes": file.nbytes, "sha256": file.sha256, "resumed_at": file.resumed_at}
+        for file in done.files
+    ]
+    facts = {"endpoint": done.endpoint, "repository": done.repository, "commit": done.commit, "files": files}
+    return {"schema": SCHEMA, "command": "model fetch", **facts} | ({"latency": command} if command else {})
+
+
+@app.command()
+def info(
+    what: Annotated[str, typer.Argument(metavar="FILE", help="a GGUF file, or minicpm-v-2.6 once it is fetched")],
+    hash_: Annotated[
+        bool, typer.Option("--hash", help="compute the SHA-256; else it is shown where it is known already")
+    ] = False,
+    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+) -> None:
+    """Say what is in a GGUF file: shapes, types, vision tower, vocabulary, chat template, licence, hash."""
+    from rich.console import Console
+
+    from s2a_bench.cli.model_text import as_json, renderables
+    from s2a_bench.inference.fetch_names import HUB_MODELS, fetched
+    from s2a_bench.inference.gguf_info import describe
+    from s2a_bench.inference.models import remembered_sha256, sha256
+
+    known = what in HUB_MODELS and not Path(what).is_file()
+    paths = fetched(what, "model info") if known else (Path(what),)
+    found = [(describe(path, "model info"), sha256(path) if hash_ else remembered_sha256(path)) for path in paths]
+    if json_:
+        files = [as_json(facts, hash_known) for facts, hash_known in found]
+        _print_json({"schema": SCHEMA, "command": "model info", "files": files})
+        return
+    terminal = Console()
+    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    for facts, hash_known in found:
+        for part in renderables(facts, hash_known):
+            console.print(part, soft_wrap=isinstance(part, str), highlight=False, markup=False)
+
+
+def _print_json(content: dict[str, Any]) -> None:
+    json.dump(content, sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
+    sys.stdout.write("\n")
+
+
+def _bytes_bar(*, disable: bool = False) -> Progress:
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    return Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), disable=disable)
 
 
 @app.command()
@@ -48,11 +167,7 @@ def dummy(
     folder = output or dummy_folder(size.value)
     files = dummy_files(folder, size.value, kind.value)
     if force or not (files.model.is_file() and files.mmproj.is_file()):
-        from rich.console import Console
-        from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
-
-        columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True), disable=size is Size.tiny) as bar:
+        with _bytes_bar(disable=size is Size.tiny) as bar:
             task = bar.add_task("write", total=None)
             write_dummy(
                 folder,

@@ -6,11 +6,12 @@ that of ggml's ``docs/gguf.md``, versions 2 and 3, little endian.
 
 from __future__ import annotations
 
+import math
 import mmap
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from s2a_bench.errors import ModelError
 
@@ -22,13 +23,34 @@ _MAX_DIMS = 4
 Value: TypeAlias = str | int | float | bool
 
 
+class TensorInfo(NamedTuple):
+    """One tensor as the header lists it; ``shape`` in GGUF's order (columns first), ``kind`` a ``ggml_type``."""
+
+    name: str
+    shape: tuple[int, ...]
+    kind: int
+    nbytes: int
+
+
+class ArrayPlace(NamedTuple):
+    """Where an array lies in the file: the type of its items, how many there are, the offset of the first."""
+
+    kind: int
+    length: int
+    at: int
+
+
 @dataclass(frozen=True, slots=True)
 class GgufHeader:
-    """What the header says: its scalar and string keys (arrays are left out) and the number of tensors."""
+    """What the header says: its scalar and string keys, where its arrays lie, and its tensors without their data."""
 
     path: Path
+    version: int
+    nbytes: int
+    """Size of the whole file."""
     fields: dict[str, Value]
-    n_tensors: int
+    arrays: dict[str, ArrayPlace]
+    tensors: tuple[TensorInfo, ...]
 
     @property
     def architecture(self) -> str:
@@ -56,9 +78,9 @@ class _Cursor:
 
     __slots__ = ("at", "data")
 
-    def __init__(self, data: mmap.mmap) -> None:
+    def __init__(self, data: mmap.mmap, at: int = 0) -> None:
         self.data = data
-        self.at = 0
+        self.at = at
 
     def scalar(self, form: str) -> int | float | bool:
         value: int | float | bool = struct.unpack_from(form, self.data, self.at)[0]
@@ -79,15 +101,14 @@ class _Cursor:
         self.skip(size)
         return self.data[start : self.at].decode()
 
-    def skip_array(self) -> None:
-        kind, count = self.integer("<I"), self.integer("<Q")
-        if kind == _STRING:
-            for _ in range(count):
+    def skip_array(self) -> ArrayPlace:
+        place = ArrayPlace(self.integer("<I"), self.integer("<Q"), self.at)
+        if place.kind == _STRING:
+            for _ in range(place.length):
                 self.skip(self.integer("<Q"))
-        elif kind in _SCALARS:
-            self.skip(count * struct.calcsize(_SCALARS[kind]))
         else:
-            raise ValueError(kind)
+            self.skip(place.length * struct.calcsize(_SCALARS[place.kind]))
+        return place
 
 
 def read_header(path: Path, flag: str) -> GgufHeader:
@@ -102,10 +123,10 @@ def read_header(path: Path, flag: str) -> GgufHeader:
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 return _parse(path, data, flag)
     except FileNotFoundError:
-        raise ModelError(f"{flag} {path}: no such file; check the path, or leave it out for the tiny dummy") from None
+        raise ModelError(f"{flag} {path}: no such file; check the path") from None
     except OSError as error:
         raise ModelError(f"{flag} {path}: cannot be read ({error.strerror or error}); check the path") from error
-    except (struct.error, EOFError, ValueError, KeyError, OverflowError, MemoryError) as error:
+    except (struct.error, EOFError, ValueError, LookupError, ArithmeticError, MemoryError) as error:
         raise ModelError(f"{flag} {path}: the GGUF header is damaged or cut short; fetch the file again") from error
 
 
@@ -117,31 +138,47 @@ def _parse(path: Path, data: mmap.mmap, flag: str) -> GgufHeader:
         raise ModelError(f"{flag} {path}: GGUF version {version} is not known (2 and 3 are); convert the model again")
     n_tensors, n_fields = cursor.integer("<Q"), cursor.integer("<Q")
     fields: dict[str, Value] = {}
+    arrays: dict[str, ArrayPlace] = {}
     for _ in range(n_fields):
         key, kind = cursor.string(), cursor.integer("<I")
         if kind == _ARRAY:
-            cursor.skip_array()
+            arrays[key] = cursor.skip_array()
         else:
             fields[key] = cursor.string() if kind == _STRING else cursor.scalar(_SCALARS[kind])
-    end = _end_of_tensors(cursor, n_tensors, int(fields.get("general.alignment", 32)))
+    tensors, last = _tensors(cursor, n_tensors)
+    alignment = int(fields.get("general.alignment", 32))
+    end = -(-cursor.at // alignment) * alignment + last
     if end > len(data):
         raise ModelError(f"{flag} {path}: cut short, {len(data)} of {end} bytes are there; fetch the file again")
-    return GgufHeader(path, fields, n_tensors)
+    return GgufHeader(path, version, len(data), fields, arrays, tensors)
 
 
-def _end_of_tensors(cursor: _Cursor, n_tensors: int, alignment: int) -> int:
-    """Return the offset at which the last tensor ends."""
+def _tensors(cursor: _Cursor, count: int) -> tuple[tuple[TensorInfo, ...], int]:
+    """Return the tensors, and the offset within the data at which the last of them ends."""
     from gguf.constants import GGML_QUANT_SIZES
 
-    last = 0
-    for _ in range(n_tensors):
-        cursor.string()
-        n_dims = cursor.integer("<I")
+    tensors, last = [], 0
+    for _ in range(count):
+        name, n_dims = cursor.string(), cursor.integer("<I")
         if n_dims > _MAX_DIMS:
             raise ValueError(n_dims)
-        elements = 1
-        for _ in range(n_dims):
-            elements *= cursor.integer("<Q")
-        block, block_bytes = GGML_QUANT_SIZES[cursor.integer("<I")]
-        last = max(last, cursor.integer("<Q") + elements // block * block_bytes)
-    return -(-cursor.at // alignment) * alignment + last
+        shape = tuple(cursor.integer("<Q") for _ in range(n_dims))
+        kind = cursor.integer("<I")
+        block, block_bytes = GGML_QUANT_SIZES[kind]
+        nbytes = math.prod(shape) // block * block_bytes
+        tensors.append(TensorInfo(name, shape, kind, nbytes))
+        last = max(last, cursor.integer("<Q") + nbytes)
+    return tuple(tensors), last
+
+
+def read_array(header: GgufHeader, key: str) -> list[Value]:
+    """Read one array of a header that `read_header` has checked; empty where the file has no such key."""
+    place = header.arrays.get(key)
+    if place is None:
+        return []
+    with header.path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        cursor = _Cursor(data, place.at)
+        if place.kind == _STRING:
+            return [cursor.string() for _ in range(place.length)]
+        items = f"<{place.length}{_SCALARS[place.kind][1:]}"
+        return list(struct.unpack_from(items, data, place.at))

@@ -1,4 +1,4 @@
-"""Find the two files of a model: the user's own, checked, or the tiny dummy, made on first use."""
+"""Find the two files of a model, checked: the user's own, a known name's, or the tiny dummy, made on first use."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from s2a_bench.errors import ModelError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.dummy import Quant, Size, dummy_files, write_dummy
+from s2a_bench.inference.fetch_names import HUB_MODELS, fetched
 from s2a_bench.inference.gguf_file import GgufHeader, read_header
 
 CACHE_VARIABLE = "S2A_BENCH_CACHE"
@@ -63,13 +64,17 @@ def resolve(config: EngineConfig) -> tuple[Path, Path]:
 def load_headers(config: EngineConfig) -> ModelFiles:
     """Read and check both headers.
 
-    Raises ModelError where a file is missing, damaged or of the wrong kind, or where no mmproj is found.
+    A name of `HUB_MODELS` instead of a path stands for its fetched files. Raises ModelError where a file is missing,
+    damaged or of the wrong kind, or where no mmproj is found.
     """
     model_path, mmproj_path = config.model, config.mmproj
     if model_path is None:
         if mmproj_path is not None:
             raise ModelError(f"--mmproj {mmproj_path}: needs the language model too; give --model, or leave out both")
         model_path, mmproj_path = tiny_dummy()
+    elif str(model_path) in HUB_MODELS and not model_path.is_file():
+        model_path, own_mmproj = fetched(str(model_path), "--model")
+        mmproj_path = mmproj_path or own_mmproj
     model = read_header(model_path, "--model")
     if model.is_mmproj:
         raise ModelError(f"--model {model_path}: this is an mmproj (vision tower); give it as --mmproj")
@@ -98,28 +103,43 @@ def _mmproj_beside(model: Path) -> Path:
 
 def sha256(path: Path) -> str:
     """Return a file's SHA-256; remembered in the cache by path, size and time of change, as models are large."""
-    status = path.stat()
-    key = hashlib.sha256(f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}".encode()).hexdigest()
-    note = cache_folder() / "sha256" / f"{key}.json"
-    try:
-        return str(json.loads(note.read_text())["sha256"])
-    except (OSError, ValueError, KeyError, TypeError):
-        pass  # not there yet, or damaged: compute it
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 22):
-            digest.update(block)
-    value = digest.hexdigest()
-    _remember(note, {"path": str(path.resolve()), "sha256": value})
+    if known := remembered_sha256(path):
+        return known
+    value = digest(path)
+    remember_sha256(path, value)
     return value
 
 
-def _remember(note: Path, facts: dict[str, str]) -> None:
-    """Write a note in one step; a cache that cannot be written costs time, nothing else."""
+def digest(path: Path) -> str:
+    """Compute a file's SHA-256 in hex."""
+    computed = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 22):
+            computed.update(block)
+    return computed.hexdigest()
+
+
+def remembered_sha256(path: Path) -> str | None:
+    """Return a file's SHA-256 if it was computed before and the file has not changed since."""
+    try:
+        return str(json.loads(_note(path).read_text())["sha256"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # not there yet, or damaged: to be computed
+
+
+def remember_sha256(path: Path, value: str) -> None:
+    """Write the note in one step; a cache that cannot be written costs time, nothing else."""
+    note = _note(path)
     try:
         note.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile("w", dir=note.parent, delete=False) as file:
-            json.dump(facts, file)
+            json.dump({"path": str(path.resolve()), "sha256": value}, file)
         Path(file.name).replace(note)
     except OSError:
         return
+
+
+def _note(path: Path) -> Path:
+    status = path.stat()
+    key = hashlib.sha256(f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}".encode()).hexdigest()
+    return cache_folder() / "sha256" / f"{key}.json"

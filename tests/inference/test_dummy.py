@@ -9,7 +9,7 @@ from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import dummy
 from s2a_bench.inference.dummy import DummyFiles, dummy_files, write_dummy
 from s2a_bench.inference.dummy_vocab import FULL_UNKNOWN, byte_alphabet, make_vocab
-from s2a_bench.inference.dummy_weights import KINDS, Kind, Tensor
+from s2a_bench.inference.dummy_weights import CHUNK_BYTES, KINDS, Kind, Tensor
 from s2a_bench.inference.gguf_file import read_header
 
 gguf = pytest.importorskip("gguf")
@@ -107,6 +107,16 @@ def test_a_tensor_has_as_many_bytes_as_it_says_however_it_is_cut(kind: Kind, mon
     tensor = Tensor("t", (6, 512), kind)
     assert sum(chunk.nbytes for chunk in tensor.chunks(0)) == tensor.nbytes
     assert tensor.nbytes == 6 * 512 // KINDS[kind][0] * KINDS[kind][1]
+
+
+def test_the_largest_tensors_come_in_small_pieces() -> None:
+    # the full model is written with about 0.13 GB of memory because of this
+    for tensor in dummy._model_tensors(dummy.SHAPES["full"], 151_666, "f16"):
+        if tensor.nbytes > 1e9:
+            assert next(tensor.chunks(0)).nbytes <= CHUNK_BYTES == 1 << 24
+            break
+    else:
+        pytest.fail("no tensor above 1 GB: the full model should have two")
 
 
 def test_progress_ends_at_the_total(tmp_path: Path) -> None:

@@ -1,0 +1,453 @@
+"""`model fetch` against a hub in this process that speaks as the real one does, and misbehaves on demand."""
+
+import errno
+import fcntl
+import hashlib
+import json
+import shutil
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import huggingface_hub.constants
+import huggingface_hub.file_download
+import jsonschema
+import pytest
+from typer.testing import CliRunner
+
+from s2a_bench.cli.model import app
+from s2a_bench.errors import ModelError, UsageError
+from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.fetch import Wanted, fetch, wanted
+from s2a_bench.inference.fetch_names import HUB_MODELS, fetched
+from s2a_bench.inference.models import load_headers
+
+NAME = "minicpm-v-2.6"
+REPOSITORY = "openbmb/MiniCPM-V-2_6-gguf"
+MODEL, MMPROJ = "ggml-model-Q4_K_M.gguf", "mmproj-model-f16.gguf"
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+TOKEN = "hf_of_this_test"  # noqa: S105 no secret
+SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-model-1.json").read_text())
+
+
+@dataclass
+class Hub:
+    """What the hub holds, how it misbehaves, and what it was asked."""
+
+    files: dict[str, bytes]
+    sha256: dict[str, str] = field(default_factory=dict)
+    """Checksums that it gives instead of the right ones."""
+    cuts: dict[str, list[int]] = field(default_factory=dict)
+    """After so many bytes of a file the connection breaks, once for each number."""
+    refuse: tuple[int, dict[str, str]] | None = None
+    """Status and headers of every answer."""
+    refuse_files: tuple[int, dict[str, str]] | None = None
+    lfs: bool = True
+    ranges: bool = True
+    listing: bytes | None = None
+    port: int = 0
+    asked: list[tuple[str, str, str | None, str | None]] = field(default_factory=list)
+    """(method, path, Range, Authorization) of each request."""
+
+    def gets(self, name: str) -> list[str | None]:
+        """Return the ranges of the downloads of one file."""
+        digest = hashlib.sha256(self.files[name]).hexdigest()
+        return [range_ for method, path, range_, _ in self.asked if method == "GET" and path == f"/store/{digest}"]
+
+    def digest(self, name: str) -> str:
+        return self.sha256.get(name, hashlib.sha256(self.files[name]).hexdigest())
+
+
+class Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    hub: Hub
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+    def do_HEAD(self) -> None:
+        self.do_GET()
+
+    def do_GET(self) -> None:
+        hub, path = self.hub, self.path.split("?", 1)[0]
+        hub.asked.append((self.command, path, self.headers["Range"], self.headers["Authorization"]))
+        if path.startswith("/store/"):
+            return self.content(path.removeprefix("/store/"))
+        refuse = hub.refuse or (hub.refuse_files if "/resolve/" in path else None)
+        if refuse:
+            return self.answer(refuse[0], refuse[1])
+        if path == f"/api/models/{REPOSITORY}":
+            return self.answer(200, {"Content-Type": "application/json"}, self.list())
+        head, _, name = path.rpartition("/")
+        if name not in hub.files or head not in {f"/{REPOSITORY}/resolve/{at}" for at in ("main", COMMIT)}:
+            return self.answer(404, {"X-Error-Code": "EntryNotFound", "X-Repo-Commit": COMMIT})
+        # the real hub leads to another host, whose answer has none of these headers
+        content = hashlib.sha256(hub.files[name]).hexdigest()
+        facts = {"X-Repo-Commit": COMMIT, "X-Linked-Etag": f'"{hub.digest(name)}"', "ETag": '"of the redirect"'}
+        facts["X-Linked-Size"] = str(len(hub.files[name]))
+        return self.answer(302, facts | {"Location": f"http://localhost:{hub.port}/store/{content}"})
+
+    def list(self) -> bytes:
+        if self.hub.listing is not None:
+            return self.hub.listing
+        siblings: list[dict[str, Any]] = [{"rfilename": "README.md", "size": 3, "blobId": "0" * 40}]
+        for name, data in self.hub.files.items():
+            lfs = {"sha256": self.hub.digest(name), "size": len(data), "pointerSize": 135}
+            siblings.append({"rfilename": name, "size": len(data)} | ({"lfs": lfs} if self.hub.lfs else {}))
+        return json.dumps({"id": REPOSITORY, "sha": COMMIT, "siblings": siblings}).encode()
+
+    def content(self, digest: str) -> None:
+        ((name, data),) = [item for item in self.hub.files.items() if hashlib.sha256(item[1]).hexdigest() == digest]
+        first = int((self.headers["Range"] or "bytes=0-")[6:-1]) if self.hub.ranges else 0
+        rest, cuts = data[first:], self.hub.cuts.get(name, [])
+        self.send_response(206 if first else 200)
+        if first:
+            self.send_header("Content-Range", f"bytes {first}-{len(data) - 1}/{len(data)}")
+        self.send_header("Content-Length", str(len(rest)))
+        self.end_headers()
+        self.wfile.write(rest[: cuts.pop(0)] if cuts else rest)
+        self.close_connection = True
+
+    def answer(self, status: int, headers: dict[str, str], body: bytes = b"") -> None:
+        self.send_response(status)
+        for key, value in headers.items():
+            self.send_header(key, value)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(body)
+
+
+@pytest.fixture
+def hub(tiny: EngineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    """A hub with the tiny dummy under the real one's names; the library's addresses and its cache point here."""
+    assert tiny.model
+    assert tiny.mmproj
+    it = Hub({MODEL: tiny.model.read_bytes(), MMPROJ: tiny.mmproj.read_bytes()})
+    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Bound", (Handler,), {"hub": it}))
+    it.port = server.server_address[1]
+    point_at(monkeypatch, f"http://127.0.0.1:{it.port}")
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(huggingface_hub.constants, "DOWNLOAD_CHUNK_SIZE", 1 << 16)
+    monkeypatch.setattr(huggingface_hub.file_download, "time", SimpleNamespace(sleep=lambda _: None))
+    monkeypatch.setenv("HF_TOKEN", TOKEN)
+    monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+    thread.start()
+    yield it
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def point_at(monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
+    constants = huggingface_hub.constants
+    monkeypatch.setattr(constants, "ENDPOINT", endpoint)
+    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", endpoint + "/{repo_id}/resolve/{revision}/{filename}")
+
+
+def refusal(want: Wanted | None = None) -> str:
+    with pytest.raises(ModelError) as caught:
+        fetch(want or wanted(NAME, None, None))
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def blobs(tmp_path: Path) -> list[str]:
+    folder = tmp_path / "hub" / f"models--{REPOSITORY.replace('/', '--')}" / "blobs"
+    return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+
+
+def test_both_files_arrive_whole_in_the_hubs_own_cache_and_are_not_fetched_twice(hub: Hub, tmp_path: Path) -> None:
+    calls: list[tuple[str, int, int]] = []
+    done = fetch(wanted(NAME, None, None), lambda *call: calls.append(call))
+    assert (done.repository, done.commit) == (REPOSITORY, COMMIT)
+    assert [file.path.read_bytes() for file in done.files] == [hub.files[MODEL], hub.files[MMPROJ]]
+    assert [file.path.name for file in done.files] == [MODEL, MMPROJ]
+    assert [file.sha256 for file in done.files] == [hub.digest(MODEL), hub.digest(MMPROJ)]
+    assert [file.resumed_at for file in done.files] == [0, 0]
+    assert blobs(tmp_path) == sorted(file.sha256 for file in done.files)
+    assert calls[-1] == (MMPROJ, len(hub.files[MMPROJ]), len(hub.files[MMPROJ]))
+    # another program that uses the hub's library finds them
+    assert huggingface_hub.try_to_load_from_cache(REPOSITORY, MODEL) == str(done.files[0].path)
+    again = fetch(wanted(NAME, None, None))
+    assert [file.path for file in again.files] == [file.path for file in done.files]
+    assert hub.gets(MODEL) == hub.gets(MMPROJ) == [None]
+
+
+def test_the_token_goes_to_the_hub_and_not_to_where_it_leads(hub: Hub) -> None:
+    fetch(wanted(NAME, None, None))
+    sent = {(path.startswith("/store/"), authorization) for _, path, _, authorization in hub.asked}
+    assert sent == {(False, f"Bearer {TOKEN}"), (True, None)}
+
+
+def test_a_broken_connection_is_taken_up_where_it_broke(hub: Hub) -> None:
+    hub.cuts[MODEL] = [1_000_000]
+    done = fetch(wanted(NAME, None, None))
+    first, second = hub.gets(MODEL)
+    assert first is None
+    assert second
+    assert 1_000_000 - (1 << 16) < int(second[6:-1]) <= 1_000_000
+    assert done.files[0].path.read_bytes() == hub.files[MODEL]
+
+
+@pytest.mark.parametrize("how", ["interrupted", "no network for long"])
+def test_a_later_fetch_goes_on_where_an_earlier_one_ended(hub: Hub, tmp_path: Path, how: str) -> None:
+    def interrupt(_name: str, there: int, _total: int) -> None:
+        if there > 2_000_000:
+            raise KeyboardInterrupt
+
+    if how == "interrupted":
+        with pytest.raises(KeyboardInterrupt):
+            fetch(wanted(NAME, None, None), interrupt)
+    else:
+        hub.cuts[MODEL] = [2_500_000, *[0] * 5]
+        assert "what has arrived is kept" in refusal()
+    (part,) = blobs(tmp_path)
+    assert part == f"{hub.digest(MODEL)}.s2a-bench.part"
+    with pytest.raises(ModelError, match="not fetched yet"):
+        fetched(NAME, "--model")
+    before = len(hub.gets(MODEL))
+    done = fetch(wanted(NAME, None, None))
+    assert done.files[0].resumed_at > 2_000_000
+    assert hub.gets(MODEL)[before:] == [f"bytes={done.files[0].resumed_at}-"]
+    assert done.files[0].path.read_bytes() == hub.files[MODEL]
+
+
+def test_a_server_that_ignores_ranges_sends_all_of_it_again(hub: Hub) -> None:
+    hub.ranges = False
+    hub.cuts[MODEL] = [3_000_000]
+    assert fetch(wanted(NAME, None, None)).files[0].path.read_bytes() == hub.files[MODEL]
+    assert len(hub.gets(MODEL)) == 2
+
+
+def test_a_part_that_is_longer_than_the_file_starts_again(hub: Hub, tmp_path: Path) -> None:
+    folder = tmp_path / "hub" / f"models--{REPOSITORY.replace('/', '--')}" / "blobs"
+    folder.mkdir(parents=True)
+    (folder / f"{hub.digest(MODEL)}.s2a-bench.part").write_bytes(b"x" * (len(hub.files[MODEL]) + 1))
+    done = fetch(wanted(NAME, None, None))
+    assert done.files[0].path.read_bytes() == hub.files[MODEL]
+    assert hub.gets(MODEL) == [None]
+
+
+def test_a_wrong_content_is_refused_and_not_kept(hub: Hub, tmp_path: Path) -> None:
+    hub.sha256[MODEL] = "ab" * 32
+    message = refusal()
+    assert message.startswith(f"{MODEL}: has SHA-256 {hashlib.sha256(hub.files[MODEL]).hexdigest()}, the hub says abab")
+    assert blobs(tmp_path) == []
+    assert huggingface_hub.try_to_load_from_cache(REPOSITORY, MODEL) is None
+
+
+def test_a_damaged_file_in_the_cache_is_told_and_left_to_the_user(hub: Hub) -> None:
+    path = fetch(wanted(NAME, None, None)).files[0].path
+    with path.open("r+b") as file:
+        file.seek(5_000_000)
+        file.write(b"?")
+    assert refusal() == (
+        f"{path.resolve()}: does not have the hub's SHA-256 {hub.digest(MODEL)}; delete it and fetch again"
+    )
+    path.resolve().unlink()
+    assert fetch(wanted(NAME, None, None)).files[0].path.read_bytes() == hub.files[MODEL]
+
+
+def test_a_file_that_the_library_fetched_is_used_as_it_is(hub: Hub) -> None:
+    for name in (MODEL, MMPROJ):
+        huggingface_hub.hf_hub_download(REPOSITORY, name)
+    before = len(hub.gets(MODEL))
+    fetch(wanted(NAME, None, None))
+    assert len(hub.gets(MODEL)) == before == 1
+
+
+def test_an_unknown_quantisation_names_those_there_are(hub: Hub) -> None:
+    assert refusal(wanted(NAME, "Q9", None)) == (f"{REPOSITORY}: has no ggml-model-Q9.gguf; it has {MODEL}, {MMPROJ}")
+    assert hub.gets(MODEL) == hub.gets(MMPROJ) == []
+
+
+def test_the_case_of_a_quantisation_does_not_matter(hub: Hub) -> None:
+    assert fetch(wanted(NAME, "q4_k_m", None)).files[0].path.name == MODEL
+    assert hub.gets(MODEL) == [None]
+
+
+@pytest.mark.parametrize(
+    ("status", "headers", "message"),
+    [
+        (404, {"X-Error-Code": "RepoNotFound"}, "no such repository at http://127.0.0.1"),
+        (401, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
+        (403, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
+        (401, {}, "answered 401; check the name, or set HF_TOKEN"),
+        (401, {"X-Error-Message": "Invalid credentials in Authorization header"}, "answered 401: Invalid credentials"),
+        (500, {}, "answered 500; try again later"),
+    ],
+)
+def test_a_refusal_by_the_hub_is_one_line(hub: Hub, status: int, headers: dict[str, str], message: str) -> None:
+    hub.refuse = (status, headers)
+    said = refusal()
+    assert said.startswith(f"{REPOSITORY}: ")
+    assert message in said
+
+
+def test_files_can_be_gated_where_the_listing_is_not(hub: Hub, tmp_path: Path) -> None:
+    hub.refuse_files = (403, {"X-Error-Code": "GatedRepo"})
+    assert "gated; ask for access" in refusal()
+    assert [name for name in blobs(tmp_path) if not name.endswith(".part")] == []
+
+
+@pytest.mark.parametrize("body", [b"<html>log in to this network</html>", b"[]", b'{"error": "no"}', b"null"])
+def test_what_is_no_hub_is_told_apart(hub: Hub, body: bytes) -> None:
+    hub.listing = body
+    assert "does not answer as a hub does; check HF_ENDPOINT" in refusal()
+
+
+def test_a_hub_without_checksums_is_refused(hub: Hub) -> None:
+    hub.lfs = False
+    assert f"gives no SHA-256 for {MODEL}" in refusal()
+
+
+def test_a_checksum_cannot_lead_out_of_the_cache(hub: Hub, tmp_path: Path) -> None:
+    hub.sha256[MODEL] = "../../../stolen"
+    assert f"gives no SHA-256 for {MODEL}" in refusal()
+    assert blobs(tmp_path) == []
+
+
+def test_no_network_names_the_ways_out(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert hub.asked == []
+    point_at(monkeypatch, "http://127.0.0.1:1")
+    message = refusal()
+    assert message.startswith(f"{REPOSITORY}: cannot be fetched from http://127.0.0.1:1 (ConnectError")
+    assert "set HF_ENDPOINT to a hub in reach" in message
+    assert f"download {MODEL} and {MMPROJ} of {REPOSITORY} by hand and give --model PATH --mmproj PATH" in message
+
+
+@pytest.mark.parametrize("endpoint", ["nonsense", "ftp://x", "http://[", ""])
+def test_an_endpoint_that_is_none_is_one_line(hub: Hub, monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
+    assert hub.asked == []
+    point_at(monkeypatch, endpoint)
+    assert "HF_ENDPOINT" in refusal()
+
+
+def test_offline_by_choice_says_so(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    huggingface_hub.close_session()  # the library looks once for each session
+    try:
+        assert "HF_HUB_OFFLINE is set" in refusal()
+    finally:
+        huggingface_hub.close_session()
+    assert hub.asked == []
+
+
+def test_a_disk_without_room_is_refused_before_the_first_byte(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=50_000_000))
+    message = refusal()
+    assert "0.01 GB are to be fetched and 0.05 GB are free in " in message
+    assert "set HF_HOME" in message
+    assert hub.gets(MODEL) == []
+
+
+def test_a_disk_that_fills_up_is_one_line(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(huggingface_hub.file_download, "http_get", full)
+    assert "the disk is full; make room, or set HF_HOME" in refusal()
+    assert hub.gets(MODEL) == []
+
+
+def test_a_cache_that_cannot_be_written_is_named(hub: Hub, tmp_path: Path) -> None:
+    (tmp_path / "hub").write_text("a file where the folder should be")
+    message = refusal()
+    assert str(tmp_path / "hub") in message
+    assert "set HF_HOME to a folder you may write" in message
+    assert hub.gets(MODEL) == []
+
+
+def test_two_fetches_of_one_file_do_not_write_into_each_other(hub: Hub, tmp_path: Path) -> None:
+    folder = tmp_path / "hub" / f"models--{REPOSITORY.replace('/', '--')}" / "blobs"
+    folder.mkdir(parents=True)
+    with (folder / f"{hub.digest(MODEL)}.s2a-bench.part").open("ab") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        assert f"{MODEL}: another process fetches it now" in refusal()
+    assert fetch(wanted(NAME, None, None)).files[0].resumed_at == 0
+
+
+@pytest.mark.parametrize(
+    "what", ["", "minicpm", "a/b", "a/b:", "a:b.gguf", "a/b/c:d.gguf", "../b c:d.gguf", "a/b..c:d", "a--b/c:d"]
+)
+def test_what_is_neither_name_nor_file_is_wrong_usage(what: str) -> None:
+    with pytest.raises(UsageError, match=r"neither minicpm-v-2.6 nor ORG/REPO:FILE"):
+        wanted(what, None, None)
+
+
+def test_a_quantisation_goes_with_a_name_only() -> None:
+    with pytest.raises(UsageError, match="--quant Q8_0"):
+        wanted("a/b:c.gguf", "Q8_0", None)
+    assert wanted("a/b:c.gguf", None, "m.gguf") == Wanted("a/b", ("c.gguf", "m.gguf"))
+    assert wanted(NAME, "Q8_0", None).files == ("ggml-model-Q8_0.gguf", MMPROJ)
+
+
+def test_a_name_stands_for_its_files_once_they_are_fetched(hub: Hub) -> None:
+    with pytest.raises(ModelError, match=f"^--model {NAME}: not fetched yet; run: s2a-bench model fetch {NAME}$"):
+        load_headers(EngineConfig(model=Path(NAME)))
+    done = fetch(wanted(NAME, None, None))
+    files = load_headers(EngineConfig(model=Path(NAME)))
+    assert (files.model.path, files.mmproj.path) == tuple(file.path for file in done.files)
+    other = done.files[0].path.with_name("ggml-model-Q8_0.gguf")
+    other.symlink_to(done.files[0].path)
+    with pytest.raises(ModelError, match=r"several were fetched \(Q4_K_M, Q8_0\); give a path"):
+        load_headers(EngineConfig(model=Path(NAME)))
+    assert load_headers(EngineConfig(model=other)).mmproj.path == files.mmproj.path
+    assert hub.gets(MODEL) == [None]
+
+
+def test_every_known_name_has_a_place_for_the_quantisation() -> None:
+    for known in HUB_MODELS.values():
+        name = known.model_file(known.quant)
+        assert known.quants([name, known.mmproj, "README.md"]) == [known.quant]
+
+
+def run(*arguments: str) -> Any:
+    return CliRunner().invoke(app, ["fetch", *arguments])
+
+
+def test_the_command_prints_the_paths_and_the_command_that_uses_them(hub: Hub) -> None:
+    result = run(NAME)
+    assert result.exit_code == 0, result.output
+    model, mmproj, command = result.stdout.splitlines()
+    assert Path(model).read_bytes() == hub.files[MODEL]
+    assert Path(mmproj).read_bytes() == hub.files[MMPROJ]
+    assert command == f"s2a-bench latency --model {model} --mmproj {mmproj}"
+
+
+def test_json_is_one_object_of_the_schema(hub: Hub) -> None:
+    result = run(NAME, "--json")
+    found = json.loads(result.stdout)
+    jsonschema.validate(found, SCHEMA)
+    assert found["command"] == "model fetch"
+    assert found["endpoint"] == f"http://127.0.0.1:{hub.port}"
+    assert [file["bytes"] for file in found["files"]] == [len(hub.files[MODEL]), len(hub.files[MMPROJ])]
+    assert found["latency"].startswith("s2a-bench latency --model ")
+
+
+def test_one_file_alone_is_fetched_and_its_partner_is_asked_for(hub: Hub) -> None:
+    result = run(f"{REPOSITORY}:{MODEL}")
+    assert result.exit_code == 0, result.output
+    (path,) = result.stdout.splitlines()
+    assert Path(path).name == MODEL
+    assert "no mmproj*.gguf lies beside it; give --mmproj" in result.stderr
+    assert hub.gets(MMPROJ) == []
+    # the second file of the same commit lies beside the first
+    assert run(f"{REPOSITORY}:{MODEL}").stdout == result.stdout
+    result = run(f"{REPOSITORY}:{MODEL}", "--mmproj", MMPROJ)
+    assert result.stdout.splitlines()[2].startswith("s2a-bench latency --model ")
+
+
+def test_a_file_that_is_no_gguf_is_told(hub: Hub) -> None:
+    hub.files["notes.gguf"] = b"not a model at all"
+    result = run(f"{REPOSITORY}:notes.gguf")
+    assert isinstance(result.exception, ModelError)
+    assert "not a GGUF file" in str(result.exception)
