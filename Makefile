@@ -2,15 +2,21 @@
 PYTHON ?= python3
 VENV ?= .venv
 export S2A_BENCH_VENV := $(abspath $(VENV))
+# `make setup CUDA=1` compiles llama.cpp for an NVIDIA GPU, CUDA=0 for the CPU again; otherwise it stays what it is.
+export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench test check setup clean
+.PHONY: bench bench-policy test check check-platforms setup clean
 
 # The main job: a real model first, then the transports alone (no model), with JPEG and with raw pixels.
 bench: setup
 	$(BIN)/s2a-bench latency
 	$(BIN)/s2a-bench latency --engine echo --transport http,ros,loopback --runs 100
 	$(BIN)/s2a-bench latency --engine echo --transport http,ros,loopback --runs 100 --payload raw
+
+# Timelines per second on one core; wants a quiet machine.
+bench-policy: setup
+	$(BIN)/python -m s2a_bench.bench.policy_speed
 
 test: setup
 	$(BIN)/python -m pytest
@@ -20,6 +26,10 @@ check: setup
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Can every supported platform install the dependencies from wheels? Asks the package index, installs nothing.
+check-platforms: setup
+	$(BIN)/python tools/check_platforms.py
 
 setup:
 	@$(PYTHON) tools/setup.py

@@ -1,13 +1,17 @@
 """Gaps between tokens: families of random gaps that profiles, the replay engine and the policy studies share.
 
 A gap is the time from one token to the next, in seconds. Every family is scaled to its mean, so that a rate stays a
-rate whatever the jitter.
+rate whatever the jitter. A family is a row of FAMILIES; `from_table` and `to_table` are its form in a profile.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+
+from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,6 +39,10 @@ class Constant:
 
     mean_s: float
 
+    def __post_init__(self) -> None:
+        """Refuse what is no mean."""
+        _between("mean_s", self.mean_s, 0)
+
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:  # noqa: ARG002 - nothing is random
         """Return the same gap everywhere."""
         import numpy as np
@@ -49,9 +57,251 @@ class Lognormal:
     mean_s: float
     cv: float
 
+    def __post_init__(self) -> None:
+        """Refuse parameters that make no distribution."""
+        _between("mean_s", self.mean_s, 0)
+        _between("cv", self.cv, 0)
+
+    def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
+        """Draw gaps."""
+        return _lognormal(rng, self.mean_s, self.cv, (tokens, plans))
+
+
+@dataclass(frozen=True, slots=True)
+class Markov:
+    """Two states, normal and pause, each with lognormal gaps: a machine that is sometimes kept from working.
+
+    A token's gap keeps the state of the gap before it or draws a new one, so that a stretch starts stationary and the
+    correlation of states falls geometrically.
+    """
+
+    mean_s: float
+    cv: float
+    """Within a state."""
+    pause_share: float
+    """Share of the tokens whose gap is a pause."""
+    pause_ratio: float
+    """Mean gap of a pause over the mean normal gap."""
+    pause_tokens: float
+    """Mean number of gaps that pauses last for; 1 / (1 - pause_share), its least, means independent gaps."""
+
+    def __post_init__(self) -> None:
+        """Refuse parameters that make no chain."""
+        _between("mean_s", self.mean_s, 0)
+        _between("cv", self.cv, 0)
+        _between("pause_share", self.pause_share, 0, 0.999)
+        _between("pause_ratio", self.pause_ratio, 0)
+        _between("pause_tokens", self.pause_tokens, 1 / (1 - self.pause_share))
+
+    @property
+    def normal_s(self) -> float:
+        """Return the mean normal gap."""
+        return self.mean_s / (1 + self.pause_share * (self.pause_ratio - 1))
+
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
         """Draw gaps."""
         import numpy as np
 
-        variance = np.log1p(self.cv**2)
-        return rng.lognormal(np.log(self.mean_s) - variance / 2, np.sqrt(variance), (tokens, plans))
+        shape = (tokens, plans)
+        redraws = rng.random(shape, np.float32) < 1 / (self.pause_tokens * (1 - self.pause_share))
+        drawn = rng.random(shape, np.float32) < self.pause_share
+        rows = np.arange(tokens, dtype=np.int32)[:, None]
+        last = np.maximum.accumulate(np.where(redraws, rows, np.int32(0)), axis=0)  # the first row counts as drawn
+        pauses = np.take_along_axis(drawn, last, axis=0)
+        gaps = _lognormal(rng, self.normal_s, self.cv, shape)
+        gaps[pauses] *= self.pause_ratio
+        return gaps
+
+
+@dataclass(frozen=True, slots=True)
+class Bursty:
+    """Tokens that travel together, as through a network or proxy that batches: one long gap, then short ones.
+
+    A stretch starts anywhere within a burst.
+    """
+
+    mean_s: float
+    cv: float
+    """Of the long gaps, and of the short ones."""
+    burst_tokens: int
+    """Tokens a burst."""
+    within: float
+    """Mean gap inside a burst over the mean of all gaps."""
+
+    def __post_init__(self) -> None:
+        """Refuse parameters that make no bursts."""
+        _between("mean_s", self.mean_s, 0)
+        _between("cv", self.cv, 0)
+        _between("burst_tokens", self.burst_tokens, 1)
+        _between("within", self.within, 0, 1)
+
+    def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
+        """Draw gaps."""
+        import numpy as np
+
+        burst = self.burst_tokens
+        scale = np.full(burst, self.within)
+        scale[0] = burst - (burst - 1) * self.within
+        places = np.arange(tokens)[:, None] + rng.integers(burst, size=plans)
+        gaps: Floats = _lognormal(rng, self.mean_s, self.cv, (tokens, plans)) * scale[places % burst]
+        return gaps
+
+
+@dataclass(frozen=True, slots=True)
+class Quantiles:
+    """Independent gaps of any distribution, given as a piecewise linear quantile function."""
+
+    mean_s: float
+    levels: tuple[float, ...]
+    """Probabilities, from 0 to 1, increasing."""
+    values: tuple[float, ...]
+    """The quantiles at ``levels``, in any unit: they are scaled so that the mean is ``mean_s``."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no quantile function."""
+        _between("mean_s", self.mean_s, 0)
+        if len(self.levels) < 2 or (self.levels[0], self.levels[-1]) != (0, 1):  # noqa: PLR2004 - a line has two ends
+            raise UsageError("levels: should run from 0 to 1")
+        if any(not low < high for low, high in zip(self.levels, self.levels[1:], strict=False)):
+            raise UsageError("levels: should increase")
+        if len(self.values) != len(self.levels):
+            raise UsageError(f"values: {len(self.values)} of them for {len(self.levels)} levels")
+        if any(not low <= high for low, high in zip(self.values, self.values[1:], strict=False)):
+            raise UsageError("values: should not decrease")
+        if not (self.values[0] >= 0 and 0 < self.values[-1] < math.inf):
+            raise UsageError("values: should be finite, none negative, not all 0")
+
+    def quantiles_s(self) -> Floats:
+        """Return the quantiles at ``levels`` in s."""
+        import numpy as np
+
+        values = np.asarray(self.values, dtype=np.float64)
+        mean = float(np.diff(self.levels) @ (values[1:] + values[:-1])) / 2
+        return values * (self.mean_s / mean)
+
+    def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
+        """Draw gaps."""
+        import numpy as np
+
+        gaps: Floats = np.interp(rng.random((tokens, plans)), self.levels, self.quantiles_s())
+        return gaps
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A recording, played from a random place in each stretch and from its start again at its end."""
+
+    mean_s: float
+    trace: tuple[float, ...]
+    """Gaps in their order, in any unit: they are scaled so that their mean is ``mean_s``."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no recording."""
+        _between("mean_s", self.mean_s, 0)
+        if not self.trace or not all(0 <= gap < math.inf for gap in self.trace) or not any(self.trace):
+            raise UsageError("trace: should hold finite gaps, none negative, not all 0")
+
+    @staticmethod
+    def of(trace_s: tuple[float, ...]) -> Recorded:
+        """Take a recording in s as it is."""
+        return Recorded(_mean(trace_s), trace_s)
+
+    def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
+        """Cut stretches out of the recording, each from a random place."""
+        return self._at(rng.integers(len(self.trace), size=plans), tokens)
+
+    def in_order(self, tokens: int, start: int = 0) -> Floats:
+        """Return the gaps from number ``start`` on, of shape (tokens,): one plan after another, exactly as recorded."""
+        import numpy as np
+
+        return self._at(np.array([start]), tokens)[:, 0]
+
+    def _at(self, starts: NDArray[np.int64], tokens: int) -> Floats:
+        import numpy as np
+
+        gaps = np.asarray(self.trace, dtype=np.float64) * (self.mean_s / _mean(self.trace))
+        picked: Floats = gaps[(np.arange(tokens)[:, None] + starts) % len(gaps)]
+        return picked
+
+
+FAMILIES: dict[str, type[Constant | Lognormal | Markov | Bursty | Quantiles | Recorded]] = {
+    "constant": Constant,
+    "lognormal": Lognormal,
+    "markov": Markov,
+    "bursty": Bursty,
+    "quantiles": Quantiles,
+    "recorded": Recorded,
+}
+"""A family's name in a profile -> the class; its fields are the keys beside ``family``."""
+
+
+def from_table(table: Mapping[str, Any], mean_s: float) -> Gaps:
+    """Make gaps from a TOML table: ``family`` and that family's parameters, all of them, but for the mean.
+
+    Raises UsageError, naming the key, for a family or key that there is not and a value of the wrong type or size.
+    """
+    name = table.get("family")
+    if not isinstance(name, str) or name not in FAMILIES:
+        raise UsageError(f"family: {name!r} is none of {', '.join(FAMILIES)}")
+    family = FAMILIES[name]
+    kinds = {field.name: str(field.type) for field in fields(family) if field.name != "mean_s"}
+    for key in table:
+        if key != "family" and key not in kinds:
+            raise UsageError(f"{key}: {name} gaps have no such key; they have {', '.join(kinds) or 'none'}")
+    values = {key: _value(key, table, kind, name) for key, kind in kinds.items()}
+    gaps: Gaps = family(mean_s, **values)
+    return gaps
+
+
+def to_table(gaps: Gaps) -> dict[str, Any]:
+    """Return the table that `from_table` reads; the mean is not part of it."""
+    names = {family: name for name, family in FAMILIES.items()}
+    family: Any = type(gaps)
+    values = {field.name: getattr(gaps, field.name) for field in fields(family) if field.name != "mean_s"}
+    return {"family": names[family]} | {
+        key: list(value) if isinstance(value, tuple) else value for key, value in values.items()
+    }
+
+
+def _value(key: str, table: Mapping[str, Any], kind: str, family: str) -> Any:
+    """Read one parameter of the type that the family's field has."""
+    if key not in table:
+        raise UsageError(f"{key}: missing; {family} gaps need it")
+    value = table[key]
+    if kind.startswith("tuple"):
+        if isinstance(value, list) and all(_is_number(item) for item in value):
+            return tuple(float(item) for item in value)
+        raise UsageError(f"{key}: should be a list of numbers")
+    if kind == "int":
+        if isinstance(value, int) and not isinstance(value, bool):
+            return value
+        raise UsageError(f"{key}: {value!r} should be a whole number")
+    if not _is_number(value):
+        raise UsageError(f"{key}: {value!r} should be a number")
+    return float(value)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _between(key: str, value: float, least: float, most: float = math.inf) -> None:
+    """Refuse a parameter that is out of its range, infinite or no number; the mean may not be 0."""
+    if not (least <= value <= most and math.isfinite(value)) or (key == "mean_s" and value == 0):
+        bound = f"between {least:g} and {most:g}" if most < math.inf else f"{least:g} or more, and finite"
+        raise UsageError(f"{key}: {value:g} should be {'above 0, and finite' if key == 'mean_s' else bound}")
+
+
+def _mean(values: tuple[float, ...]) -> float:
+    return math.fsum(values) / len(values)
+
+
+def _lognormal(rng: np.random.Generator, mean_s: float, cv: float, shape: tuple[int, int]) -> Floats:
+    """Draw lognormal values of a mean and a coefficient of variation."""
+    import numpy as np
+
+    variance = np.log1p(cv**2)
+    gaps = rng.standard_normal(shape)  # and in place: a third faster than rng.lognormal, whose values these are
+    gaps *= np.sqrt(variance)
+    gaps += np.log(mean_s) - variance / 2
+    return np.exp(gaps, out=gaps)

@@ -8,7 +8,10 @@ docs/policies.md: N skills, M plans, times in seconds from the request.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Protocol, TypeAlias
+
+from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,8 +33,9 @@ class Timing:
 class Start:
     """Start the next skill now.
 
-    It ends after ``duration_s`` if the next skill has arrived by then, or if none follows; else it is held on until
-    the next arrives, but no longer than ``latest_s`` after its start: then the robot stalls.
+    It ends after ``duration_s`` if the next skill has arrived by then, or if none follows (all ``n_skills`` have
+    started, or the stream has ended); else it is held on until the next arrives, but no longer than ``latest_s``
+    (>= ``duration_s``) after its start: then the robot stalls.
     """
 
     duration_s: float
@@ -48,10 +52,15 @@ class PlanShape:
     expected: Timing
     """Of a skill whose fragment has not been parsed yet."""
     expected_cv: float = 0.2
+    safe_start_s: float | None = None
+    """S0, which nobody knows before the last token: given in studies only, for s2a-clairvoyant."""
 
 
 class Stepper(Protocol):
-    """One policy following one plan. Times never decrease from call to call."""
+    """One policy following one plan. Times never decrease from call to call.
+
+    What happens at the same instant is told in the order token, fragment, end, and then `decide` is asked.
+    """
 
     def token(self, at_s: float) -> None:
         """Learn that a token arrived."""
@@ -68,7 +77,8 @@ class Stepper(Protocol):
     def decide(self, now_s: float) -> Start | float:
         """Say what to do while no skill runs: start the next one, or when to ask again (inf: when something happens).
 
-        After a Start the policy takes the skill as started at ``now_s``; ask again when it has ended.
+        It is asked again at that time, and before it at every token, fragment and end. After a Start the policy takes
+        the skill as started at ``now_s``; it is asked again when that has ended, held on or not.
         """
         ...
 
@@ -84,6 +94,8 @@ class Plans:
     most_s: Floats
     token_s: Floats | None = None
     """When each token arrived, shape (tokens, M), for the policies that learn from tokens."""
+    shape: PlanShape | None = None
+    """What was known before the first token, for the policies that learn; one for all M plans."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +109,10 @@ class Schedule:
 class Policy(Protocol):
     """A rule for acting."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Return its name, as in POLICIES."""
+        ...
 
     def schedule(self, plans: Plans) -> Schedule:
         """Decide for many plans at once."""
@@ -106,3 +121,23 @@ class Policy(Protocol):
     def stepper(self, shape: PlanShape) -> Stepper:
         """Follow one plan as it arrives."""
         ...
+
+
+POLICIES: dict[str, str] = {
+    "naive": "s2a_bench.policy.naive:Naive",
+    "wait-then-act": "s2a_bench.policy.wait_then_act:WaitThenAct",
+    "stream-to-act": "s2a_bench.policy.stream_to_act:StreamToAct",
+    "s2a-clairvoyant": "s2a_bench.policy.clairvoyant:Clairvoyant",
+    "s2a-mean": "s2a_bench.policy.stream_to_act:MeanStart",
+    "s2a-quantile": "s2a_bench.policy.stream_to_act:QuantileStart",
+    "s2a-robust": "s2a_bench.policy.robust:RobustStart",
+}
+"""Value of ``--policy`` -> what builds it with its defaults; the names starting with s2a- are for study."""
+
+
+def policy(name: str) -> Policy:
+    """Build a policy with its defaults; raises UsageError for an unknown name."""
+    if name not in POLICIES:
+        raise UsageError(f"--policy: '{name}' is none of {', '.join(POLICIES)}")
+    built: Policy = resolve_name(POLICIES[name])()
+    return built

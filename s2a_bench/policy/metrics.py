@@ -1,0 +1,136 @@
+"""The numbers of a timeline: waiting, stalls, regret, age of what is acted on, speed distortion, fluidity.
+
+Per skill as arrays of shape (N, M), per plan as arrays of shape (M,); times in s from the request. What a plan does not
+have is NaN, never zero: a regret over a span of length zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from s2a_bench.policy.evaluate import TOLERANCE_S
+from s2a_bench.policy.schedule import align, least_end, safe_start
+
+if TYPE_CHECKING:
+    from s2a_bench.policy import Floats, Plans, Schedule
+    from s2a_bench.policy.evaluate import Counts
+
+
+@dataclass(frozen=True, slots=True)
+class Metrics:
+    """M timelines of one policy, each number an array of shape (M,)."""
+
+    first_action_s: Floats
+    """Time to first action, s_1."""
+    end_s: Floats
+    """Completion, e_N."""
+    stalls: Counts
+    """Stalls longer than the tolerance: how often the robot stops and goes."""
+    stall_s: Floats
+    """All stalls together, whatever their length."""
+    longest_stall_s: Floats
+    stall_ratio: Floats
+    """Share of the time from first action to completion that is stalled."""
+    start_regret: Floats
+    """max(0, s_1 - S0) / S0."""
+    signed_start_regret: Floats
+    """(s_1 - S0) / S0: negative for a start before S0, which stretching can make safe."""
+    start_regret_of_wait: Floats
+    """max(0, s_1 - S0) / (t_N - S0): 0 as clairvoyant, 1 as wait-then-act. Long times to first token flatter the
+    regret over S0, not this one."""
+    end_regret: Floats
+    """(e_N - E) / E with E = S0 + P_N, the end of clairvoyant stream-to-act and of naive."""
+    end_regret_of_wait: Floats
+    """(e_N - E) / (t_N - S0): 1 as wait-then-act."""
+    end_regret_elastic: Floats
+    """(e_N - E_lo) / E_lo, over the least end that any schedule within T_min has."""
+    mean_queue_wait_s: Floats
+    """Mean of s_i - t_i."""
+    longest_queue_wait_s: Floats
+    mean_action_age_s: Floats
+    """Mean of s_i - t_observation: how old the picture is that the robot acts on."""
+    oldest_action_s: Floats
+    speed_distortion: Floats
+    """Sum of durations, held on or not, over the sum of the nominal ones: above 1 is slower than planned."""
+    fluidity: Floats
+    """Share of deadlines met, as `fluidity` defines it."""
+
+
+def measure(plans: Plans, schedule: Schedule, *, observed_s: float = 0.0, tolerance_s: float = TOLERANCE_S) -> Metrics:
+    """Derive all numbers of M timelines.
+
+    ``observed_s`` is when the picture was taken that the plan answers, on the same clock: 0 is the request, negative
+    is earlier. ``tolerance_s`` decides which stalls count (20 ms unless told; studies of P(any stall) use 1 us).
+    """
+    arrival_s, nominal_s, least_s, start_s, duration_s = align(
+        plans.arrival_s, plans.nominal_s, plans.least_s, schedule.start_s, schedule.duration_s
+    )
+    first, end = start_s[0], start_s[-1] + duration_s[-1]
+    safe = safe_start(arrival_s, nominal_s)
+    best_end = safe + nominal_s.sum(axis=0)
+    elastic_end = least_end(arrival_s, least_s)
+    stalls_s = stalls(schedule)
+    stall_s = stalls_s.sum(axis=0)
+    waits = queue_wait(plans, schedule)
+    late = np.maximum(first - safe, 0.0)
+    span = arrival_s[-1] - safe
+    return Metrics(
+        first_action_s=first,
+        end_s=end,
+        stalls=np.sum(stalls_s > tolerance_s, axis=0, dtype=np.int32),
+        stall_s=stall_s,
+        longest_stall_s=stalls_s.max(axis=0, initial=0.0),
+        stall_ratio=_share(stall_s, end - first),
+        start_regret=_share(late, safe),
+        signed_start_regret=_share(first - safe, safe),
+        start_regret_of_wait=_share(late, span),
+        end_regret=_share(end - best_end, best_end),
+        end_regret_of_wait=_share(end - best_end, span),
+        end_regret_elastic=_share(end - elastic_end, elastic_end),
+        mean_queue_wait_s=waits.mean(axis=0),
+        longest_queue_wait_s=waits.max(axis=0),
+        mean_action_age_s=start_s.mean(axis=0) - observed_s,
+        oldest_action_s=start_s.max(axis=0) - observed_s,
+        speed_distortion=_share(duration_s.sum(axis=0), nominal_s.sum(axis=0)),
+        fluidity=fluidity(stalls_s, nominal_s, tolerance_s),
+    )
+
+
+def stalls(schedule: Schedule) -> Floats:
+    """Return max(0, s_{i+1} - e_i) for i = 1..N-1, shape (N - 1, M): waiting before skill 1 is no stall."""
+    start_s, duration_s = align(schedule.start_s, schedule.duration_s)
+    stall_s: Floats = start_s[1:] - start_s[:-1]
+    stall_s -= duration_s[:-1]
+    return np.maximum(stall_s, 0.0, out=stall_s)
+
+
+def queue_wait(plans: Plans, schedule: Schedule) -> Floats:
+    """Return s_i - t_i, shape (N, M): how long each skill lies ready before it starts."""
+    wait: Floats = schedule.start_s - plans.arrival_s
+    return wait
+
+
+def fluidity(stalls_s: Floats, nominal_s: Floats, tolerance_s: float = TOLERANCE_S) -> Floats:
+    """Return the fluidity index, shape (M,): 1 - missed deadlines / all deadlines (Etalon, arXiv 2407.07000).
+
+    Etalon gives each token a deadline, carries the slack of early ones over, and after a late one counts every
+    deadline missed meanwhile, floor(lateness / D_d) + 1, before it starts anew. Here a token is a skill. Its deadline
+    is the end of the skill before, so D_d is that skill's nominal duration, the slack is the queue, and the lateness is
+    the stall; the first deadline (Etalon's D_p) is the policy's own start and therefore met. Starting late costs
+    nothing here: read it beside the time to first action.
+    """
+    stalls_s, budget_s = align(stalls_s, nominal_s[:-1])
+    late = stalls_s > tolerance_s
+    missed = np.where(late, np.floor(_share(stalls_s, budget_s)) + 1, 0.0).sum(axis=0)
+    met = 1 + np.sum(~late, axis=0)
+    index: Floats = met / (met + missed)
+    return index
+
+
+def _share(part: Floats, whole: Floats) -> Floats:
+    """Divide; NaN where there is no whole."""
+    share: Floats = np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole > 0)
+    return share

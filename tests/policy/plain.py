@@ -1,0 +1,70 @@
+"""The closed forms again, one plan at a time in plain Python: slow and obvious, to check the fast ones against.
+
+Each function takes lists of one plan, in seconds, and follows the words of the definition (shared POLICY page, sections
+1 to 3) rather than the formulas of the package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+Seconds = Sequence[float]
+
+
+def before(durations: Seconds) -> list[float]:
+    """Add up the durations before each skill."""
+    return [sum(durations[:i]) for i in range(len(durations))]
+
+
+def safe_start(arrival: Seconds, durations: Seconds) -> float:
+    """Say when to start so that every skill is there when the ones before it have run."""
+    return max(t - done for t, done in zip(arrival, before(durations), strict=True))
+
+
+def execute(arrival: Seconds, durations: Seconds, first: float) -> list[float]:
+    """Start each skill when it is there and the one before has ended."""
+    starts: list[float] = []
+    free = first
+    for t, duration in zip(arrival, durations, strict=True):
+        starts.append(max(free, t))
+        free = starts[-1] + duration
+    return starts
+
+
+def stalls(starts: Seconds, durations: Seconds) -> list[float]:
+    """Say for how long nothing runs between one skill and the next."""
+    ends = [s + d for s, d in zip(starts, durations, strict=True)]
+    return [max(0.0, following - end) for following, end in zip(starts[1:], ends[:-1], strict=True)]
+
+
+def held(arrival: Seconds, starts: Seconds, durations: Seconds, latest: Seconds) -> list[float]:
+    """Hold each skill on at its end until the next has arrived, within its bound."""
+    runs: list[float] = []
+    for i, duration in enumerate(durations):
+        end = starts[i] + duration
+        if i + 1 < len(durations) and arrival[i + 1] > end:
+            end = min(arrival[i + 1], starts[i] + latest[i])
+        runs.append(end - starts[i])
+    return runs
+
+
+def robust_start(arrival: Seconds, durations: Seconds, gap: float) -> float:
+    """Start when nothing that can still happen, with gaps of at most ``gap``, makes the robot stall (T6)."""
+    done = before(durations)
+    for known in range(1, len(arrival) + 1):
+        latest = [*arrival[:known], *(arrival[known - 1] + k * gap for k in range(1, len(arrival) - known + 1))]
+        start = max(arrival[known - 1], *(t - work for t, work in zip(latest, done, strict=True)))
+        if known == len(arrival) or start < arrival[known]:
+            return start
+    raise AssertionError("a plan has at least one skill")
+
+
+def fluidity(stall: Seconds, nominal: Seconds, tolerance: float) -> float:
+    """Count deadlines met and missed as Etalon's algorithm does, token for skill (arXiv 2407.07000)."""
+    met, missed = 1, 0
+    for late, budget in zip(stall, nominal[:-1], strict=True):
+        if late <= tolerance:
+            met += 1
+        else:
+            missed += int(late // budget) + 1
+    return met / (met + missed)

@@ -1,0 +1,295 @@
+"""What is true of start times and schedules (shared POLICY page, section 2), on any plan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+from s2a_bench.policy import Plans, PlanShape, Schedule, Timing
+from s2a_bench.policy.arrivals import uniform
+from s2a_bench.policy.metrics import stalls
+from s2a_bench.policy.robust import RobustStart
+from s2a_bench.policy.schedule import CHUNK, elastic, hold, least_end, safe_start, work_conserving
+from tests.policy import plain
+
+EXACT = 1e-9
+
+quick = settings(deadline=None, max_examples=200)
+sixteenths = st.integers(0, 64).map(lambda n: n / 16)
+"""Sums of them are exact, so that hypothesis may look for ties."""
+
+
+@st.composite
+def elastic_plans(draw: st.DrawFn, most_skills: int = 8) -> Plans:
+    """Draw one plan, (N, 1): any arrivals, T_min <= T_nom <= T_max."""
+    n = draw(st.integers(1, most_skills))
+    column = st.lists(sixteenths, min_size=n, max_size=n)
+    arrival, least = np.cumsum(draw(column)), np.array(draw(column))
+    nominal = least + np.array(draw(column))
+    most = nominal + np.array(draw(column))
+    return Plans(*(values[:, np.newaxis] for values in (arrival, nominal, least, most)))
+
+
+def total(values: np.ndarray) -> float:
+    return float(values.sum())
+
+
+def stall_of(arrival: list[float], durations: list[float], first: float) -> float:
+    return sum(plain.stalls(plain.execute(arrival, durations, first), durations))
+
+
+@quick
+@given(elastic_plans())
+def test_the_arrays_agree_with_the_plain_loop(plans: Plans) -> None:
+    t, nominal, least, most = (
+        values[:, 0].tolist() for values in (plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s)
+    )
+    for durations in (nominal, least, most):
+        column = np.array(durations)[:, np.newaxis]
+        first = safe_start(plans.arrival_s, column)
+        assert first.tolist() == [plain.safe_start(t, durations)]
+        for begin in (0.0, t[0], t[-1], first[0]):
+            starts = work_conserving(plans.arrival_s, column, begin)
+            assert starts[:, 0].tolist() == plain.execute(t, durations, begin)
+    starts = work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0])
+    assert stalls(Schedule(starts, plans.nominal_s))[:, 0].tolist() == plain.stalls(starts[:, 0].tolist(), nominal)
+    held = hold(plans.arrival_s, starts, plans.nominal_s, plans.most_s)
+    assert held[:, 0].tolist() == plain.held(t, starts[:, 0].tolist(), nominal, most)
+
+
+def test_more_plans_than_fit_a_chunk_are_the_same_plans() -> None:
+    rng = np.random.default_rng(5)
+    t = np.cumsum(rng.uniform(0, 2, (5, CHUNK + 3)), axis=0)
+    least = rng.uniform(0, 1, t.shape)
+    plans = Plans(t, least, least, least + rng.uniform(0, 1, t.shape))
+    schedule, first = elastic(plans), safe_start(t, least)
+    for column in (0, CHUNK - 1, CHUNK, CHUNK + 2):
+        cut = slice(column, column + 1)
+        alone = elastic(Plans(t[:, cut], least[:, cut], least[:, cut], plans.most_s[:, cut]))
+        assert alone.start_s[:, 0].tolist() == schedule.start_s[:, column].tolist()
+        assert alone.duration_s[:, 0].tolist() == schedule.duration_s[:, column].tolist()
+        assert plain.safe_start(t[:, column].tolist(), least[:, column].tolist()) == pytest.approx(first[column])
+
+
+def test_one_column_stands_for_all_plans() -> None:
+    t = np.array([[0.0, 1.0], [3.0, 1.5]])
+    assert safe_start(t, np.ones((2, 1))).tolist() == [2.0, 1.0]
+    assert work_conserving(t, np.ones((2, 1)), t[0]).tolist() == [[0.0, 1.0], [3.0, 2.0]]
+    assert safe_start(t[:, :1], np.array([[1.0, 2.0], [1.0, 1.0]])).tolist() == [2.0, 1.0]
+
+
+@quick
+@given(elastic_plans(), sixteenths)
+def test_t1_idling_is_conserved_whenever_execution_starts(plans: Plans, delay: float) -> None:
+    first, safe = float(plans.arrival_s[0, 0]) + delay, float(safe_start(plans.arrival_s, plans.nominal_s)[0])
+    starts = work_conserving(plans.arrival_s, plans.nominal_s, first)
+    assert total(stalls(Schedule(starts, plans.nominal_s))) == max(0.0, safe - first)
+    assert starts[-1, 0] + plans.nominal_s[-1, 0] == max(first, safe) + total(plans.nominal_s)
+
+
+@quick
+@given(elastic_plans())
+def test_naive_and_stream_to_act_end_at_the_same_instant(plans: Plans) -> None:
+    naive = work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0])
+    streamed = work_conserving(plans.arrival_s, plans.nominal_s, safe_start(plans.arrival_s, plans.nominal_s))
+    assert naive[-1, 0] == streamed[-1, 0]
+    assert total(stalls(Schedule(streamed, plans.nominal_s))) == 0
+
+
+@quick
+@given(elastic_plans())
+def test_t2_the_elastic_schedule_never_stalls_and_attains_the_least_start_and_the_least_end(plans: Plans) -> None:
+    schedule = elastic(plans)
+    assert (schedule.start_s >= plans.arrival_s).all()
+    assert (schedule.start_s[1:] == schedule.start_s[:-1] + schedule.duration_s[:-1]).all()
+    assert (schedule.duration_s >= plans.least_s).all()
+    assert (schedule.duration_s <= plans.most_s).all()
+    assert schedule.start_s[0] == safe_start(plans.arrival_s, plans.most_s)
+    assert schedule.start_s[-1] + schedule.duration_s[-1] == least_end(plans.arrival_s, plans.least_s)
+
+
+@settings(deadline=None, max_examples=80)
+@given(elastic_plans(6), st.randoms(use_true_random=False))
+def test_t2_a_linear_program_finds_nothing_less_in_any_component(plans: Plans, random: object) -> None:
+    n = len(plans.arrival_s)
+    weights = np.array([random.uniform(0.1, 1.0) for _ in range(n)])  # type: ignore[attr-defined]
+    step = np.zeros((n - 1, n))
+    step[range(n - 1), range(n - 1)], step[range(n - 1), range(1, n)] = -1, 1  # s_{i+1} - s_i
+    found = linprog(
+        weights,
+        A_ub=np.vstack([step, -step]) if n > 1 else None,
+        b_ub=np.concatenate([plans.most_s[:-1, 0], -plans.least_s[:-1, 0]]) if n > 1 else None,
+        bounds=[(t, None) for t in plans.arrival_s[:, 0]],
+    )
+    assert found.status == 0
+    # A schedule that is least in every component is the minimum whatever the weights.
+    assert elastic(plans).start_s[:, 0] == pytest.approx(found.x, abs=1e-7)
+
+
+@quick
+@given(elastic_plans())
+def test_the_papers_start_is_not_minimal_once_skills_may_be_stretched(plans: Plans) -> None:
+    earlier = safe_start(plans.arrival_s, plans.most_s)
+    assert earlier <= safe_start(plans.arrival_s, plans.nominal_s)
+
+
+def test_stretching_can_start_earlier_than_the_papers_start() -> None:
+    plans = Plans(*(np.array(column)[:, np.newaxis] for column in ([0.0, 2.0], [1.0, 1.0], [1.0, 1.0], [2.0, 2.0])))
+    assert safe_start(plans.arrival_s, plans.nominal_s) == [1.0]
+    assert elastic(plans).start_s[:, 0].tolist() == [0.0, 2.0]
+
+
+@quick
+@given(elastic_plans())
+def test_t3_stretching_alone_costs_no_completion_time(plans: Plans) -> None:
+    schedule = elastic(Plans(plans.arrival_s, plans.nominal_s, plans.nominal_s, plans.most_s))
+    assert schedule.start_s[0] == safe_start(plans.arrival_s, plans.most_s)
+    end = safe_start(plans.arrival_s, plans.nominal_s) + total(plans.nominal_s)
+    assert schedule.start_s[-1] + schedule.duration_s[-1] == end
+
+
+def test_t4_holding_only_at_the_end_of_a_skill_stalls_where_stretching_ahead_does_not() -> None:
+    column = np.ones((3, 1))
+    plans = Plans(np.array([[0.0], [0.0], [4.0]]), column, column, 2 * column)
+    first = safe_start(plans.arrival_s, plans.most_s)
+    assert first == [0.0]
+    starts = work_conserving(plans.arrival_s, plans.nominal_s, first)
+    held = Schedule(starts, hold(plans.arrival_s, starts, plans.nominal_s, plans.most_s))
+    assert held.duration_s[:, 0].tolist() == [1.0, 2.0, 1.0]
+    assert stalls(held)[:, 0].tolist() == [0.0, 1.0]
+    planned = elastic(plans)
+    assert planned.start_s[:, 0].tolist() == [0.0, 2.0, 4.0]
+    assert total(stalls(planned)) == 0
+
+
+@quick
+@given(elastic_plans(), st.lists(st.integers(0, 16), min_size=8, max_size=8))
+def test_t5_the_start_for_least_durations_is_safe_however_early_skills_finish(plans: Plans, early: list[int]) -> None:
+    part = np.array(early[: len(plans.arrival_s)])[:, np.newaxis] / 16
+    actual = plans.least_s + part * (plans.nominal_s - plans.least_s)
+    first = safe_start(plans.arrival_s, plans.least_s)
+    assert first >= safe_start(plans.arrival_s, plans.nominal_s)
+    starts = work_conserving(plans.arrival_s, actual, first)
+    assert total(stalls(Schedule(starts, actual))) <= EXACT
+
+
+@quick
+@given(elastic_plans())
+def test_t5_the_papers_start_stalls_by_the_difference_when_all_skills_finish_early(plans: Plans) -> None:
+    papers, safe = (float(safe_start(plans.arrival_s, d)[0]) for d in (plans.nominal_s, plans.least_s))
+    starts = work_conserving(plans.arrival_s, plans.least_s, papers)
+    assert total(stalls(Schedule(starts, plans.least_s))) == safe - papers
+
+
+@st.composite
+def bounded_plans(draw: st.DrawFn) -> tuple[list[float], list[float], float]:
+    """Draw arrivals with gaps of at most a bound, durations, and the bound; often at the bound itself."""
+    n = draw(st.integers(1, 7))
+    bound = draw(st.integers(1, 48)) / 16
+    gap = st.one_of(st.just(bound), st.integers(0, int(bound * 16)).map(lambda k: k / 16))
+    gaps = draw(st.lists(gap, min_size=n - 1, max_size=n - 1))
+    arrival = (np.cumsum([1.0, *gaps])).tolist()
+    return arrival, draw(st.lists(sixteenths, min_size=n, max_size=n)), bound
+
+
+@quick
+@given(bounded_plans())
+def test_t6_the_robust_rule_never_stalls_while_gaps_keep_their_bound(
+    plan: tuple[list[float], list[float], float],
+) -> None:
+    arrival, durations, bound = plan
+    assert stall_of(arrival, durations, plain.robust_start(arrival, durations, bound)) == 0
+
+
+@quick
+@given(bounded_plans(), sixteenths.filter(bool))
+def test_t6_s2a_robust_is_this_rule_where_all_skills_take_the_same_time(
+    plan: tuple[list[float], list[float], float], duration: float
+) -> None:
+    arrival, _, bound = plan
+    n, arrival_s = len(arrival), np.array(arrival)[:, np.newaxis]
+    same = np.full((n, 1), duration)
+    plans = Plans(arrival_s, same, same, same, shape=PlanShape(n, 1, Timing(duration, duration, duration)))
+    first = RobustStart(bound).schedule(plans).start_s[0, 0]
+    assert first == plain.robust_start(arrival, [duration] * n, bound)
+
+
+@quick
+@given(bounded_plans(), st.integers(0, 99))
+def test_t6_whoever_starts_earlier_can_be_made_to_stall(
+    plan: tuple[list[float], list[float], float], hundredths: int
+) -> None:
+    arrival, durations, bound = plan
+    robust = plain.robust_start(arrival, durations, bound)
+    first = arrival[0] + (robust - arrival[0]) * hundredths / 100
+    assume(first < robust)
+    known = sum(t <= first for t in arrival)
+    # Until `first` everything is as seen; from there on every gap is as long as it may be.
+    worst = [*arrival[:known], *(arrival[known - 1] + k * bound for k in range(1, len(arrival) - known + 1))]
+    assert all(t > first for t in worst[known:])
+    assert stall_of(worst, durations, first) > 0
+
+
+@quick
+@given(bounded_plans(), st.floats(0, 0.999))
+def test_t6_without_a_bound_whoever_starts_before_the_last_skill_can_be_made_to_stall(
+    plan: tuple[list[float], list[float], float], part: float
+) -> None:
+    arrival, durations, _ = plan
+    first = arrival[0] + (arrival[-1] - arrival[0]) * part
+    assume(first < arrival[-1])
+    known = sum(t <= first for t in arrival)
+    worst = [*arrival[:known], *(first + sum(durations) + 1 for _ in arrival[known:])]
+    assert stall_of(worst, durations, first) > 0
+
+
+@quick
+@given(elastic_plans())
+def test_t7_the_pre_roll_is_the_highest_point_of_the_walk_of_gaps_minus_durations(plans: Plans) -> None:
+    steps = np.diff(plans.arrival_s[:, 0]) - plans.nominal_s[:-1, 0]
+    highest = max([0.0, *np.cumsum(steps).tolist()])
+    assert safe_start(plans.arrival_s, plans.nominal_s)[0] - plans.arrival_s[0, 0] == highest
+
+
+def pre_roll(rho: float, n_skills: int, cv: float = 0.3, plans: int = 20_000) -> np.ndarray:
+    """Draw S0 - t_1 in units of T, for independent gaps with mean rho."""
+    rng = np.random.default_rng(7)
+    gaps = rng.normal(rho, cv * rho, (n_skills, plans))
+    arrival_s = np.cumsum(gaps, axis=0)
+    return safe_start(arrival_s, np.ones((n_skills, 1))) - arrival_s[0]
+
+
+def test_t7_below_rho_1_the_pre_roll_does_not_grow_with_the_plan() -> None:
+    shorter, longer, longest = (np.quantile(pre_roll(0.8, n), 0.99) for n in (16, 64, 128))
+    assert longer == pytest.approx(shorter, rel=0.05)
+    assert longest == pytest.approx(longer, rel=0.03)
+
+
+@pytest.mark.parametrize("n_skills", [8, 32, 128])
+def test_t7_above_rho_1_the_pre_roll_grows_with_the_plan_as_stated(n_skills: int) -> None:
+    rho, cv, steps = 1.8, 0.3, n_skills - 1
+    stated = steps * (rho - 1) + 2.326 * cv * rho * np.sqrt(steps)  # z = 2.326: the 99 % quantile
+    assert np.quantile(pre_roll(rho, n_skills, cv), 0.99) == pytest.approx(stated, rel=0.02)
+
+
+@pytest.mark.parametrize("n_skills", [1, 2, 8, 32])
+@pytest.mark.parametrize("rho", [0.1, 0.5, 1.0, 1.5, 7.0])
+def test_stream_to_act_starts_before_wait_by_n_minus_1_times_the_shorter_of_gap_and_skill(
+    n_skills: int, rho: float
+) -> None:
+    arrival_s = uniform(0.4, 3, 3 / (rho * 2.0), n_skills)
+    gain = arrival_s[-1] - safe_start(arrival_s, np.full((n_skills, 1), 2.0))
+    assert gain == pytest.approx((n_skills - 1) * min(rho * 2.0, 2.0))
+
+
+@pytest.mark.parametrize("n_skills", [1, 2, 8, 32])
+def test_completion_speeds_up_by_at_most_2n_over_n_plus_1_and_most_at_rho_1(n_skills: int) -> None:
+    rho = np.array([0.01, 0.3, 0.9, 0.99, 1.0, 1.01, 1.1, 3.0, 100.0])
+    arrival_s = uniform(0.0, 1.0, 1 / rho, n_skills)
+    streamed = safe_start(arrival_s, np.ones((n_skills, 1))) + n_skills
+    speed_up = (arrival_s[-1] + n_skills) / streamed
+    assert speed_up.max() == pytest.approx(2 * n_skills / (n_skills + 1))
+    assert n_skills == 1 or rho[speed_up.argmax()] == 1.0
