@@ -26,8 +26,10 @@ class Profile:
     gaps: Gaps
     """The parametric form of the gaps; its mean is 1 / tokens_per_s."""
     trace_s: tuple[float, ...] = ()
-    """Recorded gaps in their order; empty where there is no recording."""
+    """Recorded gaps in their order, warm-ups left out; empty where there is no recording."""
     assumed: tuple[str, ...] = ()
     """Which of the values are assumptions of ours, for figures to say so."""
     facts: dict[str, Any] = field(default_factory=dict)
     """Board, model, power mode, environment: the file's tables as they are."""
+    rate_cv: float = 0.0
+    """Spread of the rate from one answer to the next; studies use it, a replay keeps its rate."""

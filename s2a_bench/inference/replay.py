@@ -1,0 +1,152 @@
+"""An engine that plays a hardware profile: tokens come when that board would have sent them. Emulated, never measured.
+
+The first token comes ``prompt_s`` (with its spread) and one mean gap after the request, the others at the gaps that
+``--gaps`` names. Every token has an absolute deadline, so that late wake-ups do not add up to another rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import accumulate, count, islice
+from typing import TYPE_CHECKING, TypeAlias
+
+from s2a_bench.clock import Clock, SystemClock
+from s2a_bench.errors import EngineError, UsageError
+from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.profiles import load_profile
+from s2a_bench.jitter import Constant, Gaps, Lognormal, Recorded, to_table
+from s2a_bench.profile import Profile
+from s2a_bench.types import Request, Token
+
+if TYPE_CHECKING:
+    import numpy as np
+
+Draw: TypeAlias = "Callable[[np.random.Generator, int, int], list[float]]"
+"""Called with random numbers, how many gaps, and how many gaps were played before: gaps in s."""
+
+_PLACES = ("kitchen", "table", "shelf", "sofa")
+_OBJECTS = ("cup", "box", "bottle", "jar")
+_ARGUMENTS = {"go_to": _PLACES, "open": _OBJECTS, "close": _OBJECTS, "pick": _OBJECTS}
+"""Skills of the household set with one argument, so that its parser understands what is said here."""
+
+
+def _constant(profile: Profile) -> Draw:
+    return _drawn(Constant(profile.gaps.mean_s))
+
+
+def _parametric(profile: Profile) -> Draw:
+    return _drawn(profile.gaps)
+
+
+def _trace(profile: Profile) -> Draw:
+    if not profile.trace_s:
+        raise UsageError(
+            f"--gaps trace: profile {profile.name} holds no recording; choose parametric or constant, "
+            "or record one with 's2a-bench profile capture'"
+        )
+    recorded = Recorded.of(profile.trace_s)
+    return lambda _rng, tokens, start: recorded.in_order(tokens, start).tolist()
+
+
+def _drawn(gaps: Gaps) -> Draw:
+    return lambda rng, tokens, _start: gaps.sample(rng, tokens, 1)[:, 0].tolist()
+
+
+GAPS: dict[str, Callable[[Profile], Draw]] = {"constant": _constant, "parametric": _parametric, "trace": _trace}
+"""Value of ``--gaps`` -> where the gaps come from."""
+
+
+def check_replay(config: EngineConfig) -> None:
+    """Raise UsageError where --engine, --profile and --gaps do not go together, or the profile is not there."""
+    if config.name == "replay":
+        _settings(config)
+    elif config.profile or config.gaps:
+        flag = "--profile" if config.profile else "--gaps"
+        raise UsageError(f"{flag} needs --engine replay; --engine {config.name} answers at its own speed")
+
+
+def _settings(config: EngineConfig) -> tuple[Profile, str, Draw]:
+    if not config.profile:
+        raise UsageError("--engine replay needs --profile NAME ('s2a-bench profile list' names them)")
+    profile = load_profile(config.profile)
+    gaps = config.gaps or ("trace" if profile.trace_s else "parametric")
+    if gaps not in GAPS:
+        raise UsageError(f"--gaps: '{gaps}' is none of {', '.join(GAPS)}")
+    return profile, gaps, GAPS[gaps](profile)
+
+
+class ReplayEngine:
+    """Says numbered skill calls of six tokens each, at a profile's speed; pictures and grammar are ignored.
+
+    Text depends on ``request.seed`` alone. Times are drawn from the seed and the number of requests before, as equal
+    times for all requests of a run would hide the spread; a recording goes on where the request before ended.
+    """
+
+    def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
+        """Load the profile; raises UsageError for what `check_replay` refuses."""
+        self.facts: dict[str, float] = {}
+        self._profile, self._gaps, self._draw = _settings(config)
+        self._clock = clock or SystemClock()
+        self._requests = 0
+        self._played = 0
+        self._closed = False
+
+    def generate(self, request: Request) -> Iterator[Token]:
+        """Yield tokens at their time until ``max_tokens``."""
+        if self._closed:
+            raise EngineError("replay: the engine is closed; open a new one")
+        if request.max_tokens <= 0:
+            return
+        import numpy as np
+
+        started_ns = self._clock.now_ns()
+        rng = np.random.default_rng((request.seed % 2**32, self._requests))
+        self._requests += 1
+        prompt_s = self._prompt_s(rng)
+        gaps_s = [prompt_s + self._profile.gaps.mean_s, *self._draw(rng, request.max_tokens - 1, self._played)]
+        due_ns = accumulate(round(gap * 1e9) for gap in gaps_s)
+        self.facts = {"prompt_ms": prompt_s * 1e3, "predicted_n": 0.0, "predicted_ms": 0.0}
+        for index, (text, due) in enumerate(zip(islice(_plan(request.seed), request.max_tokens), due_ns, strict=True)):
+            self._clock.sleep_until_ns(started_ns + due)
+            self._played += index > 0
+            self.facts["predicted_n"] = float(index + 1)
+            self.facts["predicted_ms"] = (self._clock.now_ns() - started_ns) / 1e6 - self.facts["prompt_ms"]
+            yield Token(index, text)
+
+    def _prompt_s(self, rng: np.random.Generator) -> float:
+        profile = self._profile
+        if not profile.prompt_s or not profile.prompt_cv or self._gaps == "constant":
+            return profile.prompt_s
+        return float(Lognormal(profile.prompt_s, profile.prompt_cv).sample(rng, 1, 1)[0, 0])
+
+    def describe(self) -> dict[str, str | int | float | bool]:
+        """Say which profile is played and how; ``dummy`` is that of the recorded model."""
+        profile = self._profile
+        return {
+            "engine": "replay",
+            "emulated": True,
+            "dummy": profile.facts.get("model", {}).get("dummy") is True,
+            "profile": profile.name,
+            "title": profile.title,
+            "origin": profile.origin,
+            "assumed": ", ".join(profile.assumed),
+            "gaps": self._gaps,
+            "family": str(to_table(profile.gaps)["family"]) if self._gaps == "parametric" else self._gaps,
+            "tokens_per_s": profile.tokens_per_s,
+            "prompt_s": profile.prompt_s,
+            "grammar": "ignored",
+        }
+
+    def close(self) -> None:
+        """Refuse further requests."""
+        self._closed = True
+
+
+def _plan(seed: int) -> Iterator[str]:
+    """Yield the tokens of an endless plan, six a skill: ``1. go_to(table)`` and a line's end."""
+    from random import Random
+
+    random = Random(seed)  # noqa: S311 - words, not secrets
+    for number in count(1):
+        skill = random.choice(tuple(_ARGUMENTS))
+        yield from (str(number), ".", f" {skill}", "(", random.choice(_ARGUMENTS[skill]), ")\n")

@@ -1,0 +1,201 @@
+"""`s2a-bench profile`, and the replay of a profile through `latency` and `serve`, as a user meets them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import httpx
+import jsonschema
+import pytest
+
+from s2a_bench.inference.profile_file import read_profile, to_toml
+from s2a_bench.store.run import read_run
+
+SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-profile-1.json").read_text())
+FAST = {
+    "title": "A fast board",
+    "origin": "measured",
+    "tokens_per_s": 2000.0,
+    "prompt_s": 0.01,
+    "gaps": {"family": "lognormal", "cv": 0.1},
+    "model": {"dummy": True},
+}
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """Make a folder with a profile of its own to work in."""
+    (tmp_path / "profiles").mkdir()
+    (tmp_path / "profiles" / "fast.toml").write_text(to_toml(FAST))
+    return tmp_path
+
+
+def run(home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "s2a_bench", *arguments],
+        cwd=home,
+        env=os.environ
+        | {
+            "PYTHONPATH": str(Path(__file__).parent.parent.parent),
+            "XDG_CONFIG_HOME": str(home / "config"),
+            "S2A_BENCH_CACHE": str(home / "cache"),
+        },
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+
+
+def json_of(done: subprocess.CompletedProcess[str]) -> Any:
+    """Read what --json printed, and hold it against its schema."""
+    whole = json.loads(done.stdout)
+    jsonschema.validate(whole, SCHEMA)
+    return whole
+
+
+def test_list_names_the_profiles_of_this_folder_and_those_that_ship(home: Path) -> None:
+    done = run(home, "profile", "list")
+    assert done.returncode == 0, done.stderr
+    lines = {line.split()[0]: line for line in done.stdout.splitlines()}
+    assert list(lines) == ["name", "fast", "jetson-agx-orin", "jetson-orin-nano", "rtx-4080"]
+    assert "measured, dummy" in lines["fast"]
+    assert "0.0105" in lines["fast"]  # .01 s and a gap of .5 ms
+    assert "0.708 (assumed)" in lines["jetson-agx-orin"]
+    found = json_of(run(home, "profile", "list", "--json"))
+    assert found["command"] == "profile list"
+    assert [profile["name"] for profile in found["profiles"]] == list(lines)[1:]
+    assert [profile["dummy"] for profile in found["profiles"]] == [True, False, False, False]
+
+
+def test_a_wrong_file_is_named_and_the_others_are_listed(home: Path) -> None:
+    (home / "profiles" / "bad.toml").write_text(to_toml(FAST | {"tokens_per_s": -1}))
+    done = run(home, "profile", "list")
+    assert done.returncode == 0
+    assert done.stderr == "left out: profile profiles/bad.toml: tokens_per_s: -1 should be between 0 and 1e+09\n"
+    assert "fast" in done.stdout
+    done = run(home, "profile", "show", "bad")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: profile profiles/bad.toml: tokens_per_s: -1 should be between 0 and 1e+09\n"
+
+
+def test_show_says_where_numbers_are_from(home: Path) -> None:
+    text = run(home, "profile", "show", "rtx-4080").stdout
+    assert "RTX 4080, 34.2 tokens/s, first token after 0.0792 s (paper)" in text
+    assert "assumed, not from paper data: prompt_s, prompt_cv, rate_cv, gaps" in text
+    assert "  gpu: GeForce RTX 4080" in text
+    (shown,) = json_of(run(home, "profile", "show", "profiles/fast.toml", "--json"))["profiles"]
+    assert (shown["tokens_per_s"], shown["gaps"]) == (2000, {"family": "lognormal", "cv": 0.1})
+    assert shown["file"] == "profiles/fast.toml"
+
+
+def test_capture_measures_this_machine_which_match_then_finds(home: Path) -> None:
+    none = run(home, "profile", "match")
+    assert none.returncode == 1
+    assert "no profile is of this board" in none.stdout
+    flags = (
+        "--threads",
+        "1",
+        "--requests",
+        "5",
+        "--warmup",
+        "1",
+        "--tokens",
+        "12",
+        "--size",
+        "64x48",
+        "--prompt",
+        "go",
+    )
+    done = run(home, "profile", "capture", "here", *flags, "--title", "My board", "--json")
+    assert done.returncode == 0, done.stderr
+    (made,) = json_of(done)["profiles"]
+    assert made["file"] == "profiles/here.toml"
+    assert (made["recorded"], made["dummy"], made["title"]) == (55, True, "My board")
+    profile = read_profile(home / "profiles" / "here.toml")
+    assert profile.facts["model"]["threads"] == 1
+    assert len(profile.facts["model"]["model_sha256"]) == 64
+    found = json_of(run(home, "profile", "match", "--json"))
+    assert [profile["name"] for profile in found["profiles"]] == ["here"]
+    assert found["profiles"][0]["differences"] == []
+    again = run(home, "profile", "capture", "here", *flags)
+    assert again.returncode == 2
+    assert "profiles/here.toml exists already; give another NAME or --output, or --force" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["profile", "show", "tx1"], "--profile: 'tx1' is none of fast, jetson-agx-orin"),
+        (["profile", "show", "./tx1"], "--profile: there is no file ./tx1"),
+        (["profile", "capture", "../x"], "NAME: '../x' should be a plain file name"),
+        (["profile", "capture", "x", "--tokens", "1"], "--tokens: 1 should be 2 or more"),
+        (["profile", "capture", "x", "--size", "big"], "--size: 'big' should look like"),
+        (["latency", "--engine", "replay"], "--engine replay needs --profile NAME"),
+        (["latency", "--profile", "fast"], "--profile needs --engine replay; --engine llama answers at its own speed"),
+        (["latency", "--engine", "replay", "--profile", "tx1"], "--profile: 'tx1' is none of"),
+        (["latency", "--engine", "replay", "--profile", "fast", "--gaps", "wild"], "--gaps: 'wild' is none of"),
+        (["latency", "--engine", "replay", "--profile", "fast", "--gaps", "trace"], "profile fast holds no recording"),
+        (
+            ["latency", "--engine", "replay", "--profile", "fast", "--url", "http://x"],
+            "--engine replay needs our own servers; leave out --url",
+        ),
+        (["serve", "http", "--engine", "replay"], "--engine replay needs --profile NAME"),
+        (["serve", "ros", "--profile", "fast"], "--profile needs --engine replay"),
+    ],
+)
+def test_wrong_use_is_one_line_and_code_two(home: Path, arguments: list[str], message: str) -> None:
+    done = run(home, *arguments)
+    assert (done.returncode, done.stdout) == (2, ""), done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert message in line
+
+
+def test_a_server_that_replays_says_so(home: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "s2a_bench", "serve", "http", "--engine", "replay", "--profile", "fast", "--port", "0"],
+        cwd=home,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent.parent)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert "engine replay of fast (EMULATED); Ctrl-C ends it" in line
+        body = {"messages": [{"role": "user", "content": "plan"}], "max_tokens": 12}
+        answer = httpx.post(line.split()[2].rstrip(";"), json=body).json()
+        assert re.fullmatch(r"1\. \w+\(\w+\)\n2\. \w+\(\w+\)\n?", answer["choices"][0]["message"]["content"])
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+def test_a_replayed_run_is_labelled_emulated_wherever_it_shows(home: Path) -> None:
+    done = run(
+        home,
+        *("latency", "--engine", "replay", "--profile", "fast", "--transport", "loopback", "--size", "64x48"),
+        *("--runs", "4", "--warmup", "1", "--max-tokens", "20", "--json"),
+    )
+    assert done.returncode == 0, done.stderr
+    whole = json.loads(done.stdout)
+    (cell,) = whole["cells"]
+    assert (cell["engine"], cell["profile"], cell["emulated"]) == ("replay", "fast", True)
+    # a sleeping machine is late, never early; the profile draws 10 ms before the first token, and no less than 3
+    assert cell["groups_ms"]["inference"]["mean"] > 3
+    assert cell["itl_ms"]["n"] == 4 * 19
+    found = read_run(Path(home / whole["run"]))
+    assert found.manifest["model"]["emulated"] is True
+    assert set(found.samples["engine"]) == {"replay"}
+    note = "EMULATED: replayed profile fast (parametric gaps, recorded with dummy weights)"
+    tables = list((found.path / "tables").glob("*.md")) + list((found.path / "tables").glob("*.tex"))
+    assert tables
+    for table in tables:
+        assert note in table.read_text(), table
