@@ -1,0 +1,130 @@
+"""Choose the output format that costs a wanted number of tokens a skill with the tokenizer at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+from s2a_bench.errors import UsageError
+from s2a_bench.plan.codes import line_codes, stream_codes
+from s2a_bench.plan.formats import Format, Tokenize, spelled
+from s2a_bench.plan.skillset import SkillSet
+from s2a_bench.plan.wordings import Calls, Codes, Letters, Words
+
+GRANULARITIES = (6, 4, 2, 1)
+"""Tokens a skill in the paper (section IV-E)."""
+
+_FILLERS = ("-", "~", "_", ".")
+"""Words without meaning that make a call longer; which of them cost a token is the tokenizer's business."""
+
+
+def choose_format(skills: SkillSet, tokens_per_skill: int, tokenize: Tokenize, n_skills: int = 8) -> Format:
+    """Return a format in which *every* call costs exactly that many tokens, number and delimiter included.
+
+    One token: a code without delimiter stands for a call with its arguments. More: plain words where they are short
+    enough, else letters, else codes; and of these what needs the fewest fillers to make all calls cost the same.
+    Counted with ``tokenize``, line by line for plans of up to ``n_skills``, and once for all calls in a row.
+
+    Raises UsageError where this tokenizer has no such format for these skills; the message has the least possible.
+    """
+    if tokens_per_skill < 1:
+        raise UsageError(f"--tokens-per-skill: {tokens_per_skill} should be 1 or more")
+    if n_skills < 1:
+        raise UsageError(f"a plan has at least one skill, not {n_skills}")
+    if tokens_per_skill == 1:
+        return _stream(skills, tokenize)
+    fitting: list[tuple[int, Format]] = []
+    shortest = 0
+    for plain in _wordings(skills, tokenize):
+        most = max(plain.counts(tokenize, (1, n_skills)))
+        shortest = min(shortest or most, most)
+        found = _pad(plain, tokens_per_skill, tokenize, n_skills) if most <= tokens_per_skill else None
+        if found:
+            fitting.append(found)
+    if not fitting:
+        raise UsageError(
+            f"--tokens-per-skill {tokens_per_skill}: no way found to write each of the {len(skills.calls)} calls of "
+            f"'{skills.name}' in exactly that many tokens of this model; the shortest lines cost up to {shortest}. "
+            "Choose another number, or a smaller skill set"
+        )
+    return min(fitting, key=lambda found: (found[1].wording.terse, found[0]))[1]
+
+
+def _stream(skills: SkillSet, tokenize: Tokenize) -> Format:
+    calls = skills.calls
+    codes = stream_codes(len(calls), tokenize)
+    if len(codes) < len(calls):
+        raise UsageError(
+            f"--tokens-per-skill 1: '{skills.name}' has {len(calls)} calls, but only {len(codes)} codes of one token "
+            "that do not merge were found in this model's vocabulary; use a smaller skill set, or 2 tokens"
+        )
+    wording = Codes({call: code.strip() for call, code in zip(calls, codes, strict=True)})
+    return Format("code stream", skills, wording, tuple(codes), delimiter="")
+
+
+def _wordings(skills: SkillSet, tokenize: Tokenize) -> Iterator[Format]:
+    """Yield the formats without fillers, the most readable first."""
+    for numbered in (True, False):
+        yield spelled(skills, Calls(), numbered=numbered)
+    for numbered in (True, False):
+        yield spelled(skills, Words(), numbered=numbered)
+    try:
+        letters = Letters(skills)
+    except ValueError:
+        pass  # too many words for one letter each
+    else:
+        for numbered in (True, False):
+            yield spelled(skills, letters, numbered=numbered)
+    codes = line_codes(len(skills.calls), tokenize)
+    if codes:
+        yield spelled(skills, Codes(dict(zip(skills.calls, codes, strict=True))), numbered=False)
+
+
+def _pad(plain: Format, target: int, tokenize: Tokenize, n_skills: int) -> tuple[int, Format] | None:
+    """Add fillers until every call costs the target; return how many characters they are, and the format.
+
+    One filler for all calls if that does, else for each call the first that does.
+    """
+    if all(count == target for count in plain.counts(tokenize, (1,))):
+        return (0, plain) if _holds(plain, target, tokenize, n_skills) else None
+    glued = [plain.wording.glue + filler for filler in _FILLERS]
+    alike = [_filled(plain, [filler], target, tokenize, n_skills) for filler in glued]
+    mixed = [*glued, *(f" {filler}" for filler in _FILLERS)]
+    found = alike if any(alike) else [_filled(plain, mixed, target, tokenize, n_skills)]
+    sized = [(sum(map(len, format_.texts)) - sum(map(len, plain.texts)), format_) for format_ in found if format_]
+    return min(sized, key=lambda entry: entry[0], default=None)
+
+
+def _filled(plain: Format, fillers: Sequence[str], target: int, tokenize: Tokenize, n_skills: int) -> Format | None:
+    """Return the format with every call filled up to the target; None if some cannot be, or two then read alike."""
+    texts = [_padded(plain, text, fillers, target, tokenize) for text in plain.texts]
+    whole = tuple(text for text in texts if text is not None)
+    if len(whole) < len(texts):
+        return None
+    try:
+        filled = replace(plain, texts=whole, name=f"{plain.name}, filled up")
+    except ValueError:
+        return None
+    return filled if _holds(filled, target, tokenize, n_skills) else None
+
+
+def _padded(plain: Format, text: str, fillers: Sequence[str], target: int, tokenize: Tokenize) -> str | None:
+    """Return the text with as few fillers of one kind as make its line cost the target, if any do."""
+    for filler in fillers:
+        for count in range(2 * target):  # a filler may cost nothing beside another
+            padded = text + filler * count
+            cost = len(tokenize(plain.line(1, padded)))
+            if cost == target:
+                return padded
+            if cost > target:
+                break
+    return None
+
+
+def _holds(chosen: Format, target: int, tokenize: Tokenize, n_skills: int) -> bool:
+    """Check every call at every place, and all calls in a row."""
+    numbers = range(1, n_skills + 1) if chosen.numbered else (1,)
+    if any(count != target for count in chosen.counts(tokenize, numbers)):
+        return False
+    row = "".join(chosen.line(1 + index % n_skills, text) for index, text in enumerate(chosen.texts))
+    return len(tokenize(row)) == target * len(chosen.texts)

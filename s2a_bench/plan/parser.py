@@ -1,0 +1,237 @@
+"""Turn a model's answer into skills while it arrives: no I/O, any chunking, in the manner of h11.
+
+Rules, held in this file:
+- A skill is certain, and emitted, at its delimiter; in a format without delimiter, at the last byte of its code. It is
+  not emitted earlier, even where a grammar would allow one continuation only: without it ``go_to(kitchen)`` may go on.
+- At the end of the stream the last line counts as ended if no other line begins with it (``speed 5`` may be the start
+  of ``speed 50``).
+- Blanks at the ends of a line, doubled, or around brackets and commas mean nothing; empty lines are no lines.
+- Numbers in front of calls must be there in a numbered format, and are not compared: the order is that of arrival.
+- Anything else is a `BadLine`, and reading goes on at the next line; without a delimiter, after the next blank. Codes
+  that are written with blanks between must have them, so that prose is not read as codes letter by letter.
+- Bytes that are not UTF-8, and lone surrogates, become U+FFFD, which no skill contains. No more than one line is kept.
+"""
+
+from __future__ import annotations
+
+import codecs
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeAlias
+
+from s2a_bench.plan.formats import Format
+from s2a_bench.plan.skillset import Call
+from s2a_bench.plan.wordings import normalise
+
+Problem: TypeAlias = Literal["unknown-skill", "bad-argument", "malformed", "too-long", "incomplete"]
+
+
+@dataclass(frozen=True, slots=True)
+class SkillParsed:
+    """The next skill of the plan is certain."""
+
+    index: int
+    """Skills before it, from 0."""
+    call: Call
+    line: int
+    """Lines before it that are not empty, bad ones included; in a format without delimiter, codes and bad runs."""
+    chunk: int
+    """Which `Parser.feed` completed it, from 0; `Parser.close` counts as the one after the last.
+
+    Fed one token at a time, this is the token whose arrival is t_i of POLICY section 1.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class BadLine:
+    """A line that is no skill. ``text`` is cut where the line became too long."""
+
+    problem: Problem
+    text: str
+    why: str
+    line: int
+    chunk: int
+
+
+Event: TypeAlias = SkillParsed | BadLine
+
+
+class Parser:
+    """Reads one answer in one format."""
+
+    def __init__(self, format_: Format) -> None:
+        self._format = format_
+        self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
+        self._reader: _Reader = _Lines(format_) if format_.delimiter else _Codes(format_)
+        self._skills = self._lines = 0
+        self._chunk = -1
+        self._closed = False
+
+    def feed(self, chunk: str | bytes) -> list[Event]:
+        """Take the next piece of the answer, of any length, and return what has become certain with it.
+
+        Pass bytes where a chunk may end within a character. Raises ValueError after `close`.
+        """
+        if self._closed:
+            raise ValueError("the parser is closed; make a new one for another answer")
+        data = chunk.encode(errors="surrogatepass") if isinstance(chunk, str) else chunk
+        self._chunk += 1
+        return self._events(self._reader.read(self._decoder.decode(data)))
+
+    def close(self) -> list[Event]:
+        """End the answer and return what that makes certain; nothing the second time."""
+        if self._closed:
+            return []
+        self._closed = True
+        self._chunk += 1
+        return self._events(self._reader.read(self._decoder.decode(b"", final=True)) + self._reader.end())
+
+    def _events(self, found: list[_Found]) -> list[Event]:
+        """Give what was found its numbers."""
+        events: list[Event] = []
+        for result in found:
+            if isinstance(result, int):
+                call = self._format.skills.calls[result]
+                events.append(SkillParsed(self._skills, call, self._lines, self._chunk))
+                self._skills += 1
+            else:
+                events.append(BadLine(result.problem, result.text, result.why, self._lines, self._chunk))
+            self._lines += 1
+        return events
+
+
+@dataclass(frozen=True, slots=True)
+class _Bad:
+    problem: Problem
+    text: str
+    why: str
+
+
+_Found: TypeAlias = int | _Bad
+"""A place in ``skills.calls``, or why there is none."""
+
+
+class _Reader(Protocol):
+    def read(self, text: str) -> list[_Found]: ...
+
+    def end(self) -> list[_Found]: ...
+
+
+class _Lines:
+    """Reads a format with a delimiter: collects a line, then looks it up."""
+
+    def __init__(self, format_: Format) -> None:
+        self._format = format_
+        self._limit = 64 + 2 * max(map(len, format_.texts))
+        """Characters; the rest is for blanks and for a number."""
+        self._line = ""
+        self._skipping = False
+
+    def read(self, text: str) -> list[_Found]:
+        found: list[_Found] = []
+        start = 0
+        while True:
+            end = text.find(self._format.delimiter, start)
+            found += self._collect(text, start, len(text) if end < 0 else end)
+            if end < 0:
+                return found
+            found += self._finish()
+            start = end + len(self._format.delimiter)
+
+    def end(self) -> list[_Found]:
+        line = self._line.strip()
+        text = "" if self._format.numbered and line.isdecimal() else _text(line, self._format)
+        if line and text is not None:
+            longer = next((key for key in self._format.table if key.startswith(text) and key != text), None)
+            if longer is not None:
+                return [_Bad("incomplete", line, f"the answer ended where '{longer}' was still possible")]
+        return self._finish()
+
+    def _collect(self, text: str, start: int, end: int) -> list[_Found]:
+        """Keep a part of the line, up to the limit."""
+        if self._skipping:
+            return []
+        self._line += text[start : min(end, start + self._limit + 1)]
+        if len(self._line) <= self._limit:
+            return []
+        cut, self._line, self._skipping = self._line[: self._limit], "", True
+        return [_Bad("too-long", cut, f"more than {self._limit} characters without the end of a line")]
+
+    def _finish(self) -> list[_Found]:
+        """Look up the line that has ended."""
+        line, self._line, self._skipping = self._line.strip(), "", False
+        return [_look_up(line, self._format)] if line else []
+
+
+class _Codes:
+    """Reads a format without delimiter: codes of which none begins another."""
+
+    def __init__(self, format_: Format) -> None:
+        self._format = format_
+        self._starts = {code[:length] for code in format_.table for length in range(1, len(code))}
+        self._apart = format_.texts[0][:1].isspace()
+        self._code = ""
+        self._skipping = self._after_code = False
+
+    def read(self, text: str) -> list[_Found]:
+        found: list[_Found] = []
+        for char in text:
+            if char.isspace():
+                if self._code:
+                    found.append(_look_up(self._code, self._format))
+                self._code, self._skipping, self._after_code = "", False, False
+            elif not self._skipping:
+                found += self._take(char)
+        return found
+
+    def _take(self, char: str) -> list[_Found]:
+        """Add a character to the code, and look that up when it can grow no further."""
+        if self._after_code and self._apart:
+            self._skipping = True
+            return [_Bad("malformed", char, "codes should be apart")]
+        self._code += char
+        self._after_code = self._code in self._format.table
+        if not self._after_code and self._code in self._starts:
+            return []
+        code, self._code = self._code, ""
+        self._skipping = not self._after_code
+        return [_look_up(code, self._format)]
+
+    def end(self) -> list[_Found]:
+        if not self._code:
+            return []
+        return [_Bad("incomplete", self._code, "the answer ended within a code")]
+
+
+def _text(line: str, format_: Format) -> str | None:
+    """Return what a line says, without its number and meaningless blanks; None where the number is missing."""
+    if not format_.numbered:
+        return normalise(line)
+    number, dot, text = line.partition(".")
+    return normalise(text) if dot and number.isascii() and number.isdecimal() else None
+
+
+def _look_up(line: str, format_: Format) -> _Found:
+    """Find the call of a line, or say what is wrong with it."""
+    text = _text(line, format_)
+    if text is None:
+        return _Bad("malformed", line, "a number and a dot should come first")
+    index = format_.table.get(text)
+    return _explain(text, line, format_) if index is None else index
+
+
+def _explain(text: str, line: str, format_: Format) -> _Bad:
+    """Say why a text is no call."""
+    wording = format_.wording
+    fields = wording.fields(text)
+    if not fields:
+        return _Bad("malformed", line, f"should look like '{format_.texts[0].strip()}'")
+    head, *rest = fields
+    skill = next((skill for skill in format_.skills.skills if wording.head(skill) == head), None)
+    if skill is None:
+        return _Bad("unknown-skill", line, f"'{head}' is none of the skills")
+    for argument, given in zip(skill.arguments, rest, strict=False):
+        if given not in {wording.value(argument.vocabulary, value) for value in argument.values}:
+            return _Bad("bad-argument", line, f"'{given}' is no {argument.name} of {skill.name}")
+    if len(rest) < len(skill.arguments):
+        return _Bad("bad-argument", line, f"{skill.name} has {len(skill.arguments)} arguments, {len(rest)} are given")
+    return _Bad("malformed", line, f"{skill.name} is not written as listed")

@@ -1,0 +1,75 @@
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gguf import GGUFWriter
+
+from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.dummy_vocab import make_vocab
+from s2a_bench.inference.models import resolve
+from s2a_bench.inference.tokenizer import Tokenizer
+from s2a_bench.plan import GRANULARITIES, Format, SkillSet, Tokenize, choose_format, load_skills, paper_format
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("S2A_BENCH_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def tiny(cache: None) -> EngineConfig:  # noqa: ARG001 the files lie there
+    model, mmproj = resolve(EngineConfig())
+    return EngineConfig(model=model, mmproj=mmproj, threads=1)
+
+
+@pytest.fixture(scope="session")
+def of_bytes(tiny: EngineConfig) -> Tokenizer:
+    return Tokenizer(tiny.model)
+
+
+@pytest.fixture(scope="session")
+def of_words(tmp_path_factory: pytest.TempPathFactory) -> Tokenizer:
+    """Qwen2's kind and number of tokens, with merges of the full dummy: pairs, triples, fours of letters."""
+    path = tmp_path_factory.mktemp("vocabulary") / "words.gguf"
+    vocab = make_vocab(full=True)
+    writer = GGUFWriter(path, "qwen2")
+    writer.add_name("words")
+    writer.add_tokenizer_model("gpt2")
+    writer.add_tokenizer_pre("qwen2")
+    writer.add_token_list(vocab.tokens)
+    writer.add_token_types(vocab.types)
+    writer.add_token_merges(vocab.merges)
+    writer.add_eos_token_id(vocab.eos)
+    writer.add_block_count(1)
+    writer.add_context_length(512)
+    writer.add_embedding_length(64)
+    writer.add_feed_forward_length(64)
+    writer.add_head_count(1)
+    writer.add_layer_norm_rms_eps(1e-6)
+    writer.add_tensor("token_embd.weight", np.zeros((1, 64), np.float32))
+    writer.write_header_to_file()
+    writer.write_kv_data_to_file()
+    writer.write_tensors_to_file()
+    writer.close()
+    return Tokenizer(Path(path))
+
+
+@pytest.fixture(scope="session", params=["household", "driving"])
+def skills(request: pytest.FixtureRequest) -> SkillSet:
+    return load_skills(request.param)
+
+
+@pytest.fixture(scope="session", params=["of_bytes", "of_words"])
+def tokenize(request: pytest.FixtureRequest) -> Tokenize:
+    tokenizer: Tokenizer = request.getfixturevalue(request.param)
+    return tokenizer
+
+
+@pytest.fixture(scope="session", params=["paper", *GRANULARITIES])
+def format_(request: pytest.FixtureRequest, skills: SkillSet, tokenize: Tokenize) -> Format:
+    if request.param == "paper":
+        return paper_format(skills)
+    return choose_format(skills, request.param, tokenize)

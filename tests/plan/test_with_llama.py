@@ -1,0 +1,72 @@
+from collections.abc import Iterator
+
+import pytest
+
+from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.llama_cpp import LlamaCppEngine
+from s2a_bench.inference.tokenizer import Tokenizer
+from s2a_bench.plan import (
+    GRANULARITIES,
+    Parser,
+    SkillParsed,
+    SkillSet,
+    choose_format,
+    grammar,
+    load_skills,
+    measure_validity,
+    paper_format,
+    prompt,
+)
+from s2a_bench.types import Request, Token
+
+
+@pytest.fixture(scope="module")
+def engine(tiny: EngineConfig) -> Iterator[LlamaCppEngine]:
+    engine = LlamaCppEngine(tiny)
+    yield engine
+    engine.close()
+
+
+def tokens(engine: LlamaCppEngine, text: str, gbnf: str, seed: int, most: int = 300) -> Iterator[Token]:
+    return engine.generate(Request("r", text, max_tokens=most, grammar=gbnf, seed=seed))
+
+
+@pytest.mark.parametrize("size", GRANULARITIES)
+@pytest.mark.parametrize("pinned", [False, True])
+def test_a_model_under_the_grammar_writes_n_skills_of_l_tokens(
+    engine: LlamaCppEngine, of_bytes: Tokenizer, skills: SkillSet, size: int, pinned: bool
+) -> None:
+    format_ = choose_format(skills, size, of_bytes)
+    gbnf = grammar(format_, 8, of_bytes if pinned else None)
+    for seed in range(2):
+        parser = Parser(format_)
+        events = []
+        for count, token in enumerate(tokens(engine, prompt(format_, 8, "Go."), gbnf, seed)):
+            found = parser.feed(token.text)
+            assert bool(found) == ((count + 1) % size == 0)
+            events += found
+        assert parser.close() == []
+        assert all(isinstance(event, SkillParsed) for event in events)
+        assert [event.chunk for event in events] == [size * at - 1 for at in range(1, 9)]
+
+
+def test_a_model_under_the_grammar_writes_the_papers_form(engine: LlamaCppEngine) -> None:
+    paper = paper_format(load_skills("household"))
+    answer = "".join(token.text for token in tokens(engine, prompt(paper, 8), grammar(paper, 8), 1))
+    assert [line.partition(".")[0] for line in answer.splitlines()] == list("12345678")
+    parser = Parser(paper)
+    assert len([event for event in parser.feed(answer) if isinstance(event, SkillParsed)]) == 8
+
+
+def test_the_grammar_is_what_makes_skills_valid(engine: LlamaCppEngine, of_bytes: Tokenizer, skills: SkillSet) -> None:
+    format_ = choose_format(skills, 4, of_bytes)
+
+    def ask(gbnf: str, seed: int) -> Iterator[str]:
+        return (token.text for token in tokens(engine, prompt(format_, 6), gbnf, seed, 60))
+
+    found = measure_validity(ask, format_, 6, answers=4, tokenize=of_bytes)
+    assert set(found) == {"grammar", "free"}
+    assert (found["grammar"].share, found["grammar"].as_ordered, found["grammar"].skills) == (1.0, 4, 24)
+    assert found["free"].answers == 4
+    assert (found["free"].share or 0.0) < 0.5  # random weights
+    assert found["free"].as_ordered == 0
