@@ -45,7 +45,12 @@ class TransportError(S2AError):
 
 
 class RequestFailed(TransportError):
-    """The server refused or broke off this one request; the next may succeed."""
+    """The server refused or broke off this one request; the next may succeed, perhaps after ``retry_after_s``."""
+
+    def __init__(self, message: str = "", *, retry_after_s: float | None = None) -> None:
+        """Keep the message, and how long the server asked to wait, if it did."""
+        super().__init__(message)
+        self.retry_after_s = retry_after_s
 
 
 class MessagesLost(RequestFailed):

@@ -52,6 +52,10 @@ class Client(Protocol):
         """
         ...
 
+    def describe(self) -> dict[str, str]:
+        """Say how the server is asked, as far as the route does not tell, for the manifest."""
+        ...
+
     def close(self) -> None:
         """Close connections; may be called twice."""
         ...
@@ -95,6 +99,12 @@ class Route:
     """The server is not ours, so it sends no marks."""
     model: str = "default"
     """http: the model's name in the request."""
+    dialect: str = ""
+    """http: what a black box speaks, a name of ``http.dialects.DIALECTS``; empty: ask which OpenAI server it is."""
+    api_key_env: str = ""
+    """http: the environment variable that holds a black box's API key."""
+    extra_body: str = ""
+    """http: JSON that is merged into every request's body (RFC 7396)."""
     middleware: str = ""
     """ros: cyclonedds or rclpy; empty: rclpy in a sourced ROS 2 environment, else cyclonedds."""
     qos: str = "reliable"

@@ -71,5 +71,9 @@ class LoopbackClient:
             raise RequestFailed(str(error)) from error
         trace.receive(served.to_remote())
 
+    def describe(self) -> dict[str, str]:
+        """Add nothing: the route tells all."""
+        return {}
+
     def close(self) -> None:
         """Do nothing: there is no connection."""

@@ -1,4 +1,4 @@
-"""The HTTP client against servers that are not ours, well-behaved and not."""
+"""The HTTP client against a llama-server, well-behaved and not, byte by byte; see test_dialects for the others."""
 
 from __future__ import annotations
 
@@ -87,7 +87,9 @@ def serve() -> Iterator[Serve]:
 
 def ask(url: str, request: Request | None = None) -> tuple[list[str], Trace]:
     """Ask a black box; return the texts and the trace."""
-    client = open_client(Route("http", "as-deployed", url, payload="jpeg", black_box=True, timeout_s=20))
+    client = open_client(
+        Route("http", "as-deployed", url, payload="jpeg", black_box=True, dialect="llama-server", timeout_s=20)
+    )
     trace = Trace()
     trace.mark(RESIDUAL)
     try:
@@ -155,8 +157,8 @@ def test_comment_pings_and_odd_chunk_boundaries_do_no_harm(serve: Serve) -> None
         ([http_head("429 Too Many Requests", "text/plain"), b"slow down"], "429: slow down"),
         ([http_head("503 Service Unavailable", "text/plain")], "503: nothing"),
         ([http_head(kind="application/json"), b'{"error":{"message":"no such model"}}'], "200: no such model"),
-        ([http_head(), b"data: {not json}\n\n"], "OpenAI dialect"),
-        ([http_head(), b"data: [1, 2]\n\n"], "OpenAI dialect"),
+        ([http_head(), b"data: {not json}\n\n"], "not the dialect 'llama-server'"),
+        ([http_head(), b"data: [1, 2]\n\n"], "not the dialect 'llama-server'"),
         (
             [b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nContent-Length: 99\r\n\r\n", FINISH],
             "broke the conn",
@@ -175,7 +177,7 @@ def test_a_connection_that_the_server_closed_is_opened_again(serve: Serve) -> No
     head = LLAMA_SERVER[0].replace(b"Connection: close\r\n\r\n", b"Keep-Alive: timeout=5, max=100\r\n")
     whole = b"".join(LLAMA_SERVER[1:])
     chunked = [head + b"Transfer-Encoding: chunked\r\n\r\n", b"%x\r\n%s\r\n0\r\n\r\n" % (len(whole), whole)]
-    client = open_client(Route("http", "as-deployed", serve(chunked), black_box=True))
+    client = open_client(Route("http", "as-deployed", serve(chunked), black_box=True, dialect="llama-server"))
     for number in range(20):
         assert len(list(client.request(Request(str(number), "plan"), Trace()))) == 2
     client.close()

@@ -6,6 +6,7 @@ import base64
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import asdict
 from threading import Thread
 
 import cv2
@@ -67,6 +68,24 @@ def test_a_new_client_per_request_shows_as_connect(url: str) -> None:
     client = open_client(Route("http", "as-deployed", url, connection="client-per-request"))
     _, trace = ask(client, Request("a", "plan"))
     assert "connect" in budget(trace.chain()).stages_ns
+
+
+def test_our_own_server_is_known_by_its_url_and_keeps_its_marks(url: str) -> None:
+    client = open_client(Route("http", "as-deployed", url, black_box=True))
+    _, trace = ask(client, Request("a", "plan"))
+    client.close()
+    assert client.describe() == {"url": url + "/v1/chat/completions", "dialect": "s2a"}
+    assert set(budget(trace.chain()).stages_ns) == {"json_pack", "network", "json_parse", "inference", "return"}
+
+
+def test_marks_of_another_hosts_clock_are_not_mixed_with_ours(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.transport.http.client.clock_id", lambda: "another boot")
+    monkeypatch.setattr("s2a_bench.trace.clock_id", lambda: "another boot")
+    monkeypatch.setattr(dialect, "remote_to_json", lambda remote: {**asdict(remote), "clock": "this boot"})
+    client = open_client(Route("http", "as-deployed", url))
+    _, trace = ask(client, Request("a", "plan"))
+    client.close()
+    assert set(budget(trace.chain()).stages_ns) == {"json_pack", "server"}
 
 
 @pytest.mark.parametrize(("connection", "connections"), [("keep-alive", 1), ("per-request", 3)])

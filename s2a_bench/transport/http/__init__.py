@@ -1,1 +1,1 @@
-"""HTTP/JSON in the OpenAI chat/completions dialect with Server-Sent Events, in three variants."""
+"""HTTP: our own server in three variants of OpenAI's dialect, and a client that speaks to other servers too."""

@@ -1,8 +1,9 @@
-"""The HTTP client on httpx: encode, pack, send, read the event stream, and mark each step.
+"""The HTTP client on httpx: encode, pack, send, read the answer, and mark each step, in every dialect.
 
-A black box (llama-server, any OpenAI-compatible server) sends no marks. llama-server's response headers leave when
-its slot starts, so for it they end the stage `ingest`, the first token ends `inference`, and its ``timings`` become
-facts.
+Our own server sends its marks with the last event. A black box sends none: where its response headers are known to
+leave when inference starts (llama-server), they end the stage `ingest` and the first token ends `inference`; anywhere
+else all from the last byte packed to the first token is the stage `server`. The first token is the first text of the
+answer: empty pieces and what a model thinks before are none. What a server tells of its own times becomes facts.
 """
 
 from __future__ import annotations
@@ -10,44 +11,75 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any
 
 import httpx
-from httpx_sse import EventSource
 
-from s2a_bench.clock import now_ns
+from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Route
+from s2a_bench.transport.credentials import read_key
 from s2a_bench.transport.http import dialect
+from s2a_bench.transport.http.detect import body_of, detected
+from s2a_bench.transport.http.dialects import OWN, Event, Picture, open_dialect
+from s2a_bench.transport.http.dialects.decoder import Decoder
+from s2a_bench.transport.http.merge import merged, read_patch
+from s2a_bench.transport.http.refusals import refusal
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Request, Token
 
-FACTS = ("cache_n", "prompt_n", "prompt_ms", "predicted_n", "predicted_ms")
-"""What of llama-server's ``timings`` is kept."""
+ERROR_LIMIT = 1 << 16
+"""Bytes that are read of a refusal."""
 
 
 class HttpClient:
     """One variant of the HTTP pipeline."""
 
     def __init__(self, route: Route, alive: Callable[[], bool]) -> None:
-        """Prepare to ask the server at ``route.address``; nothing is sent yet."""
+        """Prepare to ask the server at ``route.address``; a black box of no known dialect is asked what it is."""
         self.camera = None
         self._route = route
         self._alive = alive
         self._codec = dialect.CODECS[route.variant]
-        path = dialect.PATHS[dialect.AS_DEPLOYED if route.black_box else route.variant]
-        self._url = route.address.rstrip("/").removesuffix("/v1") + path
-        self._headers = {"content-type": "application/json"}
+        self._key = read_key(route.api_key_env)
+        self._client = self._new_client() if route.connection != "client-per-request" else None
+        self._dialect = open_dialect(self._dialect_name())
+        self._url = self._dialect.url(route.address, route.model) if route.black_box else self._own_url()
+        self._extra = read_patch(route.extra_body)
+        self._headers = {"content-type": "application/json", **self._authorization()}
         if route.connection != "keep-alive":
             self._headers["connection"] = "close"
-        self._client = self._new_client() if route.connection != "client-per-request" else None
+
+    def _own_url(self) -> str:
+        return self._route.address.rstrip("/") + dialect.PATHS[self._route.variant]
+
+    def _dialect_name(self) -> str:
+        """Return the dialect that the route names, our own server's, or what the server says."""
+        route = self._route
+        if route.dialect or not route.black_box:
+            return route.dialect or OWN
+        client = self._client or self._new_client()
+        try:
+            key = open_dialect("openai").authorization(self._key) if self._key else {}
+            return detected(route.address, client, key)
+        finally:
+            if client is not self._client:
+                client.close()
+
+    def _authorization(self) -> dict[str, str]:
+        return self._dialect.authorization(self._key) if self._key else {}
+
+    def describe(self) -> dict[str, str]:
+        """Say who is asked, and how, for the manifest."""
+        return {"url": self._url, "dialect": self._dialect.name}
 
     def _new_client(self) -> httpx.Client:
         """Build the client; its TLS context alone takes about 20 ms, which is why it is normally built once."""
         # a kept connection stays kept, however long a turn of the other cells takes
         limits = httpx.Limits(keepalive_expiry=None)
-        return httpx.Client(timeout=self._route.timeout_s, trust_env=False, limits=limits)
+        # a cloud may be behind a proxy and with certificates that the environment names; what is measured here is not
+        trust_env = self._route.address.startswith("https:")
+        return httpx.Client(timeout=self._route.timeout_s, trust_env=trust_env, limits=limits)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Encode and send the request and yield the streamed tokens."""
@@ -58,13 +90,13 @@ class HttpClient:
             trace.mark("connect")
         packed_ns = trace.marks[-1][1]
         try:
-            with _translated(self._alive, self._url), ExitStack() as stack:
+            with self._translated(), ExitStack() as stack:
                 response = self._send(client, body, headers, stack, trace)
                 headers_ns = now_ns()
-                streams = response.headers.get("content-type", "").startswith("text/event-stream")
-                if response.status_code != httpx.codes.OK or not streams:
-                    response.read()
-                    raise RequestFailed(f"{self._url} answered {response.status_code}: {_error_of(response.text)}")
+                kind = response.headers.get("content-type", "")
+                if response.status_code != httpx.codes.OK or not kind.startswith(self._dialect.media_type):
+                    text = body_of(response, ERROR_LIMIT, self._route.timeout_s)
+                    raise refusal(self._url, response, text, self._route, self._dialect.media_type)
                 yield from self._tokens(response, trace, headers_ns, packed_ns)
         finally:
             if client is not self._client:
@@ -87,108 +119,107 @@ class HttpClient:
 
     def _pack(self, request: Request, trace: Trace) -> tuple[bytes, dict[str, str]]:
         """Build the body, marking each stage."""
-        fields = dialect.parameters(request, self._route.model, black_box=self._route.black_box)
         if self._route.variant == dialect.BINARY:
-            media_type, data = "application/octet-stream", None
-            for frame in request.images[:1]:
-                media_type, data = encoded(frame, self._route.payload, trace)
-            fields["prompt"] = request.prompt
-            header = json.dumps(fields)  # headers are ASCII, which the standard library's JSON is
-            body = data.tobytes() if data is not None else b""
-            headers = {**self._headers, "content-type": media_type, dialect.PARAMETERS_HEADER: header}
+            body, headers = self._pack_binary(request, trace)
         else:
-            uris = []
+            pictures = []
             for frame in request.images:
-                media_type, data = encoded(frame, self._route.payload, trace)
-                text = self._codec.to_base64(data)
+                media_type, data = self._dialect.encode(frame, self._route.payload, trace)
+                text = self._codec.to_base64(data.reshape(-1))
                 trace.mark("base64_encode")
-                uris.append(dialect.data_uri(media_type, text))
-            fields["messages"] = dialect.messages(request.prompt, uris)
+                pictures.append(Picture(media_type, text, data.shape))
+            fields = merged(self._dialect.body(request, pictures, self._route.model), self._extra)
             body, headers = self._codec.dumps(fields), self._headers
         trace.mark("json_pack")
         trace.facts["payload_bytes"] = len(body)
         return body, headers
 
-    def _tokens(self, response: httpx.Response, trace: Trace, headers_ns: int, packed_ns: int) -> Iterator[Token]:
-        """Yield the tokens of an event stream; after the last, complete the trace."""
-        first_ns, index, finished, done = 0, 0, False, False
-        for data in _events(response):
-            if data == "[DONE]":
-                done = True
-                continue  # read to the end, or the connection could not be kept
-            event = self._codec.loads(data)
-            if "error" in event:
-                raise RequestFailed(f"the server broke off: {_message_of(event['error'])}")
-            for choice in event.get("choices") or ():
-                text = (choice.get("delta") or {}).get("content")
-                finished = finished or bool(choice.get("finish_reason"))
-                if text is not None and (text or not self._route.black_box):  # black boxes open with an empty one
-                    if not first_ns:
-                        first_ns = now_ns()
-                        if not self._route.black_box:
-                            trace.marks.append(("return", first_ns))
-                    yield Token(index, text, choice.get("token", -1))
-                    index += 1
-            self._learn(event, trace)
-        if not (done or finished):
-            raise RequestFailed(f"{self._url} ended the stream before the answer was complete")
-        if self._route.black_box and first_ns:
-            known = "prompt_ms" in trace.facts  # only llama-server's headers are known to wait for the slot
-            trace.marks += [("ingest", headers_ns), ("inference", first_ns)] if known else [("server", first_ns)]
-            trace.facts["headers_ms"] = (headers_ns - packed_ns) / 1e6
+    def _pack_binary(self, request: Request, trace: Trace) -> tuple[bytes, dict[str, str]]:
+        """Build our own binary variant: the picture is the body, all else a header."""
+        media_type, data = "application/octet-stream", None
+        for frame in request.images[:1]:
+            media_type, data = encoded(frame, self._route.payload, trace)
+        fields = dialect.parameters(request, self._route.model)
+        fields |= {**dialect.own_parameters(request), "prompt": request.prompt}
+        header = json.dumps(fields)  # headers are ASCII, which the standard library's JSON is
+        headers = {**self._headers, "content-type": media_type, dialect.PARAMETERS_HEADER: header}
+        return data.tobytes() if data is not None else b"", headers
 
-    @staticmethod
-    def _learn(event: dict[str, Any], trace: Trace) -> None:
-        """Keep the server's marks and what it says about caching and timing."""
-        if "s2a" in event:
-            trace.receive(dialect.remote_of_json(event["s2a"]))
-        timings = event.get("timings") or {}
-        trace.facts.update({name: float(timings[name]) for name in FACTS if name in timings})
-        usage = event.get("usage") or {}
-        cached = (usage.get("prompt_tokens_details") or {}).get("cached_tokens")
-        if cached is not None:
-            trace.facts.setdefault("cache_n", float(cached))
+    def _tokens(self, response: httpx.Response, trace: Trace, headers_ns: int, packed_ns: int) -> Iterator[Token]:
+        """Yield the tokens of an answer; after the last, complete the trace."""
+        first_ns, thinking_ns, thoughts, index, finished = 0, 0, 0, 0, False
+        for event in self._events(response):
+            if event.error:
+                raise RequestFailed(f"{self._url}: {event.error}")
+            if event.thinking:
+                thinking_ns = thinking_ns or now_ns()
+                thoughts += 1
+            if event.text is not None:
+                first_ns = first_ns or now_ns()
+                yield Token(index, event.text, event.token_id)
+                index += 1
+            finished = finished or bool(event.finish)
+            trace.facts.update(event.facts)
+            if event.remote is not None:
+                trace.receive(event.remote)
+        if not finished:
+            raise RequestFailed(f"{self._url} ended the stream before the answer was complete")
+        if not first_ns and (thoughts or trace.facts.get("thinking_n")):
+            raise RequestFailed(
+                f"{self._url} thought and gave no answer: raise --max-tokens, or turn thinking off with --extra-body"
+            )
+        if thinking_ns:
+            trace.facts |= {"thinking_pieces": float(thoughts), "thinking_ms": (first_ns - thinking_ns) / 1e6}
+        if first_ns:
+            self._mark(trace, headers_ns, packed_ns, first_ns)
+
+    def _mark(self, trace: Trace, headers_ns: int, packed_ns: int, first_ns: int) -> None:
+        """Name the stretch from the last byte packed to the first token, as far as it is known what it was."""
+        if trace.remote is not None and trace.remote.clock == clock_id():
+            trace.marks.append(("return", first_ns))
+            return
+        trace.facts["headers_ms"] = (headers_ns - packed_ns) / 1e6
+        if self._dialect.starts_with_headers(trace.facts):
+            trace.marks += [("ingest", headers_ns), ("inference", first_ns)]
+            trace.facts["headers_off_ms"] = (first_ns - headers_ns) / 1e6 - trace.facts["prompt_ms"]
+        else:
+            trace.marks.append(("server", first_ns))
+
+    def _events(self, response: httpx.Response) -> Iterator[Event]:
+        """Yield the events of an answer; comments and drops of an event do not count as a sign of life for ever."""
+        decoder = Decoder(self._dialect, self._codec.loads)
+        heard_ns, patience_ns = now_ns(), int(self._route.timeout_s * 1e9)
+        for data in response.iter_bytes():
+            for event in decoder.feed(data):
+                yield event
+                heard_ns = now_ns()
+            if now_ns() - heard_ns > patience_ns:
+                raise RequestFailed(f"{self._url} sent nothing that means anything for {self._route.timeout_s:g} s")
+        yield from decoder.end()
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        """Turn what httpx raises into this project's errors, with the key struck out."""
+        url = self._url
+        try:
+            yield
+        except RequestFailed as error:
+            if not (self._key and self._key in str(error)):
+                raise
+            shown = str(error).replace(self._key, "***")
+            raise RequestFailed(shown, retry_after_s=error.retry_after_s) from None
+        except httpx.ConnectError as error:
+            raise ServerDied(f"nothing answers at {url}: {error}") from error
+        except httpx.TimeoutException as error:
+            raise RequestFailed(f"{url} was silent for too long: {type(error).__name__}") from error
+        except httpx.RequestError as error:
+            if not self._alive():
+                raise ServerDied(f"the server at {url} is gone: {error}") from error
+            raise RequestFailed(f"{url} broke the connection: {error}") from error
+        except httpx.InvalidURL as error:
+            raise TransportError(f"--url: '{url}' is no URL: {error}") from error
 
     def close(self) -> None:
         """Close the kept connection."""
         if self._client is not None:
             self._client.close()
-
-
-def _events(response: httpx.Response) -> Iterator[str]:
-    """Yield the data of each server-sent event, comments and empty events left out."""
-    for event in EventSource(response).iter_sse():
-        if event.data:
-            yield event.data
-
-
-@contextmanager
-def _translated(alive: Callable[[], bool], url: str) -> Iterator[None]:
-    """Turn what httpx and the JSON decoders raise into this project's errors."""
-    try:
-        yield
-    except httpx.ConnectError as error:
-        raise ServerDied(f"nothing answers at {url}: {error}") from error
-    except httpx.TimeoutException as error:
-        raise RequestFailed(f"{url} was silent for too long: {type(error).__name__}") from error
-    except httpx.RequestError as error:
-        if not alive():
-            raise ServerDied(f"the server at {url} is gone: {error}") from error
-        raise RequestFailed(f"{url} broke the connection: {error}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:  # JSON errors are ValueErrors
-        raise RequestFailed(f"{url} does not speak the OpenAI dialect: {error!r}") from error
-    except httpx.InvalidURL as error:
-        raise TransportError(f"--url: '{url}' is no URL: {error}") from error
-
-
-def _error_of(text: str) -> str:
-    """Return the message inside an error body, or the start of the body."""
-    try:
-        return _message_of(json.loads(text)["error"])
-    except (ValueError, KeyError, TypeError):
-        return text[:200].strip() or "nothing"
-
-
-def _message_of(error: Any) -> str:
-    """Return the message of an OpenAI error object, which some servers send as a plain string."""
-    return str(error.get("message", error)) if isinstance(error, dict) else str(error)

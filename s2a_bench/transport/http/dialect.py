@@ -1,4 +1,4 @@
-"""The words on the HTTP wire: request bodies and streamed events, without any I/O.
+"""The words on the wire of our own HTTP server: request bodies and streamed events, without any I/O.
 
 The dialect is OpenAI's ``chat/completions`` with Server-Sent Events. Three things are added, all optional: the
 media type ``application/x-raw`` for uncompressed pixels, the fields ``grammar`` (as llama-server has it) and
@@ -18,6 +18,7 @@ import pybase64
 
 from s2a_bench.trace import Remote
 from s2a_bench.transport import HTTP_VARIANTS
+from s2a_bench.transport.http.dialects.common import TEMPERATURE, TOP_P
 from s2a_bench.types import Request
 
 AS_DEPLOYED, BEST_EFFORT, BINARY = HTTP_VARIANTS
@@ -77,24 +78,22 @@ def split_data_uri(uri: str) -> tuple[str, str]:
     return head[len("data:") : -len(";base64")], encoded
 
 
-def parameters(request: Request, model: str, *, black_box: bool) -> dict[str, Any]:
-    """Return the request's fields apart from the messages."""
-    fields: dict[str, Any] = {
+def parameters(request: Request, model: str) -> dict[str, Any]:
+    """Return the request's standard fields apart from the messages."""
+    return {
         "model": model,
         "stream": True,
         "stream_options": {"include_usage": True},
         "max_tokens": request.max_tokens,
-        "temperature": 0.7,  # as our own llama engine samples
-        "top_p": 0.8,
+        "temperature": TEMPERATURE,
+        "top_p": TOP_P,
         "seed": request.seed,
     }
-    if request.grammar:
-        fields["grammar"] = request.grammar
-    if black_box:
-        fields["cache_prompt"] = False  # llama-server: a repeated picture must not give a false fast first token
-    else:
-        fields["request_id"] = request.id
-    return fields
+
+
+def own_parameters(request: Request) -> dict[str, Any]:
+    """Return the fields that only our own server knows."""
+    return {"request_id": request.id, **({"grammar": request.grammar} if request.grammar else {})}
 
 
 def messages(prompt: str, uris: list[str]) -> list[dict[str, Any]]:

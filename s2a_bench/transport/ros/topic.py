@@ -84,6 +84,10 @@ class TopicClient:
                 raise ServerDied("the server's process is gone")
         raise RequestFailed(f"no token for {self._route.timeout_s:.0f} s")
 
+    def describe(self) -> dict[str, str]:
+        """Add nothing: the route tells all."""
+        return {}
+
     def close(self) -> None:
         """Leave the domain."""
         self.middleware.close()

@@ -1,0 +1,112 @@
+"""What HTTP servers speak: one adapter a dialect, without any I/O, behind one table.
+
+An adapter builds a request's body and says what one message of the answer means. Cutting the bytes into messages is
+the `Decoder`'s; sending, marking stages and telling errors are the client's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pkgutil import resolve_name
+from typing import Any, Protocol
+
+from s2a_bench.errors import UsageError
+from s2a_bench.trace import Remote, Trace
+from s2a_bench.types import Frame, Pixels, Request
+
+OWN = "s2a"
+"""The dialect of our own server, in all its variants."""
+
+DIALECTS: dict[str, str] = {
+    OWN: "s2a_bench.transport.http.dialects.openai:Own",
+    "openai": "s2a_bench.transport.http.dialects.openai:OpenAI",
+    "llama-server": "s2a_bench.transport.http.dialects.openai:LlamaServer",
+    "vllm": "s2a_bench.transport.http.dialects.openai:Vllm",
+    "ollama": "s2a_bench.transport.http.dialects.ollama:Ollama",
+    "tgi": "s2a_bench.transport.http.dialects.tgi:Tgi",
+    "gemini": "s2a_bench.transport.http.dialects.gemini:Gemini",
+    "openvla": "s2a_bench.transport.http.dialects.openvla:OpenVla",
+}
+"""Dialect -> ``module:Class``, built without arguments."""
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture that is ready to be packed; ``shape`` is that of the bytes: (n,) or (height, width, 3)."""
+
+    media_type: str
+    base64: str
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """What one message of an answer says; a field at its default says nothing.
+
+    ``text`` is a piece of the answer itself, ``thinking`` what a model says to itself before, ``finish`` why the
+    answer is complete, ``error`` that it will never be.
+    """
+
+    text: str | None = None
+    token_id: int = -1
+    thinking: str = ""
+    finish: str = ""
+    facts: dict[str, float] = field(default_factory=dict)
+    remote: Remote | None = None
+    error: str = ""
+
+
+class Framing(Protocol):
+    """How messages are cut out of a body."""
+
+    def feed(self, data: bytes) -> Iterator[str]:
+        """Yield the messages that these bytes complete; raises ValueError for one that is too large."""
+        ...
+
+    def end(self) -> Iterator[str]:
+        """Yield what is left when the body has ended."""
+        ...
+
+
+class Dialect(Protocol):
+    """One dialect: pure, without state."""
+
+    name: str
+    media_type: str
+    """What a good answer's content-type starts with."""
+    payloads: tuple[str, ...]
+    """How pictures can travel."""
+    framing: Callable[[], Framing]
+
+    def url(self, base: str, model: str) -> str:
+        """Return where to post, for the URL that a user gave."""
+        ...
+
+    def authorization(self, key: str) -> dict[str, str]:
+        """Return the headers that carry an API key."""
+        ...
+
+    def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
+        """Return the media type and the bytes of a picture, marking each stage."""
+        ...
+
+    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
+        """Return the request's body; raises UsageError for what the dialect cannot say."""
+        ...
+
+    def event(self, message: Any) -> Event:
+        """Say what one message means; whatever it raises for a message of another form is the Decoder's to catch."""
+        ...
+
+    def starts_with_headers(self, facts: dict[str, float]) -> bool:
+        """Tell whether the response's headers are known to have left when inference started."""
+        ...
+
+
+def open_dialect(name: str) -> Dialect:
+    """Return an adapter by its name; raises UsageError for an unknown one."""
+    if name not in DIALECTS:
+        raise UsageError(f"--dialect: '{name}' is none of {', '.join(DIALECTS)}")
+    dialect: Dialect = resolve_name(DIALECTS[name])()
+    return dialect

@@ -1,0 +1,70 @@
+"""What the dialects share: joining URLs, reading numbers, and the class of those that take encoded pictures."""
+
+from __future__ import annotations
+
+from typing import Any
+from urllib.parse import urlsplit, urlunsplit
+
+from s2a_bench.errors import UsageError
+from s2a_bench.trace import Trace
+from s2a_bench.transport.http.dialects import Framing
+from s2a_bench.transport.http.dialects.framing import ServerSentEvents
+from s2a_bench.transport.pictures import encoded
+from s2a_bench.types import Frame, Pixels, Request
+
+TEMPERATURE, TOP_P = 0.7, 0.8
+"""As our own llama engine samples."""
+
+
+class Chat:
+    """A chat that streams server-sent events, takes JPEG or PNG, and a bearer token (RFC 6750)."""
+
+    media_type = "text/event-stream"
+    payloads: tuple[str, ...] = ("jpeg", "jpeg-preencoded", "png")
+    framing: type[Framing] = ServerSentEvents
+
+    def authorization(self, key: str) -> dict[str, str]:
+        """Return the usual header of an API key."""
+        return {"authorization": f"Bearer {key}"}
+
+    def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
+        """Encode as the payload says."""
+        return encoded(frame, payload, trace)
+
+    def starts_with_headers(self, facts: dict[str, float]) -> bool:  # noqa: ARG002 - llama-server's tell
+        """Most servers send their headers at some other moment."""
+        return False
+
+
+def endpoint(base: str, root: str, path: str, query: str = "") -> str:
+    """Join a user's URL with a dialect's path: it may end with the server, with the API's root, or be whole."""
+    try:
+        parts = urlsplit(base)
+    except ValueError as error:
+        raise UsageError(f"--url: '{base}' is no URL: {error}") from error
+    here = parts.path.rstrip("/")
+    if not here.endswith(path):
+        here = here.removesuffix(root) + root + path
+    return urlunsplit((parts.scheme, parts.netloc, here, "&".join(filter(None, (parts.query, query))), ""))
+
+
+def refuse_grammar(request: Request, name: str) -> None:
+    """Raise UsageError for a grammar that the dialect has no field for."""
+    if request.grammar:
+        raise UsageError(
+            f"--grammar: the dialect '{name}' has no field for a GBNF grammar; leave it out, or ask a server of "
+            "--dialect llama-server or vllm"
+        )
+
+
+def numbers(source: Any, names: dict[str, str], scale: float = 1.0) -> dict[str, float]:
+    """Return the numbers of a JSON object under our names, times ``scale``; what is missing or null stays absent."""
+    found = source or {}
+    return {ours: float(found[theirs]) * scale for theirs, ours in names.items() if found.get(theirs) is not None}
+
+
+def text_of(value: Any) -> str:
+    """Return a text as it is; raises TypeError for anything else, which would fail far from here."""
+    if not isinstance(value, str):
+        raise TypeError(f"{type(value).__name__} where text should be")
+    return value

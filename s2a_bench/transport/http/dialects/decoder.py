@@ -1,0 +1,95 @@
+"""Bytes of an answer in, events out: a sans-I/O decoder for every dialect.
+
+Whatever a server sends, it yields events and never raises: what cannot be understood is an event with an error, and
+nothing follows an error.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+from s2a_bench.transport.http.dialects import Dialect, Event
+
+DONE = "[DONE]"
+"""OpenAI's last message, which is no JSON."""
+
+QUOTED = 120
+"""Characters of a message that an error quotes."""
+
+ODD = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError)
+"""What reading a message of an unexpected form raises; JSON and Unicode errors are ValueErrors."""
+
+
+class Decoder:
+    """One answer's decoder."""
+
+    def __init__(self, dialect: Dialect, loads: Callable[[str], Any] = json.loads) -> None:
+        """Start at the beginning of a body."""
+        self._dialect = dialect
+        self._loads = loads
+        self._framing = dialect.framing()
+        self._failed = False
+
+    def feed(self, data: bytes) -> Iterator[Event]:
+        """Yield the events that these bytes complete."""
+        yield from self._events(self._framing.feed(data))
+
+    def end(self) -> Iterator[Event]:
+        """Yield what the end of the body completes."""
+        yield from self._events(self._framing.end())
+
+    def _events(self, messages: Iterator[str]) -> Iterator[Event]:
+        """Read each message until one is an error."""
+        if self._failed:
+            return
+        try:
+            for message in messages:
+                event = self._event(message)
+                self._failed = bool(event.error)
+                yield event
+                if self._failed:
+                    return
+        except ValueError as error:  # of the framing: too large
+            self._failed = True
+            yield Event(error=f"the server sent {error}")
+
+    def _event(self, message: str) -> Event:
+        """Say what one message means."""
+        if message == DONE:
+            return Event(finish="done")
+        try:
+            value = self._loads(message)
+            error = error_in(value)
+            if error:
+                return Event(error=f"the server broke off: {error}")
+            event = self._dialect.event(value)
+        except ODD as problem:
+            start = message[:QUOTED].strip()
+            return Event(error=f"this is not the dialect '{self._dialect.name}' ({problem!r}): {start}")
+        return _storable(event)
+
+
+def error_in(value: Any) -> str:
+    """Return the message of an error object in any of the forms that servers give it, or nothing.
+
+    OpenAI, llama-server and Gemini send ``{"error": {"message": ...}}`` (Gemini at times in a list), Ollama and TGI
+    ``{"error": "..."}``, vLLM until 0.10 ``{"object": "error", "message": ...}``, FastAPI ``{"detail": ...}``.
+    """
+    if isinstance(value, list) and value:
+        value = value[0]
+    if not isinstance(value, dict):
+        return ""
+    error = value.get("error") or (value if value.get("object") == "error" else value.get("detail"))
+    if isinstance(error, dict):
+        error = error.get("message") or error
+    return str(error) if error else ""
+
+
+def _storable(event: Event) -> Event:
+    """Replace lone surrogates, which JSON can carry and no file can keep."""
+    if event.text is None or event.text.isascii():
+        return event
+    return replace(event, text=event.text.encode("utf-8", "replace").decode())

@@ -1,0 +1,76 @@
+"""Gemini's ``streamGenerateContent``: server-sent events that end with the body, errors as bare JSON."""
+
+from __future__ import annotations
+
+from typing import Any
+from urllib.parse import quote
+
+from s2a_bench.transport.http.dialects import Event, Picture
+from s2a_bench.transport.http.dialects.common import (
+    TEMPERATURE,
+    TOP_P,
+    Chat,
+    endpoint,
+    numbers,
+    refuse_grammar,
+    text_of,
+)
+from s2a_bench.types import Request
+
+USAGE = {
+    "promptTokenCount": "prompt_n",
+    "candidatesTokenCount": "predicted_n",
+    "thoughtsTokenCount": "thinking_n",
+    "cachedContentTokenCount": "cache_n",
+}
+COMPLETE = frozenset({"STOP", "MAX_TOKENS"})
+"""Every other reason (SAFETY, RECITATION, ...) means that the answer was cut."""
+
+
+class Gemini(Chat):
+    """Google's API, by key."""
+
+    name = "gemini"
+
+    def url(self, base: str, model: str) -> str:
+        """Return the route, which has the model in it."""
+        return endpoint(base, "/v1beta", f"/models/{quote(model, safe='')}:streamGenerateContent", "alt=sse")
+
+    def authorization(self, key: str) -> dict[str, str]:
+        """Return Google's own header."""
+        return {"x-goog-api-key": key}
+
+    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:  # noqa: ARG002
+        """Return one turn of the user; how much the model thinks is left to its default."""
+        refuse_grammar(request, self.name)
+        inline = [{"inlineData": {"mimeType": picture.media_type, "data": picture.base64}} for picture in pictures]
+        generation = {
+            "maxOutputTokens": request.max_tokens,
+            "temperature": TEMPERATURE,
+            "topP": TOP_P,
+            "seed": request.seed,
+        }
+        return {
+            "generationConfig": generation,
+            "contents": [{"role": "user", "parts": [*inline, {"text": request.prompt}]}],
+        }
+
+    def event(self, message: Any) -> Event:
+        """Read one chunk, which may hold several parts, thoughts among them."""
+        said, thought, finish = "", "", ""
+        for candidate in message.get("candidates") or ():
+            finish = text_of(candidate.get("finishReason") or "")
+            for part in (candidate.get("content") or {}).get("parts") or ():
+                text = text_of(part.get("text") or "")
+                if part.get("thought"):
+                    thought += text
+                else:
+                    said += text
+        if blocked := (message.get("promptFeedback") or {}).get("blockReason"):
+            return Event(error=f"the prompt was refused: {blocked}")
+        if finish and finish not in COMPLETE:
+            return Event(error=f"the answer was cut: {finish}")
+        facts = numbers(message.get("usageMetadata"), USAGE)
+        if "prompt_n" in facts:  # evaluated, as llama.cpp counts them
+            facts["prompt_n"] -= facts.get("cache_n", 0.0)
+        return Event(said or None, -1, thought, finish, facts)

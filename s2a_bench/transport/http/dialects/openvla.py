@@ -1,0 +1,72 @@
+"""OpenVLA's ``/act``: an array of pixels in, an array of actions out, by json_numpy; nothing is streamed.
+
+The whole action is one token, so its time to first token is that of the answer.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import json_numpy
+import numpy as np
+
+from s2a_bench.frames.convert import bgr_to_rgb, to_bgr, yuyv_to_rgb
+from s2a_bench.trace import Trace
+from s2a_bench.transport.http.dialects import Event, Picture
+from s2a_bench.transport.http.dialects.common import Chat, endpoint, refuse_grammar
+from s2a_bench.transport.http.dialects.framing import WholeBody
+from s2a_bench.types import Frame, Pixels, Request
+
+FAILED = "error"
+"""The whole body of a failure, with status 200 (``vla-scripts/deploy.py``)."""
+
+NUMBERS = re.compile(r"[<>|=]?[fiu][0-9]+")
+"""The element types that are read."""
+
+
+class OpenVla(Chat):
+    """An action server; the model's name of a request is its ``unnorm_key``."""
+
+    name = "openvla"
+    media_type = "application/json"
+    payloads = ("raw",)
+    framing = WholeBody
+
+    def url(self, base: str, model: str) -> str:  # noqa: ARG002 - a server has one model
+        """Return the only route."""
+        return endpoint(base, "", "/act")
+
+    def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:  # noqa: ARG002 - always pixels
+        """Return the pixels as RGB, height x width x 3, marking `convert`."""
+        if frame.encoding == "rgb8":
+            return "", frame.data
+        pixels = yuyv_to_rgb(frame.data) if frame.encoding == "yuv422_yuy2" else bgr_to_rgb(to_bgr(frame))
+        trace.mark("convert")
+        return "", pixels
+
+    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
+        """Return what ``json_numpy.dumps`` makes of the array, and the instruction."""
+        refuse_grammar(request, self.name)
+        fields: dict[str, Any] = {"instruction": request.prompt}
+        if model != "default":
+            fields["unnorm_key"] = model
+        for picture in pictures[:1]:
+            fields["image"] = {"__numpy__": picture.base64, "dtype": "|u1", "shape": picture.shape}
+        return fields
+
+    def event(self, message: Any) -> Event:
+        """Read the action: an array, an array in a JSON text (a server that was sent ``encoded``), or a list."""
+        if message == FAILED:
+            return Event(error="the server answered 'error': its own output says why")
+        if isinstance(message, str):
+            message = json.loads(message)
+        if isinstance(message, dict):
+            if not NUMBERS.fullmatch(message["dtype"]):
+                raise ValueError(f"an action of type {message['dtype']}")
+            message = json_numpy.object_hook(message)
+        action = np.asarray(message, np.float64)
+        if not (action.size and np.isfinite(action).all()):
+            raise ValueError("an action that is no finite numbers")
+        return Event(json.dumps(action.tolist()), finish="stop", facts={"action_n": float(action.size)})

@@ -1,0 +1,68 @@
+"""What a refused request tells: one line with the server's words and the way out, and how long it asks to wait."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime, timezone
+from email.utils import parsedate_to_datetime
+from typing import Any
+
+import httpx
+
+from s2a_bench.errors import RequestFailed
+from s2a_bench.transport import Route
+from s2a_bench.transport.http.dialects.decoder import error_in
+
+QUOTED = 200
+"""Characters that are shown of a body that is no error object."""
+
+
+def refusal(url: str, response: httpx.Response, body: str, route: Route, expected: str) -> RequestFailed:
+    """Describe an answer whose status or content type is wrong."""
+    try:
+        value = json.loads(body)
+    except (ValueError, RecursionError):
+        value = None
+    said = error_in(value) or body[:QUOTED].strip() or "nothing"
+    kind = response.headers.get("content-type", "no content type").partition(";")[0]
+    if response.status_code == httpx.codes.OK and not kind.startswith(expected):
+        said += f" (as {kind} where {expected} belongs; see --dialect)"
+    wait_s = _retry_after_s(response, value)
+    asked = f"; it asks to wait {wait_s:g} s" if wait_s else ""
+    advice = _advice(response, route)
+    line = f"{url} answered {response.status_code}: {' '.join(said.split())}{asked}{'; ' if advice else ''}{advice}"
+    return RequestFailed(line, retry_after_s=wait_s)
+
+
+def _advice(response: httpx.Response, route: Route) -> str:
+    """Return the way out for a status that has one."""
+    if response.is_redirect:
+        return f"it moved: give {response.headers.get('location', 'its new place')} to --url"
+    key = f"the key in ${route.api_key_env} is not accepted"
+    no_key = "name the environment variable that holds its key with --api-key-env"
+    return {
+        401: key if route.api_key_env else no_key,
+        403: key if route.api_key_env else no_key,
+        404: f"see --url, --dialect and --served-model (now '{route.model}')",
+        413: "choose a smaller --size, or --payload jpeg",
+        429: "it wants fewer requests: see its quota, or --runs",
+    }.get(response.status_code, "")
+
+
+def _retry_after_s(response: httpx.Response, body: Any) -> float | None:
+    """Return how long the server asks to wait: the header (RFC 9110, 10.2.3), or Google's RetryInfo in the body."""
+    text = response.headers.get("retry-after", "").strip()
+    try:
+        return max(0.0, float(text))
+    except ValueError:
+        pass
+    try:
+        until = parsedate_to_datetime(text)
+        return max(0.0, (until - datetime.now(timezone.utc)).total_seconds())
+    except (ValueError, TypeError):  # no date, or one without a zone
+        pass
+    try:
+        delays = [detail["retryDelay"] for detail in body["error"]["details"] if "retryDelay" in detail]
+        return max(0.0, float(delays[0].removesuffix("s")))
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError):
+        return None

@@ -1,0 +1,94 @@
+"""`s2a-bench latency --url` against servers that are not ours, as a user runs it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conformance.transport import Recorder
+from tests.servers.sockets import Received, head, serving
+from tests.servers.speakers import Cloud, LlamaServer, Ollama, answering
+
+SMALL = ["--transport", "http", "--size", "64x48", "--runs", "2", "--warmup", "1", "--max-tokens", "3"]
+KEY = "sekret-0123456789"
+
+
+def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, *arguments, "--output", str(output)]
+    environment = {**os.environ, "MY_KEY": KEY}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, env=environment)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
+    keys = []
+    reply = answering(Ollama(), Recorder(["go", "_to"]))
+
+    def keyed(received: Received) -> object:
+        keys.append(received.headers["authorization"])
+        return reply(received)
+
+    with serving(keyed) as url:  # type: ignore[arg-type]
+        done = run("--url", url, "--dialect", "ollama", "--api-key-env", "MY_KEY", "--json", output=tmp_path)
+    assert set(keys) == {f"Bearer {KEY}"}
+    result = json.loads(done.stdout)
+    assert [(cell["variant"], cell["n"], cell["errors"]) for cell in result["cells"]] == [
+        ("as-deployed", 2, 0),
+        ("best-effort", 2, 0),
+    ]
+    assert all("server" in cell["stages_ms"] and "inference" not in cell["stages_ms"] for cell in result["cells"])
+    folder = Path(result["run"])
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["asked"]["http/as-deployed"] == {"url": url + "/api/chat", "dialect": "ollama"}
+    with (folder / "samples.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["server_prompt_ms"] for row in rows} == {"100.0"}
+    assert all(json.loads(row["facts"])["outside_model_ms"] == pytest.approx(10.0) for row in rows)
+    assert not [path for path in folder.rglob("*") if path.is_file() and KEY.encode() in path.read_bytes()]
+    assert KEY not in done.stdout + done.stderr
+
+
+def test_an_unknown_server_is_asked_what_it_is(tmp_path: Path) -> None:
+    chat = answering(LlamaServer(), Recorder(["go"]))
+
+    def reply(received: Received) -> object:
+        if received.path == "/v1/models":
+            return [head(kind="application/json") + b'{"data":[{"id":"m","owned_by":"llamacpp"}]}']
+        return chat(received)
+
+    with serving(reply) as url:  # type: ignore[arg-type]
+        done = run("--url", url, "--http", "as-deployed", "--json", output=tmp_path)
+    (cell,) = json.loads(done.stdout)["cells"]
+    assert {"ingest", "inference"} <= set(cell["stages_ms"])
+
+
+def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path: Path) -> None:
+    reply = [head("429 Too Many Requests", "application/json", "Retry-After: 0.01"), Cloud().refusal(429, "slow down")]
+    with serving(lambda _: reply) as url:
+        done = run("--url", url, "--dialect", "openai", "--http", "best-effort", "--runs", "9", output=tmp_path, code=1)
+    assert "waiting 0.01 s, as the server of http/best-effort asks" in done.stderr
+    last = done.stderr.strip().splitlines()[-2:]
+    assert any("failed 5 times in a row" in line and "answered 429: slow down" in line for line in last)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--url", "http://x", "--dialect", "openvla"], "with --dialect openvla a picture travels as raw"),
+        (["--url", "http://x", "--api-key-env", KEY], "takes the name of an environment variable, not the key itself"),
+        (["--url", "http://x", "--extra-body", "@/no/such"], "--extra-body: cannot read /no/such"),
+    ],
+)
+def test_bad_flags_are_named_before_anything_is_kept(arguments: list[str], says: str, tmp_path: Path) -> None:
+    done = run(*arguments, output=tmp_path / "results", code=2)
+    assert says in done.stderr
+    assert KEY not in done.stderr
+    assert not (tmp_path / "results").exists()

@@ -1,0 +1,453 @@
+"""Every dialect against servers that speak it faithfully, and that misbehave in every way seen in the wild."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from threading import Event
+
+import numpy as np
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import RequestFailed, UsageError
+from s2a_bench.frames.convert import decode_image, encode_png, to_bgr
+from s2a_bench.trace import Trace, budget
+from s2a_bench.transport import Client, Handler, Route, open_client
+from s2a_bench.transport.http.dialects import DIALECTS
+from s2a_bench.types import Request, Token
+from tests.conformance.transport import Connect, Recorder, TransportContract, ask, yuyv_frame
+from tests.servers.sockets import CLOSE, Received, Reply, chunk, head, kept_head, serving
+from tests.servers.speakers import SPEAKERS, Cloud, Gemini, LlamaServer, Ollama, Speaker, answering
+
+GO_TO = [Token(0, "go", 11), Token(1, "_to", 12)]
+Pieces = list[bytes]
+
+
+def route(speaker: Speaker, url: str, **more: object) -> Route:
+    fields = {"payload": "png", "black_box": True, "dialect": speaker.dialect, "timeout_s": 20.0, **more}
+    return Route("http", "as-deployed", url, **fields)  # type: ignore[arg-type]
+
+
+@contextmanager
+def client_of(speaker: Speaker, reply: Reply, **more: object) -> Iterator[Client]:
+    with serving(reply) as url:
+        client = open_client(route(speaker, url, **more))
+        try:
+            yield client
+        finally:
+            client.close()
+
+
+def said(speaker: Speaker, pieces: Pieces, **more: object) -> tuple[list[str], Trace]:
+    """What a client makes of these pieces."""
+    with client_of(speaker, lambda _: pieces, **more) as client:
+        tokens, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
+    return [token.text for token in tokens], trace
+
+
+def answer(speaker: Speaker, closing: Callable[[list[Token]], bytes] | None = None) -> Pieces:
+    """A whole good answer of two tokens."""
+    tokens = [speaker.token(token) for token in GO_TO]
+    return [head(kind=speaker.kind), speaker.opening(), *tokens, (closing or speaker.closing)(GO_TO)]
+
+
+@pytest.fixture(params=SPEAKERS, ids=lambda speaker: speaker.dialect)
+def speaker(request: pytest.FixtureRequest) -> Speaker:
+    return request.param  # type: ignore[no-any-return]
+
+
+class TestContract(TransportContract):
+    """The transports' contract, as far as a foreign server carries it: no ids, no marks, no raw pixels."""
+
+    lossless = False
+
+    @pytest.fixture
+    def connect(self, speaker: Speaker) -> Iterator[Connect]:
+        with ExitStack() as stack:
+
+            def connect(handler: Handler) -> Client:
+                return stack.enter_context(client_of(speaker, answering(speaker, handler)))
+
+            yield connect
+
+    def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect) -> None:
+        tokens, _ = ask(connect(Recorder(["go", "", "_to(", "キッチン", ")\n"])), Request("a", "plan", (yuyv_frame(),)))
+        assert [(token.index, token.text) for token in tokens] == [(0, "go"), (1, "_to("), (2, "キッチン"), (3, ")\n")]
+
+    def test_every_field_of_a_request_reaches_the_handler(self, connect: Connect) -> None:
+        handler = Recorder(["x"])
+        ask(connect(handler), Request("id-7", 'Grüße,\n"robot"\t机器人', (), max_tokens=9, seed=42))
+        (got,) = handler.requests
+        assert got == Request("", 'Grüße,\n"robot"\t机器人', (), max_tokens=9, seed=42)
+
+    def test_the_picture_arrives_as_rgb(self, connect: Connect) -> None:
+        handler, frame = Recorder(["x"]), yuyv_frame(seed=3)
+        ask(connect(handler), Request("a", "", (frame,)))
+        (image,) = handler.requests[0].images
+        np.testing.assert_array_equal(image.data, decode_image(encode_png(to_bgr(frame))))
+
+    def test_stages_and_residual_sum_to_the_whole(self, connect: Connect) -> None:
+        _, trace = ask(connect(Recorder(["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
+        spent = budget(trace.chain())
+        assert sum(spent.stages_ns.values()) + spent.residual_ns == spent.e2e_ns
+        assert all(duration >= 0 for duration in spent.stages_ns.values())
+        assert not {"network", "json_parse", "return"} & set(spent.stages_ns)
+
+    def test_the_servers_marks_come_back(self, connect: Connect) -> None:
+        """It has none; nothing is made up."""
+        _, trace = ask(connect(Recorder(["x"])), Request("a", "plan"))
+        assert trace.remote is None
+
+
+FACTS = {
+    "openai": {"prompt_n": 8, "cache_n": 4, "predicted_n": 2, "thinking_n": 0},
+    "llama-server": {"prompt_n": 9, "cache_n": 3, "prompt_ms": 97.5, "predicted_n": 2, "predicted_ms": 2.0}
+    | {"thinking_n": 0},
+    "vllm": {"prompt_n": 8, "cache_n": 4, "predicted_n": 2, "thinking_n": 0}
+    | {"first_token_ms": 31.5, "predicted_ms": 80.0, "queue_ms": 0.25, "mean_itl_ms": 8.0},
+    "ollama": {"prompt_n": 8, "predicted_n": 2}
+    | {"total_ms": 150.0, "load_ms": 10.0, "prompt_ms": 100.0, "predicted_ms": 30.0, "outside_model_ms": 10.0},
+    "tgi": {"prompt_n": 8, "predicted_n": 2},
+    "gemini": {"prompt_n": 8, "predicted_n": 2},
+}
+CLIENTS_OWN = {"payload_bytes", "headers_ms", "headers_off_ms", "reconnects"}
+
+
+def test_what_a_server_tells_of_itself_is_kept_by_clear_names(speaker: Speaker) -> None:
+    texts, trace = said(speaker, answer(speaker))
+    assert texts == ["go", "_to"]
+    told = {name: value for name, value in trace.facts.items() if name not in CLIENTS_OWN}
+    assert told == pytest.approx(FACTS[speaker.dialect])
+
+
+def test_only_llama_server_shows_where_ingest_ends(speaker: Speaker) -> None:
+    _, trace = said(speaker, answer(speaker))
+    after_packing = [stage for stage, _ in trace.chain()][-2:]
+    assert after_packing == (["ingest", "inference"] if speaker.dialect == "llama-server" else ["json_pack", "server"])
+
+
+def test_missing_usage_and_timings_are_absent_not_zero(speaker: Speaker) -> None:
+    texts, trace = said(speaker, answer(speaker, speaker.bare_closing))
+    assert texts == ["go", "_to"]
+    assert not {"predicted_n", "prompt_ms", "predicted_ms", "total_ms", "outside_model_ms", "cache_n"} & set(
+        trace.facts
+    )
+    assert trace.chain()[-1][0] == "server"
+
+
+def test_a_failure_on_the_way_keeps_the_tokens_before_it(speaker: Speaker) -> None:
+    pieces = [head(kind=speaker.kind), speaker.token(GO_TO[0]), speaker.error("out of memory"), speaker.token(GO_TO[1])]
+    seen = []
+    with client_of(speaker, lambda _: pieces) as client, pytest.raises(RequestFailed, match="broke off: out of memory"):
+        seen.extend(token.text for token in client.request(Request("a", "plan"), Trace()))
+    assert seen == ["go"]
+
+
+def test_an_answer_without_its_end_is_a_failure(speaker: Speaker) -> None:
+    with pytest.raises(RequestFailed, match="before the answer was complete"):
+        said(speaker, answer(speaker)[:-1])
+
+
+def test_a_connection_that_breaks_in_the_middle_of_a_chunk_is_a_failure(speaker: Speaker) -> None:
+    broken = [kept_head(speaker.kind), chunk(speaker.token(GO_TO[0])), b"ff\r\ndata", CLOSE]
+    with pytest.raises(RequestFailed, match="broke the connection"):
+        said(speaker, broken)
+
+
+@pytest.mark.parametrize(
+    ("status", "more", "says", "retry_after_s"),
+    [
+        ("401 Unauthorized", [], "answered 401: no way; name the environment variable .* --api-key-env", None),
+        ("403 Forbidden", [], "answered 403: no way; .* --api-key-env", None),
+        ("404 Not Found", [], "answered 404: no way; see --url, --dialect and --served-model", None),
+        ("413 Payload Too Large", [], "answered 413: no way; choose a smaller --size", None),
+        ("429 Too Many Requests", ["Retry-After: 7"], "answered 429: no way; it asks to wait 7 s; .*quota", 7.0),
+        ("503 Service Unavailable", ["retry-after: 1.5"], "answered 503: no way; it asks to wait 1.5 s$", 1.5),
+        ("503 Busy", ["Retry-After: Wed, 21 Oct 2015 07:28:00 GMT"], "answered 503: no way$", 0.0),
+        ("503 Busy", ["Retry-After: soon"], "answered 503: no way$", None),
+        ("500 Oops", [], "answered 500: no way$", None),
+    ],
+)
+def test_a_refusal_says_what_and_the_way_out(
+    speaker: Speaker, status: str, more: list[str], says: str, retry_after_s: float | None
+) -> None:
+    body = speaker.refusal(int(status[:3]), "no\n  way")
+    with pytest.raises(RequestFailed, match=says) as failure:
+        said(speaker, [head(status, "application/json", *more), body])
+    assert failure.value.retry_after_s == retry_after_s
+
+
+def test_googles_retry_delay_is_in_the_body() -> None:
+    body = b'{"error":{"message":"quota","details":[{"@type":"x"},{"retryDelay":"34.5s"}]}}'
+    with pytest.raises(RequestFailed, match=r"it asks to wait 34\.5 s") as failure:
+        said(Gemini(), [head("429 Too Many Requests", "application/json"), body])
+    assert failure.value.retry_after_s == 34.5
+
+
+def test_a_moved_server_is_not_followed(speaker: Speaker) -> None:
+    with pytest.raises(RequestFailed, match="answered 307: nothing; it moved: give https://elsewhere/ to --url"):
+        said(speaker, [head("307 Moved", "text/plain", "Location: https://elsewhere/")])
+
+
+@pytest.mark.parametrize("kind", ["application/json", "text/html; charset=utf-8", ""])
+def test_an_error_with_status_200_is_a_failure(speaker: Speaker, kind: str) -> None:
+    with pytest.raises(RequestFailed, match="answered 200: model is gone"):
+        said(speaker, [head(kind=kind), speaker.refusal(400, "model is gone")])
+
+
+def test_a_page_of_another_server_is_named(speaker: Speaker) -> None:
+    with pytest.raises(RequestFailed, match=r"answered 200: <html>.* \(as text/html where .* see --dialect"):
+        said(speaker, [head(kind="text/html"), b"<html>\n<title>router</title>" + b"x" * 500_000])
+
+
+def test_text_that_is_no_json_is_a_failure(speaker: Speaker) -> None:
+    garbage = b"data: {not json}\n\n" if "stream" in speaker.kind else b"{not json}\n"
+    with pytest.raises(RequestFailed, match=f"not the dialect '{speaker.dialect}'"):
+        said(speaker, [head(kind=speaker.kind), garbage])
+
+
+@pytest.mark.parametrize("value", [b"[1,2]", b'{"choices":7,"message":7,"token":7,"candidates":7}', b'"x"', b"7"])
+def test_json_of_another_shape_is_a_failure(speaker: Speaker, value: bytes) -> None:
+    line = b"data: " + value + b"\n\n" if "stream" in speaker.kind else value + b"\n"
+    with pytest.raises(RequestFailed, match=f"not the dialect '{speaker.dialect}'"):
+        said(speaker, [head(kind=speaker.kind), line])
+
+
+def test_pings_empty_pieces_and_single_bytes_do_no_harm(speaker: Speaker) -> None:
+    ping = b": ping\n\n:\n\n" if "stream" in speaker.kind else b"\n\r\n"
+    texts = ["キッチン", "", "é\n", "🤖"]
+    tokens = [Token(index, text, index) for index, text in enumerate(texts)]
+    body = ping.join([speaker.opening(), *map(speaker.token, tokens), speaker.closing(tokens)]) + ping
+    got, _ = said(speaker, [head(kind=speaker.kind), *(body[i : i + 1] for i in range(len(body)))])
+    assert got == ["キッチン", "é\n", "🤖"]
+
+
+def test_the_clock_stops_at_the_first_piece_that_is_not_empty(speaker: Speaker) -> None:
+    stamps = []
+
+    def reply(_: Received) -> Iterator[bytes]:
+        yield head(kind=speaker.kind)
+        yield speaker.opening() + speaker.token(Token(0, "", 5))
+        Event().wait(0.05)  # long enough for a client that takes the empty piece for a token to be caught
+        stamps.append(now_ns())
+        yield speaker.token(GO_TO[0]) + speaker.closing(GO_TO)
+
+    with client_of(speaker, reply) as client:
+        _, trace = ask(client, Request("a", "plan"))
+    assert trace.chain()[-1][1] >= stamps[0]
+
+
+@pytest.mark.parametrize("speaker", [one for one in SPEAKERS if one.dialect != "tgi"], ids=lambda one: one.dialect)
+class TestThinking:
+    def test_is_no_token_and_becomes_a_fact(self, speaker: Speaker) -> None:
+        thoughts = [speaker.thinking("hm"), speaker.thinking(", well")]
+        pieces = answer(speaker)
+        texts, trace = said(speaker, [*pieces[:2], *thoughts, *pieces[2:]])
+        assert texts == ["go", "_to"]
+        assert trace.facts["thinking_pieces"] == 2
+        assert 0 <= trace.facts["thinking_ms"] < 20_000
+
+    def test_alone_is_no_answer(self, speaker: Speaker) -> None:
+        pieces = [head(kind=speaker.kind), speaker.thinking("hm"), speaker.closing([])]
+        with pytest.raises(RequestFailed, match="thought and gave no answer: raise --max-tokens"):
+            said(speaker, pieces)
+
+
+@pytest.mark.parametrize("speaker", [Cloud(), Ollama()], ids=lambda one: one.dialect)
+def test_a_server_that_only_pings_is_given_up(speaker: Speaker) -> None:
+    ping = b": ping\n\n" if "stream" in speaker.kind else b"\n"
+
+    def drip(_: Received) -> Iterator[bytes]:
+        yield head(kind=speaker.kind)
+        yield speaker.token(GO_TO[0])
+        while not Event().wait(0.01):
+            yield ping
+
+    with (
+        pytest.raises(RequestFailed, match=r"nothing that means anything for 1 s"),
+        client_of(speaker, drip, timeout_s=1.0) as client,
+    ):
+        ask(client, Request("a", "plan"))
+
+
+def test_a_silent_server_is_given_up(speaker: Speaker) -> None:
+    over = Event()
+
+    def silent(_: Received) -> Iterator[bytes]:
+        yield head(kind=speaker.kind)
+        over.wait(20)
+
+    with client_of(speaker, silent, timeout_s=0.2) as client:
+        with pytest.raises(RequestFailed, match="silent for too long: ReadTimeout"):
+            ask(client, Request("a", "plan"))
+        over.set()
+
+
+def test_a_line_without_end_is_given_up(speaker: Speaker) -> None:
+    def endless(_: Received) -> Iterator[bytes]:
+        yield head(kind=speaker.kind)
+        while True:
+            yield b"data: " * 100_000
+
+    with (
+        pytest.raises(RequestFailed, match="the server sent a line of more than"),
+        client_of(speaker, endless) as client,
+    ):
+        ask(client, Request("a", "plan"))
+
+
+def test_a_kept_connection_that_the_server_closed_is_opened_again(speaker: Speaker) -> None:
+    """It promises to keep it and closes after each answer; the race with its closing is ours to mend."""
+    whole = b"".join(answer(speaker)[1:])
+    reply = [kept_head(speaker.kind), chunk(whole), chunk(b""), CLOSE]
+    with client_of(speaker, lambda _: reply) as client:
+        for number in range(10):
+            assert len(list(client.request(Request(str(number), "plan"), Trace()))) == 2
+
+
+class TestKeys:
+    def headers(self, speaker: Speaker, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+        seen: list[Received] = []
+
+        def reply(received: Received) -> Pieces:
+            seen.append(received)
+            return answer(speaker)
+
+        monkeypatch.setenv("MY_KEY", " sekret \n")
+        with client_of(speaker, reply, api_key_env="MY_KEY") as client:
+            ask(client, Request("a", "plan"))
+        return seen[-1].headers
+
+    def test_a_key_travels_in_the_header_of_the_dialect(
+        self, speaker: Speaker, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        headers = self.headers(speaker, monkeypatch)
+        if speaker.dialect == "gemini":
+            assert headers["x-goog-api-key"] == "sekret"
+            assert "authorization" not in headers
+        else:
+            assert headers["authorization"] == "Bearer sekret"
+
+    def test_a_server_that_repeats_the_key_does_not_make_us_repeat_it(
+        self, speaker: Speaker, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("MY_KEY", "sekret")
+        pieces = [head("401 No", "application/json"), speaker.refusal(401, "the key sekret is wrong")]
+        with pytest.raises(RequestFailed, match=r"the key \*\*\* is wrong; the key in \$MY_KEY is not accepted"):
+            said(speaker, pieces, api_key_env="MY_KEY")
+
+    @pytest.mark.parametrize(
+        ("name", "value"), [("sk-12-34", None), ("NO_SUCH", None), ("EMPTY", " "), ("ODD", "a\nb")]
+    )
+    def test_a_bad_variable_is_named_without_its_content(
+        self, name: str, value: str | None, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        if value is not None:
+            monkeypatch.setenv(name, value)
+        with pytest.raises(UsageError, match="--api-key-env") as error:
+            open_client(Route("http", "as-deployed", "http://x", black_box=True, dialect="openai", api_key_env=name))
+        assert "sk-12" not in str(error.value)
+        assert "a\nb" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("dialect", "base", "path"),
+    [
+        ("openai", "", "/v1/chat/completions"),
+        ("openai", "/", "/v1/chat/completions"),
+        ("openai", "/v1/", "/v1/chat/completions"),
+        ("openai", "/openai/v1", "/openai/v1/chat/completions"),
+        ("openai", "/v1beta/openai/chat/completions", "/v1beta/openai/chat/completions"),
+        ("openai", "/v1?api-version=2", "/v1/chat/completions?api-version=2"),
+        ("ollama", "", "/api/chat"),
+        ("ollama", "/api", "/api/chat"),
+        ("ollama", "/api/chat", "/api/chat"),
+        ("tgi", "", "/generate_stream"),
+        ("tgi", "/generate_stream", "/generate_stream"),
+        ("gemini", "", "/v1beta/models/a%2Fb:streamGenerateContent?alt=sse"),
+        ("gemini", "/v1beta/", "/v1beta/models/a%2Fb:streamGenerateContent?alt=sse"),
+        ("openvla", "", "/act"),
+        ("openvla", "/act", "/act"),
+    ],
+)
+def test_a_url_may_end_at_the_server_the_api_or_the_route(dialect: str, base: str, path: str) -> None:
+    client = open_client(
+        Route("http", "as-deployed", "http://h:1" + base, black_box=True, dialect=dialect, model="a/b")
+    )
+    client.close()
+    assert client.describe() == {"url": "http://h:1" + path, "dialect": dialect}
+
+
+@pytest.mark.parametrize(
+    ("owner", "dialect"),
+    [("llamacpp", "llama-server"), ("vllm", "vllm"), ("s2a-bench", "s2a"), ("library", "openai"), (None, "openai")],
+)
+def test_an_openai_server_is_told_by_whom_its_model_is_owned(owner: str | None, dialect: str) -> None:
+    asked = []
+
+    def reply(received: Received) -> Pieces:
+        asked.append((received.method, received.path))
+        body = b'{"object":"list","data":[{"id":"m","owned_by":"%s"}]}' % (owner or "").encode()
+        return [head(kind="application/json"), body] if owner else [head("404 Not Found", "text/html"), b"no"]
+
+    with client_of(LlamaServer(), reply, dialect="") as client:
+        assert client.describe()["dialect"] == dialect
+    assert asked == [("GET", "/v1/models")]
+
+
+def test_a_grammar_reaches_the_servers_that_know_it_and_is_refused_elsewhere(speaker: Speaker) -> None:
+    handler = Recorder(["x"])
+    request = Request("a", "plan", grammar='root ::= "x"')
+    with client_of(speaker, answering(speaker, handler)) as client:
+        if speaker.dialect in {"llama-server", "vllm"}:
+            ask(client, request)
+            assert handler.requests[0].grammar == 'root ::= "x"'
+        else:
+            with pytest.raises(UsageError, match=f"--grammar: the dialect '{speaker.dialect}' has no field"):
+                ask(client, request)
+
+
+def test_extra_fields_are_merged_and_null_takes_one_out() -> None:
+    seen: list[Received] = []
+    speaker = SPEAKERS[0]
+
+    def reply(received: Received) -> Pieces:
+        seen.append(received)
+        return answer(speaker)
+
+    extra = '{"max_tokens": null, "max_completion_tokens": 9, "stream_options": {"include_obfuscation": false}}'
+    with client_of(speaker, reply, extra_body=extra) as client:
+        ask(client, Request("a", "plan"))
+    body = seen[0].json
+    assert "max_tokens" not in body
+    assert body["max_completion_tokens"] == 9
+    assert body["stream_options"] == {"include_usage": True, "include_obfuscation": False}
+
+
+@pytest.mark.parametrize("reason", ["SAFETY", "RECITATION"])
+def test_an_answer_that_a_filter_cut_is_a_failure(reason: str) -> None:
+    last = b'data: {"candidates":[{"finishReason":"%s"}]}\n\n' % reason.encode()
+    with pytest.raises(RequestFailed, match=f"the answer was cut: {reason}"):
+        said(Gemini(), [*answer(Gemini())[:-1], last])
+    last = b'data: {"promptFeedback":{"blockReason":"%s"}}\n\n' % reason.encode()
+    with pytest.raises(RequestFailed, match=f"the prompt was refused: {reason}"):
+        said(Gemini(), [head(), last])
+
+
+def test_both_variants_say_the_same(speaker: Speaker) -> None:
+    handlers = []
+    for variant in ("as-deployed", "best-effort"):
+        handler = Recorder(["x"])
+        handlers.append(handler)
+        with serving(answering(speaker, handler)) as url:
+            client = open_client(Route("http", variant, url, "png", black_box=True, dialect=speaker.dialect))
+            ask(client, Request("a", "Grüße", (yuyv_frame(),), max_tokens=3, seed=5))
+            client.close()
+    (first,), (second,) = (handler.requests for handler in handlers)
+    assert (first.prompt, first.max_tokens, first.seed) == (second.prompt, second.max_tokens, second.seed)
+    np.testing.assert_array_equal(first.images[0].data, second.images[0].data)
+
+
+def test_every_dialect_is_tested_here_or_in_a_module_of_its_own() -> None:
+    assert set(DIALECTS) == {speaker.dialect for speaker in SPEAKERS} | {"s2a", "openvla"}
