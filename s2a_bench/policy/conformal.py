@@ -1,0 +1,204 @@
+"""How cautious to be: calibrate lambda on recorded plans so that stalls are as rare as asked, and track it.
+
+A plan's *score* is the least caution from which on it does not stall: at that lambda and at every greater one of
+GRID. "Stalls at lambda or at a greater one" is a loss of 0 or 1 that cannot grow with lambda, as conformal risk
+control wants it. With n exchangeable plans, choosing the least lambda at which r of them stall makes
+
+- the expected share of stalls among further plans at most (r + 1) / (n + 1): conformal risk control (Angelopoulos,
+  Bates, Fisch, Lei and Schuster, ICLR 2024, arXiv 2208.02814, theorem 1), here the split conformal quantile;
+- that share, for the lambda at hand rather than on average over calibrations, at most x with confidence
+  1 - P(Bin(n, x) <= r): a risk-controlling prediction set (Bates et al., J. ACM 2021, arXiv 2101.02703).
+
+`calibrate` takes the greatest r that keeps the first at epsilon or less *and* the second at 2 epsilon with 99.9 %
+confidence: whoever calibrates once lives with that one lambda. With epsilon = 1 %, 400 plans give r = 0 and 1000 plans
+r = 7: more plans allow a smaller lambda. The scores come from plans that the prior may have been
+fitted to; with a prior of its own plans the first bound is exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from s2a_bench.errors import UsageError
+from s2a_bench.policy import Plans, Policy
+from s2a_bench.policy.stream_to_act import StreamToAct
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from s2a_bench.policy import Floats
+
+EPSILON: Final = 0.01
+"""Share of plans that may stall."""
+PLANS: Final = 400
+"""As many should be recorded: with 342 or more one calibration is as good as promised."""
+TOLERANCE_S: Final = 1e-6
+"""Any longer gap between skills is a stall."""
+CEILING: Final = 2.0
+"""The share that one calibration may really have, over epsilon ..."""
+CONFIDENCE: Final = 0.999
+"""... with this confidence."""
+GRID: Final = (*(i / 4 for i in range(17)), 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0, 16.0, 24.0, 32.0)
+"""The values of lambda that are tried; beyond them a plan is waited for."""
+ROUNDING: Final = 1e-9
+"""A product this close below a whole number is one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What calibration found, and what it promises for further plans of the same kind."""
+
+    caution: float
+    """lambda; infinity where nothing less than waiting for the whole plan is safe enough."""
+    epsilon: float
+    plans: int
+    stalled: int
+    """Calibration plans that stall with this caution or a greater one."""
+    expected_risk: float
+    """Bound on P(any stall) of a further plan, on average over calibrations; at most epsilon."""
+    risk: float
+    """Bound on P(any stall) with this caution, with ``confidence``."""
+    confidence: float
+
+
+def scores(policy: StreamToAct, plans: Plans) -> Floats:
+    """Return each plan's score, shape (M,): the least caution of GRID from which on it does not stall, else infinity.
+
+    Tries the greatest caution first; a plan that has stalled is done.
+    """
+    import numpy as np
+
+    count = plans.arrival_s.shape[1]
+    score = np.full(count, GRID[0])
+    left = np.arange(count)
+    above = math.inf
+    for caution in reversed(GRID):
+        stalls = stalled(replace(policy, caution=caution), take(plans, left))
+        score[left[stalls]] = above
+        left, above = left[~stalls], caution
+        if not left.size:
+            break
+    return score
+
+
+def check(plans: int, epsilon: float = EPSILON) -> None:
+    """Refuse to calibrate on so few plans that nothing can be promised; raises UsageError."""
+    if not 0 < epsilon < 1:
+        raise UsageError(f"--epsilon: {epsilon:g} should be between 0 and 1")
+    if (plans + 1) * epsilon < 1 - ROUNDING:
+        raise UsageError(
+            f"--epsilon: {plans} calibration plans promise {1 / (plans + 1):.2g} at best, not {epsilon:g}: "
+            f"take {math.ceil(1 / epsilon - ROUNDING) - 1} or more ({PLANS} are better), or raise --epsilon"
+        )
+
+
+def coarse(plans: int, epsilon: float = EPSILON) -> bool:
+    """Tell whether these are too few plans for the second promise, even if none of them stalls: worth a warning."""
+    return upper_bound(0, plans, CONFIDENCE) > CEILING * epsilon
+
+
+def calibrate(policy: StreamToAct, plans: Plans, epsilon: float = EPSILON) -> Calibration:
+    """Find lambda for P(any stall) <= ``epsilon`` from recorded plans; see the module's head.
+
+    Raises UsageError where so few plans allow no such promise.
+    """
+    return choose(scores(policy, plans), epsilon)
+
+
+def choose(score: Floats, epsilon: float = EPSILON) -> Calibration:
+    """Find lambda from scores, shape (plans,)."""
+    import numpy as np
+    from scipy import stats
+
+    count = score.size
+    check(count, epsilon)
+    may_stall = math.floor((count + 1) * epsilon + ROUNDING) - 1
+    while may_stall and stats.binom.cdf(may_stall, count, min(CEILING * epsilon, 1.0)) > 1 - CONFIDENCE:
+        may_stall -= 1
+    caution = float(np.sort(score)[count - 1 - may_stall])
+    return Calibration(
+        caution=caution,
+        epsilon=epsilon,
+        plans=count,
+        stalled=int(np.sum(score > caution)),
+        expected_risk=(may_stall + 1) / (count + 1),
+        risk=upper_bound(may_stall, count, CONFIDENCE),
+        confidence=CONFIDENCE,
+    )
+
+
+class Tracker:
+    """Follow lambda from plan to plan while the machine drifts: adaptive conformal inference.
+
+    The level alpha, the share of recent scores that may lie above lambda, moves by ``step`` (epsilon - stalled) after
+    every plan. Where it leaves no room, lambda is infinite and the next plan is waited for, which cannot stall; so
+    among T plans the share that stalls exceeds epsilon by at most (alpha_1 + step) / (step T), whatever the machine
+    does (Gibbs and Candes, NeurIPS 2021, arXiv 2106.00170, proposition 4.1). The scores are those of as many recent
+    plans as there were to begin with, so that lambda also learns how much caution the machine needs now.
+    """
+
+    def __init__(self, score: Iterable[float], epsilon: float = EPSILON, *, step: float = 0.002) -> None:
+        """Begin with the scores of a calibration."""
+        first = tuple(score)
+        if not first:
+            raise ValueError("tracking begins with the scores of a calibration")
+        self.epsilon = epsilon
+        self.step = step
+        self.level = epsilon
+        self._scores = deque(first, maxlen=len(first))
+
+    @property
+    def caution(self) -> float:
+        """Return lambda for the next plan."""
+        count = len(self._scores)
+        above = min(math.floor((count + 1) * self.level + ROUNDING), count) - 1
+        return math.inf if above < 0 else sorted(self._scores)[count - 1 - above]
+
+    def learn(self, score: float, *, stalled: bool) -> None:
+        """Learn how a plan went: whether it stalled, and its score, which its recorded arrivals tell afterwards.
+
+        The level stays below 2 epsilon: a long calm must not use up the alertness.
+        """
+        self.level = min(self.level + self.step * (self.epsilon - stalled), CEILING * self.epsilon)
+        self._scores.append(score)
+
+
+def upper_bound(stalled: int, plans: int, confidence: float) -> float:
+    """Return the share x with P(Bin(plans, x) <= stalled) = 1 - confidence (Clopper and Pearson, Biometrika 1934).
+
+    The upper end of their two-sided 95 % interval is the bound with confidence .975.
+    """
+    from scipy import stats
+
+    return 1.0 if stalled == plans else float(stats.beta.ppf(confidence, stalled + 1, plans - stalled))
+
+
+def stalled(policy: Policy, plans: Plans) -> NDArray[np.bool_]:
+    """Tell which plans stall at all, shape (M,)."""
+    import numpy as np
+
+    from s2a_bench.policy.metrics import stalls
+
+    return np.asarray((stalls(policy.schedule(plans)) > TOLERANCE_S).any(axis=0))
+
+
+def take(plans: Plans, columns: NDArray[np.intp]) -> Plans:
+    """Take some of the plans."""
+
+    def cut(rows: Floats) -> Floats:
+        return rows if rows.shape[1] == 1 else rows[:, columns]
+
+    tokens = None if plans.token_s is None else cut(plans.token_s)
+    return replace(
+        plans,
+        arrival_s=cut(plans.arrival_s),
+        nominal_s=cut(plans.nominal_s),
+        least_s=cut(plans.least_s),
+        most_s=cut(plans.most_s),
+        token_s=tokens,
+    )

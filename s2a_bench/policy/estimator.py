@@ -1,0 +1,97 @@
+"""How fast do the tokens come: a prior from the hardware profile, made sharper by every token of the plan.
+
+The gaps of one plan have an unknown mean mu ~ N(mu0, tau0^2) and vary around it with variance sigma^2; then after g
+gaps that took ``elapsed`` together mu is N(mu_g, v_g) with (conjugate update, e.g. Gelman et al., Bayesian Data
+Analysis, 3rd edition, section 2.5)
+
+    w = tau0^2 / (sigma^2 + g tau0^2),    mu_g = mu0 + w (elapsed - g mu0),    v_g = sigma^2 w.
+
+tau0 and sigma are kept relative to the mean: a board that is slower today is as much more uneven. sigma^2 is the
+variance a token that *sums* of gaps have: larger than that of single gaps where slow tokens come in bursts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
+
+from s2a_bench.errors import UsageError
+from s2a_bench.profile import Profile
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+Number = TypeVar("Number", float, "Floats")
+"""One plan's value, or an array of many plans' values."""
+
+PLAN_CV = 0.10
+"""How much the mean gap differs from plan to plan, where a profile does not say."""
+
+LEAST_CV = 1e-6
+"""Estimates stay above it: a variance of zero would forbid to learn."""
+
+
+@dataclass(frozen=True, slots=True)
+class GapPrior:
+    """What is known of the gaps between tokens before a plan's first token."""
+
+    mean_s: float
+    plan_cv: float
+    """tau0 / mu0: how much the mean gap differs from plan to plan."""
+    token_cv: float
+    """sigma / mu: square root of a long sum's variance a token, over the mean."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no prior."""
+        for name in ("mean_s", "plan_cv", "token_cv"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise UsageError(f"prior: {name} = {getattr(self, name):g} should be above 0 and finite")
+
+    @staticmethod
+    def of_profile(profile: Profile, *, seed: int = 0) -> GapPrior:
+        """Take rate and spreads from a hardware profile; how sums of its gaps spread is drawn (2,000 of 64 gaps)."""
+        import numpy as np
+
+        sums = profile.gaps.sample(np.random.default_rng(seed), 64, 2000).sum(axis=0)
+        cv = float(sums.std() / sums.mean()) * 64**0.5
+        return GapPrior(1 / profile.tokens_per_s, profile.rate_cv or PLAN_CV, max(cv, LEAST_CV))
+
+    @staticmethod
+    def fit(token_s: Floats) -> GapPrior:
+        """Estimate the prior from recorded plans: when each token arrived, in s, of shape (tokens, plans).
+
+        sigma^2 comes from sums over blocks of about sqrt(gaps) gaps, freed of each plan's own mean; tau0^2 is what the
+        plans' means vary beyond what sigma explains. Raises UsageError for fewer than 2 gaps a plan or 2 plans.
+        """
+        import numpy as np
+
+        gaps = np.diff(token_s, axis=0)
+        count, plans = gaps.shape
+        if count < 2 or plans < 2:  # noqa: PLR2004 - a spread within plans and one between them
+            raise UsageError(f"a prior needs 2 plans of 3 tokens or more, not {plans} of {count + 1}")
+        means = gaps.mean(axis=0)
+        mean = float(means.mean())
+        if not mean > 0:
+            raise UsageError("a prior needs tokens that arrive one after another, not all at once")
+        size = max(1, min(round(count**0.5), count // 2))
+        blocks = gaps[: count // size * size].reshape(-1, size, plans).sum(axis=1)
+        # Unbiased within each plan, then the mean over plans: a variance a gap, relative to the mean squared.
+        token = float(blocks.var(axis=0, ddof=1).mean()) / size / mean**2
+        plan = float(means.var(ddof=1)) / mean**2 - token / count
+        return GapPrior(mean, max(plan, LEAST_CV**2) ** 0.5, max(token, LEAST_CV**2) ** 0.5)
+
+    def learned(self, gaps: Number, elapsed_s: Number) -> tuple[Number, Number]:
+        """Return the plan's mean gap in s and its variance relative to the mean squared, v / mu^2.
+
+        ``gaps`` gaps took ``elapsed_s`` together.
+        """
+        plan, token = self.plan_cv**2, self.token_cv**2
+        weight = plan / (token + gaps * plan)
+        return self.mean_s + weight * (elapsed_s - gaps * self.mean_s), token * weight
+
+
+VAGUE: Final = GapPrior(mean_s=0.2, plan_cv=3.0, token_cv=0.2)
+"""Without a profile: next to nothing is known of the rate, and the first gaps of each plan tell it."""

@@ -1,0 +1,126 @@
+"""Draw the figures of docs/policies.md, docs/timeline.md, docs/boundary.md: `.venv/bin/python tools/docs_figures.py`.
+
+They come from runs in virtual time with fixed seeds, so that running this again changes no figure.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from s2a_bench.bench.boundary import BoundaryConfig, run_boundary
+from s2a_bench.bench.timeline import run_timeline
+from s2a_bench.bench.timeline_config import TimelineConfig
+from s2a_bench.policy.arrivals import uniform
+from s2a_bench.policy.schedule import safe_start, work_conserving
+from s2a_bench.report.boundary_figure import build_boundary
+from s2a_bench.report.draw import new_figure
+from s2a_bench.report.style import paper_column
+from s2a_bench.report.timeline_figures import build_timelines, policy_colours
+from s2a_bench.report.timelines import timelines_of
+from s2a_bench.store.run import Run, read_run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FOLDER = Path(__file__).parent.parent / "docs" / "figures"
+DPI = 150
+ORIN = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
+
+
+class Quiet:
+    """Progress that nobody looks at."""
+
+    def opened(self, folder: Path) -> None:
+        """Do nothing."""
+
+    def stage(self, text: str) -> None:
+        """Do nothing."""
+
+    def expect(self, samples: int) -> None:
+        """Do nothing."""
+
+    def advance(self) -> None:
+        """Do nothing."""
+
+
+def timelines(config: TimelineConfig) -> Figure:
+    """Draw a timeline run."""
+    run = _run(lambda output: run_timeline(config, output, Quiet()))
+    return build_timelines(run, timelines_of(run))
+
+
+def boundary(config: BoundaryConfig) -> Figure:
+    """Draw a boundary run."""
+    return build_boundary(_run(lambda output: run_boundary(config, output, Quiet())))
+
+
+def safe_start_figure() -> Figure:
+    """Draw why S0 is where it is: arrivals as points, and when each skill starts under three first moves."""
+    arrival_s = uniform(0.5, 6, 4.8, 8)
+    nominal_s = np.ones_like(arrival_s)
+    safe_s = float(safe_start(arrival_s, nominal_s)[0])
+    naive_s = work_conserving(arrival_s, nominal_s, arrival_s[0])
+    skills = np.arange(1, 9)
+    colours = policy_colours([])
+    figure = new_figure(
+        2.5, "When skill i starts, and when it has arrived\nL = 6, R = 4.8 tokens/s, T = 1 s, c = 0.5 s"
+    )
+    axes = figure.subplots()
+    axes.fill_betweenx(skills, 0, arrival_s[:, 0], color="#EEEEEE", linewidth=0, label="not arrived yet")
+    axes.plot(naive_s[:, 0], skills, "o-", color=colours["naive"], markersize=6, label="naive: starts on arrival")
+    early_s = safe_s - 1 + skills - 1
+    axes.plot(early_s, skills, ":", color="#666666", label=f"without a stall from {safe_s - 1:g} s: impossible")
+    axes.plot(
+        safe_s + skills - 1,
+        skills,
+        "s-",
+        color=colours["stream-to-act"],
+        markersize=4,
+        label=f"from $S_0$ = {safe_s:g} s",
+    )
+    axes.plot(arrival_s[:, 0], skills, "k|", markersize=9, label="arrival $t_i$")
+    axes.set_xlim(0, 11.5)
+    axes.set_ylim(0.6, 8.4)
+    axes.set_yticks(skills)
+    axes.set_xlabel("time from the request (s)")
+    axes.set_ylabel("skill i")
+    figure.legend(loc="outside lower center", ncols=2, columnspacing=1.0)
+    return figure
+
+
+def _run(make: Callable[[Path], Path]) -> Run:
+    """Make a run in a folder that goes again."""
+    with TemporaryDirectory() as folder:
+        return read_run(make(Path(folder)))
+
+
+FIGURES: dict[str, Callable[[], Figure]] = {
+    "policies": lambda: timelines(ORIN),
+    "safe-start": safe_start_figure,
+    "online": lambda: timelines(
+        replace(ORIN, policies=("naive", "s2a-clairvoyant", "s2a-mean", "stream-to-act"), jitter="profile")
+    ),
+    "timeline": lambda: timelines(TimelineConfig()),
+    "boundary": lambda: boundary(BoundaryConfig()),
+    "boundary-jitter": lambda: boundary(BoundaryConfig(jitter="lognormal:cv=0.2")),
+}
+
+
+def main() -> None:
+    """Draw all of them, or those that are named."""
+    FOLDER.mkdir(exist_ok=True)
+    for name in sys.argv[1:] or FIGURES:
+        with paper_column():
+            FIGURES[name]().savefig(FOLDER / f"{name}.png", dpi=DPI)
+        print(FOLDER / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()
