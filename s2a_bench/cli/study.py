@@ -1,0 +1,64 @@
+"""s2a-bench study: Monte Carlo studies of when to act."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from s2a_bench.cli.options import WIDTH
+
+
+def study(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="targets (what stream-to-act must reach), frontier (stalls against regret), "
+            "drift (tracking lambda), misfit (wrong N, L, rate)"
+        ),
+    ],
+    plans: Annotated[int | None, typer.Option(help="plans a cell [default: the study's own number]")] = None,
+    calibration_plans: Annotated[int, typer.Option(help="plans that prior and lambda come from")] = 400,
+    epsilon: Annotated[float, typer.Option(help="share of plans that may stall")] = 0.01,
+    profile: Annotated[str, typer.Option(help="profile whose recorded gaps the frontier adds as a family")] = "",
+    seed: Annotated[int, typer.Option(help="seed; every cell has its own from it")] = 0,
+    jobs: Annotated[int, typer.Option(help="processes")] = 1,
+    output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
+) -> None:
+    """Study when to act on drawn plans: nothing is measured, everything repeats by its seed."""
+    from rich.console import Console
+
+    from s2a_bench.bench.studies import StudyConfig, run_study
+    from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.report.studies import study_tables
+    from s2a_bench.report.terminal import lay_out
+    from s2a_bench.store.run import read_run
+
+    config = StudyConfig(seed, plans, calibration_plans, epsilon, jobs, _recording(profile))
+    with RunProgress() as progress:
+        folder = run_study(name, config, output, progress)
+        run = read_run(folder)
+        for doubt in run.manifest["warnings"]:
+            progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
+    terminal = Console()
+    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    for table in study_tables(run):
+        console.print(lay_out(table))
+        for note in table.notes:
+            console.print(note, markup=False, highlight=False)
+        console.print()
+    console.print(f"run folder: {folder}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _recording(name: str) -> tuple[float, ...]:
+    """Return a profile's recorded gaps."""
+    from s2a_bench.errors import UsageError
+    from s2a_bench.inference.profiles import load_profile
+
+    if not name:
+        return ()
+    recording = load_profile(name).trace_s
+    if not recording:
+        raise UsageError(f"--profile: {name} holds no recorded gaps; measure one with s2a-bench profile")
+    return recording

@@ -1,0 +1,58 @@
+"""`s2a-bench study` as a user runs it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.store.run import read_run
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "s2a_bench", "study", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=200,
+    )
+
+
+def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
+    done = run("misfit", "--plans", "100", "--calibration-plans", "100", "--output", str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "Wrong beliefs" in done.stdout
+    assert (
+        "warning [few-calibration-plans]: 100 calibration plans are few: one lambda may stall up to 6.7%" in done.stderr
+    )
+    (folder,) = tmp_path.iterdir()
+    assert f"run folder: {folder}" in done.stdout
+    kept = read_run(folder)
+    assert kept.manifest["state"] == "finished"
+    assert kept.manifest["seeds"] == {"study": 0}
+    assert (folder / "studies.parquet").exists()
+    rows = kept.tables["studies"]
+    assert len(rows) == 3 * 17
+    assert (rows["plans"] == 100).all()
+    for name in ("N -2", "L x 1.25", "gap x 2"):
+        assert name in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fly"], "--study: 'fly' is none of targets, frontier, drift, misfit"),
+        (["targets", "--calibration-plans", "20"], "20 calibration plans promise 0.048 at best, not 0.01: take 99 or"),
+        (["targets", "--epsilon", "0"], "--epsilon: 0 should be between 0 and 1"),
+        (["frontier", "--profile", "rtx-4080"], "--profile: rtx-4080 holds no recorded gaps"),
+    ],
+)
+def test_wrong_use_is_one_line_and_leaves_nothing_behind(arguments: list[str], message: str, tmp_path: Path) -> None:
+    done = run(*arguments, "--output", str(tmp_path))
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []

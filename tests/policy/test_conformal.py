@@ -1,0 +1,138 @@
+"""Calibrated caution keeps its promise, says when it cannot, and follows a machine that drifts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from s2a_bench.bench.worlds import World
+from s2a_bench.errors import UsageError
+from s2a_bench.jitter import Markov
+from s2a_bench.policy import Plans
+from s2a_bench.policy.conformal import GRID, Tracker, calibrate, choose, coarse, scores, stalled, take, upper_bound
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy.stream_to_act import StreamToAct
+
+WORLD = World(4.8, 0.5, 2, 4, 0.25)
+"""rho = 1.67: a start at the first skill stalls."""
+BURSTS = Markov(1 / 4.8, 0.2, pause_share=0.02, pause_ratio=10.0, pause_tokens=3.0)
+
+
+def fitted(plans: Plans) -> StreamToAct:
+    assert plans.token_s is not None
+    return StreamToAct(GapPrior.fit(plans.token_s))
+
+
+def test_a_plan_s_score_is_the_least_caution_from_which_on_it_never_stalls() -> None:
+    plans = replace(WORLD, gaps=BURSTS).draw(np.random.default_rng(1), 25)
+    policy = fitted(plans)
+    found = scores(policy, plans)
+    for column in range(25):
+        alone = take(plans, np.array([column]))
+        least = math.inf
+        for caution in reversed(GRID):
+            if stalled(replace(policy, caution=caution), alone)[0]:
+                break
+            least = caution
+        assert found[column] == least
+    assert len(set(found.tolist())) >= 5
+
+
+def test_a_plan_that_only_waiting_saves_scores_infinity() -> None:
+    plans = WORLD.draw(np.random.default_rng(2), 3)
+    assert plans.token_s is not None
+    token_s = plans.token_s.copy()
+    token_s[-1, 1] += 1000
+    plans = replace(plans, token_s=token_s, arrival_s=token_s[1::2])
+    assert scores(StreamToAct(GapPrior(1 / 4.8, 0.1, 0.2)), plans)[1] == math.inf
+
+
+@pytest.mark.parametrize(("count", "may_stall"), [(99, 0), (341, 0), (342, 0), (400, 0), (1000, 7), (4000, 39)])
+def test_more_plans_allow_more_of_them_to_stall(count: int, may_stall: int) -> None:
+    found = choose(np.arange(count, dtype=float))
+    assert found.stalled == may_stall
+    assert found.caution == count - 1 - may_stall
+    assert found.expected_risk == (may_stall + 1) / (count + 1) <= 0.01
+    assert coarse(count) == (count < 342) == (found.risk > 0.02)
+
+
+def test_the_promises_hold_for_scores_of_any_distribution() -> None:
+    rng = np.random.default_rng(6)
+    risks = np.array([1 - choose(rng.random(400)).caution for _ in range(4000)])  # P(score > lambda), exactly
+    error = risks.std() / 4000**0.5
+    assert risks.mean() <= 1 / 401 + 4 * error
+    assert risks.mean() >= 1 / 401 - 4 * error  # and no more careful than said
+    assert (risks > 0.02).mean() <= 0.001 + 4 * (0.001 / 4000) ** 0.5
+
+
+@pytest.mark.parametrize("gaps", [None, BURSTS], ids=["lognormal", "bursts"])
+def test_among_exchangeable_plans_no_more_stall_than_promised(gaps: Markov | None) -> None:
+    world = replace(WORLD, gaps=gaps)
+    rng = np.random.default_rng(7)
+    stalls, count = 0, 0
+    for _ in range(12):
+        calibration = world.draw(rng, 400)
+        policy = fitted(calibration)
+        policy = replace(policy, caution=calibrate(policy, calibration).caution)
+        plans = world.draw(rng, 1000)
+        stalls, count = stalls + int(stalled(policy, plans).sum()), count + 1000
+    assert stats.binomtest(stalls, count, 0.01, alternative="greater").pvalue > 0.01
+    assert stalls > 0  # not safe by waiting
+
+
+def test_too_few_plans_are_refused_with_what_would_do() -> None:
+    with pytest.raises(UsageError, match=r"98 calibration plans promise 0\.01 at best.*take 99 or more"):
+        choose(np.zeros(98))
+    assert choose(np.zeros(98), 0.02).caution == 0
+    for epsilon in (0.0, 1.0, math.nan):
+        with pytest.raises(UsageError, match="between 0 and 1"):
+            choose(np.zeros(98), epsilon)
+
+
+@given(stalls=st.integers(0, 50), plans=st.integers(50, 500))
+def test_the_upper_bound_is_scipy_s(stalls: int, plans: int) -> None:
+    interval = stats.binomtest(stalls, plans).proportion_ci(0.95, "exact")
+    assert upper_bound(stalls, plans, 0.975) == pytest.approx(interval.high)
+
+
+@given(stalls=st.lists(st.booleans(), min_size=1, max_size=3000), step=st.floats(0.001, 0.05))
+def test_tracking_bounds_the_stalls_whatever_happens(stalls: list[bool], step: float) -> None:
+    tracker = Tracker(np.linspace(0, 3, 100), 0.02, step=step)
+    level, happened = tracker.level, 0
+    for would in stalls:
+        stall = would and not math.isinf(tracker.caution)  # a plan that is waited for does not stall
+        happened += stall
+        tracker.learn(9.0, stalled=stall)
+    bound = (level + step) / (step * len(stalls))
+    # Infinity needs a level below 1 / (n + 1) only: the bound is looser by what is left below it.
+    assert happened / len(stalls) <= 0.02 + bound + 1e-9
+
+
+def test_tracking_begins_with_the_calibration_and_keeps_as_many_scores() -> None:
+    tracker = Tracker([0.0] * 90 + [1.0] * 9 + [5.0], 0.05)
+    assert tracker.caution == 1.0
+    for _ in range(100):
+        tracker.learn(7.0, stalled=False)
+    assert tracker.caution == 7.0
+    with pytest.raises(ValueError, match="begins with the scores"):
+        Tracker([])
+
+
+def test_stalls_raise_the_caution_and_calm_lowers_it() -> None:
+    tracker = Tracker(np.linspace(0, 4, 400), 0.01)
+    before = tracker.caution
+    tracker.learn(0.0, stalled=True)
+    assert tracker.caution > before
+    for _ in range(5):
+        tracker.learn(0.0, stalled=True)
+    assert tracker.caution == math.inf
+    for _ in range(2000):
+        tracker.learn(float(np.linspace(0, 4, 400)[_ % 400]), stalled=False)
+    assert tracker.caution <= before
+    assert tracker.level <= 0.02

@@ -1,0 +1,119 @@
+"""What is known of a plan's rate: the prior, what tokens add to it, and where the prior comes from."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from s2a_bench.errors import UsageError
+from s2a_bench.jitter import Lognormal, Markov
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.profile import Profile
+
+
+def by_integration(prior: GapPrior, gaps: list[float]) -> tuple[float, float]:
+    """Bayes' rule on a grid of mean gaps: slow and obvious."""
+    sigma, tau = prior.token_cv * prior.mean_s, prior.plan_cv * prior.mean_s
+    means = np.linspace(prior.mean_s - 12 * tau, prior.mean_s + 12 * tau, 400_001)
+    log = -((means - prior.mean_s) ** 2) / (2 * tau**2)
+    for gap in gaps:
+        log -= (gap - means) ** 2 / (2 * sigma**2)
+    weight = np.exp(log - log.max())
+    weight /= weight.sum()
+    mean = float(weight @ means)
+    return mean, float(weight @ (means - mean) ** 2)
+
+
+@pytest.mark.parametrize("gaps", [[], [0.3], [0.1, 0.25, 0.2, 0.3], [0.2] * 40])
+def test_tokens_sharpen_the_prior_as_bayes_rule_says(gaps: list[float]) -> None:
+    prior = GapPrior(0.2, 0.1, 0.3)
+    mean, relative = prior.learned(float(len(gaps)), sum(gaps))
+    expected, variance = by_integration(prior, gaps)
+    assert mean == pytest.approx(expected, rel=1e-6)
+    assert relative * prior.mean_s**2 == pytest.approx(variance, rel=1e-4)
+
+
+@given(
+    gaps=st.lists(st.floats(0.01, 10), min_size=1, max_size=30),
+    plan_cv=st.floats(0.01, 3),
+    token_cv=st.floats(0.01, 3),
+)
+def test_learning_at_every_token_and_at_once_is_the_same(gaps: list[float], plan_cv: float, token_cv: float) -> None:
+    prior = GapPrior(1.0, plan_cv, token_cv)
+    mean, variance = prior.mean_s, plan_cv**2
+    for gap in gaps:  # the update, one gap at a time: precision-weighted means
+        precision = 1 / variance + 1 / token_cv**2
+        mean, variance = (mean / variance + gap / token_cv**2) / precision, 1 / precision
+    assert prior.learned(float(len(gaps)), math.fsum(gaps)) == pytest.approx((mean, variance))
+
+
+def test_arrays_of_plans_learn_as_each_plan_does() -> None:
+    prior = GapPrior(0.2, 0.1, 0.2)
+    gaps, elapsed = np.array([0.0, 3.0, 50.0]), np.array([0.0, 0.9, 8.0])
+    means, variances = prior.learned(gaps, elapsed)
+    for place in range(3):
+        assert prior.learned(float(gaps[place]), float(elapsed[place])) == (means[place], variances[place])
+
+
+def test_fitting_finds_the_spreads_that_the_plans_were_drawn_with() -> None:
+    rng = np.random.default_rng(3)
+    gaps = rng.lognormal(0, 0.1, 2000) * Lognormal(0.5, 0.2).sample(rng, 48, 2000)
+    prior = GapPrior.fit(2 + np.cumsum(gaps, axis=0))
+    assert prior.mean_s == pytest.approx(0.5 * math.exp(0.005), rel=0.01)
+    assert prior.plan_cv == pytest.approx(0.1, rel=0.05)
+    assert prior.token_cv == pytest.approx(0.2, rel=0.05)
+
+
+def test_fitting_is_right_on_average_for_plans_of_three_gaps_too() -> None:
+    rng = np.random.default_rng(5)
+    gaps = rng.lognormal(0, 0.1, 40_000) * Lognormal(0.5, 0.2).sample(rng, 4, 40_000)
+    prior = GapPrior.fit(np.cumsum(gaps, axis=0))
+    assert prior.token_cv == pytest.approx(0.2, rel=0.03)
+    assert prior.plan_cv == pytest.approx(0.1, rel=0.1)
+
+
+def test_bursts_count_with_the_spread_of_their_sums() -> None:
+    rng = np.random.default_rng(4)
+    bursty = Markov(0.2, 0.2, pause_share=0.02, pause_ratio=10.0, pause_tokens=4.0)
+    token_s = np.cumsum(bursty.sample(rng, 192, 2000), axis=0)
+    single = float((np.diff(token_s, axis=0)).std()) / 0.2
+    fitted = GapPrior.fit(token_s).token_cv
+    long_sums = float(bursty.sample(rng, 1000, 2000).sum(axis=0).std()) / 0.2 / 1000**0.5
+    assert fitted > 1.5 * single
+    assert fitted == pytest.approx(long_sums, rel=0.15)
+
+
+@pytest.mark.parametrize("shape", [(2, 50), (9, 1), (9, 0)])
+def test_too_little_is_refused(shape: tuple[int, int]) -> None:
+    with pytest.raises(UsageError, match=r"a prior needs 2 plans of 3 tokens or more, not"):
+        GapPrior.fit(np.cumsum(np.ones(shape), axis=0))
+
+
+def test_tokens_without_time_between_them_are_refused() -> None:
+    with pytest.raises(UsageError, match="all at once"):
+        GapPrior.fit(np.ones((5, 5)))
+
+
+def test_gaps_without_any_spread_still_let_plans_teach_something() -> None:
+    prior = GapPrior.fit(np.cumsum(np.ones((12, 5)), axis=0))
+    assert 0 < prior.token_cv < 1e-3
+    mean, _ = prior.learned(5.0, 10.0)
+    assert 1.0 < mean <= 2.0
+
+
+def test_a_profile_tells_rate_and_spreads() -> None:
+    profile = Profile("x", "X", "paper", 4.8, 0.5, 0.15, Lognormal(1 / 4.8, 0.2))
+    prior = GapPrior.of_profile(profile)
+    assert prior.mean_s == 1 / 4.8
+    assert prior.plan_cv == 0.1
+    assert prior.token_cv == pytest.approx(0.2, rel=0.05)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
+def test_a_prior_that_is_none_is_refused(value: float) -> None:
+    with pytest.raises(UsageError, match="plan_cv"):
+        GapPrior(0.2, value, 0.2)

@@ -1,0 +1,223 @@
+"""The online rule: its formulas by hand, its steps against its arrays, and what it must never do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from s2a_bench.policy import Plans, PlanShape, Schedule, Start, Timing
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy.metrics import stalls
+from s2a_bench.policy.schedule import safe_start
+from s2a_bench.policy.stream_to_act import MeanStart, OnlineStepper, QuantileStart, StreamToAct
+from tests.conformance.policy import EXACT, Stream, draw, follow
+
+SHAPE = PlanShape(4, 2, Timing(1.0, 0.8, 1.5), expected_cv=0.2)
+PRIOR = GapPrior(0.5, 0.1, 0.2)
+KINDS = st.sampled_from([StreamToAct, MeanStart, QuantileStart])
+PRIORS = st.builds(GapPrior, st.floats(0.02, 2), st.floats(0.01, 3), st.floats(0.01, 2))
+CAUTIONS = st.one_of(st.floats(0, 6), st.just(math.inf))
+
+
+def stepper(caution: float = 2.0, *, prior: GapPrior = PRIOR) -> OnlineStepper:
+    """Make a stepper that has seen two tokens, at 1.0 and 1.6, and the first of four skills with them."""
+    made = StreamToAct(prior, caution).stepper(SHAPE)
+    assert isinstance(made, OnlineStepper)
+    made.token(1.0)
+    made.token(1.6)
+    made.fragment(1.6, Timing(1.2, 1.0, 1.5))
+    return made
+
+
+def forecast(tokens: float, unknown: int, caution: float, duration_s: float) -> float:
+    """Write down the forecast after those two tokens, in s from the second: one gap of 0.6 s has been seen."""
+    sigma, tau = 0.2 * 0.5, 0.1 * 0.5
+    variance = 1 / (1 / tau**2 + 1 / sigma**2)
+    mean = variance * (0.5 / tau**2 + 0.6 / sigma**2)
+    scale = (mean / 0.5) ** 2  # spreads are relative to the mean
+    noise = scale * (tokens * sigma**2 + tokens**2 * variance) + unknown * (0.2 * duration_s) ** 2
+    return tokens * mean + caution * math.sqrt(noise)
+
+
+@pytest.mark.parametrize("caution", [0.0, 1.0, 3.0])
+def test_the_start_is_when_mean_meets_nominal_and_caution_meets_stretched(caution: float) -> None:
+    demands = [
+        1.6 + forecast(2 + 2 * unknown, unknown, lam, known) - (first + unknown * known)
+        for unknown in range(3)
+        for lam, first, known in ((0.0, 1.2, 1.0), (caution, 1.5, 1.5))
+    ]
+    answer = stepper(caution).decide(1.6)
+    if max(demands) <= 1.6:
+        assert isinstance(answer, Start)
+    else:
+        assert answer == pytest.approx(max(demands))
+        assert isinstance(stepper(caution).decide(max(demands) + 1e-12), Start)
+
+
+@pytest.mark.parametrize("now_s", [1.7, 2.0, 2.2, 2.4])
+def test_a_skill_is_stretched_to_the_worst_forecast_which_a_late_token_pushes(now_s: float) -> None:
+    robot = stepper(1.0)
+    robot.due_s = now_s  # it has begun, and is not late
+    ratios = []
+    for unknown in range(3):
+        arrival = max(
+            1.6 + forecast(2 + 2 * unknown, unknown, 1.0, 1.0), now_s + forecast(1 + 2 * unknown, unknown, 1.0, 1.0)
+        )
+        ratios.append((arrival - now_s) / (1.2 + unknown))
+    answer = robot.decide(now_s)
+    assert isinstance(answer, Start)
+    assert answer.duration_s == pytest.approx(1.2 * min(max(*ratios, 1.0), 1.25))
+    assert answer.latest_s == 1.5
+
+
+def test_an_overdue_token_puts_the_start_off_until_it_comes() -> None:
+    slow = GapPrior(2.0, 0.001, 0.01)
+    robot = stepper(0.0, prior=slow)
+    assert robot.decide(1.6) == math.inf  # 6 tokens of 2 s for 3.2 s of work: only another token can tell
+    robot.token(3.6)
+    robot.token(5.6)
+    robot.fragment(5.6, Timing(4.5, 4.0, 5.0))
+    at_s = robot.decide(5.6)
+    assert at_s == pytest.approx(5.6 + 4 * 2.0 - (1.2 + 4.5 + 1.0), abs=0.1)  # before the next token is due
+    robot.token(at_s - 0.1)
+    earlier = robot.decide(at_s - 0.1)
+    assert isinstance(earlier, Start)  # it came early, and one less is missing
+
+
+def test_lateness_is_recovered_down_to_the_least_duration_and_not_beyond_schedule() -> None:
+    shape = replace(SHAPE, n_skills=3)
+    robot = StreamToAct(PRIOR).stepper(shape)
+    for at_s in (0.5, 1.0):
+        robot.token(at_s)
+        robot.fragment(at_s, Timing(1.0, 0.8, 1.5))
+    robot.token(1.5)
+    robot.fragment(1.5, Timing(1.0, 0.8, 1.5))
+    robot.end(1.5)
+    assert robot.decide(1.5) == Start(1.0, 1.5)
+    late = robot.decide(2.6)  # .1 s late
+    assert isinstance(late, Start)
+    assert late.duration_s == pytest.approx(0.9)
+    later = robot.decide(4.5)  # 1 s late
+    assert isinstance(later, Start)
+    assert later.duration_s == pytest.approx(0.8)
+
+
+def run(policy: StreamToAct, plans: Plans, column: int) -> Schedule:
+    """Step through one plan."""
+    assert plans.token_s is not None
+    assert plans.shape is not None
+    timings = [
+        Timing(*map(float, row))
+        for row in zip(plans.nominal_s[:, column], plans.least_s[:, column], plans.most_s[:, column], strict=True)
+    ]
+    stream = Stream(plans.token_s[:, column].tolist(), plans.arrival_s[:, column].tolist(), timings)
+    starts, durations = follow(policy.stepper(plans.shape), stream, plans.shape.n_skills)
+    return Schedule(np.array(starts), np.array(durations))
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    kind=KINDS,
+    prior=PRIORS,
+    caution=CAUTIONS,
+    seed=st.integers(0, 2**32 - 1),
+    n_skills=st.integers(1, 9),
+    tokens=st.integers(1, 5),
+    rho=st.floats(0.2, 4.0),
+    more=st.integers(0, 4),
+    believed_tokens=st.floats(0.5, 7.0),
+    expected_cv=st.floats(0, 0.5),
+    parsing_s=st.floats(0, 0.4),
+    trailing=st.integers(0, 3),
+)
+def test_steps_and_arrays_agree_whatever_is_believed_and_however_fragments_lag(
+    kind: type[StreamToAct],
+    prior: GapPrior,
+    caution: float,
+    seed: int,
+    n_skills: int,
+    tokens: int,
+    rho: float,
+    more: int,
+    believed_tokens: float,
+    expected_cv: float,
+    parsing_s: float,
+    trailing: int,
+) -> None:
+    plans = draw(seed, n_skills, tokens, rho, 3)
+    assert plans.token_s is not None
+    after = plans.token_s[-1] + np.cumsum(np.full((trailing, 3), 0.21), axis=0)
+    plans = replace(
+        plans,
+        token_s=np.vstack([plans.token_s, after]),
+        # Fragments are parsed later than their last token, between tokens and past them.
+        arrival_s=plans.arrival_s + parsing_s * np.arange(1, n_skills + 1)[:, np.newaxis],
+        shape=PlanShape(n_skills + more, believed_tokens, Timing(1.1, 0.9, 1.4), expected_cv),
+    )
+    schedule = kind(prior, caution).schedule(plans)
+    for column in range(3):
+        stepped = run(kind(prior, caution), plans, column)
+        np.testing.assert_allclose(stepped.start_s, schedule.start_s[:, column], rtol=0, atol=EXACT)
+        np.testing.assert_allclose(stepped.duration_s, schedule.duration_s[:, column], rtol=0, atol=EXACT)
+
+
+@settings(deadline=None, max_examples=60)
+@given(kind=KINDS, seed=st.integers(0, 2**32 - 1), rho=st.floats(0.2, 4.0), low=CAUTIONS, high=CAUTIONS)
+def test_more_caution_never_starts_earlier(
+    kind: type[StreamToAct], seed: int, rho: float, low: float, high: float
+) -> None:
+    plans = draw(seed, 6, 3, rho, 20)
+    low, high = sorted((low, high))
+    assert (kind(PRIOR, high).schedule(plans).start_s[0] >= kind(PRIOR, low).schedule(plans).start_s[0]).all()
+
+
+def test_each_plan_may_have_its_own_caution() -> None:
+    from s2a_bench.policy.online import schedule
+
+    plans = draw(7, 6, 3, 1.4, 4)
+    cautions = [0.0, 1.0, 3.0, math.inf]
+    together = schedule(PRIOR, cautions, plans, elastic=True)
+    for column, caution in enumerate(cautions):
+        alone = StreamToAct(PRIOR, caution).schedule(plans)
+        np.testing.assert_array_equal(together.start_s[:, column], alone.start_s[:, column])
+        np.testing.assert_array_equal(together.duration_s[:, column], alone.duration_s[:, column])
+
+
+def test_infinite_caution_waits_for_the_whole_plan_and_never_stalls() -> None:
+    plans = draw(8, 6, 3, 1.4, 50, gap_cv=1.0)
+    schedule = StreamToAct(PRIOR, math.inf).schedule(plans)
+    np.testing.assert_array_equal(schedule.start_s[0], plans.arrival_s[-1])
+    assert (stalls(schedule) <= EXACT).all()
+
+
+def test_without_any_spread_the_online_start_is_the_paper_s_s0() -> None:
+    prior = GapPrior(0.25, 1e-6, 1e-6)
+    token_s = 0.5 + 0.25 * np.arange(1.0, 49)[:, np.newaxis]
+    nominal_s = np.ones((8, 1))
+    shape = PlanShape(8, 6, Timing(1.0, 0.8, 1.5), expected_cv=0.0)
+    plans = Plans(token_s[5::6], nominal_s, 0.8 * nominal_s, 1.5 * nominal_s, token_s, shape)
+    schedule = StreamToAct(prior, 2.33).schedule(plans)
+    assert schedule.start_s[0, 0] == pytest.approx(float(safe_start(plans.arrival_s, nominal_s)[0]), abs=1e-4)
+    assert schedule.start_s[0, 0] == pytest.approx(0.5 + 8 * 1.5 - 7, abs=1e-4)
+    np.testing.assert_allclose(np.diff(schedule.start_s, axis=0), 1.0, atol=1e-4)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**32 - 1), rho=st.floats(0.2, 4.0))
+def test_the_mean_rule_starts_with_stream_to_act_at_its_least_and_stalls_more(seed: int, rho: float) -> None:
+    plans = draw(seed, 6, 3, rho, 20)
+    mean, elastic = MeanStart(PRIOR).schedule(plans), StreamToAct(PRIOR, 0.0).schedule(plans)
+    np.testing.assert_allclose(mean.start_s[0], elastic.start_s[0], rtol=0, atol=EXACT)
+    assert (stalls(mean) > 1e-6).any(axis=0).sum() >= (stalls(elastic) > 1e-6).any(axis=0).sum()
+
+
+def test_plans_without_tokens_or_shape_are_refused() -> None:
+    plans = draw(1, 3, 2, 1.0, 1)
+    for missing in ("token_s", "shape"):
+        with pytest.raises(ValueError, match="need token_s and shape"):
+            StreamToAct(PRIOR).schedule(replace(plans, **{missing: None}))
