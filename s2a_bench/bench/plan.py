@@ -10,8 +10,12 @@ from urllib.parse import urlsplit
 
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import ENGINES, EngineConfig
+from s2a_bench.inference.replay import check_replay
 from s2a_bench.ros import MIDDLEWARES
 from s2a_bench.transport import CONNECTIONS, HTTP_VARIANTS, NAMES, PAYLOADS, QOS_PROFILES, ROS_VARIANTS, WIRES, Route
+from s2a_bench.transport.credentials import read_key
+from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
+from s2a_bench.transport.http.merge import read_patch
 
 LARGEST = 16_384
 ROS_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -48,6 +52,12 @@ class LatencyConfig:
     url: str = ""
     served_model: str = "default"
     """The model's name in requests to a black box."""
+    dialect: str = ""
+    """What a black box speaks; empty: it is asked."""
+    api_key_env: str = ""
+    """The environment variable that holds a black box's API key, which itself is nowhere kept."""
+    extra_body: str = ""
+    """JSON that is merged into every request to a black box."""
     llama_server: Path | None = None
     port: int = 0
     middleware: str = ""
@@ -65,6 +75,8 @@ class LatencyConfig:
     grammar: str = ""
     seed: int = 0
     timeout_s: float = 300.0
+    sample_resources_hz: float = 10.0
+    """How often CPU, memory, GPU and power are read beside the run; 0: never."""
 
     @property
     def black_box(self) -> bool:
@@ -100,6 +112,7 @@ class LatencyConfig:
             ("--timeout", self.timeout_s, 0.1, 86_400),
             ("--result-timeout", self.result_timeout_s, 0, 86_400),
             ("--fps", self.fps, 0.1, 1_000),
+            ("--sample-resources", self.sample_resources_hz, 0, 1_000),
         ):
             if not least <= value <= most:
                 raise UsageError(f"{flag}: {value} is not between {least} and {most}")
@@ -112,6 +125,10 @@ class LatencyConfig:
         for flag, text in (("--prompt", self.prompt), ("--grammar", self.grammar)):
             if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
                 raise UsageError(f"{flag}: the text is not valid UTF-8, or has a NUL")
+        check_replay(self.engine)
+        if self.engine.name == "replay" and (self.black_box or self.action):
+            flag = "--url" if self.url else "--llama-server" if self.llama_server else "--action"
+            raise UsageError(f"--engine replay needs our own servers; leave out {flag}")
         self._check_black_box()
         self._check_action()
         self._check_stream()
@@ -119,6 +136,7 @@ class LatencyConfig:
     def _check_black_box(self) -> None:
         if self.url and self.llama_server:
             raise UsageError("--url and --llama-server name two HTTP servers; give one of them")
+        self._check_dialect()
         if not self.black_box:
             return
         flag = "--url" if self.url else "--llama-server"
@@ -126,12 +144,25 @@ class LatencyConfig:
             raise UsageError(f"{flag} needs http among --transport")
         if self.url and not _is_url(self.url):
             raise UsageError(f"--url: '{self.url}' should start with http:// or https:// and name a host")
-        if self.payload == "raw":
-            raise UsageError(f"--payload raw needs our own server; with {flag} use jpeg, jpeg-preencoded or png")
+        if "@" in urlsplit(self.url).netloc:
+            raise UsageError("--url: leave the password out, which would be kept with the results; see --api-key-env")
+        payloads = open_dialect(self.dialect or "openai").payloads
+        if self.payload not in payloads:
+            spoken = f"--dialect {self.dialect}" if self.dialect else flag
+            raise UsageError(f"--payload {self.payload}: with {spoken} a picture travels as {' or '.join(payloads)}")
         if "binary" in self.http:
             raise UsageError(f"--http binary needs our own server; leave it out with {flag}")
         if self.llama_server and self.engine.name != "llama":
             raise UsageError(f"--llama-server runs a model; leave out --engine {self.engine.name}")
+
+    def _check_dialect(self) -> None:
+        given = {"--dialect": self.dialect, "--api-key-env": self.api_key_env, "--extra-body": self.extra_body}
+        for flag, value in given.items():
+            if value and not self.url:
+                raise UsageError(f"{flag} is about a server that runs already; name it with --url")
+        _one_of("--dialect", [self.dialect] if self.dialect else [], tuple(DIALECTS))
+        read_key(self.api_key_env)
+        read_patch(self.extra_body)
 
     def _check_action(self) -> None:
         if "ros" in self.transports and not self.ros:
@@ -198,6 +229,9 @@ def route_of(config: LatencyConfig, transport: str, address: str) -> Route:
         result_timeout_s=config.result_timeout_s,
         timeout_s=config.timeout_s,
         model=config.served_model,
+        dialect="llama-server" if config.llama_server else config.dialect,
+        api_key_env=config.api_key_env,
+        extra_body=config.extra_body,
     )
 
 

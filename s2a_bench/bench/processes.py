@@ -18,6 +18,7 @@ from typing import IO, Any
 import httpx
 
 from s2a_bench import errors
+from s2a_bench.bench.llama_flags import llama_flags
 from s2a_bench.bench.serving import ServerJob
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import EngineError, PortInUse, ServerDied, UsageError
@@ -155,11 +156,8 @@ class LlamaServer(ServerProcess):
         if not (binary.is_file() and os.access(binary, os.X_OK)):
             raise UsageError(f"--llama-server: {binary} is no program that can be run")
         port = _free_port(port)
-        command = [str(binary), "--model", str(engine.model), "--mmproj", str(engine.mmproj)]
+        command = [str(binary), *llama_flags(engine), "--mmproj", str(engine.mmproj)]
         command += ["--host", "127.0.0.1", "--port", str(port), "--ctx-size", str(engine.context), "--parallel", "1"]
-        # what our own engine does: every CPU this process may use, and nothing on a GPU unless told
-        command += ["--threads", str(engine.threads or len(os.sched_getaffinity(0)))]
-        command += ["--gpu-layers", str(engine.gpu_layers if engine.gpu_layers >= 0 else 999)]
         if engine.gpu_layers == 0:
             command.append("--no-mmproj-offload")
         files = load_headers(engine)

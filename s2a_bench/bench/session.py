@@ -8,8 +8,9 @@ from itertools import pairwise
 from s2a_bench.bench.feed import Feed, StreamedFrame, StreamFeed, fingerprint
 from s2a_bench.bench.plan import Cell, LatencyConfig
 from s2a_bench.bench.recording import RunRecorder
+from s2a_bench.bench.resources.sampler import Sampler
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import EngineError, S2AError, ServerDied, SourceError, UsageError
+from s2a_bench.errors import EngineError, RequestFailed, S2AError, ServerDied, SourceError, UsageError
 from s2a_bench.store.schema import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import Mark, Trace
 from s2a_bench.transport import Client
@@ -30,12 +31,16 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """The rows of one request; ``fingerprint`` tells its picture from others, ``fatal`` ends the run."""
+    """The rows of one request; ``fingerprint`` tells its picture from others, ``fatal`` ends the run.
+
+    ``retry_after_s`` is how long a server that refused asks to be left alone.
+    """
 
     sample: SampleRow
     tokens: list[TokenRow]
     fingerprint: int
     fatal: S2AError | None = None
+    retry_after_s: float = 0.0
 
 
 KEPT_FRAMES = 90
@@ -46,7 +51,13 @@ class Session:
     """The client side of one cell."""
 
     def __init__(
-        self, cell: Cell, client: Client, feed: Feed, config: LatencyConfig, recorder: RunRecorder | None = None
+        self,
+        cell: Cell,
+        client: Client,
+        feed: Feed,
+        config: LatencyConfig,
+        recorder: RunRecorder | None = None,
+        sampler: Sampler | None = None,
     ) -> None:
         """Measure ``cell`` with an open client, recording what travels if there is a recorder."""
         self.cell = cell
@@ -54,7 +65,10 @@ class Session:
         self.feed = feed
         self._config = config
         self._recorder = recorder
+        self._sampler = sampler or Sampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
+        self.prompt_n = 0
+        """Tokens of the last prompt, pictures included; 0 where nobody says."""
 
     def measure(self, place: Place) -> Measured:
         """Make one request; a failure becomes a row with its error, and says whether it is the run's end."""
@@ -62,7 +76,9 @@ class Session:
         request_id = f"{self.cell.name}-{place.block}"
         seen: list[tuple[Token, int]] = []
         trace = Trace()
-        error, fatal = "", None
+        error, fatal, retry_after_s = "", None, 0.0
+        started_ns = now_ns()
+        self._sampler.edge()
         frame = self.feed.capture(trace)
         images = () if frame is None else (frame,)
         config = self._config
@@ -72,6 +88,10 @@ class Session:
         except S2AError as failure:
             error = f"{type(failure).__name__}: {failure}"
             fatal = failure if isinstance(failure, FATAL) else None
+            if isinstance(failure, RequestFailed):
+                retry_after_s = failure.retry_after_s or 0.0
+        self._sampler.edge()
+        trace.facts.update(self._sampler.window(started_ns, now_ns()))
         if not error and not seen:
             error = "RequestFailed: the answer was empty"
         if self._recorder is not None:
@@ -79,7 +99,8 @@ class Session:
                 self._recorder.frame(frame)
             self._recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
             self._recorder.flush()
-        return replace(self._rows(place, request_id, frame, trace, seen, error), fatal=fatal)
+        rows = self._rows(place, request_id, frame, trace, seen, error)
+        return replace(rows, fatal=fatal, retry_after_s=retry_after_s)
 
     def _rows(
         self,
@@ -102,6 +123,7 @@ class Session:
         if isinstance(self.feed, StreamFeed) and streamed is None:
             error = error or "RequestFailed: the server knew no frame of this camera"
         started_ns = inference_start_ns(trace)
+        self.prompt_n = _whole(facts.get("prompt_n")) or self.prompt_n
         sample = SampleRow(
             cell=self.cell.name,
             pipeline=self.cell.route.transport,

@@ -34,7 +34,13 @@ def latency(
     ] = "",
     result_timeout: Annotated[float, typer.Option(help="seconds an action's result is kept")] = 60.0,
     wire: Annotated[str, typer.Option(help="ROS picture: bgr, yuyv, compressed")] = "bgr",
-    url: Annotated[str, typer.Option(help="an OpenAI-compatible server that runs already (a black box)")] = "",
+    url: Annotated[str, typer.Option(help="a server that runs already (a black box)")] = "",
+    dialect: Annotated[
+        str,
+        typer.Option(help="what --url speaks: openai, llama-server, vllm, ollama, tgi, gemini, openvla [default: ask]"),
+    ] = "",
+    api_key_env: Annotated[str, typer.Option(help="NAME of the environment variable with the API key of --url")] = "",
+    extra_body: Annotated[str, typer.Option(help="JSON, or @FILE, merged into every request to --url")] = "",
     served_model: Annotated[str, typer.Option(help="the model's name at --url")] = "default",
     llama_server: Annotated[
         Path | None, typer.Option(help="start this llama.cpp server on the same model files (a black box)")
@@ -47,7 +53,11 @@ def latency(
     qos: Annotated[str, typer.Option(help="the camera topic's: reliable, sensor_data (best effort)")] = "reliable",
     namespace: Annotated[str, typer.Option(help="ROS namespace of the topics")] = "/s2a_bench",
     connection: Annotated[str, typer.Option(help="HTTP: keep-alive, per-request, client-per-request")] = "keep-alive",
-    engine: Annotated[str, typer.Option(help="llama (a real model), echo (no model: transport alone)")] = "llama",
+    engine: Annotated[
+        str, typer.Option(help="llama (a real model), echo (no model: transport alone), replay (a --profile: EMULATED)")
+    ] = "llama",
+    profile: Annotated[str, typer.Option(help="replay: the board to play, a name of 'profile list' or a path")] = "",
+    gaps: Annotated[str, typer.Option(help="replay: trace, parametric, constant [default: trace if recorded]")] = "",
     model: Annotated[Path | None, typer.Option(help="GGUF model [default: the tiny dummy]")] = None,
     mmproj: Annotated[Path | None, typer.Option(help="GGUF vision tower that goes with --model")] = None,
     threads: Annotated[int, typer.Option(min=0, help="CPU threads of the model; 0: all")] = 0,
@@ -62,6 +72,9 @@ def latency(
     grammar: Annotated[Path | None, typer.Option(help="GBNF file that every answer obeys")] = None,
     seed: Annotated[int, typer.Option(help="seed of the order, the source and the sampling")] = 0,
     timeout: Annotated[float, typer.Option(help="longest silence of a server, in seconds")] = 300.0,
+    sample_resources: Annotated[
+        float, typer.Option(help="readings a second of CPU, memory, GPU and power beside the run; 0: none")
+    ] = 10.0,
     record: Annotated[
         Path | None, typer.Option(help="also record frames, requests and tokens, as run.mcap (rosbag2)")
     ] = None,
@@ -69,7 +82,7 @@ def latency(
     against: Annotated[str, typer.Option(help="paper: draw the paper's figures beside ours")] = "",
     quick: Annotated[bool, typer.Option("--quick", help="fewer samples: a first look")] = False,
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", help="also the cost of a mark and the environment")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="also what measuring costs, and the environment")] = False,
 ) -> None:
     """Measure what the transport costs: HTTP/JSON + Base64 against ROS 2-native, every stage, one interleaved run."""
     from s2a_bench.bench.latency import run_latency
@@ -97,6 +110,9 @@ def latency(
         connection=connection,
         url=url,
         served_model=served_model,
+        dialect=dialect,
+        api_key_env=api_key_env,
+        extra_body=text_or_file(extra_body, "--extra-body"),
         llama_server=llama_server,
         port=port,
         middleware=middleware,
@@ -104,7 +120,7 @@ def latency(
         dds_tuning=dds_tuning,
         domain_id=domain_id(os.environ),
         namespace=namespace,
-        engine=EngineConfig(engine, model, mmproj, threads, gpu_layers, context),
+        engine=EngineConfig(engine, model, mmproj, threads, gpu_layers, context, profile=profile, gaps=gaps),
         runs=few["runs"] if runs is None else runs,
         warmup=few["warmup"] if warmup is None else warmup,
         mode=mode,
@@ -114,6 +130,7 @@ def latency(
         grammar=file_text(grammar, "--grammar") if grammar else "",
         seed=seed,
         timeout_s=timeout,
+        sample_resources_hz=sample_resources,
     )
     config.check()
     with RunProgress() as progress:
@@ -152,5 +169,8 @@ def _show(folder: Path, progress: RunProgress, *, as_json: bool, against_paper: 
         console.print(part)
     if verbose:
         console.print(f"a mark costs {run.manifest['mark_cost_ns']} ns")
+        if sampled := run.manifest.get("resources"):
+            share, edge_us = sampled["core_share"] or 0, sampled["edge_us"]
+            console.print(f"sampling takes {share:.2%} of a core, and {edge_us} us before and after each request")
         console.print_json(data=run.manifest["environment"])
     console.print(f"run folder: {folder}", highlight=False, markup=False, soft_wrap=True)

@@ -23,6 +23,14 @@ def numbers(flag: str, text: str) -> tuple[float, ...]:
         raise UsageError(f"{flag}: '{text}' should be numbers with commas between them") from error
 
 
+def whole_numbers(flag: str, text: str) -> tuple[int, ...]:
+    """Read whole numbers between commas, each once; raises UsageError naming the flag."""
+    try:
+        return tuple(int(part) for part in listed(text))
+    except ValueError as error:
+        raise UsageError(f"{flag}: '{text}' should be whole numbers with commas between them") from error
+
+
 def size_of(text: str) -> tuple[int, int]:
     """Read ``WIDTHxHEIGHT``."""
     width, cross, height = text.lower().partition("x")

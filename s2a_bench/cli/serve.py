@@ -27,6 +27,8 @@ DEFAULTS: dict[str, Any] = {
     "threads": 0,
     "gpu-layers": 0,
     "context": 4096,
+    "profile": "",
+    "gaps": "",
     "host": "127.0.0.1",
     "port": 8080,
     "namespace": "/llama",
@@ -44,12 +46,14 @@ LEAST = {"threads": 0, "gpu-layers": -1, "context": 256, "port": 0, "max-tokens"
 MOST = {"port": 65_535, "max-tokens": 2**20, "result-timeout": 86_400, "feedback-interval": 60}
 """Bounds of the numbers, wherever they come from; seconds are 0 at least."""
 
-Engine = Annotated[str | None, typer.Option(help="llama, echo [default: llama]")]
+Engine = Annotated[str | None, typer.Option(help="llama, echo, replay (a --profile: EMULATED) [default: llama]")]
 Model = Annotated[str | None, typer.Option(help="GGUF model [default: the tiny dummy]")]
 Mmproj = Annotated[str | None, typer.Option(help="GGUF vision tower that goes with --model")]
 Threads = Annotated[int | None, typer.Option(min=0, help="CPU threads of the model; 0: all")]
 GpuLayers = Annotated[int | None, typer.Option(min=-1, help="model layers on the GPU; -1: all")]
 Context = Annotated[int | None, typer.Option(min=256, help="context length in tokens")]
+Profile = Annotated[str | None, typer.Option(help="replay: the board to play, a name of 'profile list' or a path")]
+Gaps = Annotated[str | None, typer.Option(help="replay: trace, parametric, constant [default: trace if recorded]")]
 Config = Annotated[Path | None, typer.Option(help="TOML file with these flags as keys; a flag wins over it")]
 
 
@@ -61,6 +65,8 @@ def http(
     threads: Threads = None,
     gpu_layers: GpuLayers = None,
     context: Context = None,
+    profile: Profile = None,
+    gaps: Gaps = None,
     host: Annotated[str | None, typer.Option(help="address to bind [default: 127.0.0.1]")] = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="0: any free one [default: 8080]")] = None,
     config: Config = None,
@@ -68,8 +74,9 @@ def http(
     """Serve the OpenAI dialect (chat/completions with image data URIs, streamed) until interrupted."""
     from s2a_bench.transport import Route
 
-    given = {"engine": engine, "model": model, "mmproj": mmproj, "threads": threads, "gpu-layers": gpu_layers}
-    settings = _settings({**given, "context": context, "host": host, "port": port}, config)
+    given: dict[str, Any] = {"engine": engine, "model": model, "mmproj": mmproj, "threads": threads}
+    given |= {"gpu-layers": gpu_layers, "context": context, "profile": profile, "gaps": gaps}
+    settings = _settings({**given, "host": host, "port": port}, config)
     route = Route("http", address=f"{settings['host']}:{settings['port']}")
     _run(route, settings, lambda address: f"serving at {address}/v1/chat/completions")
 
@@ -82,6 +89,8 @@ def ros(
     threads: Threads = None,
     gpu_layers: GpuLayers = None,
     context: Context = None,
+    profile: Profile = None,
+    gaps: Gaps = None,
     namespace: Annotated[str | None, typer.Option(help="of the action and the topics [default: /llama]")] = None,
     middleware: Annotated[str | None, typer.Option(help="cyclonedds, rclpy")] = None,
     qos: Annotated[str | None, typer.Option(help="the camera topics': sensor_data, reliable")] = None,
@@ -99,6 +108,7 @@ def ros(
     from s2a_bench.transport import QOS_PROFILES, Route
 
     given: dict[str, Any] = {"engine": engine, "model": model, "mmproj": mmproj, "threads": threads}
+    given |= {"profile": profile, "gaps": gaps}
     given |= {
         "gpu-layers": gpu_layers,
         "context": context,
@@ -168,11 +178,21 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _engine(settings: dict[str, Any]) -> EngineConfig:
     from s2a_bench.inference import EngineConfig
+    from s2a_bench.inference.replay import check_replay
 
     model, mmproj = (Path(settings[key]) if settings[key] else None for key in ("model", "mmproj"))
-    return EngineConfig(
-        settings["engine"], model, mmproj, settings["threads"], settings["gpu-layers"], settings["context"]
+    engine = EngineConfig(
+        settings["engine"],
+        model,
+        mmproj,
+        settings["threads"],
+        settings["gpu-layers"],
+        settings["context"],
+        profile=settings["profile"],
+        gaps=settings["gaps"],
     )
+    check_replay(engine)
+    return engine
 
 
 def _run(route: Route, settings: dict[str, Any], ready: Callable[[str], str]) -> None:
@@ -196,7 +216,9 @@ def _run(route: Route, settings: dict[str, Any], ready: Callable[[str], str]) ->
 
         for number in SIGNALS:
             signal.signal(number, stop)
-        typer.echo(f"{ready(server.address)}; engine {engine.describe()['engine']}; Ctrl-C ends it")
+        facts = engine.describe()
+        name = f"replay of {facts['profile']} (EMULATED)" if facts.get("emulated") else facts["engine"]
+        typer.echo(f"{ready(server.address)}; engine {name}; Ctrl-C ends it")
         server.serve()
     finally:
         engine.close()

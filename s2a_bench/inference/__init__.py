@@ -58,15 +58,20 @@ class EngineConfig:
     """Type of the KV cache: f32, f16, q8_0, q4_0."""
     flash_attention: str = "auto"
     """auto, on, off."""
+    sampling: str = "model"
+    """model: as its authors recommend; greedy: the likeliest token."""
     profile: str = ""
     """replay: name or path of the hardware profile."""
     gaps: str = ""
     """replay: trace (the recorded gaps), parametric, constant; empty: the best that the profile has."""
+    pace: float = 0.0
+    """Tokens/s that answers are held back to; 0: as fast as they come."""
 
 
 ENGINES: dict[str, str] = {
     "llama": "s2a_bench.inference.one_thread:llama",
     "echo": "s2a_bench.inference.echo:EchoEngine",
+    "replay": "s2a_bench.inference.replay:ReplayEngine",
 }
 """Value of ``--engine`` -> what builds it, called with the config."""
 
@@ -76,4 +81,8 @@ def open_engine(config: EngineConfig) -> Engine:
     if config.name not in ENGINES:
         raise UsageError(f"--engine: '{config.name}' is none of {', '.join(ENGINES)}")
     engine: Engine = resolve_name(ENGINES[config.name])(config)
+    if config.pace:
+        from s2a_bench.inference.paced import PacedEngine
+
+        return PacedEngine(engine, config.pace)
     return engine

@@ -16,15 +16,13 @@ from llama_cpp.llama_chat_format import MiniCPMv26ChatHandler
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, ModelError
 from s2a_bench.inference import EngineConfig, llama_log
+from s2a_bench.inference.llama_decode import GreedySampler, Sampler, TokenBatch, TokenBytes
 from s2a_bench.inference.llama_gbnf import GrammarSampler, grammar_error
+from s2a_bench.inference.llama_settings import FLASH_ATTENTION, KV_TYPES, SAMPLINGS, check_settings
 from s2a_bench.inference.models import ModelFiles, load_headers, sha256
 from s2a_bench.types import Frame, Request, Token
 
 _URL = "s2a-bench:image/{:04d}/"
-_SAMPLING = {"temp": 0.7, "top_p": 0.8, "top_k": 100, "min_p": 0.0}
-"""That of llama.cpp's ``README-minicpmv2.6.md``, without the penalty on repetition, which breaks structured output."""
-
-_PIECE_BYTES = 1024
 _MS_NS = 1_000_000
 
 
@@ -33,10 +31,31 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc]  # the library has no t
 
     prompt: list[int]
 
-    def _init_sampler(self, *args: Any, grammar: Any = None, **settings: Any) -> Any:
+    def __init__(self, model: str, *, flash_attention: int, **settings: Any) -> None:
+        self._flash_attention = flash_attention
+        super().__init__(model, **settings)
+
+    @property
+    def context_params(self) -> Any:
+        """The library's settings for llama.cpp, which know flash attention on and off only, with ours in them."""
+        self._context_params.flash_attn_type = self._flash_attention
+        return self._context_params
+
+    @context_params.setter
+    def context_params(self, params: Any) -> None:
+        self._context_params = params
+
+    def sampler(self, name: str, grammar: str) -> Sampler:
         """Build the library's chain of samplers, and let a grammar judge what comes out of it."""
-        chain = super()._init_sampler(*args, **settings)
-        return chain if grammar is None else GrammarSampler(chain, self._model.vocab, grammar, self._candidates)
+        if name == "greedy" and not grammar:
+            return GreedySampler(self._n_vocab)
+        chain: Sampler = self._init_sampler(**SAMPLINGS[name])
+        return GrammarSampler(chain, self._model.vocab, grammar, self._candidates) if grammar else chain
+
+    def eval(self, tokens: list[int]) -> None:
+        """Evaluate, and wait: a GPU's queue would otherwise be counted as the vision tower's time, or the reverse."""
+        super().eval(tokens)
+        llama_cpp.llama_synchronize(self.ctx)
 
     def create_completion(self, prompt: list[int], **_settings: Any) -> Iterator[Any]:
         """Keep the prompt; the library's own loop joins tokens into characters and drops their indices."""
@@ -84,32 +103,39 @@ class _PixelHandler(MiniCPMv26ChatHandler):  # type: ignore[misc]  # the library
 
 
 class LlamaCppEngine:
-    """A GGUF model on this machine. ``facts`` holds prompt_n, prompt_ms, predicted_n, predicted_ms of the last request.
+    """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names.
 
     ``prompt_n`` is what llama.cpp says it evaluated, pictures included; ``prompt_ms`` is the time from the request to
-    the first token's logits, slicing and vision tower included.
+    the first token's logits, slicing and vision tower included; ``prompt_eval_ms`` is the language model's part of it.
+    ``predicted_n`` tokens took ``predicted_ms`` from there to the last.
     """
 
     def __init__(self, config: EngineConfig) -> None:
         """Load both files; raises ModelError where llama.cpp refuses one."""
+        check_settings(config)
         self.facts: dict[str, float] = {}
         self._files = load_headers(config)
         self._config = config
         self._threads = config.threads or len(os.sched_getaffinity(0))
         self._turn = 0
         self._grammar_errors: dict[str, str] = {}  # checked once each: an answer's grammar rarely changes
-        self._piece = ctypes.create_string_buffer(_PIECE_BYTES)
         self._llama: _Prefilled | None = None
         llama_log.silence()
         llama_log.reason()
         self._handler = _PixelHandler(str(self._files.mmproj.path), use_gpu=config.gpu_layers != 0)
         self._llama = self._load(self._files)
+        self._batch = TokenBatch()
 
     def _load(self, files: ModelFiles) -> _Prefilled:
         try:
             llama = _Prefilled(
                 str(files.model.path),
                 n_ctx=self._config.context,
+                n_batch=self._config.batch,
+                n_ubatch=self._config.batch,
+                type_k=KV_TYPES[self._config.kv_type],
+                type_v=KV_TYPES[self._config.kv_type],
+                flash_attention=FLASH_ATTENTION[self._config.flash_attention],
                 n_gpu_layers=self._config.gpu_layers,
                 n_threads=self._threads,
                 n_threads_batch=self._threads,
@@ -124,6 +150,7 @@ class LlamaCppEngine:
         except ValueError as error:
             llama.close()
             raise ModelError(f"--mmproj {files.mmproj.path}: llama.cpp: {error}") from error
+        self._pieces = TokenBytes(llama._model.vocab)  # noqa: SLF001
         return llama
 
     def generate(self, request: Request) -> Iterator[Token]:
@@ -139,19 +166,21 @@ class LlamaCppEngine:
         self._check(llama, request)
         started = now_ns()
         self._evaluate(llama, request)
-        llama_cpp.llama_synchronize(llama.ctx)  # a GPU works behind our back; sampling would wait for it anyway
         prompt_done = now_ns()
         perf = llama_cpp.llama_perf_context(llama.ctx)
         self.facts = {
             "prompt_n": float(perf.n_p_eval),
             "prompt_ms": (prompt_done - started) / _MS_NS,
+            "prompt_eval_ms": perf.t_p_eval_ms,
             "predicted_n": 0.0,
             "predicted_ms": 0.0,
         }
         ignore_end = self._files.dummy and not request.grammar  # random weights end at random, counts should not
-        decoder = codecs.getincrementaldecoder("utf-8")("replace")
+        decode = codecs.getincrementaldecoder("utf-8")("replace").decode
         llama.set_seed(request.seed & 0x7FFF_FFFF)  # 2**32-1 would mean a random seed
-        ids = llama.generate(llama.prompt, grammar=request.grammar or None, **_SAMPLING)
+        sampler = llama.sampler(self._config.sampling, request.grammar)
+        ids = self._batch.answer(llama._ctx, sampler, len(llama.prompt))  # noqa: SLF001
+        count, last_ns, pieces = 0, prompt_done, self._pieces
         try:
             for index in range(request.max_tokens):
                 if turn != self._turn:
@@ -159,14 +188,15 @@ class LlamaCppEngine:
                 token = next(ids)
                 if not ignore_end and llama_cpp.llama_vocab_is_eog(llama._model.vocab, token):  # noqa: SLF001
                     return
-                text = decoder.decode(self._bytes(llama, token), final=index + 1 == request.max_tokens)
-                self.facts["predicted_n"] = float(index + 1)
-                self.facts["predicted_ms"] = (now_ns() - prompt_done) / _MS_NS
+                text = decode(pieces[token], index + 1 == request.max_tokens)
+                count, last_ns = index + 1, now_ns()
                 yield Token(index, text, token)
         except RuntimeError as error:
             raise EngineError(f"llama: generation failed: {llama_log.reason() or error}") from error
         finally:
-            ids.close()
+            if turn == self._turn:
+                self.facts["predicted_n"] = float(count)
+                self.facts["predicted_ms"] = (last_ns - prompt_done) / _MS_NS
 
     def _evaluate(self, llama: _Prefilled, request: Request) -> None:
         """Run pictures and prompt through the model, on an empty KV cache, up to the first token's logits."""
@@ -210,12 +240,6 @@ class LlamaCppEngine:
         if wrong:
             raise EngineError(f"llama: the grammar of request {request.id} is not valid GBNF: {wrong}")
 
-    def _bytes(self, llama: _Prefilled, token: int) -> bytes:
-        """Return a token's bytes; the library's `detokenize` cuts at 32. Special tokens have none."""
-        vocab = llama._model.vocab  # noqa: SLF001
-        size = llama_cpp.llama_token_to_piece(vocab, token, self._piece, _PIECE_BYTES, 0, False)
-        return self._piece.raw[: max(0, size)]
-
     def describe(self) -> dict[str, str | int | float | bool]:
         """Say what answers; the first call hashes the files, which takes seconds for gigabytes."""
         model, mmproj = self._files.model, self._files.mmproj
@@ -234,6 +258,10 @@ class LlamaCppEngine:
             "gpu_layers": self._config.gpu_layers,
             "gpu_offload_supported": bool(llama_cpp.llama_supports_gpu_offload()),
             "context": self._config.context,
+            "batch": self._config.batch,
+            "kv_type": self._config.kv_type,
+            "flash_attention": self._config.flash_attention,
+            "sampling": self._config.sampling,
         }
         if self._llama is not None:
             handle = self._llama.model
@@ -252,3 +280,4 @@ class LlamaCppEngine:
         if self._llama is not None:
             self._llama.close()
             self._llama = None
+            self._batch.close()

@@ -3,17 +3,60 @@
 llama.cpp computes with OpenMP, and libgomp keeps a team of threads for every thread that ever asked. Where a server's
 threads take turns, teams add up, libgomp sees more threads than cores and stops spinning between operations: half the
 speed for a small model. So all of an engine's work is done on one thread; changing to it is part of `inference`.
+
+Changing threads costs some 50 us, a sixth of a small model's token. So the engine does not wait for who reads: it
+computes the next token while the last one is sent, as llama-server does, and is at most `AHEAD` tokens ahead.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from queue import SimpleQueue
 from typing import Any
 
 from s2a_bench.errors import EngineError
 from s2a_bench.inference import Engine, EngineConfig
 from s2a_bench.types import Request, Token
+
+AHEAD = 8
+"""Tokens that may wait for who reads, before the engine waits too."""
+
+
+class _Answer:
+    """The tokens of one request on their way from the engine's thread to the one that asked."""
+
+    def __init__(self) -> None:
+        self._wanted = True
+        self._tokens: SimpleQueue[Token | None] = SimpleQueue()
+        self._places: SimpleQueue[None] = SimpleQueue()  # a semaphore, but one in C
+        for _ in range(AHEAD):
+            self._places.put(None)
+
+    def write(self, tokens: Iterator[Token]) -> None:
+        """Compute tokens while they are wanted; raises what the engine raises."""
+        try:
+            while self._room() and (token := next(tokens, None)) is not None:
+                self._tokens.put(token)
+        finally:
+            _close(tokens)
+            self._tokens.put(None)
+
+    def _room(self) -> bool:
+        """Wait for a place, and tell whether a token is still wanted."""
+        self._places.get()
+        return self._wanted
+
+    def read(self) -> Iterator[Token]:
+        """Yield the tokens until the engine has no more."""
+        while (token := self._tokens.get()) is not None:
+            self._places.put(None)
+            yield token
+
+    def cancel(self) -> None:
+        """Want no more."""
+        self._wanted = False
+        self._places.put(None)
 
 
 class OneThreadEngine:
@@ -22,6 +65,7 @@ class OneThreadEngine:
     def __init__(self, make: Callable[[], Engine]) -> None:
         """Make the engine on its thread; raises what ``make`` raises."""
         self._closed = False
+        self._answer = _Answer()
         self._thread = ThreadPoolExecutor(1, "engine")
         try:
             self._engine = self._thread.submit(make).result()
@@ -35,31 +79,37 @@ class OneThreadEngine:
         return self._engine.facts
 
     def generate(self, request: Request) -> Generator[Token, None, None]:
-        """Yield the engine's tokens, each computed when it is asked for."""
-        tokens = self._run(self._engine.generate, request)
+        """Yield the engine's tokens, which it computes ahead; a later request ends this one, as does leaving early."""
+        self._answer.cancel()
+        answer = self._answer = _Answer()
+        writing = self._submit(lambda: answer.write(self._engine.generate(request)))
         try:
-            while (token := self._run(next, tokens, None)) is not None:
-                yield token
+            yield from answer.read()
+            if answer is not self._answer:
+                raise EngineError("a later request took over the engine; one request at a time")
+            writing.result()
         finally:
-            self._run(_close, tokens)
+            answer.cancel()
+            wait([writing])
 
     def describe(self) -> dict[str, str | int | float | bool]:
         """Say what the engine says."""
-        described: dict[str, str | int | float | bool] = self._run(self._engine.describe)
+        described: dict[str, str | int | float | bool] = self._submit(self._engine.describe).result()
         return described
 
     def close(self) -> None:
         """Free the engine and end its thread."""
         if not self._closed:
-            self._run(self._engine.close)
+            self._answer.cancel()
+            self._submit(self._engine.close).result()
             self._closed = True
             self._thread.shutdown()
 
-    def _run(self, work: Callable[..., Any], *arguments: Any) -> Any:
-        """Do one thing on the engine's thread."""
+    def _submit(self, work: Callable[[], Any]) -> Future[Any]:
+        """Do one thing on the engine's thread, after what it is doing."""
         if self._closed:
             raise EngineError("the engine is closed; open a new one")
-        return self._thread.submit(work, *arguments).result()
+        return self._thread.submit(work)
 
 
 def _close(tokens: object) -> None:

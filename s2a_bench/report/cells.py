@@ -49,6 +49,11 @@ class Cell:
         """Name the transport."""
         return self.about["pipeline"]
 
+    @property
+    def emulated(self) -> bool:
+        """Tell whether a replayed profile answered."""
+        return self.about["engine"] == "replay"
+
     def values_ms(self, metric: str) -> Floats:
         """Return the values of a stage, or of another column less ``_ns``, in ms."""
         return numbers_ms(self.good[f"{metric}_ns"])
@@ -130,14 +135,19 @@ def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | Non
     """
     if metric == "e2e_without_inference" and cell.has_ingest != base.has_ingest:
         return None
-    above, below = cell.by_block(metric), base.by_block(metric)
+    return ratio_of_blocks(cell.by_block(metric), base.by_block(metric), seed)
+
+
+def ratio_of_blocks(above: dict[int, list[float]], below: dict[int, list[float]], seed: int) -> Ratio | None:
+    """Divide the medians of values by block; paired where both have as many in each block, None where one has none."""
     if not above or not below:
         return None
     shapes = {len(values) for values in (*above.values(), *below.values())}
     if above.keys() == below.keys() and len(shapes) == 1:
         blocks = sorted(above)
         return ratio_of_medians([above[block] for block in blocks], [below[block] for block in blocks], seed=seed)
-    return ratio_of_medians(cell.values_ms(metric), base.values_ms(metric), seed=seed, paired=False)
+    values, others = ([value for block in blocks.values() for value in block] for blocks in (above, below))
+    return ratio_of_medians(values, others, seed=seed, paired=False)
 
 
 def seed_of(run: Run) -> int:
@@ -152,10 +162,19 @@ def engine_note(run: Run, cells: list[Cell]) -> str:
     if "echo" in engines:
         notes.append("echo engine")
     if "replay" in engines:
-        notes.append("emulated: replayed profile")
+        notes.append(_emulated(run.manifest.get("model") or {}))
     if "llama" in engines and (run.manifest.get("model") or {}).get("dummy"):
         notes.append("dummy weights")
     return ", ".join(notes)
+
+
+def _emulated(model: dict[str, Any]) -> str:
+    """Say which board was played, how, and where its rate is from."""
+    note = f"EMULATED: replayed profile {model.get('profile', '')}".rstrip()
+    said = [f"{model['gaps']} gaps"] if "gaps" in model else []
+    said += ["the paper's rate"] if model.get("origin") == "paper" else []
+    said += ["recorded with dummy weights"] if model.get("dummy") else []
+    return f"{note} ({', '.join(said)})" if said else note
 
 
 def groups_present(cells: list[Cell]) -> list[str]:

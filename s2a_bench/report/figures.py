@@ -7,24 +7,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from s2a_bench.errors import StoreError
 from s2a_bench.report.cells import Cell, cells_of, engine_note, groups_present, summary_of
+from s2a_bench.report.draw import LINE_CHARS, WIDE_SPREAD, logarithmic, name_rows, new_figure, save, write_beside
 from s2a_bench.report.paper import CAVEAT, LABEL, paper_latency
-from s2a_bench.report.style import GREY, GROUP_FILLS, RESIDUAL_FILL, WIDTH_IN, cell_looks, paper_column
+from s2a_bench.report.style import GREY, GROUP_FILLS, RESIDUAL_FILL, cell_looks
 from s2a_bench.report.tables import mean_sd, number
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from s2a_bench.report.cells import Floats
     from s2a_bench.store.run import Run
-
-WIDE_SPREAD = 10
-"""Values that spread by more than this factor get a logarithmic axis, or a panel of shares."""
-
-_LINE_CHARS = 62
-"""As many characters of 7 point fit into one column."""
 
 
 def build_latency_bars(run: Run, *, against_paper: bool = False) -> Figure:
@@ -40,18 +33,20 @@ def build_latency_bars(run: Run, *, against_paper: bool = False) -> Figure:
             (f"paper:\n{claim.name}", claim.mean_ms, claim.sd_ms, f"{claim.mean_ms:g} ± {claim.sd_ms:.1f}", GREY)
             for claim in paper_latency()
         ]
-    figure = _figure(0.75 + 0.34 * len(rows) + (0.45 if against_paper else 0), _title(run, cells, "Mean ± sd", metric))
+    figure = new_figure(
+        0.75 + 0.34 * len(rows) + (0.45 if against_paper else 0), _title(run, cells, "Mean ± sd", metric)
+    )
     axes = figure.subplots()
     for place, (_, mean, sd, text, colour) in enumerate(rows):
         axes.barh(place, mean, 0.62, color=colour, edgecolor="black", linewidth=0.5)
         # A time is never below zero, whatever the standard deviation is.
         axes.errorbar(mean, place, xerr=[[min(sd, mean)], [sd]], color="black", capsize=2, linewidth=0.8)
-        _write_beside(axes, place, text)
-    _name_rows(axes, [name for name, *_ in rows])
+        write_beside(axes, place, text)
+    name_rows(axes, [name for name, *_ in rows])
     axes.set_xlim(left=0)
     axes.set_xlabel(_axis_label(metric))
     if against_paper:
-        text = f"{LABEL}\n" + textwrap.fill(CAVEAT, _LINE_CHARS - 12)
+        text = f"{LABEL}\n" + textwrap.fill(CAVEAT, LINE_CHARS - 12)
         figure.legend(
             handles=[Patch(facecolor=GREY, edgecolor="black", linewidth=0.5, label=text)], loc="outside lower left"
         )
@@ -76,7 +71,7 @@ def build_stage_breakdown(run: Run) -> Figure:
     shares = bool(wholes) and max(wholes) > WIDE_SPREAD * min(wholes)
     panels = 2 if shares else 1
     height = 0.95 + panels * (0.3 + 0.34 * len(cells)) + 0.16 * -(-len(fills) // 4)
-    figure = _figure(height, _title(run, cells, "Stages, means", metric))
+    figure = new_figure(height, _title(run, cells, "Stages, means", metric))
     all_axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
     for axes, share in zip(all_axes, (False, True), strict=False):
         for place, (part, whole) in enumerate(zip(parts, wholes, strict=True)):
@@ -87,8 +82,8 @@ def build_stage_breakdown(run: Run) -> Figure:
                 axes.barh(place, width, 0.66, left, color=colour, hatch=hatch, edgecolor=edge, linewidth=0.3)
                 left += width
             if not share:
-                _write_beside(axes, place, number(whole))
-        _name_rows(axes, [_label(cell) for cell in cells])
+                write_beside(axes, place, number(whole))
+        name_rows(axes, [_label(cell) for cell in cells])
         axes.set_xlim(0, 100 if share else None)
         axes.set_xlabel("share (%)" if share else _axis_label(metric))
     handles = [
@@ -109,7 +104,7 @@ def build_distribution(run: Run) -> Figure:
     """Draw the empirical distribution of e2e without inference, a line a cell; logarithmic where it spreads widely."""
     cells, metric = _shown(run)
     looks = cell_looks([cell.name for cell in cells])
-    figure = _figure(2.35 + 0.14 * -(-len(cells) // 2), _title(run, cells, "Distribution", metric))
+    figure = new_figure(2.35 + 0.14 * -(-len(cells) // 2), _title(run, cells, "Distribution", metric))
     axes = figure.subplots()
     every: list[Floats] = [cell.values_ms(metric) for cell in cells]
     for cell, values in zip(cells, every, strict=True):
@@ -117,7 +112,7 @@ def build_distribution(run: Run) -> Figure:
         axes.ecdf(values, label=cell.name, color=colour, linestyle=line)
     low, high = min(values.min() for values in every), max(values.max() for values in every)
     if low > 0 and high > WIDE_SPREAD * low:
-        _logarithmic(axes, high / low)
+        logarithmic(axes, high / low)
     axes.set_ylim(0, 1.02)
     axes.set_ylabel("share of samples")
     axes.set_xlabel(_axis_label(metric))
@@ -135,20 +130,7 @@ def write_figures(run: Run, against_paper: bool = False) -> list[Path]:
         "stage_breakdown": lambda: build_stage_breakdown(run),
         "distribution": lambda: build_distribution(run),
     }
-    folder = run.path / "figures"
-    written = []
-    try:
-        folder.mkdir(exist_ok=True)
-        for name, build in builders.items():
-            with paper_column():
-                figure = build()
-                for suffix in ("png", "pdf"):
-                    path = folder / f"{name}.{suffix}"
-                    figure.savefig(path)
-                    written.append(path)
-    except OSError as error:
-        raise StoreError(f"cannot write {folder}: {error.strerror}; the samples are kept") from error
-    return written
+    return save(run.path / "figures", builders)
 
 
 def _shown(run: Run) -> tuple[list[Cell], str]:
@@ -160,17 +142,6 @@ def _shown(run: Run) -> tuple[list[Cell], str]:
     return [], "e2e"
 
 
-def _figure(height_in: float, title: str) -> Figure:
-    """Make a figure that draws itself with Agg, without pyplot and its global state."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH_IN, height_in + 0.13 * title.count("\n")), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, x=0.01, horizontalalignment="left")
-    return figure
-
-
 def _title(run: Run, cells: list[Cell], what: str, metric: str) -> str:
     """Say what is drawn, from how many samples, of what size, and what did not really answer."""
     counts = sorted({cell.n for cell in cells})
@@ -180,7 +151,7 @@ def _title(run: Run, cells: list[Cell], what: str, metric: str) -> str:
     left_out = [cell.name for cell in cells_of(run) if cell.name not in {shown.name for shown in cells}]
     facts += [f"{name} not shown (inference unknown)" for name in left_out]
     lines = [f"{what}: {'end to end without inference' if metric != 'e2e' else 'end to end'}", ", ".join(facts)]
-    return "\n".join(textwrap.fill(line, _LINE_CHARS, break_on_hyphens=False) for line in lines)
+    return "\n".join(textwrap.fill(line, LINE_CHARS, break_on_hyphens=False) for line in lines)
 
 
 def _axis_label(metric: str) -> str:
@@ -197,25 +168,3 @@ def _label(cell: Cell) -> str:
 def _part(cell: Cell, name: str) -> Floats:
     """Return the values of a group or of the residual in ms."""
     return cell.values_ms("residual") if name == "residual" else cell.group_ms(name)
-
-
-def _name_rows(axes: Axes, names: list[str]) -> None:
-    """Put the names to the left, the first one on top."""
-    axes.set_yticks(range(len(names)), names)
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    axes.tick_params(axis="y", length=0)
-
-
-def _write_beside(axes: Axes, place: int, text: str) -> None:
-    """Write a number to the right of the axes, where no bar can cover it."""
-    axes.text(1.02, place, text, transform=axes.get_yaxis_transform(), verticalalignment="center")
-
-
-def _logarithmic(axes: Axes, spread: float) -> None:
-    """Make the x axis logarithmic with plain numbers: 0.1, 1, 10; 2 and 5 as well where there is room."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if spread < WIDE_SPREAD**2 else (1,)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())

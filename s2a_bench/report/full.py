@@ -23,11 +23,14 @@ def csv_texts(run: Run) -> dict[str, str]:
     cells = cells_of(run)
     found = ratios(cells, seed_of(run))
     return {
-        "stages.csv": _text(("cell", "group", "stage", *_SUMMARY), _stages(cells)),
-        "summary.csv": _text(("cell", "metric", "errors", "warmups", *_SUMMARY), _summaries(cells)),
-        "ratios.csv": _text(
-            ("metric", "of", "to", "value", "ci95_low", "ci95_high"),
-            ((f"{metric}_ms", of.name, to.name, ratio.value, ratio.low, ratio.high) for metric, of, to, ratio in found),
+        "stages.csv": csv_text(("cell", "group", "stage", *_SUMMARY, "emulated"), _stages(cells)),
+        "summary.csv": csv_text(("cell", "metric", "errors", "warmups", *_SUMMARY, "emulated"), _summaries(cells)),
+        "ratios.csv": csv_text(
+            ("metric", "of", "to", "value", "ci95_low", "ci95_high", "emulated"),
+            (
+                (f"{metric}_ms", of.name, to.name, ratio.value, ratio.low, ratio.high, of.emulated or to.emulated)
+                for metric, of, to, ratio in found
+            ),
         ),
     }
 
@@ -37,7 +40,7 @@ def _stages(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
     for cell in cells:
         for stage in (*stages_present([cell]), "residual"):
             if summary := summary_of(cell.values_ms(stage)):
-                yield cell.name, STAGES.get(stage, ""), stage, *_values(summary)
+                yield cell.name, STAGES.get(stage, ""), stage, *_values(summary), cell.emulated
 
 
 def _summaries(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
@@ -47,9 +50,9 @@ def _summaries(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
         metrics |= {"itl_ms": cell.itl_ms(), "residual_share": cell.residual_shares()}
         found = {name: summary for name, values in metrics.items() if (summary := summary_of(values))}
         for name, summary in found.items():
-            yield cell.name, name, cell.errors, cell.warmups, *_values(summary)
+            yield cell.name, name, cell.errors, cell.warmups, *_values(summary), cell.emulated
         if not found:
-            yield cell.name, "", cell.errors, cell.warmups, 0, *[None] * (len(_SUMMARY) - 1)
+            yield cell.name, "", cell.errors, cell.warmups, 0, *[None] * (len(_SUMMARY) - 1), cell.emulated
 
 
 def _values(summary: Summary) -> tuple[object, ...]:
@@ -57,7 +60,7 @@ def _values(summary: Summary) -> tuple[object, ...]:
     return tuple(getattr(summary, name) for name in _SUMMARY)
 
 
-def _text(header: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> str:
+def csv_text(header: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> str:
     """Write rows as CSV; None is an empty field."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

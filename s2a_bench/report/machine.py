@@ -14,6 +14,7 @@ from s2a_bench.report.cells import (
     stages_present,
     summary_of,
 )
+from s2a_bench.stats import Ratio
 from s2a_bench.store.schema import SCHEMA
 
 if TYPE_CHECKING:
@@ -24,45 +25,59 @@ if TYPE_CHECKING:
 def to_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
     cells = cells_of(run)
+    found = ratios(cells, seed_of(run))
+    return frame(
+        run,
+        [{**about_cell(cell, run), **_cell(cell)} for cell in cells],
+        [ratio_entry(f"{metric}_ms", cell.name, base.name, ratio) for metric, cell, base, ratio in found],
+    )
+
+
+def frame(run: Run, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    """Return what the objects of all commands share, around a command's own cells."""
     return {
         "schema": SCHEMA,
         "command": run.manifest["command"],
         "run": str(run.path),
         "state": run.manifest["state"],
         "environment": run.manifest.get("environment", {}),
-        "cells": [_cell(cell, run.manifest) for cell in cells],
-        "ratios": [
-            {
-                "metric": f"{metric}_ms",
-                "of": cell.name,
-                "to": base.name,
-                "value": ratio.value,
-                "ci95": None if ratio.low is None or ratio.high is None else [ratio.low, ratio.high],
-            }
-            for metric, cell, base, ratio in ratios(cells, seed_of(run))
-        ],
+        "cells": cells,
+        "ratios": ratios,
+        **more,
         "warnings": run.manifest.get("warnings", []),
     }
 
 
-def _cell(cell: Cell, manifest: dict[str, Any]) -> dict[str, Any]:
-    """Return one cell; a metric that no sample has is an absent key."""
-    alone = [cell]
-    whole: dict[str, Any] = {
+def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
+    """Return one ratio of the object."""
+    interval = None if ratio.low is None or ratio.high is None else [ratio.low, ratio.high]
+    return {"metric": metric, "of": of, "to": to, "value": ratio.value, "ci95": interval}
+
+
+def about_cell(cell: Cell, run: Run) -> dict[str, Any]:
+    """Return what the cells of all commands say about themselves."""
+    return {
         "cell": cell.name,
         **cell.about,
-        "profile": manifest.get("configuration", {}).get("profile"),
-        "emulated": cell.about["engine"] == "replay",
+        "profile": run.manifest.get("model", {}).get("profile"),
+        "emulated": cell.emulated,
         "n": cell.n,
         "errors": cell.errors,
         "warmups": cell.warmups,
+    }
+
+
+def _cell(cell: Cell) -> dict[str, Any]:
+    """Return one cell's numbers; a metric that no sample has is an absent key."""
+    alone = [cell]
+    whole: dict[str, Any] = {
         "residual_flagged": cell.flagged(),
-        "stages_ms": _summaries((stage, cell.values_ms(stage)) for stage in stages_present(alone)),
-        "groups_ms": _summaries((group, cell.group_ms(group)) for group in groups_present(alone)),
+        "stages_ms": summaries((stage, cell.values_ms(stage)) for stage in stages_present(alone)),
+        "groups_ms": summaries((group, cell.group_ms(group)) for group in groups_present(alone)),
     }
     metrics = ("e2e", "e2e_without_inference", "ttft", "frame_age")
-    whole |= _summaries((f"{metric}_ms", cell.values_ms(metric)) for metric in metrics)
-    return whole | _summaries(
+    whole |= summaries((f"{metric}_ms", cell.values_ms(metric)) for metric in metrics)
+    return whole | summaries(
         [
             ("itl_ms", cell.itl_ms()),
             ("token_delay_ms", cell.token_delay_ms()),
@@ -71,7 +86,7 @@ def _cell(cell: Cell, manifest: dict[str, Any]) -> dict[str, Any]:
     )
 
 
-def _summaries(metrics: Iterable[tuple[str, Floats]]) -> dict[str, Any]:
+def summaries(metrics: Iterable[tuple[str, Floats]]) -> dict[str, Any]:
     """Summarise the metrics that have values; ``n`` tells where only some samples have a stage."""
     found = ((name, summary_of(values)) for name, values in metrics)
     return {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from importlib.resources import files
+from typing import Any
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -26,11 +27,37 @@ class PaperLatency:
     sd_ms: float
 
 
+@dataclass(frozen=True, slots=True)
+class PaperThroughput:
+    """One row of the paper's table II: tokens/s, the mean of 10 runs, on a board."""
+
+    name: str
+    tokens_per_s: float
+
+
 def paper_latency() -> tuple[PaperLatency, PaperLatency]:
     """Return HTTP/JSON and ROS-native as claimed in section V-B."""
-    whole = tomllib.loads(files("s2a_bench.report").joinpath("paper_reference.toml").read_text(encoding="utf-8"))
-    orin = whole["latency"]["orin_agx"]
+    orin = _reference()["latency"]["orin_agx"]
     return (
         PaperLatency("HTTP/JSON", orin["http_json_mean_ms"], orin["http_json_sd_ms"]),
         PaperLatency("ROS-native", orin["ros_native_mean_ms"], orin["ros_native_sd_ms"]),
     )
+
+
+def paper_throughput() -> tuple[PaperThroughput, ...]:
+    """Return the three boards of table II (section V-D); no spread is given there."""
+    table = _reference()["throughput"]
+    return (
+        PaperThroughput("RTX 4080", table["rtx_4080"]),
+        PaperThroughput("Jetson AGX Orin", table["jetson_agx_orin"]),
+        PaperThroughput("Jetson Orin Nano", table["jetson_orin_nano"]),
+    )
+
+
+def paper_colours() -> dict[str, str]:
+    """Return policy -> the name of its colour in the paper's figure 5."""
+    return dict(_reference()["timeline"]["colours"])
+
+
+def _reference() -> dict[str, Any]:
+    return tomllib.loads(files("s2a_bench.report").joinpath("paper_reference.toml").read_text(encoding="utf-8"))

@@ -36,6 +36,7 @@ _CELL_LOOKS: Final = {
     "ros/topic": ("#0072B2", "-"),
     "ros/action": ("#56B4E9", "--"),
     "loopback": ("#009E73", ":"),
+    "in-process": ("#009E73", ":"),
 }
 _OTHER_LOOKS: Final = (("#56B4E9", "-."), ("#F0E442", "--"), ("#999999", ":"), ("#000000", "-"))
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2a_bench.errors import StoreError
 from s2a_bench.report.frame_path import frame_table
 from s2a_bench.report.full import csv_texts
-from s2a_bench.report.tables import stage_table, summary_table, to_latex, to_markdown, token_table
+from s2a_bench.report.tables import TextTable, stage_table, summary_table, to_latex, to_markdown, token_table
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
@@ -21,9 +22,14 @@ def write_tables(run: Run) -> list[Path]:
         tables["tokens"] = tokens
     if frames := frame_table(run):
         tables["frames"] = frames
+    return write_texts(run, tables, csv_texts(run))
+
+
+def write_texts(run: Run, tables: Mapping[str, TextTable], csvs: Mapping[str, str]) -> list[Path]:
+    """Write ``tables/``: each table as .md and .tex, and CSV texts under their names; raises StoreError."""
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
     texts |= {f"{name}.tex": to_latex(table) for name, table in tables.items()}
-    texts |= csv_texts(run)
+    texts |= csvs
     folder = run.path / "tables"
     try:
         folder.mkdir(exist_ok=True)

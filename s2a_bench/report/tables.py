@@ -140,7 +140,8 @@ def token_table(run: Run) -> TextTable | None:
         row += [number(value) for value in (gap.median, gap.p99)] if gap else [ABSENT] * 2
         rows.append((cell.name, *row))
     header = ("cell", "delay median", "p90", "p99", "gap median", "gap p99")
-    return TextTable("Tokens in ms: engine to client (delay), and from one to the next (gap)", header, rows, 1)
+    title = "Tokens in ms: engine to client (delay), and from one to the next (gap)"
+    return TextTable(title, header, rows, 1, notes=_engine_notes(run, cells))
 
 
 def to_markdown(table: TextTable) -> str:
@@ -194,8 +195,7 @@ def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
             f"{cell.pipeline} {cell.about['payload']}" for cell in cells if cell.about["payload"] not in {"none", ""}
         )
         notes.append(f"{', '.join(sizes)}; payload: {', '.join(payloads) or 'none'}.")
-    if note := engine_note(run, cells):
-        notes.append(f"{note[0].upper()}{note[1:]}.")
+    notes += _engine_notes(run, cells)
     if any(cell.has_ingest for cell in cells):
         notes.append(
             "A llama-server's ingest slices and resizes the picture, which our engine counts as inference: compare e2e."
@@ -208,6 +208,12 @@ def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
     if failed := sum(cell.errors for cell in cells):
         notes.append(f"{failed} samples failed and are in no number here; samples.csv says why.")
     return tuple(notes)
+
+
+def _engine_notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
+    """Say what did not really answer, as a sentence."""
+    note = engine_note(run, cells)
+    return (f"{note[0].upper()}{note[1:]}.",) if note else ()
 
 
 def _latex_row(row: tuple[str, ...]) -> str:

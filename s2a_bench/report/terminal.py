@@ -34,10 +34,10 @@ def renderables(run: Run) -> list[RenderableType]:
         shown.append(tokens)
     if frames := frame_table(run):
         shown.append(frames)
-    return [*(_lay_out(table) for table in shown), " ".join(stages.notes)]
+    return [*(lay_out(table) for table in shown), " ".join(stages.notes)]
 
 
-def _lay_out(table: TextTable) -> RenderableType:
+def lay_out(table: TextTable) -> RenderableType:
     """Turn a table into one for the terminal: long headers broken, the gaps narrowed where that makes it fit."""
     from rich import box
     from rich.padding import Padding

@@ -104,7 +104,8 @@ def test_a_repeated_frame_is_evaluated_in_full_again(shared: LlamaCppEngine) -> 
 def test_facts_tell_what_the_last_request_cost(shared: LlamaCppEngine) -> None:
     ask(shared, max_tokens=5)
     facts = dict(shared.facts)
-    assert set(facts) == {"prompt_n", "prompt_ms", "predicted_n", "predicted_ms"}
+    assert set(facts) == {"prompt_n", "prompt_ms", "prompt_eval_ms", "predicted_n", "predicted_ms"}
+    assert facts["prompt_eval_ms"] <= facts["prompt_ms"]
     assert facts["predicted_n"] == 5
     assert facts["prompt_n"] > 10
     assert min(facts["prompt_ms"], facts["predicted_ms"]) > 0

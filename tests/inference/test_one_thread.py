@@ -11,7 +11,7 @@ import pytest
 from s2a_bench.errors import EngineError, ModelError
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.echo import EchoEngine
-from s2a_bench.inference.one_thread import OneThreadEngine
+from s2a_bench.inference.one_thread import AHEAD, OneThreadEngine
 from s2a_bench.types import Request, Token
 from tests.conformance.engine import EngineSuite
 
@@ -31,8 +31,11 @@ class TestOneThread(EngineSuite):
 class Spy:
     """Remembers on which threads it was used."""
 
-    def __init__(self) -> None:
+    def __init__(self, fails_at: int = -1) -> None:
         self.facts = {"prompt_n": 1.0}
+        self.made = 0
+        self.reached = threading.Event()
+        self._fails_at = fails_at
         self.threads = [threading.get_ident()]
         self.closed_early = False
 
@@ -40,8 +43,11 @@ class Spy:
         try:
             for index in range(request.max_tokens):
                 self.threads.append(threading.get_ident())
-                if index == 3:
+                if index == self._fails_at:
                     raise EngineError("enough")
+                self.made += 1
+                if self.made == 1 + AHEAD:
+                    self.reached.set()
                 yield Token(index, "x")
         except GeneratorExit:
             self.closed_early = True
@@ -79,15 +85,60 @@ def test_all_work_is_done_on_one_thread_that_is_not_the_callers() -> None:
 def test_leaving_early_cancels_the_engine() -> None:
     spy = Spy()
     engine = OneThreadEngine(lambda: spy)
-    tokens = engine.generate(Request("a", "b", max_tokens=3))
+    tokens = engine.generate(Request("a", "b", max_tokens=99))
     next(tokens)
     tokens.close()
     assert spy.closed_early
+    assert spy.made <= 1 + AHEAD + 1
+    engine.close()
+
+
+def test_the_engine_computes_ahead_but_not_without_bound() -> None:
+    spy = Spy()
+    engine = OneThreadEngine(lambda: spy)
+    tokens = engine.generate(Request("a", "b", max_tokens=99))
+    first = next(tokens)
+    spy.reached.wait(60)
+    assert first.index == 0
+    assert spy.made == 1 + AHEAD  # the place of the token that was read is free again
+    assert [token.index for token in tokens] == list(range(1, 99))
+    assert spy.made == 99
+    engine.close()
+
+
+def test_a_later_request_ends_an_earlier_one() -> None:
+    engine = OneThreadEngine(Spy)
+    early = engine.generate(Request("early", "b", max_tokens=99))
+    next(early)
+    assert len(list(engine.generate(Request("later", "b", max_tokens=5)))) == 5
+    with pytest.raises(EngineError, match="one request at a time"):
+        list(early)
+    engine.close()
+
+
+def test_closing_ends_an_answer_under_way() -> None:
+    spy = Spy()
+    engine = OneThreadEngine(lambda: spy)
+    tokens = engine.generate(Request("a", "b", max_tokens=99))
+    next(tokens)
+    engine.close()
+    assert spy.closed_early
+    tokens.close()
+    with pytest.raises(EngineError, match="closed"):
+        next(engine.generate(Request("b", "b")))
+
+
+def test_tokens_before_an_error_arrive_before_it() -> None:
+    engine = OneThreadEngine(lambda: Spy(fails_at=3))
+    tokens = engine.generate(Request("a", "b", max_tokens=9))
+    assert [next(tokens).index for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(EngineError, match="enough"):
+        next(tokens)
     engine.close()
 
 
 def test_errors_come_through() -> None:
-    engine = OneThreadEngine(Spy)
+    engine = OneThreadEngine(lambda: Spy(fails_at=0))
     with pytest.raises(EngineError, match="enough"):
         list(engine.generate(Request("a", "b", max_tokens=9)))
     engine.close()

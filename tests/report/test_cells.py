@@ -120,7 +120,15 @@ def test_what_did_not_really_answer_is_said(make_run: MakeRun) -> None:
         return engine_note(run, cells_of(run))
 
     assert note() == "echo engine"
-    assert note(engine="replay") == "emulated: replayed profile"
+    assert note(engine="replay") == "EMULATED: replayed profile"
+    played = {"profile": "agx", "gaps": "trace", "origin": "measured", "dummy": True}
+    assert note(engine="replay", manifest={"model": played}) == (
+        "EMULATED: replayed profile agx (trace gaps, recorded with dummy weights)"
+    )
+    played |= {"gaps": "constant", "origin": "paper", "dummy": False}
+    assert note(engine="replay", manifest={"model": played}) == (
+        "EMULATED: replayed profile agx (constant gaps, the paper's rate)"
+    )
     assert note(engine="llama", manifest={"model": {"dummy": True}}) == "dummy weights"
     assert note(engine="llama", manifest={"model": {"dummy": False}}) == ""
     assert note(engine="llama") == ""

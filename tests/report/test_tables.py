@@ -160,6 +160,7 @@ def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -
         "sd": "0.0",
         "p90": "0.0124",
         "p99": "0.0124",
+        "emulated": "False",
     }
     summary = list(csv.DictReader(io.StringIO(texts["summary.csv"])))
     assert {row["metric"] for row in summary} == {
@@ -170,6 +171,9 @@ def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -
         "residual_share",
     }
     ratio = next(csv.DictReader(io.StringIO(texts["ratios.csv"])))
+    assert ratio["emulated"] == "False"
+    for text in csv_texts(make_run(HAND, n=4, engine="replay")).values():
+        assert {row["emulated"] for row in csv.DictReader(io.StringIO(text))} == {"True"}
     assert (ratio["of"], ratio["to"], float(ratio["value"])) == ("http/as-deployed", "ros/topic", 26 / 4.5124)
 
 
@@ -177,7 +181,7 @@ def test_a_cell_in_which_everything_failed_is_in_the_summary(
     make_run: MakeRun, make_row: Callable[..., SampleRow]
 ) -> None:
     run = make_run({}, extra=(make_row("ros/topic", {"capture": 1}, 1, error="lost"),))
-    assert csv_texts(run)["summary.csv"].splitlines()[1] == "ros/topic,,1,0,0,,,,,"
+    assert csv_texts(run)["summary.csv"].splitlines()[1] == "ros/topic,,1,0,0,,,,,,False"
     assert summary_table(run).rows == [("ros/topic", "0", "1", NONE, NONE, NONE, NONE)]
 
 

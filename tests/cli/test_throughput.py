@@ -1,0 +1,149 @@
+"""`s2a-bench throughput` as a user runs it: the tiny model, real servers, and a stand-in for llama-bench."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from s2a_bench.store.run import Run, read_run
+from tests.llama_bench_stand_in import install
+
+ROOT = Path(__file__).parent.parent.parent
+SMALL = ["--size", "64x48", "--runs", "2", "--warmup", "1", "--max-tokens", "40", "--threads", "1"]
+REAL = "S2A_BENCH_LLAMA_BENCH"
+"""Names the real llama-bench, for the test that needs it."""
+
+
+def run(*arguments: str, output: Path, code: int = 0, **environment: str) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "s2a_bench", "throughput", *arguments, "--output", str(output)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        env={**os.environ, **environment},
+    )
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def only_run(output: Path) -> Run:
+    (folder,) = output.iterdir()
+    return read_run(folder)
+
+
+def valid(text: str) -> dict[str, Any]:
+    whole: dict[str, Any] = json.loads(text)
+    jsonschema.validate(whole, json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text()))
+    return whole
+
+
+def test_in_process_http_and_ros_stand_beside_llama_bench(tmp_path: Path) -> None:
+    program = install(tmp_path)
+    everywhere = ["--transport", "in-process,http,ros", "--payload", "raw"]
+    done = run(*SMALL, *everywhere, "--reference", str(program), "--json", output=tmp_path / "r")
+    whole = valid(done.stdout)
+    assert whole["command"] == "throughput"
+    assert [cell["cell"] for cell in whole["cells"]] == ["in-process", "http/as-deployed", "ros/topic"]
+    for cell in whole["cells"]:
+        assert (cell["n"], cell["warmups"], cell["errors"], cell["t_eval"]) == (2, 1, 0, "engine")
+        assert cell["itl_ms"]["n"] == 2 * 39
+        assert {"image_ms", "prompt_eval_ms", "prefill_tokens_per_s", "ttft_ms"} <= set(cell)
+        assert [place["first"] for place in cell["positions"]] == [0, 32]
+    compared = {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]}
+    assert compared == {
+        ("in-process", "llama-bench"),
+        ("http/as-deployed", "llama-bench"),
+        ("ros/topic", "llama-bench"),
+        ("http/as-deployed", "in-process"),
+        ("ros/topic", "in-process"),
+    }
+    assert whole["reference"]["decode_tokens_per_s"]["mean"] == pytest.approx(1000)
+    kept = only_run(tmp_path / "r")
+    prompts = set(kept.samples["prompt_n"])
+    assert len(prompts) == 1
+    assert set(kept.tables["reference"]["depth"]) == prompts  # like with like: as deep as our prompts are long
+    assert whole["reference"]["depths"] == [int(next(iter(prompts)))]
+    assert kept.manifest["configuration"]["engine"]["sampling"] == "greedy"
+    answers = kept.tokens.groupby("request_id")["text"].apply("".join).groupby(lambda name: name.rsplit("-", 1)[1])
+    assert (answers.nunique() == 1).all()  # the same frame, the same greedy answer in every cell of a block
+    assert len(kept.tokens) == 9 * 40
+    assert kept.samples["frame_index"].nunique() > 1
+
+
+def test_the_engines_settings_reach_it_and_the_terminal_shows_all(tmp_path: Path) -> None:
+    settings = ["--batch", "64", "--context", "1024", "--kv-type", "q8_0", "--flash-attention", "on"]
+    done = run(*SMALL, *settings, "--against", "paper", output=tmp_path)
+    kept = only_run(tmp_path)
+    model = kept.manifest["model"]
+    expected = {"batch": 64, "context": 1024, "kv_type": "q8_0", "flash_attention": "on", "sampling": "model"}
+    assert {key: model[key] for key in expected} == expected
+    assert "Dummy weights." in done.stdout
+    text = " ".join(done.stdout.split())
+    assert all(title in text for title in ("Tokens a second", "Before the first token", "by position"))
+    assert str(kept.path) in done.stdout
+    names = {path.name for path in (kept.path / "figures").iterdir()}
+    assert {"throughput_bars.png", "gaps.pdf", "positions.png"} <= names
+    assert (kept.path / "tables" / "throughput.tex").stat().st_size > 0
+    assert not (kept.path / "reference.csv").exists()
+
+
+def test_a_replayed_profile_is_labelled_emulated(tmp_path: Path) -> None:
+    done = run(*SMALL, "--max-tokens", "3", "--engine", "replay", "--profile", "rtx-4080", "--json", output=tmp_path)
+    (cell,) = valid(done.stdout)["cells"]
+    assert cell["emulated"] is True
+    assert cell["profile"] == "rtx-4080"
+
+
+def test_a_reference_that_fails_ends_the_run_with_one_line_and_keeps_the_samples(tmp_path: Path) -> None:
+    arguments = [*SMALL, "--reference", str(install(tmp_path))]
+    done = run(*arguments, output=tmp_path / "r", code=1, S2A_STAND_IN_FAULT="crash")
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("error:"))
+    assert "exit code 1: main: error: failed to load model" in line
+    kept = only_run(tmp_path / "r")
+    assert kept.manifest["state"] == "failed"
+    assert len(kept.samples) == 1
+    assert str(kept.path) in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--transport", "loopback"], "--transport: 'loopback' is none of in-process, http, ros"),
+        (["--transport", ""], "--transport: name at least one"),
+        (["--kv-type", "q3"], "--kv-type: 'q3' is none of f32, f16, q8_0, q4_0"),
+        (["--kv-type", "q4_0", "--flash-attention", "off"], "--kv-type q4_0 needs flash attention"),
+        (["--flash-attention", "1"], "--flash-attention: '1' is none of auto, on, off"),
+        (["--sampling", "hot"], "--sampling: 'hot' is none of model, greedy"),
+        (["--batch", "1"], "--batch: 1 is not between 32 and"),
+        (["--engine", "echo"], "--engine echo computes nothing"),
+        (["--max-tokens", "1"], "--max-tokens: a rate needs 2 tokens or more"),
+        (["--reference", "/no/such"], "--reference: /no/such is no program that can be run"),
+        (["--against", "us"], "--against: 'us' should be paper"),
+        (["--url", "http://x"], "--url needs http among --transport"),
+        (["--bogus"], "No such option: --bogus"),
+    ],
+)
+def test_wrong_use_is_one_line_and_code_two(tmp_path: Path, arguments: list[str], message: str) -> None:
+    done = run(*arguments, output=tmp_path / "r", code=2)
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("error:"))
+    assert message in line
+    assert done.stdout == ""
+    assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.skipif(REAL not in os.environ, reason=f"{REAL} does not name llama.cpp's llama-bench")
+def test_the_real_llama_bench_understands_what_it_is_asked(tmp_path: Path) -> None:
+    settings = ["--kv-type", "q8_0", "--batch", "64", "--reference", os.environ[REAL]]
+    reference = valid(run(*SMALL, *settings, "--json", output=tmp_path).stdout)["reference"]
+    assert reference["decode_tokens_per_s"]["n"] == 2
+    facts = json.loads(only_run(tmp_path).tables["reference"]["facts"].iloc[0])
+    assert (facts["n_batch"], facts["type_k"], facts["n_threads"], facts["n_gpu_layers"]) == (64, "q8_0", 1, 0)
