@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from s2a_bench import __version__
+from s2a_bench.bench.doctor import Machine
+from s2a_bench.bench.doctor.gpu import current_power_mode, nvml
 from s2a_bench.clock import clock_id
 
 PACKAGES = (
@@ -16,10 +18,14 @@ PACKAGES = (
     "fastapi",
     "httptools",
     "httpx",
+    "huggingface-hub",
+    "json-numpy",
     "llama-cpp-python",
     "numpy",
+    "nvidia-ml-py",
     "opencv-python-headless",
     "orjson",
+    "psutil",
     "pybase64",
     "pydantic",
     "rosbags",
@@ -60,12 +66,22 @@ def collect() -> dict[str, Any]:
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
         "packages": {name: found for name in PACKAGES if (found := _version(name))},
         "ros": {name: os.environ[name] for name in ROS_VARIABLES if name in os.environ},
+        "gpus": _gpus(),
+        "power_mode": (current_power_mode(Machine()) or ("",))[0],
     }
     for name, path in KERNEL_FACTS.items():
         text = _read(path)
         if text:
             facts[name] = int(text) if text.isdecimal() else text
-    return {name: value for name, value in facts.items() if value not in (None, "")}
+    return {name: value for name, value in facts.items() if value not in (None, "", [])}
+
+
+def _gpus() -> list[dict[str, Any]]:
+    """Name the NVIDIA GPUs with their driver."""
+    with nvml() as (lib, gpus):
+        return [
+            {"name": str(lib.nvmlDeviceGetName(gpu)), "driver": str(lib.nvmlSystemGetDriverVersion())} for gpu in gpus
+        ]
 
 
 def _read(path: str) -> str:

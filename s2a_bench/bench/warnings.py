@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from s2a_bench.bench.doctor import BEFORE_RUN, Finding, Machine, examine
+from s2a_bench.bench.doctor.robot import RMEM_WANTED
 from s2a_bench.clock import realtime_offset_ns
 from s2a_bench.store.schema import SampleRow
 from s2a_bench.trace import RESIDUAL_LIMIT, budget
 
-RMEM_WANTED = 4 << 20
+LARGE_PICTURE = 640 * 480
+"""Pixels above which DDS needs more receive buffer than Linux gives by default."""
 CLOCK_STEP_NS = 50_000_000
+HEADERS_OFF_MS, HEADERS_OFF_SHARE = 20.0, 0.25
+"""Beyond both, a llama-server's headers did not leave when its slot started."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,33 +33,15 @@ class Doubt:
         return {"code": self.code, "message": self.message, "advice": self.advice}
 
 
-def before_run(width: int, height: int, *, uses_dds: bool) -> list[Doubt]:
-    """Look at the machine before measuring."""
-    doubts = []
-    governors = {path.read_text().strip() for path in _cpu_files("cpufreq/scaling_governor")}
-    if governors - {"performance"}:
-        doubts.append(
-            Doubt(
-                "cpu-governor",
-                f"the CPU governor is {', '.join(sorted(governors))}: the clock changes while measuring",
-                "sudo cpupower frequency-set -g performance",
-            )
-        )
-    load, cores = os.getloadavg()[0], len(os.sched_getaffinity(0))
-    if load > cores / 2:
-        doubts.append(
-            Doubt("load", f"load average {load:.1f} on {cores} cores before the run", "stop what else runs, or wait")
-        )
-    rmem = _number(Path("/proc/sys/net/core/rmem_max"))
-    if uses_dds and rmem is not None and rmem < RMEM_WANTED and width * height > 640 * 480:
-        doubts.append(
-            Doubt(
-                "rmem-max",
-                f"net.core.rmem_max is {rmem}: DDS loses fragments of large pictures and stalls by 200 ms",
-                f"sudo sysctl -w net.core.rmem_max={RMEM_WANTED}",
-            )
-        )
-    return doubts
+def before_run(width: int, height: int, *, uses_dds: bool, machine: Machine | None = None) -> list[Doubt]:
+    """Return the doctor's warnings that concern a run, for pictures of this size in pixels."""
+    codes = [*BEFORE_RUN, *(["rmem-max"] if uses_dds and width * height > LARGE_PICTURE else [])]
+    return doubts_of(examine(machine or Machine(), codes))
+
+
+def doubts_of(findings: Iterable[Finding]) -> list[Doubt]:
+    """Return the doctor's warnings and errors as runs store them."""
+    return [Doubt(seen.code, seen.message, seen.fix) for seen in findings if seen.level in {"warning", "error"}]
 
 
 @dataclass(slots=True)
@@ -116,6 +102,8 @@ class SampleGuard:
     _in_a_row: dict[str, int] = field(default_factory=dict)
     _succeeded: dict[str, int] = field(default_factory=dict)
     _lost: dict[str, int] = field(default_factory=dict)
+    _headers: dict[str, int] = field(default_factory=dict)
+    _last: dict[str, str] = field(default_factory=dict)
 
     def see(self, row: SampleRow, fingerprint: int) -> None:
         """Look at one sample and the fingerprint of its picture."""
@@ -125,12 +113,16 @@ class SampleGuard:
             self._frames_lost[row.cell] = int(lost)
         self._in_a_row[row.cell] = self._in_a_row.get(row.cell, 0) + 1 if row.error else 0
         if row.error:
+            self._last[row.cell] = row.error
             _count(self._lost if row.error.startswith("MessagesLost") else self._failed, row.cell)
             return
         if row.cache_n:
             _count(self._cached, row.cell)
         if not row.warmup:
             _count(self._succeeded, row.cell)
+        off_ms = abs(row.facts.get("headers_off_ms", 0.0))
+        if not row.warmup and off_ms > max(HEADERS_OFF_MS, HEADERS_OFF_SHARE * (row.server_prompt_ms or 0.0)):
+            _count(self._headers, row.cell)
         share = budget(row.marks).residual_share
         if not row.warmup and share is not None and share > RESIDUAL_LIMIT:
             _count(self._residual, row.cell)
@@ -138,6 +130,10 @@ class SampleGuard:
     def failures_in_a_row(self, cell: str) -> int:
         """Count a cell's failures since its last success."""
         return self._in_a_row.get(cell, 0)
+
+    def last_error(self, cell: str) -> str:
+        """Return what went wrong last in a cell, or nothing."""
+        return self._last.get(cell, "")
 
     def successes(self, cell: str) -> int:
         """Count a cell's samples that took part in its numbers."""
@@ -156,13 +152,20 @@ class SampleGuard:
                 self._cached,
                 "prompt-cache",
                 "answers came partly from the server's prompt cache: time to first token is too good",
-                "start llama-server with --no-cache-prompt --cache-ram 0",
+                "start llama-server with --no-cache-prompt --cache-ram 0, vLLM with --no-enable-prefix-caching; "
+                "where --dialect was given, leave it out: a server that is known is asked without its cache",
             ),
             *_told(
                 self._residual,
                 "residual",
                 f"samples have more than {RESIDUAL_LIMIT:.0%} of their time outside every stage",
                 "look at the machine's load; single samples do no harm to a median",
+            ),
+            *_told(
+                self._headers,
+                "ingest-unsure",
+                "samples whose headers did not leave when the slot started, by the server's own prompt_ms",
+                "where it is most of them, this build sends headers at another moment: compare e2e, not ingest",
             ),
             *_told(
                 self._frames_lost,

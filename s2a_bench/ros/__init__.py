@@ -255,7 +255,8 @@ MIDDLEWARES: dict[str, str] = {
 }
 """Name -> class, built as ``Class(domain_id, tuning, node_name)``."""
 WAYS_OUT = {
-    "cyclonedds": "cyclonedds has wheels for x86-64 only: build it from source, or leave ros out of --transport",
+    "cyclonedds": "it has wheels for x86-64 only: elsewhere source a ROS 2 installation, whose rclpy is taken then "
+    "(source /opt/ros/<distribution>/setup.bash), or leave ros out of --transport",
     "rclpy": "it comes with ROS 2: source /opt/ros/<distribution>/setup.bash, or use --middleware cyclonedds",
 }
 

@@ -39,12 +39,18 @@ def test_good_samples_raise_no_doubt() -> None:
         (row("b", cache_n=7), 2, "prompt-cache"),
         (row("b", marks=LOOSE), 2, "residual"),
         (row("b", facts={"frames_lost": 2.0}), 2, "lost-frames"),
+        (row("b", facts={"headers_off_ms": -97.0}, server_prompt_ms=97.5), 2, "ingest-unsure"),
         (row("b", error="MessagesLost: 3", marks=[]), 2, "lost-messages"),
         (row("b", error="RequestFailed: x", marks=[]), 2, "failed-samples"),
     ],
 )
 def test_each_doubt_has_its_code(second: SampleRow, fingerprint: int, code: str) -> None:
     assert codes((row("a"), 1), (second, fingerprint)) == [code]
+
+
+@pytest.mark.parametrize(("off_ms", "prompt_ms"), [(-2.8, 97.5), (19.0, 5.0), (200.0, 1000.0)])
+def test_headers_that_fit_the_servers_own_time_are_no_doubt(off_ms: float, prompt_ms: float) -> None:
+    assert codes((row("a", facts={"headers_off_ms": off_ms}, server_prompt_ms=prompt_ms), 1)) == []
 
 
 def test_the_same_picture_in_another_cell_is_no_duplicate() -> None:
@@ -85,6 +91,7 @@ def test_failures_in_a_row_end_with_a_success() -> None:
     assert guard.failures_in_a_row("ros/topic") == 1
     assert guard.successes("ros/topic") == 1
     assert guard.successes("loopback") == 0
+    assert (guard.last_error("ros/topic"), guard.last_error("loopback")) == ("x", "")
 
 
 def test_what_cannot_be_read_is_no_doubt() -> None:

@@ -1,0 +1,72 @@
+"""`s2a-bench doctor`: what of this machine would distort a measurement, and the command that mends it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from s2a_bench.bench.doctor import Finding
+
+STYLES = {"state": "green", "advice": "cyan", "warning": "yellow", "error": "bold red"}
+
+
+def doctor(
+    output: Annotated[Path, typer.Option(help="folder for run folders, whose disk is looked at")] = Path("results"),
+    strict: Annotated[bool, typer.Option("--strict", help="exit with 1 on warnings too")] = False,
+    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+) -> int:
+    """Check this machine: state, advice, warnings (with the command that mends them) and errors, one line each."""
+    from s2a_bench.bench.doctor import LEVELS, Machine, examine, worst
+
+    findings = examine(replace(Machine(), output=output))
+    if json_:
+        json.dump(_as_json(findings), sys.stdout, indent=2, ensure_ascii=False)
+        sys.stdout.write("\n")
+    else:
+        _show(findings)
+    limit = "warning" if strict else "error"
+    return int(LEVELS.index(worst(findings)) >= LEVELS.index(limit))
+
+
+def _show(findings: list[Finding]) -> None:
+    """Print a line for each check, and how many there were of each level."""
+    from rich.console import Console
+    from rich.text import Text
+
+    from s2a_bench.bench.doctor import LEVELS
+
+    console = Console()
+    wide = max(len(finding.code) for finding in findings)
+    for finding in findings:
+        line = Text(f"{finding.level:8}", STYLES[finding.level])
+        line.append(f"{finding.code:{wide}}  ", "bold").append(finding.message, "default")
+        if finding.fix:
+            line.append(f" -> {finding.fix}", "bold")
+        console.print(line, soft_wrap=True, highlight=False)
+    counts = {level: sum(finding.level == level for finding in findings) for level in LEVELS}
+    console.print(", ".join(f"{count} {level}" for level, count in counts.items()), highlight=False)
+
+
+def _as_json(findings: list[Finding]) -> dict[str, Any]:
+    """Return the object of ``--json``: every finding, and the warnings and errors as runs store them."""
+    from dataclasses import asdict
+
+    from s2a_bench.bench import environment
+    from s2a_bench.bench.doctor import worst
+    from s2a_bench.bench.warnings import doubts_of
+    from s2a_bench.store.schema import SCHEMA
+
+    return {
+        "schema": SCHEMA,
+        "command": "doctor",
+        "environment": environment.collect(),
+        "worst": worst(findings),
+        "checks": [asdict(finding) for finding in findings],
+        "warnings": [doubt.to_manifest() for doubt in doubts_of(findings)],
+    }

@@ -1,0 +1,139 @@
+"""`s2a-bench doctor`, and sampling beside a run, as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from s2a_bench.bench import doctor as bench
+from s2a_bench.bench.doctor import CHECKS, Finding, Level
+from s2a_bench.cli import doctor
+from s2a_bench.store.run import Run, read_run
+
+ROOT = Path(__file__).parent.parent.parent
+SCHEMA = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
+ECHO = [
+    "latency",
+    "--engine",
+    "echo",
+    "--transport",
+    "http,loopback",
+    "--size",
+    "64x48",
+    "--runs",
+    "4",
+    "--warmup",
+    "1",
+]
+
+
+def s2a_bench(*arguments: str, code: int = 0, **environ: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "s2a_bench", *arguments]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=120, env={**os.environ, **environ}
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def test_every_line_is_one_check_with_its_level() -> None:
+    *lines, counts = s2a_bench("doctor", ROS_DOMAIN_ID="7").stdout.splitlines()
+    seen = [line.split()[1] for line in lines]
+    assert seen == [code for code in CHECKS if code in seen]
+    assert {line.split()[0] for line in lines} <= {"state", "advice", "warning"}
+    assert sum(int(part.split()[0]) for part in counts.split(",")) == len(lines)
+    assert any("domain 7, loopback only" in line for line in lines)
+
+
+def test_json_is_one_object_that_the_schema_describes() -> None:
+    told = json.loads(s2a_bench("doctor", "--json").stdout)
+    jsonschema.Draft202012Validator(SCHEMA).validate(told)
+    assert told["command"] == "doctor"
+    for key in ("checks", "worst"):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate({name: value for name, value in told.items() if name != key}, SCHEMA)
+    levels = {check["code"]: check["level"] for check in told["checks"]}
+    assert {doubt["code"] for doubt in told["warnings"]} == {
+        code for code, level in levels.items() if level in {"warning", "error"}
+    }
+
+
+def test_an_error_is_exit_code_one_with_the_way_out() -> None:
+    done = s2a_bench("doctor", code=1, ROS_DOMAIN_ID="300")
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("error")]
+    assert "ROS_DOMAIN_ID: '300'" in line
+    assert "-> unset ROS_DOMAIN_ID" in line
+
+
+@pytest.mark.parametrize(
+    ("level", "plain", "strict"), [("state", 0, 0), ("advice", 0, 0), ("warning", 0, 1), ("error", 1, 1)]
+)
+def test_the_exit_code_is_the_severitys(
+    level: Level, plain: int, strict: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = [Finding("disk", "state", "room"), Finding("load", level, "busy", "wait")]
+    monkeypatch.setattr(bench, "examine", lambda _machine: found)
+    assert doctor.doctor() == plain
+    assert doctor.doctor(strict=True) == strict
+    assert f"{level:8}load  busy -> wait" in capsys.readouterr().out.splitlines()
+
+
+def run_folder(tmp_path: Path) -> Run:
+    (folder,) = tmp_path.iterdir()
+    return read_run(folder)
+
+
+def test_a_run_samples_resources_and_says_what_that_cost(tmp_path: Path) -> None:
+    done = s2a_bench(*ECHO, "--verbose", "--sample-resources", "50", "--output", str(tmp_path))
+    assert "sampling takes" in done.stdout
+    run = run_folder(tmp_path)
+    told = run.manifest["resources"]
+    assert told["hz"] == 50
+    assert {"cpu", "memory"} <= told["readers"].keys()
+    assert told["polls"] >= 1
+    assert told["core_share"] > 0
+    for cell, facts in zip(run.samples["cell"], run.samples["facts"], strict=True):
+        spent = json.loads(facts)
+        assert spent["client_cpu_ns"] > 0
+        assert spent["server_cpu_ns"] >= (0 if cell == "loopback" else 1)
+        assert spent["client_rss_bytes"] > 1 << 20
+    table = run.tables["resources"]
+    assert set(table["reader"]) == set(told["readers"])
+    edges = table[table["reader"] == "cpu"]["client_cpu_ns"]
+    assert edges.is_monotonic_increasing
+    assert len(edges) >= 2 * len(run.samples)
+
+
+def test_sampling_can_be_left_out(tmp_path: Path) -> None:
+    s2a_bench(*ECHO, "--sample-resources", "0", "--output", str(tmp_path))
+    run = run_folder(tmp_path)
+    assert run.manifest["resources"] == {}
+    assert not list(run.path.glob("resources*"))
+    assert not any("cpu" in facts for facts in run.samples["facts"])
+
+
+def test_a_negative_rate_is_refused() -> None:
+    done = s2a_bench(*ECHO, "--sample-resources", "-1", code=2)
+    assert "--sample-resources: -1.0 is not between 0 and 1000" in done.stderr
+
+
+def test_without_cyclonedds_one_line_names_rclpy() -> None:
+    """As on aarch64, where it has no wheel."""
+    code = (
+        "import sys\nsys.modules['cyclonedds'] = None\nfrom s2a_bench.ros import open_middleware\n"
+        "from s2a_bench.errors import TransportError\n"
+        "try:\n    open_middleware('cyclonedds')\nexcept TransportError as error:\n    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    (line,) = done.stdout.splitlines()
+    assert line.startswith("middleware cyclonedds is not installed")
+    assert "rclpy" in line
+    assert "source /opt/ros/<distribution>/setup.bash" in line
+    assert "--transport" in line
