@@ -106,6 +106,9 @@ def timeline(
     ] = None,
     output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
     per_skill: Annotated[bool, typer.Option("--per-skill", help="also print every skill of the shown plans")] = False,
+    data_only: Annotated[
+        bool, typer.Option("--data-only", help="write no tables and figures into the run folder")
+    ] = False,
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live."""
@@ -136,7 +139,7 @@ def timeline(
         asked.check()
         from s2a_bench.bench.live import run_live
 
-        execute(lambda view: run_live(asked, output, view), as_json=json_, per_skill=per_skill)
+        execute(lambda view: run_live(asked, output, view), as_json=json_, per_skill=per_skill, data_only=data_only)
         return
     refuse_without_live(given)
     default_profiles = REAL_TIME_PROFILE if real_time else PROFILES
@@ -163,14 +166,18 @@ def timeline(
     if real_time:
         from s2a_bench.bench.real_time import run_real_time
 
-        execute(lambda view: run_real_time(config, output, view), as_json=json_, per_skill=per_skill)
+        execute(
+            lambda view: run_real_time(config, output, view), as_json=json_, per_skill=per_skill, data_only=data_only
+        )
     else:
         from s2a_bench.bench.timeline import run_timeline
 
-        execute(lambda view: run_timeline(config, output, view), as_json=json_, per_skill=per_skill)
+        execute(
+            lambda view: run_timeline(config, output, view), as_json=json_, per_skill=per_skill, data_only=data_only
+        )
 
 
-def execute(run: Callable[[TimelineView], Path], *, as_json: bool, per_skill: bool) -> None:
+def execute(run: Callable[[TimelineView], Path], *, as_json: bool, per_skill: bool, data_only: bool) -> None:
     """Run timelines, and show what came of them."""
     from s2a_bench.cli.timeline_view import TimelineView
 
@@ -178,7 +185,9 @@ def execute(run: Callable[[TimelineView], Path], *, as_json: bool, per_skill: bo
     with view:
         try:
             folder = run(view)
-            view.stage("drawing")
+            if not data_only:
+                view.stage("drawing")
+                draw(folder)
             show(folder, view, as_json=as_json, per_skill=per_skill)
         except (S2AError, KeyboardInterrupt):
             if view.folder is not None:
@@ -186,24 +195,32 @@ def execute(run: Callable[[TimelineView], Path], *, as_json: bool, per_skill: bo
             raise
 
 
-def show(folder: Path, progress: RunProgress, *, as_json: bool, per_skill: bool) -> None:
-    """Write tables, figures and trace of any run of timelines, and print what the user asked for."""
-    from rich.console import Console
-
+def draw(folder: Path) -> None:
+    """Write tables, figures and trace of any run of timelines."""
     from s2a_bench.report.chrome_trace import write_trace
     from s2a_bench.report.table_files import write_texts
-    from s2a_bench.report.terminal import lay_out
     from s2a_bench.report.timeline_figures import write_timeline_figures
-    from s2a_bench.report.timeline_machine import timelines_to_json
     from s2a_bench.report.timeline_tables import timeline_csv, timeline_tables
+    from s2a_bench.store.run import read_run
+
+    run = read_run(folder)
+    write_texts(run, timeline_tables(run), timeline_csv(run))
+    write_timeline_figures(run)
+    write_trace(run)
+
+
+def show(folder: Path, progress: RunProgress, *, as_json: bool, per_skill: bool) -> None:
+    """Print what the user asked for of any run of timelines."""
+    from rich.console import Console
+
+    from s2a_bench.report.terminal import lay_out
+    from s2a_bench.report.timeline_machine import timelines_to_json
+    from s2a_bench.report.timeline_tables import timeline_tables
     from s2a_bench.report.timelines import timelines_of
     from s2a_bench.store.run import read_run
 
     run = read_run(folder)
     tables = timeline_tables(run)
-    write_texts(run, tables, timeline_csv(run))
-    write_timeline_figures(run)
-    write_trace(run)
     for doubt in run.manifest["warnings"]:
         progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
     if as_json:
@@ -218,5 +235,7 @@ def show(folder: Path, progress: RunProgress, *, as_json: bool, per_skill: bool)
             console.print(lay_out(table))
     for note in tables["timelines"].notes:
         console.print(note)
-    console.print(f"trace for ui.perfetto.dev: {folder / 'trace.json'}", highlight=False, markup=False, soft_wrap=True)
+    trace = folder / "trace.json"
+    if trace.exists():
+        console.print(f"trace for ui.perfetto.dev: {trace}", highlight=False, markup=False, soft_wrap=True)
     console.print(f"run folder: {folder}", highlight=False, markup=False, soft_wrap=True)

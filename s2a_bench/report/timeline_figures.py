@@ -97,8 +97,8 @@ def draw_panel(axes: Axes, cells: Sequence[Timelines], colours: dict[str, str], 
     axes.set_xlim(0, end_s * 1.02)
 
 
-def write_timeline_figures(run: Run) -> list[Path]:
-    """Write ``figures/timeline*.png`` and ``.pdf``: one figure for every plan length and T_nom."""
+def timeline_figures(run: Run) -> dict[str, Callable[[], Figure]]:
+    """Return every figure by its file's name: one for every plan length and T_nom."""
     cells = [cell for cell in timelines_of(run) if len(cell.skills)]
     shapes = list(dict.fromkeys(cell.setting[2:] for cell in cells))
     builders: dict[str, Callable[[], Figure]] = {}
@@ -106,7 +106,12 @@ def write_timeline_figures(run: Run) -> list[Path]:
         name = "timeline" if len(shapes) == 1 else f"timeline_N{n_skills}_T{t_nom_s:g}"
         same = [cell for cell in cells if cell.setting[2:] == (n_skills, t_nom_s)]
         builders[name] = partial(build_timelines, run, same)
-    return save(run.path / "figures", builders)
+    return builders
+
+
+def write_timeline_figures(run: Run) -> list[Path]:
+    """Write ``figures/timeline*.png`` and ``.pdf``."""
+    return save(run.path / "figures", timeline_figures(run))
 
 
 def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: float) -> None:

@@ -172,7 +172,8 @@ def _live_notes(run: Run) -> list[str]:
     dummy = " Dummy weights: what the plan says means nothing." if live.get("dummy") else ""
     grammar = "held to its form by a grammar" if live["grammar"] else "without a grammar"
     robot = "skills only take their time" if live["robot"] == "timed" else f"skills are carried out by {live['robot']}"
-    tokens = "EMULATED tokens" if live["emulated"] else "LIVE: real tokens"
+    whose = "tokens of a server that runs already" if live["engine"] == "unknown" else "real tokens"
+    tokens = "EMULATED tokens" if live["emulated"] else f"LIVE: {whose}"
     how = f"parsed and executed as they arrive, {grammar}; {robot}"
     return [f"{tokens} over {live['transport']}{paced}, {how}.{dummy}"]
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 
@@ -13,12 +15,27 @@ from s2a_bench.bench import study_drift, study_jitter, study_misfit, study_targe
 from s2a_bench.bench.studies import STUDIES, StudyConfig, cells_of, results, run_study
 from s2a_bench.bench.worlds import World, generator, recorded_plans
 from s2a_bench.errors import UsageError
+from s2a_bench.policy.conformal import calibrate
+from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
-from s2a_bench.report.studies import regret_at, study_tables, targets
+from s2a_bench.policy.stream_to_act import StreamToAct
+from s2a_bench.report.studies import regret_at, study_tables, table_files, targets
+from s2a_bench.report.study_figures import write_study_figure
+from s2a_bench.report.study_machine import study_to_json
 from s2a_bench.store.run import read_run
 from s2a_bench.store.schema import STUDIES as TABLE
 from s2a_bench.store.schema import StudyRow
+
+SCHEMA = Path(__file__).parents[2] / "docs" / "schema" / "s2a-bench-1.json"
+TARGETS = [
+    "P(any stall), pooled, upper end of 95 %",
+    "P(any stall), worst setting",
+    "start regret, all settings",
+    "start regret, rho > .8",
+    "end regret, all settings",
+    "end regret, rho > .8",
+]
 
 HARDEST = (
     World(4.8, 0.5, 6, 4, 1.0),
@@ -167,13 +184,25 @@ def test_rare_stalls_cost_more_under_pauses_than_under_even_jitter() -> None:
     costs = {}
     for gaps in study_jitter.families(1 / 4.8, (0.2, 0.1, 0.3)):
         rows = frame(study_jitter.cell(config, replace(world, gaps=gaps)))
-        elastic = rows[rows["policy"] == "stream-to-act"]
+        elastic = rows[(rows["policy"] == "stream-to-act") & (rows["condition"] == "")]
         costs[str(elastic["family"].iloc[0])] = [regret_at(elastic, level) for level in (0.0, 0.01, 0.05, 0.2)]
         assert elastic["p_any_stall"].iloc[-1] == 0  # lambda = infinity waits
         assert costs[str(elastic["family"].iloc[0])] == sorted(costs[str(elastic["family"].iloc[0])], reverse=True)
     assert set(costs) == {"lognormal", "markov", "bursty", "recorded"}
     assert costs["markov"][1] > 1.0
     assert costs["lognormal"][1] < 0.2
+
+
+def test_a_frontier_marks_where_calibration_would_put_the_robot() -> None:
+    config = StudyConfig(plans=300, calibration_plans=200)
+    world = World(0.58, 3.0, 1, 8, 2.0)
+    rows = study_jitter.cell(config, world)
+    (chosen,) = (row for row in rows if row.condition == study_jitter.CALIBRATED)
+    drawn = world.draw(generator(config.seed, study_jitter.NAME, world), config.calibration_plans)
+    assert drawn.token_s is not None
+    found = calibrate(StreamToAct(GapPrior.fit(drawn.token_s)), drawn, config.epsilon)
+    assert chosen.caution == found.caution > 0
+    assert replace(chosen, condition="") in rows
 
 
 def test_recorded_answers_become_plans_and_short_ones_are_left_out() -> None:
@@ -202,6 +231,12 @@ def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest
     tables = study_tables(run)
     assert all(len(row) == len(table.header) for table in tables for row in table.rows)
     assert all("nan" not in entry.lower() for table in tables for row in table.rows for entry in row)
+    assert len(table_files(tables)) == len(tables)
+    assert [path.name for path in write_study_figure(run)] == [f"{name}.png", f"{name}.pdf"]
+    told = study_to_json(run)
+    jsonschema.validate(told, json.loads(SCHEMA.read_text()))
+    assert len(told["cells"]) == len(run.tables["studies"])
+    assert [each["what"] for each in told.get("targets", [])] == (TARGETS if name == "targets" else [])
 
 
 @pytest.mark.parametrize(

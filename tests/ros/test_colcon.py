@@ -43,8 +43,9 @@ def test_manifests_carry_our_name_version_and_licence(package: str) -> None:
 
 
 def test_the_interface_package_generates_every_message() -> None:
-    listed = re.findall(r'"(msg/\w+\.msg)"', (PACKAGES["s2a_msgs"] / "CMakeLists.txt").read_text())
-    assert listed == sorted(f"msg/{path.name}" for path in (PACKAGES["s2a_msgs"] / "msg").iterdir())
+    listed = re.findall(r'"((?:action|msg)/\w+\.\w+)"', (PACKAGES["s2a_msgs"] / "CMakeLists.txt").read_text())
+    folder = PACKAGES["s2a_msgs"]
+    assert listed == sorted(str(path.relative_to(folder)) for path in folder.glob("*/*"))
 
 
 @needs_colcon
@@ -85,7 +86,7 @@ def test_ros2_run_finds_the_program_and_it_has_its_files(tmp_path: Path, flags: 
     package = ROOT / "s2a_bench"
     files = [path for path in package.glob("**/*.*") if path.is_file() and path.suffix != ".pyc"]
     names = [str(path.relative_to(package)) for path in files]
-    names += [f"ros/s2a_msgs/msg/{path.name}" for path in (ROOT / "s2a_msgs" / "msg").iterdir()]
+    names += [f"ros/s2a_msgs/{path.relative_to(ROOT / 's2a_msgs')}" for path in (ROOT / "s2a_msgs").glob("*/*")]
     assert [name for name in names if not (installed / name).is_file()] == []
 
 

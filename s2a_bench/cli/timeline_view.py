@@ -1,0 +1,189 @@
+"""Timelines while they happen: lanes that grow on the terminal, or a line a policy where there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rich.console import Group
+from rich.live import Live
+from rich.text import Text
+
+from s2a_bench.cli.progress import RunProgress
+from s2a_bench.clock import now_ns
+
+if TYPE_CHECKING:
+    from s2a_bench.bench.execution import Scene
+    from s2a_bench.runtime.record import Record
+
+REFRESHES_HZ = 8
+STATUS = 21
+"""Columns to the right of the lanes."""
+LEAST_LANE = 20
+NARROW = 90
+"""Terminals of fewer columns get no words beside the lanes, but short ones."""
+COLOURS = ("blue", "yellow", "green", "cyan", "magenta")
+STALL_S = 0.02
+"""Shorter ones are the machine's, not the policy's: POLICY section 1."""
+
+WAITING, SKILL, STALL, TOKEN, COMPLETE, NOW, SAFE = "─█╱·┃│┊"  # noqa: RUF001 - a hatch, not a slash
+
+
+class TimelineView(RunProgress):
+    """Progress of a run, and the timelines that it is executing."""
+
+    @contextmanager
+    def show(self, scene: Scene) -> Iterator[None]:
+        """Show a scene while the context lasts; its last state stays on the terminal."""
+        if not self.console.is_terminal:
+            yield
+            for record in scene.records:
+                self.say(f"  {record.policy}: {summary(record)}")
+            return
+        self._bar.stop()  # one live display at a time
+        try:
+            with Live(
+                get_renderable=lambda: draw(scene, now_ns(), self.console.width),
+                console=self.console,
+                refresh_per_second=REFRESHES_HZ,
+            ):
+                yield
+        finally:
+            self._bar.start()
+
+
+def draw(scene: Scene, at_ns: int, width: int) -> Group:
+    """Draw a scene at a moment, ``width`` columns wide: tokens, a lane a policy, and the time axis below."""
+    names = max(len(record.policy) for record in scene.records)
+    status = STATUS if width >= NARROW else STATUS - 9
+    first = scene.records[0]
+    now_s = (at_ns - first.requested_ns) / 1e9 if first.requested_ns is not None else 0.0
+    over = all(record.outcome for record in scene.records)
+    if over:
+        now_s = max(_end_s(record) for record in scene.records)
+    axis = _Axis(max(width - names - status - 3, LEAST_LANE), max(scene.span_s, now_s, 1e-3))
+    safe_s = _safe_s(first)
+    clock = "" if over else f"  {now_s:.1f} s"
+    lines = [Text(f"{scene.title}{clock}", style="bold", no_wrap=True, overflow="ellipsis")]
+    lines.append(_row("tokens", names, _tokens(first, axis, None if over else now_s), f"{len(first.token_ns)}"))
+    for place, record in enumerate(scene.records):
+        lane = _lane(record, axis, now_s, safe_s, COLOURS[place % len(COLOURS)])
+        lines.append(_row(record.policy, names, lane, _status(record, scene.n_skills, short=width < NARROW)))
+    lines.append(_row("", names, _scale(axis, safe_s, first.ended_ns is not None), "s"))
+    return Group(*lines)
+
+
+def summary(record: Record) -> str:
+    """Say in words how a plan went."""
+    stalls = [stall / 1e9 for stall in record.stalls_ns if stall > STALL_S * 1e9]
+    if not record.skills or record.requested_ns is None:
+        return f"{record.outcome}, nothing was started" + (f": {record.why}" if record.why else "")
+    start_s = (record.skills[0].start_ns - record.requested_ns) / 1e9
+    why = "" if record.outcome == "completed" else f"; {record.outcome}: {record.why}"
+    return (
+        f"started at {start_s:.2f} s, ended at {_end_s(record):.2f} s, {len(stalls)} stalls of {sum(stalls):.2f} s{why}"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Axis:
+    """Seconds as columns."""
+
+    columns: int
+    span_s: float
+
+    def column(self, at_s: float) -> int:
+        """Return the column of a time."""
+        return min(max(int(at_s / self.span_s * self.columns), 0), self.columns - 1)
+
+    def cells(self, from_s: float, to_s: float) -> range:
+        """Return the columns of a stretch, one at least."""
+        first = self.column(from_s)
+        return range(first, max(self.column(to_s), first + 1))
+
+
+def _row(name: str, names: int, lane: Text, status: str) -> Text:
+    """Put a lane between its name and its numbers."""
+    return Text.assemble(f"{name:<{names}} ", lane, f" {status}", no_wrap=True, overflow="crop")
+
+
+def _tokens(record: Record, axis: _Axis, now_s: float | None) -> Text:
+    """Draw tokens, those that complete a skill, and the present."""
+    cells = [" "] * axis.columns
+    zero_ns = record.requested_ns or 0
+    for at_ns in list(record.token_ns):
+        cells[axis.column((at_ns - zero_ns) / 1e9)] = TOKEN
+    for at_ns, _ in list(record.arrivals):
+        cells[axis.column((at_ns - zero_ns) / 1e9)] = COMPLETE
+    if now_s is not None:
+        cells[axis.column(now_s)] = NOW
+    return Text("".join(cells))
+
+
+def _lane(record: Record, axis: _Axis, now_s: float, safe_s: float | None, colour: str) -> Text:
+    """Draw one policy: waiting, skills with their numbers, stalls, S0 and the present."""
+    cells: list[tuple[str, str]] = [(" ", "")] * axis.columns
+    zero_ns = record.requested_ns or 0
+    skills = list(record.skills)
+    starts = [(skill.start_ns - zero_ns) / 1e9 for skill in skills]
+    ends = [now_s if skill.end_ns is None else (skill.end_ns - zero_ns) / 1e9 for skill in skills]
+    for column in range(axis.column(starts[0] if starts else now_s)):
+        cells[column] = (WAITING, "dim")
+    until = [*starts[1:], now_s if record.outcome is None else 0.0]
+    for start_s, end_s, next_s, skill in zip(starts, ends, until, skills, strict=False):
+        if next_s - end_s > STALL_S:
+            for column in axis.cells(end_s, next_s):
+                cells[column] = (STALL, "red")
+        for column in axis.cells(start_s, end_s):
+            cells[column] = (SKILL, colour)
+        cells[axis.column(start_s)] = (str((skill.index + 1) % 10), f"bold white on {colour}")
+    if safe_s is not None and cells[axis.column(safe_s)][0] in {WAITING, " "}:
+        cells[axis.column(safe_s)] = (SAFE, "bold")
+    if record.outcome is None and cells[axis.column(now_s)][0] == " ":
+        cells[axis.column(now_s)] = (NOW, "")
+    return Text.assemble(*cells)
+
+
+def _status(record: Record, n_skills: int, *, short: bool) -> str:
+    """Count what has happened."""
+    done = f"{len(record.ran)}/{n_skills}"
+    if record.outcome not in {None, "completed"}:
+        return f"{done} {record.outcome}"
+    stalls = [stall / 1e9 for stall in record.stalls_ns if stall > STALL_S * 1e9]
+    return f"{done} {sum(stalls):.1f}s" if short else f"{done} {len(stalls)} stalls {sum(stalls):.1f} s"
+
+
+def _scale(axis: _Axis, safe_s: float | None, known: bool) -> Text:
+    """Write the times below the lanes, and where S0 is: so far in brackets, until the whole plan has come."""
+    cells = [" "] * axis.columns
+    step = next(
+        (each for each in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if each / axis.span_s * axis.columns > 7),  # noqa: PLR2004 - columns that a number needs
+        axis.span_s,
+    )
+    marks = [(step * place, f"{step * place:g}") for place in range(int(axis.span_s / step) + 1)]
+    if safe_s is not None:  # first, so that a number too near makes room
+        marks.insert(0, (safe_s, "S0" if known else "(S0)"))
+    for at_s, text in marks:
+        column = min(axis.column(at_s), axis.columns - len(text))
+        if not "".join(cells[max(column - 1, 0) : column + len(text) + 1]).strip():
+            cells[column : column + len(text)] = text
+    return Text("".join(cells), style="dim")
+
+
+def _safe_s(record: Record) -> float | None:
+    """Return S0 of the skills that have arrived; None before the first."""
+    found, before_s = None, 0.0
+    for at_ns, call in list(record.arrivals):
+        at_s = (at_ns - (record.requested_ns or 0)) / 1e9
+        found = at_s - before_s if found is None else max(found, at_s - before_s)
+        before_s += call.skill.durations.nominal_s
+    return found
+
+
+def _end_s(record: Record) -> float:
+    """Return when the last skill ended, or the stream where none ran."""
+    ends = [skill.end_ns for skill in record.ran if skill.end_ns is not None]
+    at_ns = ends[-1] if ends else record.ended_ns
+    return (at_ns - record.requested_ns) / 1e9 if at_ns is not None and record.requested_ns is not None else 0.0

@@ -1,0 +1,81 @@
+"""What an executor did: skills as they really ran, the orders it gave, and how the plan ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from s2a_bench.plan import Call
+from s2a_bench.runtime.events import Fault
+
+Outcome: TypeAlias = Literal["completed", "short", "skill-failed", "skill-overran", "aborted"] | Fault
+"""How a plan ended. ``short``: the stream ended properly, with fewer skills than announced; they were carried out."""
+
+What: TypeAlias = Literal["start", "extend", "compress", "end", "hold", "abort"]
+
+
+@dataclass(slots=True)
+class SkillRun:
+    """One skill that was started; times on the executor's clock, in ns."""
+
+    index: int
+    call: Call
+    arrival_ns: int
+    due_ns: int
+    """When the reason to start it was there: a time the policy named, an arrival, or the end of the skill before."""
+    ordered_ns: int
+    """When the order was given: what the durations count from."""
+    start_ns: int
+    """When the robot had the order."""
+    duration_ns: int
+    """As first ordered by the policy."""
+    latest_ns: int
+    """How long it may be held on for while the next skill is missing."""
+    until_ns: int
+    """The end as ordered last."""
+    end_ns: int | None = None
+    """When it was over; None while it runs."""
+
+    @property
+    def jitter_ns(self) -> int:
+        """Return the start jitter: from the reason to start until the robot had the order."""
+        return self.start_ns - self.due_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """An order to the robot; ``index`` is the skill's, -1 for a hold before the first."""
+
+    at_ns: int
+    what: What
+    index: int
+
+
+@dataclass(slots=True)
+class Record:
+    """All of one plan under one policy; filled while it runs, so that it can be watched."""
+
+    policy: str
+    requested_ns: int | None = None
+    token_ns: list[int] = field(default_factory=list)
+    arrivals: list[tuple[int, Call]] = field(default_factory=list)
+    ended_ns: int | None = None
+    """When the stream ended or broke."""
+    skills: list[SkillRun] = field(default_factory=list)
+    commands: list[Command] = field(default_factory=list)
+    extra: int = 0
+    """Skills beyond those announced, which were not carried out."""
+    outcome: Outcome | None = None
+    """None while it runs."""
+    why: str = ""
+    """What went wrong, where something did."""
+
+    @property
+    def ran(self) -> list[SkillRun]:
+        """Return the skills that have ended."""
+        return [skill for skill in self.skills if skill.end_ns is not None]
+
+    @property
+    def stalls_ns(self) -> list[int]:
+        """Return how long the robot had nothing to do between skills, as it happened."""
+        return [after.start_ns - (before.end_ns or 0) for before, after in zip(self.ran, self.skills[1:], strict=False)]

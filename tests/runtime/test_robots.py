@@ -1,0 +1,288 @@
+"""Robots on the system clock: functions, ROS 2 actions, and those of other packages."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from importlib.metadata import EntryPoint
+from threading import Event as Flag
+from threading import Thread
+from types import ModuleType
+
+import pytest
+
+from s2a_bench import runtime
+from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.plan import Call, Gap, SkillSet, load_skills, parse_skills
+from s2a_bench.policy import PlanShape, Timing, policy
+from s2a_bench.ros import ActionServer, Middleware, ServerGoal, open_middleware
+from s2a_bench.ros.messages import default
+from s2a_bench.runtime import ROBOTS, Robot, find_robot
+from s2a_bench.runtime.actions import EXECUTE_SKILL, ActionRobot
+from s2a_bench.runtime.callables import Action, CallableRobot, Motion
+from s2a_bench.runtime.events import AbortAsked, LiveInbox, Requested, SkillCame, StreamEnded
+from s2a_bench.runtime.executor import Executor
+from s2a_bench.runtime.record import Record
+
+QUICK = parse_skills(
+    """
+name = "quick"
+role = "test"
+gap = "stop"
+[vocabulary]
+thing = ["cup", "box"]
+[[skill]]
+name = "wave"
+arguments = ["thing"]
+t_min_s = 0.02
+t_nom_s = 0.04
+t_max_s = 0.06
+gap = "coast"
+""",
+    "quick",
+)
+CUP, BOX = QUICK.calls
+NS = 1_000_000
+
+
+def execute(robot: Robot, calls: list[Call], *, patience_s: float = 10.0, abort_at: Flag | None = None) -> Record:
+    """Run calls that have all arrived, on the system clock."""
+    inbox = LiveInbox()
+    known = PlanShape(len(calls), 1, Timing(0.04, 0.02, 0.06))
+    executor = Executor(policy("naive"), known, robot, inbox, SystemClock(), gap=QUICK.gap, patience_s=patience_s)
+    start_ns = now_ns()
+    for event in (Requested(start_ns), *(SkillCame(start_ns, call) for call in calls), StreamEnded(start_ns)):
+        inbox.put(event)
+    if abort_at is not None:
+        Thread(target=lambda: (abort_at.wait(10), inbox.put(AbortAsked(now_ns()))), daemon=True).start()
+    return executor.run()
+
+
+class TestFunctions:
+    def test_each_call_is_made_with_its_arguments_in_order(self) -> None:
+        seen: list[object] = []
+
+        def wave(motion: Motion) -> None:
+            seen.append(motion.arguments["thing"])
+            assert motion.wait()
+
+        record = execute(CallableRobot(QUICK, {"wave": wave}, seen.append), [CUP, BOX, CUP])
+        assert record.outcome == "completed"
+        assert seen == ["stop", "cup", "box", "cup", "coast"]
+        for run in record.skills:
+            assert run.end_ns is not None
+            assert run.end_ns >= run.until_ns == run.ordered_ns + 40 * NS
+            assert run.due_ns <= run.ordered_ns <= run.start_ns
+
+    def test_a_function_that_raises_fails_the_plan(self) -> None:
+        def wave(motion: Motion) -> None:
+            raise RuntimeError(f"no grip on the {motion.arguments['thing']}")
+
+        record = execute(CallableRobot(QUICK, {"wave": wave}), [CUP, BOX])
+        assert (record.outcome, len(record.skills)) == ("skill-failed", 1)
+        assert record.why == "wave(cup): RuntimeError: no grip on the cup"
+
+    def test_a_function_that_takes_longer_is_waited_for(self) -> None:
+        clock = SystemClock()
+        record = execute(CallableRobot(QUICK, {"wave": lambda _: clock.sleep_until_ns(now_ns() + 90 * NS)}), [CUP, BOX])
+        assert record.outcome == "completed"
+        first, second = record.skills
+        assert first.end_ns is not None
+        assert first.end_ns - first.ordered_ns >= 90 * NS
+        assert second.start_ns >= first.end_ns
+
+    def test_a_function_that_does_not_end_is_told_to_and_given_up(self) -> None:
+        told = Flag()
+
+        def wave(motion: Motion) -> None:
+            while motion.wait():
+                pass
+            told.set()
+
+        record = execute(CallableRobot(QUICK, {"wave": wave}), [CUP], patience_s=0.05)
+        assert record.outcome == "skill-overran"
+        assert told.wait(10)
+
+    def test_an_abort_reaches_the_function(self) -> None:
+        begun, stopped = Flag(), Flag()
+
+        def wave(motion: Motion) -> None:
+            begun.set()
+            motion.retime(now_ns() + 3600 * 10**9)
+            assert not motion.wait()
+            assert motion.aborted
+            stopped.set()
+
+        record = execute(CallableRobot(QUICK, {"wave": wave}), [CUP, BOX], abort_at=begun)
+        assert (record.outcome, len(record.skills)) == ("aborted", 1)
+        assert stopped.wait(10)
+
+    def test_waiting_follows_a_moved_end(self) -> None:
+        motion = Motion(CUP, now_ns() + 3600 * 10**9)
+        assert motion.remaining_s > 3000
+        Thread(target=motion.retime, args=(now_ns(),)).start()
+        assert motion.wait()
+        assert motion.remaining_s == 0
+
+    def test_waiting_a_while_does_not_wait_for_the_end(self) -> None:
+        motion = Motion(CUP, now_ns() + 3600 * 10**9)
+        assert motion.wait(0.001)
+        assert not motion.aborted
+
+    def test_a_skill_without_a_function_is_refused(self) -> None:
+        actions: dict[str, Action] = {"go_to": lambda _: None, "pick": lambda _: None}
+        with pytest.raises(UsageError, match="--robot: no function for the skills open, close, place of 'household'"):
+            CallableRobot(load_skills("household"), actions)
+
+
+class TestPlugIns:
+    @pytest.fixture
+    def offer(self, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+        """A package that offers a robot."""
+        module = ModuleType("somebodys_robot")
+        monkeypatch.setitem(sys.modules, "somebodys_robot", module)
+        points = [
+            EntryPoint("arm", "somebodys_robot:arm", runtime.ENTRY_POINTS),
+            EntryPoint("gone", "somebodys_robot:leg", runtime.ENTRY_POINTS),
+        ]
+        monkeypatch.setattr(runtime, "entry_points", lambda group: points if group == runtime.ENTRY_POINTS else [])
+        return module
+
+    def test_a_robot_of_another_package_is_found_by_its_name(self, offer: ModuleType) -> None:
+        waved: list[Gap] = []
+
+        def arm(skills: SkillSet) -> Robot:
+            return CallableRobot(skills, {"wave": lambda _: None}, waved.append)
+
+        offer.arm = arm  # type: ignore[attr-defined]
+        record = execute(find_robot("arm")(QUICK), [CUP])
+        assert (record.outcome, waved[-1]) == ("completed", "coast")
+
+    def test_one_that_cannot_be_loaded_says_which(self, offer: ModuleType) -> None:
+        del offer
+        with pytest.raises(UsageError, match="--robot gone: somebodys_robot:leg cannot be loaded"):
+            find_robot("gone")
+
+    def test_an_unknown_one_names_all_there_are(self, offer: ModuleType) -> None:
+        del offer
+        with pytest.raises(UsageError, match="'kuka' is none of timed, ros, arm, gone"):
+            find_robot("kuka")
+
+    @pytest.mark.parametrize("name", list(ROBOTS))
+    def test_ours_are_found(self, name: str) -> None:
+        assert callable(find_robot(name))
+
+
+class TestRosActions:
+    pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
+
+    @pytest.fixture
+    def stack(self) -> Iterator[ExitStack]:
+        with ExitStack() as stack:
+            yield stack
+
+    @pytest.fixture
+    def serving(self, dds_domain: int, stack: ExitStack) -> Middleware:
+        middleware = open_middleware("cyclonedds", domain_id=dds_domain)
+        stack.callback(middleware.close)
+        return middleware
+
+    @pytest.fixture
+    def server(self, serving: Middleware) -> ActionServer:
+        return serving.action_server("/arm/execute_skill", EXECUTE_SKILL)
+
+    @pytest.fixture
+    def robot(self, dds_domain: int, stack: ExitStack, server: ActionServer) -> ActionRobot:
+        del server
+        robot = ActionRobot(open_middleware("cyclonedds", domain_id=dds_domain), "/arm")
+        stack.callback(robot.close)
+        return robot
+
+    def serve(
+        self, server: ActionServer, goals: int, answer: str = "succeed", begun: Flag | None = None
+    ) -> list[tuple[str, list[str], float]]:
+        """Answer goals on a thread, and return what they ask for as it comes."""
+        asked: list[tuple[str, list[str], float]] = []
+        self.cancelled = Flag()
+
+        def end(goal: ServerGoal) -> None:
+            if answer == "reject":
+                goal.reject()
+                return
+            goal.accept()
+            assert goal.executing()
+            success = answer == "succeed"
+            result = default(EXECUTE_SKILL + "_Result", success=success, message="" if success else "jammed")
+            if answer == "cancel":
+                assert begun is not None
+                begun.set()
+                while not goal.cancel_requested:
+                    server.next_goal(0.01)
+                goal.canceled(result)
+                self.cancelled.set()
+            elif answer == "abort":
+                goal.abort(result)
+            else:
+                goal.succeed(result)
+
+        def run() -> None:
+            while len(asked) < goals:
+                goal = server.next_goal(0.1)
+                if goal is not None:
+                    wanted = goal.unpack()
+                    asked.append((wanted.skill, list(wanted.arguments), wanted.duration))
+                    end(goal)
+
+        Thread(target=run, daemon=True).start()
+        return asked
+
+    def test_every_skill_is_a_goal_and_ends_with_its_result(self, server: ActionServer, robot: ActionRobot) -> None:
+        asked = self.serve(server, 2)
+        record = execute(robot, [CUP, BOX])
+        assert (record.outcome, len(record.ran)) == ("completed", 2)
+        assert [(skill, arguments) for skill, arguments, _ in asked] == [("wave", ["cup"]), ("wave", ["box"])]
+        assert all(0 <= duration_s <= 0.04 for _, _, duration_s in asked)
+
+    @pytest.mark.parametrize(
+        ("answer", "why"),
+        [
+            ("abort", "wave(cup): the goal ended ABORTED: jammed"),
+            ("reject", "wave(cup): the robot rejected the goal"),
+            ("fail", "wave(cup): jammed"),
+        ],
+    )
+    def test_a_goal_that_goes_wrong_fails_the_plan(
+        self, server: ActionServer, robot: ActionRobot, answer: str, why: str
+    ) -> None:
+        self.serve(server, 1, answer)
+        record = execute(robot, [CUP, BOX])
+        assert (record.outcome, record.why, len(record.skills)) == ("skill-failed", why, 1)
+
+    def test_an_abort_cancels_the_goal(self, server: ActionServer, robot: ActionRobot) -> None:
+        begun = Flag()
+        asked = self.serve(server, 1, "cancel", begun)
+        record = execute(robot, [CUP], abort_at=begun)
+        assert (record.outcome, [skill for skill, _, _ in asked]) == ("aborted", ["wave"])
+        assert self.cancelled.wait(10)
+
+    def test_gaps_are_published(self, serving: Middleware, server: ActionServer, robot: ActionRobot) -> None:
+        from s2a_bench.ros import QoS
+
+        listener = serving.subscription("/arm/gap", "std_msgs/msg/String", QoS())
+        deadline = now_ns() + 10 * 10**9
+        while not listener.matched() and now_ns() < deadline:
+            listener.take(0.01)
+        self.serve(server, 1)
+        execute(robot, [CUP])
+        heard = []
+        while (packed := listener.take(0.5)) is not None:
+            heard.append(listener.unpack(packed).data)
+        assert heard[-1] == "coast"
+
+    def test_a_robot_that_is_not_there_is_missed(self, dds_domain: int, stack: ExitStack) -> None:
+        middleware = open_middleware("cyclonedds", domain_id=dds_domain)
+        stack.callback(middleware.close)
+        with pytest.raises(TransportError, match="--robot ros: no server of the action /nowhere/execute_skill"):
+            ActionRobot(middleware, "/nowhere", server_timeout_s=0.2)
