@@ -10,7 +10,9 @@ S2AError
 │   │   └── MessagesLost the middleware lost messages of this request
 │   ├── PortInUse        a server cannot bind its address
 │   └── ServerDied       the server's process is gone
-└── StoreError           a run folder cannot be written or read
+├── SimulatorError       a simulator cannot start, or goes away
+├── StoreError           a run folder cannot be written or read
+└── UnlikeRuns           runs of other machines, models or settings, which are not to be compared
 """
 
 from __future__ import annotations
@@ -65,5 +67,13 @@ class ServerDied(TransportError):
     """The server's process is gone."""
 
 
+class SimulatorError(S2AError):
+    """A simulator cannot start, or goes away."""
+
+
 class StoreError(S2AError):
     """A run folder cannot be written or read."""
+
+
+class UnlikeRuns(S2AError):
+    """Runs of other machines, models or settings, which are not to be compared."""

@@ -1,0 +1,122 @@
+"""One launch cut into batches of time, which are drawn with replacement: how far its statistics are to be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Final, TypeAlias, final
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+Rows: TypeAlias = "Sequence[Floats]"
+"""The values of one launch in order of time: one array a request (its one value, or the gaps of its tokens)."""
+
+STATISTICS: Final[Mapping[str, float | None]] = {"median": 0.5, "mean": None, "p90": 0.9, "p99": 0.99}
+"""Statistic -> its quantile; the mean has none."""
+
+BATCHES: Final = 10
+"""A launch is cut into as many stretches of time; 10 to 30 are enough for an interval (Schmeiser 1982)."""
+
+FEWEST_ROWS: Final = 5
+"""Fewer requests have no interval."""
+
+FEWEST_BEYOND: Final = 5
+"""A percentile has an interval where at least so many values lie beyond it: p90 needs 50 values, p99 500."""
+
+_RESAMPLES: Final = 1000
+
+
+@final
+class Launch:
+    """The values of one launch; percentiles of resamples are found in the sorted values, without copying them."""
+
+    def __init__(self, rows: Rows) -> None:
+        """Cut the rows into `BATCHES` batches, fewer where there are fewer rows; no row is empty."""
+        import numpy as np
+
+        self.n_rows = len(rows)
+        self.batches = [
+            np.concatenate([rows[place] for place in places])
+            for places in np.array_split(np.arange(len(rows)), min(BATCHES, len(rows)))
+        ]
+        values = np.concatenate(self.batches)
+        order = np.argsort(values, kind="stable")
+        owners = np.repeat(np.arange(len(self.batches)), [len(batch) for batch in self.batches])[order]
+        self.values: Floats = values[order]
+        self.counts = np.cumsum(owners[:, None] == np.arange(len(self.batches)), axis=0)
+        levels = np.array([row[0] if len(row) == 1 else np.median(row) for row in rows])
+        self._memory = _neighbours(levels)
+
+    @property
+    def dependent(self) -> bool:
+        """Tell whether requests remember longer than a batch lasts: about (1 + r) / (1 - r) requests."""
+        return (1 + self._memory) > self.n_rows / len(self.batches) * (1 - self._memory)
+
+    @property
+    def hidden(self) -> float:
+        """Return by how much the variance between batches falls short of that of their mean, batches being alike.
+
+        As if the requests were an autoregressive series of order 1, whose mean over m requests has the variance below.
+        """
+        r, n, k = self._memory, self.n_rows, len(self.batches)
+
+        def variance(m: float) -> float:
+            return float((1 + r) / (1 - r) - 2 * r * (1 - r**m) / (m * (1 - r) ** 2)) / m
+
+        return variance(n) * (k - 1) / (variance(n / k) - variance(n)) if k > 1 else 1.0
+
+    def allows(self, statistic: str) -> bool:
+        """Tell whether there are enough values for an interval."""
+        quantile = STATISTICS[statistic] or 0.0
+        return self.n_rows >= FEWEST_ROWS and (
+            statistic == "median" or round(len(self.values) * (1 - quantile), 6) >= FEWEST_BEYOND
+        )
+
+    def statistic(self, name: str) -> float:
+        """Return the statistic of all values; percentiles interpolate linearly, as in `stats.summarise`."""
+        import numpy as np
+
+        quantile = STATISTICS[name]
+        return float(self.values.mean() if quantile is None else np.quantile(self.values, quantile))
+
+    def draw(self, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Draw batches with replacement: one line a resample, how often each batch is in it."""
+        n = len(self.batches)
+        return rng.multinomial(n, [1 / n] * n, size=_RESAMPLES)
+
+    def replicate(self, name: str, drawn: NDArray[np.int64]) -> Floats:
+        """Return the statistic of every resample."""
+        import numpy as np
+
+        quantile = STATISTICS[name]
+        sizes = drawn @ self.counts[-1]
+        if quantile is None:
+            sums = np.array([batch.sum() for batch in self.batches])
+            return np.asarray(drawn @ sums / sizes)
+        place = quantile * (sizes - 1)
+        low = self._ranked(drawn, np.floor(place))
+        return np.asarray(low + (place % 1) * (self._ranked(drawn, np.ceil(place)) - low))
+
+    def _ranked(self, drawn: NDArray[np.int64], ranks: Floats) -> Floats:
+        """Return the value of a rank, from 0, in every resample, by bisection of the sorted values."""
+        import numpy as np
+
+        low = np.zeros(len(drawn), dtype=np.int64)
+        high = np.full(len(drawn), len(self.values) - 1)
+        while (low < high).any():
+            middle = (low + high) // 2
+            reached = (self.counts[middle] * drawn).sum(axis=1) > ranks
+            low, high = np.where(reached, low, middle + 1), np.where(reached, middle, high)
+        return self.values[low]
+
+
+def _neighbours(values: Floats) -> float:
+    """Return how alike neighbours are, from 0 to 0.95: the lag-1 correlation of ranks (outliers matter little)."""
+    from scipy import stats
+
+    ranks = stats.rankdata(values) - (len(values) + 1) / 2
+    spread = float(ranks @ ranks)
+    return min(0.95, max(0.0, float(ranks[1:] @ ranks[:-1]) / spread)) if spread else 0.0

@@ -1,0 +1,96 @@
+"""`s2a-bench compare`: what changed from one run to another, and gates on it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from s2a_bench.cli.options import WIDTH, listed
+from s2a_bench.errors import UsageError
+
+if TYPE_CHECKING:
+    from s2a_bench.report.compare_gates import Judgement
+
+TRIPPED = 3
+"""Exit code where a gate trips."""
+
+
+def compare(
+    baseline: Annotated[str, typer.Argument(metavar="A", help="run folder; repeated launches with commas")],
+    other: Annotated[str, typer.Argument(metavar="B", help="what is compared with A: one folder, or as above")],
+    metric: Annotated[
+        list[str] | None,
+        typer.Option(help="METRIC or METRIC.STATISTIC (median, mean, p90, p99), with commas; or all [default: a few]"),
+    ] = None,
+    fail_if: Annotated[
+        list[str] | None,
+        typer.Option(help="gate, e.g. e2e.median>5%, tokens_per_s<-5%, ros/topic:e2e.p99>10%; may be repeated"),
+    ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="gates trip on the change itself, significant or not")
+    ] = False,
+    min_effect: Annotated[float, typer.Option(min=0, help="the smallest change that is called one, in per cent")] = 5.0,
+    unlike: Annotated[bool, typer.Option("--unlike", help="compare other machines, models or settings too")] = False,
+    output: Annotated[Path | None, typer.Option(help="folder for table, figure and JSON")] = None,
+    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+) -> None:
+    """Compare run B with run A: effect sizes with intervals, one stated test, gates for CI (exit code 3)."""
+    from rich.console import Console
+
+    from s2a_bench.report.compare import compare as compare_runs
+    from s2a_bench.report.compare import metrics_of, open_comparison, read_side, shown_metrics
+    from s2a_bench.report.compare_doubts import doubts
+    from s2a_bench.report.compare_files import write_comparison
+    from s2a_bench.report.compare_gates import judge, read_gate
+    from s2a_bench.report.compare_machine import compare_to_json
+    from s2a_bench.report.compare_tables import compare_table
+    from s2a_bench.report.terminal import lay_out
+
+    gates = [read_gate(text) for text in fail_if or ()]
+    if strict and not gates:
+        raise UsageError("--strict: there is no gate; add --fail-if")
+    sides = [read_side(text, name) for name, text in (("A", baseline), ("B", other))]
+    compared = open_comparison(*sides, unlike=unlike, least=min_effect / 100)
+    names = [name for text in metric or () for name in listed(text)]
+    compared = compare_runs(compared, metrics_of(compared, names) if names else shown_metrics(compared))
+    judgements = judge(compared, gates, strict=strict)
+    found = doubts(compared)
+    whole = compare_to_json(compared, judgements, found)
+    for doubt in found:
+        _say(f"note [{doubt.code}]: {doubt.message}; {doubt.advice}")
+    written = write_comparison(output, compared, whole) if output else []
+    if json_:
+        json.dump(whole, sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
+        sys.stdout.write("\n")
+    else:
+        terminal = Console()
+        console = terminal if terminal.is_terminal else Console(width=WIDTH)
+        table = compare_table(compared)
+        console.print(lay_out(table))
+        for line in (*table.notes, *(f"written: {path}" for path in written)):
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
+    raise typer.Exit(_gate_code(judgements))
+
+
+def _gate_code(judgements: Sequence[Judgement]) -> int:
+    """Say what the gates found, and return the exit code: a tripped gate before one that cannot be judged."""
+    from s2a_bench.report import compare_gates
+    from s2a_bench.report.compare_tables import change_text
+
+    for one in judgements:
+        line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {change_text(one.comparison)}"
+        p = "" if one.p_holm is None else f", p = {one.p_holm:.2g}"
+        few = "; too few values for a test: measure more, or --strict" if one.outcome == compare_gates.UNDECIDED else ""
+        _say(line + p + few)
+    outcomes = {one.outcome for one in judgements}
+    return TRIPPED if compare_gates.TRIPPED in outcomes else 1 if compare_gates.UNDECIDED in outcomes else 0
+
+
+def _say(line: str) -> None:
+    """Print a line beside the result."""
+    print(line, file=sys.stderr)  # noqa: T201 - the command line's own output

@@ -1,0 +1,153 @@
+"""`s2a-bench compare` as a user runs it: exit codes, JSON, files, and wrong use."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+ROOT = Path(__file__).parent.parent.parent
+SCHEMA = json.loads((ROOT / "docs/schema/s2a-bench-compare-1.json").read_text())
+REFERENCE = "results/reference"
+ECHO = f"{REFERENCE}/echo-jpeg"
+RAW = f"{REFERENCE}/echo-raw"
+LLAMA = f"{REFERENCE}/llama-jpeg"
+
+
+def run(*arguments: str, code: int = 0, command: str = "compare") -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [sys.executable, "-m", "s2a_bench", command, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+        cwd=ROOT,
+        env=os.environ | {"COLUMNS": "100"},
+    )
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def timelines(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Return run folders of timelines: computed ones, and drawn ones of two seeds."""
+    folders = {}
+    for name, flags in {
+        "even": ["--profile", "jetson-agx-orin"],
+        "drawn": ["--profile", "jetson-agx-orin", "--jitter", "lognormal:cv=0.3", "--plans", "60", "--seed", "1"],
+        "drawn-too": ["--profile", "jetson-agx-orin", "--jitter", "lognormal:cv=0.3", "--plans", "60", "--seed", "2"],
+    }.items():
+        root = tmp_path_factory.mktemp(name)
+        run("--tokens-per-skill", "6", "--output", str(root), *flags, command="timeline")
+        folders[name] = str(next(root.iterdir()))
+    return folders
+
+
+def test_a_run_against_itself_has_no_change_and_says_what_cannot_be_known() -> None:
+    done = run(ECHO, ECHO, "--json", "--fail-if", "e2e.median>5%")
+    whole = json.loads(done.stdout)
+    jsonschema.validate(whole, SCHEMA)
+    assert {one["change"]["value"] for one in whole["comparisons"]} == {0.0}
+    assert {one["verdict"] for one in whole["comparisons"]} <= {"same", "unclear"}
+    assert {one["outcome"] for one in whole["gates"]} == {"passed"}
+    assert "note [one-launch]:" in done.stderr
+
+
+def test_a_gate_that_trips_is_exit_code_three_and_files_are_written_all_the_same(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = run(ECHO, RAW, "--unlike", "--fail-if", "http/as-*:e2e.median>5%", "--output", str(out), code=3)
+    assert "gate http/as-*:e2e.median>5% tripped in http/as-deployed: +126 % [" in done.stderr
+    assert "e2e: median, ms" in done.stdout
+    assert all(len(line) <= 100 for line in done.stdout.splitlines()[:20])
+    names = sorted(path.name for path in out.iterdir())
+    assert names == [f"compare.{suffix}" for suffix in ("csv", "json", "md", "pdf", "png", "tex")]
+    jsonschema.validate(json.loads((out / "compare.json").read_text()), SCHEMA)
+
+
+def test_a_gate_that_cannot_be_judged_is_an_error_unless_it_is_strict() -> None:
+    done = run(ECHO, ECHO, "--fail-if", "loopback:e2e.p99>5%", code=1)
+    assert "undecided in loopback: 0.0 %; too few values for a test: measure more, or --strict" in done.stderr
+    run(ECHO, ECHO, "--fail-if", "loopback:e2e.p99>5%", "--strict")
+
+
+def test_computed_timelines_are_the_same_to_the_last_digit(timelines: dict[str, str], tmp_path: Path) -> None:
+    done = run(timelines["even"], timelines["even"], "--metric", "all", "--json", "--output", str(tmp_path))
+    whole = json.loads(done.stdout)
+    assert not list(tmp_path.glob("*.png"))  # nothing to draw
+    jsonschema.validate(whole, SCHEMA)
+    assert {one["verdict"] for one in whole["comparisons"]} == {"same"}
+    assert {one["p"] for one in whole["comparisons"]} == {1.0}
+
+
+def test_drawn_timelines_of_two_seeds_do_not_differ(timelines: dict[str, str]) -> None:
+    whole = json.loads(run(timelines["drawn"], timelines["drawn-too"], "--json").stdout)
+    jsonschema.validate(whole, SCHEMA)
+    assert not {"better", "worse"} & {one["verdict"] for one in whole["comparisons"]}
+    assert "one-launch" not in {one["code"] for one in whole["warnings"]}
+
+
+def test_throughput_is_compared_with_higher_as_better(tmp_path: Path) -> None:
+    replay = ("--engine", "replay", "--profile", "rtx-4080", "--transport", "in-process")
+    few = ("--runs", "6", "--warmup", "1", "--max-tokens", "8", "--sample-resources", "0")
+    run(*replay, *few, "--output", str(tmp_path), command="throughput")
+    folder = str(next(tmp_path.iterdir()))
+    whole: dict[str, Any] = json.loads(run(folder, folder, "--json").stdout)
+    jsonschema.validate(whole, SCHEMA)
+    better = {one["metric"]: one["better"] for one in whole["comparisons"]}
+    assert better["decode_tokens_per_s"] == "higher"
+    assert better["ttft_ms"] == better["itl"] == "lower"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        ([ECHO], 2, "Missing argument 'B'"),
+        ([ECHO, "/no/such"], 1, "/no/such is no run folder"),
+        ([ECHO, RAW], 1, "cells of one name differ: http/as-deployed payload: jpeg against raw"),
+        (
+            [ECHO, LLAMA],
+            1,
+            "the runs are unlike: model engine: echo against llama; --unlike compares them",
+        ),
+        ([ECHO, ECHO, "--metric", "speed"], 2, "--metric: 'speed' is no metric of these latency runs; there are e2e"),
+        ([ECHO, ECHO, "--fail-if", "e2e"], 2, "--fail-if: 'e2e' should look like e2e.median>5%"),
+        ([ECHO, ECHO, "--fail-if", "zmq:e2e>5%"], 2, "--fail-if: no cell with e2e is called 'zmq'; there are http/as-"),
+        ([ECHO, ECHO, "--strict"], 2, "--strict: there is no gate; add --fail-if"),
+        ([ECHO, ECHO, "--min-effect", "-1"], 2, "--min-effect"),
+        ([f"{ECHO},{ECHO}", ECHO], 2, "A: a folder is named twice"),
+        ([f"{ECHO},{RAW}", ECHO], 2, "name several launches on both sides, or one on each"),
+        ([ECHO, ECHO, "--output", "README.md"], 1, "--output README.md: "),
+    ],
+)
+def test_wrong_use_is_one_line(arguments: list[str], code: int, message: str) -> None:
+    done = run(*arguments, code=code)
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error:")]
+    assert message in line
+    assert done.stdout == ""
+
+
+def test_an_interrupted_run_is_compared_and_told(tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    shutil.copytree(ROOT / ECHO, folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"state": "running"}))
+    assert f"note [state]: {folder} is running, not finished" in run(ECHO, str(folder)).stderr
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys\nsys.argv = ['s2a-bench', 'compare', '--help']\nfrom s2a_bench.cli import main\n"
+        "try:\n    main()\nfinally:\n    sys.stderr.write(str([n for n in ('pandas', 'scipy') if n in sys.modules]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "[]")
+    for flag in ("metric", "fail-if", "strict", "min-effect", "unlike", "output", "json"):
+        assert f"--{flag}" in done.stdout

@@ -1,0 +1,356 @@
+"""Two runs side by side: what belongs together, what is refused, what is called a change, and what a gate does."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+
+from s2a_bench.batches import STATISTICS
+from s2a_bench.errors import UnlikeRuns, UsageError
+from s2a_bench.report.compare import Compared, compare, metrics_of, open_comparison, read_side, shown_metrics
+from s2a_bench.report.compare_alike import differences
+from s2a_bench.report.compare_doubts import doubts
+from s2a_bench.report.compare_figure import build_forest
+from s2a_bench.report.compare_files import write_comparison
+from s2a_bench.report.compare_gates import judge, read_gate
+from s2a_bench.report.compare_machine import compare_to_json
+from s2a_bench.report.compare_metrics import KINDS
+from s2a_bench.report.compare_tables import compare_csv, compare_table, percent
+from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.schema import SampleRow
+
+SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-compare-1.json").read_text())
+STAGES = {"capture": 1.0, "image_encode": 2.0, "network": 4.0, "inference": 0.5, "return": 2.5}
+CELLS = {"http/as-deployed": STAGES, "http/binary": STAGES, "ros/topic": STAGES, "loopback": STAGES}
+MACHINE = {"cpu": "Cortex-A78AE", "cores": 12, "governor": "performance", "packages": {"numpy": "2.4"}, "load": [0.1]}
+MODEL = {"engine": "llama", "dummy": False, "model_sha256": "aa"}
+MANIFEST = {"environment": MACHINE, "model": MODEL, "configuration": {"runs": 60, "http": {"payload": "jpeg"}}}
+
+MakeRow = Callable[..., SampleRow]
+Launch = Callable[..., Run]
+
+
+@pytest.fixture
+def launch(tmp_path: Path, make_row: MakeRow) -> Launch:
+    """Write a run whose cells share the machine's ups and downs, which are alike from block to block."""
+
+    def make(
+        seed: int,
+        *,
+        factor: float = 1.0,
+        n: int = 60,
+        correlation: float = 0.4,
+        cells: Any = tuple(CELLS),
+        manifest: dict[str, Any] | None = None,
+        **facts: Any,
+    ) -> Run:
+        rng = np.random.default_rng(seed)
+        load = 0.0
+        with RunWriter.create(tmp_path, "latency", manifest or MANIFEST) as run:
+            for block in range(n):
+                load = correlation * load + np.sqrt(1 - correlation**2) * rng.standard_normal()
+                for cell in cells:
+                    slow = np.exp(0.08 * load + 0.08 * rng.standard_normal()) * factor
+                    marks, at_ns = [("", 10**9)], 10**9
+                    for stage, length_ms in STAGES.items():
+                        at_ns += round(length_ms * slow * 1e6)
+                        marks.append((stage, at_ns))
+                    run.sample(make_row(cell, STAGES, block, marks=marks, **facts))
+        return read_run(run.path)
+
+    return make
+
+
+def opened(first: Run, second: Run, *, unlike: bool = False, least: float = 0.05) -> Compared:
+    return open_comparison([first], [second], unlike=unlike, least=least)
+
+
+def compared(first: Run, second: Run, *names: str, **settings: Any) -> Compared:
+    both = opened(first, second, **settings)
+    return compare(both, metrics_of(both, names) if names else shown_metrics(both))
+
+
+def verdicts(found: Compared) -> list[str]:
+    return [one.verdict for one in found.comparisons]
+
+
+def with_(manifest: dict[str, Any], part: str, **facts: Any) -> dict[str, Any]:
+    return {**manifest, part: {**manifest[part], **facts}}
+
+
+@pytest.mark.slow
+def test_a_comparison_of_the_same_thing_finds_nothing_in_at_least_95_of_100_repeats(launch: Launch) -> None:
+    """The whole command: four cells, two metrics, samples that are alike from block to block, Holm over all."""
+    clean = 0
+    for repeat in range(100):
+        found = compared(launch(2 * repeat), launch(2 * repeat + 1))
+        assert len(found.comparisons) == 8
+        clean += not {"better", "worse"} & set(verdicts(found))
+    assert clean >= 95
+
+
+def test_a_slowdown_of_ten_per_cent_is_found_in_every_cell(launch: Launch) -> None:
+    found = [compared(launch(repeat, n=200), launch(100 + repeat, n=200, factor=1.1)) for repeat in range(10)]
+    words = [word for each in found for word in verdicts(each)]
+    assert words.count("worse") >= 76
+    assert "better" not in words
+    sizes = [one.change.relative for each in found for one in each.comparisons]
+    assert np.mean([size for size in sizes if size is not None]) == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_change_below_the_smallest_effect_is_none_however_sure_it_is(launch: Launch) -> None:
+    first, second = (launch(seed, n=1000, correlation=0, factor=by) for seed, by in ((1, 1), (2, 1.025)))
+    assert set(verdicts(compared(first, second, "e2e.mean"))) == {"same"}
+    assert set(verdicts(compared(first, second, "e2e.mean", least=0.01))) == {"worse"}
+
+
+def test_what_is_better_depends_on_the_metric() -> None:
+    directions = {name: metric.better for kind in KINDS.values() for name, metric in kind.metrics.items()}
+    assert directions["e2e"] == directions["stall_s"] == directions["itl"] == "lower"
+    assert directions["tokens_per_s"] == directions["fluidity"] == "higher"
+    assert all(metric.statistic in STATISTICS for kind in KINDS.values() for metric in kind.metrics.values())
+    assert all(name in kind.metrics for kind in KINDS.values() for name in kind.shown)
+
+
+def test_cells_without_a_partner_are_listed_and_not_compared(launch: Launch) -> None:
+    found = compared(launch(1, cells=("ros/topic", "loopback")), launch(2, cells=("ros/topic", "http/binary")), "e2e")
+    assert [one.pair.name for one in found.comparisons] == ["ros/topic"]
+    assert found.only == (("loopback",), ("http/binary",))
+    assert [doubt.message for doubt in doubts(found) if doubt.code == "only"] == [
+        "only in A: loopback",
+        "only in B: http/binary",
+    ]
+    with pytest.raises(UnlikeRuns, match="no cell is in every run: loopback against ros/topic"):
+        opened(launch(1, cells=("loopback",)), launch(2, cells=("ros/topic",)))
+
+
+@pytest.mark.parametrize(
+    ("part", "facts", "said"),
+    [
+        ("environment", {"cpu": "EPYC"}, "cpu: Cortex-A78AE against EPYC"),
+        ("environment", {"cores": 6}, "cores: 12 against 6"),
+        ("environment", {"governor": "powersave"}, "governor: performance against powersave"),
+        ("model", {"model_sha256": "bb"}, "model model_sha256: aa against bb"),
+        ("model", {"dummy": True}, "model dummy: False against True"),
+        ("model", {"engine": "replay"}, "model engine: llama against replay"),
+    ],
+)
+def test_another_machine_or_model_is_refused_unless_told(
+    launch: Launch, part: str, facts: dict[str, Any], said: str
+) -> None:
+    first, second = launch(1, n=6), launch(2, n=6, manifest=with_(MANIFEST, part, **facts))
+    with pytest.raises(UnlikeRuns) as caught:
+        opened(first, second)
+    assert str(caught.value) == f"the runs are unlike: {said}; --unlike compares them all the same"
+    told = next(doubt for doubt in doubts(compared(first, second, "e2e", unlike=True)) if doubt.code == "unlike")
+    assert told.message == f"the runs are unlike: {said}"
+
+
+def test_another_gpu_is_refused_and_another_driver_is_told(launch: Launch) -> None:
+    def with_gpu(name: str, driver: str) -> Run:
+        return launch(1, n=2, manifest=with_(MANIFEST, "environment", gpus=[{"name": name, "driver": driver}]))
+
+    found = [(one.what, one.fatal) for one in differences(with_gpu("Orin", "1"), with_gpu("H200", "2"))]
+    assert found == [("GPU name", True), ("GPU driver", False)]
+
+
+def test_versions_and_settings_are_told_and_not_refused(launch: Launch) -> None:
+    manifest = with_(MANIFEST, "environment", packages={"numpy": "2.5"}, kernel="6.1", load=[9.0])
+    manifest["configuration"] = {"runs": 60, "http": {"payload": "png"}}
+    found = opened(launch(1, n=6), launch(2, n=6, manifest=manifest)).differences
+    assert [str(one) for one in found] == [
+        "kernel: not known against 6.1",
+        "package numpy: 2.4 against 2.5",
+        "configuration http.payload: jpeg against png",
+    ]
+    assert not any(one.fatal for one in found)
+
+
+def test_a_fact_that_only_one_run_knows_is_told_and_not_refused(launch: Launch) -> None:
+    found = opened(
+        launch(1, n=6), launch(2, n=6, manifest=with_(MANIFEST, "environment", power_mode="MAXN"))
+    ).differences
+    assert [(str(one), one.fatal) for one in found] == [("power_mode: not known against MAXN", False)]
+
+
+def test_another_setting_under_the_same_name_is_refused_unless_told(launch: Launch) -> None:
+    first, second = launch(1, cells=("http/binary",)), launch(2, cells=("http/binary",), payload="raw")
+    with pytest.raises(UnlikeRuns, match="cells of one name differ: http/binary payload: jpeg against raw; --unlike"):
+        opened(first, second)
+    assert len(compared(first, second, "e2e", unlike=True).comparisons) == 1
+
+
+def test_runs_of_two_commands_are_never_compared(launch: Launch, tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "throughput", MANIFEST) as other:
+        pass
+    with pytest.raises(UsageError, match="these are runs of latency and throughput"):
+        opened(launch(1, n=2), read_run(other.path), unlike=True)
+    with RunWriter.create(tmp_path, "study", MANIFEST) as other:
+        pass
+    study = read_run(other.path)
+    with pytest.raises(UsageError, match="runs of study cannot be compared, only those of latency, throughput"):
+        opened(study, study)
+
+
+def test_what_went_wrong_in_a_run_is_told(launch: Launch, tmp_path: Path, make_row: MakeRow) -> None:
+    doubtful = {**MANIFEST, "warnings": [{"code": "load", "message": "m", "advice": "a"}]}
+    with RunWriter.create(tmp_path, "latency", doubtful) as run:
+        for block in range(20):
+            run.sample(make_row("loopback", STAGES, block, error="lost" if block < 3 else ""))
+        run.finish("interrupted")
+    found = doubts(compared(launch(1, cells=("loopback",)), read_run(run.path), "e2e"))
+    said = {doubt.code: doubt.message for doubt in found}
+    assert said["state"].endswith("is interrupted, not finished")
+    assert said["warnings"].endswith("has warnings: load")
+    assert said["errors"] == "loopback: 3 of 20 requests failed in B"
+    assert "one-launch" in said
+
+
+def test_repeated_launches_are_compared_by_launch(launch: Launch) -> None:
+    sides = [[launch(10 * side + each) for each in range(3)] for side in (1, 2)]
+    both = open_comparison(*sides, unlike=False, least=0.05)
+    found = compare(both, metrics_of(both, ["e2e"]))
+    assert found.launches
+    assert [one.n for one in found.comparisons] == [(180, 180)] * 4
+    assert "one-launch" not in {doubt.code for doubt in doubts(found)}
+    assert "over launches" in compare_table(found).notes[1]
+    with pytest.raises(UsageError, match="several launches on both sides, or one on each"):
+        open_comparison(sides[0], sides[1][:1], unlike=False, least=0.05)
+
+
+def test_a_metric_that_there_is_not_is_answered_by_those_there_are(launch: Launch) -> None:
+    both = opened(launch(1, n=6), launch(2, n=6))
+    with pytest.raises(
+        UsageError, match="'speed' is no metric of these latency runs; there are e2e_without_inference, "
+    ):
+        metrics_of(both, ["speed"])
+    with pytest.raises(UsageError, match=r"'e2e\.p98' is no metric .*; the statistics are median, mean, p90, p99"):
+        metrics_of(both, ["e2e.p98"])
+    with pytest.raises(UsageError, match="no cell has base64_encode on both sides"):
+        metrics_of(both, ["base64_encode"])
+    assert [(metric.name, statistic) for metric, statistic in metrics_of(both, ["e2e", "group.encode.p90", "e2e"])] == [
+        ("e2e", "median"),
+        ("group.encode", "p90"),
+    ]
+    found = compare(both, metrics_of(both, ["all"]))
+    assert {one.metric.name for one in found.comparisons} >= {"capture", "group.network", "e2e", "residual"}
+
+
+@pytest.mark.parametrize(
+    ("text", "cells", "metric", "rises", "limit"),
+    [
+        ("e2e.median>5%", "", "e2e.median", True, 0.05),
+        ("tokens_per_s<-2.5%", "", "tokens_per_s", False, -0.025),
+        (" ros/topic:e2e.p99 > 10 % ", "ros/topic", "e2e.p99", True, 0.1),
+        ("a:b/*:group.encode<- 0%", "a:b/*", "group.encode", False, 0.0),
+    ],
+)
+def test_a_gate_is_read(text: str, cells: str, metric: str, rises: bool, limit: float) -> None:
+    gate = read_gate(text)
+    assert (gate.cells, gate.metric, gate.rises, gate.limit) == (cells, metric, rises, limit)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "e2e", "e2e>5", "e2e<5%", "e2e>-5%", "e2e=5%", ">5%", "e2e>five%", "e2e>5%x", "e2e>>5%"]
+)
+def test_what_is_no_gate_is_refused_with_an_example(text: str) -> None:
+    with pytest.raises(UsageError, match=r"--fail-if: .* should look like e2e\.median>5%"):
+        read_gate(text)
+
+
+def outcomes(found: Compared, *gates: str, strict: bool = False) -> set[str]:
+    return {one.outcome for one in judge(found, [read_gate(gate) for gate in gates], strict=strict)}
+
+
+def test_a_gate_trips_beyond_its_limit_only(launch: Launch) -> None:
+    found = opened(launch(1, n=300), launch(2, n=300, factor=1.1))
+    assert outcomes(found, "e2e>5%") == {"tripped"}
+    assert outcomes(found, "e2e>20%") == {"passed"}
+    assert outcomes(found, "e2e<-5%") == {"passed"}
+    back = opened(launch(2, n=300, factor=1.1), launch(1, n=300))
+    assert outcomes(back, "e2e<-5%") == {"tripped"}
+    assert {one.comparison.pair.name for one in judge(found, [read_gate("http/*:e2e>5%")], strict=False)} == {
+        "http/as-deployed",
+        "http/binary",
+    }
+
+
+def test_a_gate_does_not_trip_on_noise_unless_it_is_strict(launch: Launch) -> None:
+    found = opened(launch(1, n=10, cells=("loopback",)), launch(2, n=10, cells=("loopback",), factor=1.02))
+    (one,) = judge(found, [read_gate("e2e>0%")], strict=False)
+    assert one.p_holm is not None
+    assert one.p_holm > 0.05
+    rises = (one.comparison.change.relative or 0) > 0
+    assert one.outcome == "passed"
+    assert outcomes(found, "e2e>0%" if rises else "e2e<-0%", strict=True) == {"tripped"}
+
+
+def test_a_gate_that_too_few_values_feed_is_undecided_not_passed(launch: Launch) -> None:
+    found = opened(launch(1), launch(2, factor=2))
+    assert outcomes(found, "e2e.p99>10%") == {"undecided"}
+    assert outcomes(found, "e2e.p99>10%", strict=True) == {"tripped"}
+
+
+def test_a_gate_on_a_cell_that_there_is_not_is_answered_by_those_there_are(launch: Launch) -> None:
+    with pytest.raises(
+        UsageError, match="no cell with e2e is called 'zmq'; there are http/as-deployed, http/binary, ros"
+    ):
+        outcomes(opened(launch(1, n=6), launch(2, n=6)), "zmq:e2e>5%")
+
+
+def test_the_json_object_is_what_its_schema_says(launch: Launch) -> None:
+    found = compared(launch(1), launch(2, factor=1.2), "e2e", "e2e.p99")
+    whole = compare_to_json(found, judge(found, [read_gate("e2e>5%")], strict=False), doubts(found))
+    jsonschema.validate(whole, SCHEMA)
+    json.dumps(whole, allow_nan=False)
+    assert [one["verdict"] for one in whole["comparisons"]] == ["worse"] * 4 + ["too few"] * 4
+    assert {one["outcome"] for one in whole["gates"]} == {"tripped"}
+    first = whole["comparisons"][0]
+    assert first["setting"]["payload"] == "jpeg"
+    assert first["change"]["value"] == pytest.approx(first["ratio"]["value"] - 1)
+    assert first["other"] / first["baseline"] == pytest.approx(first["ratio"]["value"])
+
+
+def test_the_files_say_what_the_table_says(launch: Launch, tmp_path: Path) -> None:
+    found = compared(launch(1), launch(2, factor=1.2), "e2e")
+    table = compare_table(found)
+    assert table.rows[0][0] == "e2e: median, ms"
+    assert [row[0] for row in table.rows[1:]] == ["http/as-deployed", "http/binary", "ros/topic", "loopback"]
+    assert all(row[-1] == "worse" and len(row) == len(table.header) for row in table.rows[1:])
+    assert "Echo engine." in table.notes[0]
+    written = write_comparison(tmp_path / "deep" / "out", found, {"a": 1})
+    assert sorted(path.suffix for path in written) == [".csv", ".json", ".md", ".pdf", ".png", ".tex"]
+    rows = list(csv.DictReader(io.StringIO(compare_csv(found))))
+    assert float(rows[0]["ratio"]) == found.comparisons[0].change.ratio.value
+    assert float(rows[3]["p_holm"]) == found.comparisons[3].p_holm
+
+
+def test_the_figure_has_a_panel_a_metric_and_a_row_a_cell(launch: Launch) -> None:
+    figure = build_forest(compared(launch(1), launch(2), "e2e", "capture"))
+    assert figure is not None
+    assert [axes.get_title("left") for axes in figure.axes] == ["e2e.median", "capture.median"]
+    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == list(CELLS)
+
+
+@pytest.mark.parametrize(
+    ("share", "text"), [(0.1, "+10"), (0.0994, "+9.9"), (-0.034, "-3.4"), (0.0, "0.0"), (-0.0004, "0.0"), (1.5, "+150")]
+)
+def test_a_change_is_written_in_per_cent(share: float, text: str) -> None:
+    assert percent(share) == text
+
+
+def test_a_side_is_one_folder_or_several_each_once(launch: Launch) -> None:
+    paths = [str(launch(seed, n=2).path) for seed in (1, 2)]
+    assert [str(run.path) for run in read_side(" , ".join(paths), "A")] == paths
+    with pytest.raises(UsageError, match="A: a folder is named twice"):
+        read_side(f"{paths[0]},{paths[0]}", "A")
+    with pytest.raises(UsageError, match="B: name a run folder"):
+        read_side(" , ", "B")
