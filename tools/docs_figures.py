@@ -1,6 +1,7 @@
 """Draw the figures of docs/policies.md, docs/timeline.md, docs/boundary.md: `.venv/bin/python tools/docs_figures.py`.
 
-They come from runs in virtual time with fixed seeds, so that running this again changes no figure.
+They come from runs in virtual time with fixed seeds, so that running this again changes no figure. Those of
+docs/studies.md take minutes and are drawn where they are named: `... study-targets study-frontier`.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from s2a_bench.bench.boundary import BoundaryConfig, run_boundary
+from s2a_bench.bench.studies import StudyConfig, run_study
 from s2a_bench.bench.timeline import run_timeline
 from s2a_bench.bench.timeline_config import TimelineConfig
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
 from s2a_bench.report.boundary_figure import build_boundary
 from s2a_bench.report.draw import new_figure
+from s2a_bench.report.study_figures import build_frontier, build_targets
 from s2a_bench.report.style import paper_column
 from s2a_bench.report.timeline_figures import build_timelines, policy_colours
 from s2a_bench.report.timelines import timelines_of
@@ -59,6 +62,11 @@ def timelines(config: TimelineConfig) -> Figure:
 def boundary(config: BoundaryConfig) -> Figure:
     """Draw a boundary run."""
     return build_boundary(_run(lambda output: run_boundary(config, output, Quiet())))
+
+
+def study(name: str, config: StudyConfig) -> Run:
+    """Make a study's run."""
+    return _run(lambda output: run_study(name, config, output, Quiet()))
 
 
 def safe_start_figure() -> Figure:
@@ -112,13 +120,19 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "boundary-jitter": lambda: boundary(BoundaryConfig(jitter="lognormal:cv=0.2")),
 }
 
+SLOW: dict[str, Callable[[], Figure]] = {
+    "study-targets": lambda: build_targets(study("targets", StudyConfig(seed=20261121))),
+    "study-frontier": lambda: build_frontier(study("frontier", StudyConfig())),
+}
+"""Drawn where they are named."""
+
 
 def main() -> None:
     """Draw all of them, or those that are named."""
     FOLDER.mkdir(exist_ok=True)
     for name in sys.argv[1:] or FIGURES:
         with paper_column():
-            FIGURES[name]().savefig(FOLDER / f"{name}.png", dpi=DPI)
+            (FIGURES | SLOW)[name]().savefig(FOLDER / f"{name}.png", dpi=DPI)
         print(FOLDER / f"{name}.png")
 
 

@@ -1,4 +1,7 @@
-"""What rare stalls cost: P(any stall) against regret, for families of gaps, as lambda goes from 0 to waiting."""
+"""What rare stalls cost: P(any stall) against regret, for families of gaps, as lambda goes from 0 to waiting.
+
+The lambda that calibration would choose is tried once more, under the condition `CALIBRATED`: where a robot would be.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,14 @@ from s2a_bench.bench.studies import Cell, StudyConfig
 from s2a_bench.bench.study_rows import study_row
 from s2a_bench.bench.worlds import TOKEN_CV, World, generator
 from s2a_bench.jitter import Bursty, Gaps, Lognormal, Markov, Recorded
-from s2a_bench.policy.conformal import GRID
+from s2a_bench.policy.conformal import GRID, calibrate
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import QuantileStart, StreamToAct
 from s2a_bench.store.schema import StudyRow
 
 NAME: Final = "frontier"
 PLANS: Final = 4000
+CALIBRATED: Final = "calibrated"
 
 WORLDS: Final = (
     World(4.8, 0.5, 4, 8, 1.0),
@@ -56,8 +60,11 @@ def cell(config: StudyConfig, world: World) -> list[StudyRow]:
     assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
     prior = GapPrior.fit(calibration.token_s)
     plans = world.draw(rng, config.plans or PLANS)
-    return [
+    cautions = (*GRID, math.inf)
+    found = [
         study_row(NAME, world, kind(prior, caution), plans, calibration_plans=config.calibration_plans)
         for kind in (StreamToAct, QuantileStart)
-        for caution in (*GRID, math.inf)
+        for caution in cautions
     ]
+    chosen = cautions.index(calibrate(StreamToAct(prior), calibration, config.epsilon).caution)
+    return [*found, replace(found[chosen], condition=CALIBRATED)]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from s2a_bench.cli.model_validity import validity
 from s2a_bench.cli.options import WIDTH
 
 if TYPE_CHECKING:
@@ -177,3 +178,6 @@ def dummy(
             )
     typer.echo(files.model)
     typer.echo(files.mmproj)
+
+
+app.command()(validity)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from s2a_bench.cli.options import WIDTH
+from s2a_bench.errors import S2AError
+
+if TYPE_CHECKING:
+    from s2a_bench.store.run import Run
 
 
 def study(
@@ -25,30 +31,53 @@ def study(
     seed: Annotated[int, typer.Option(help="seed; every cell has its own from it")] = 0,
     jobs: Annotated[int, typer.Option(help="processes")] = 1,
     output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
+    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Study when to act on drawn plans: nothing is measured, everything repeats by its seed."""
-    from rich.console import Console
-
     from s2a_bench.bench.studies import StudyConfig, run_study
     from s2a_bench.cli.progress import RunProgress
-    from s2a_bench.report.studies import study_tables
-    from s2a_bench.report.terminal import lay_out
     from s2a_bench.store.run import read_run
 
     config = StudyConfig(seed, plans, calibration_plans, epsilon, jobs, _recording(profile))
-    with RunProgress() as progress:
-        folder = run_study(name, config, output, progress)
-        run = read_run(folder)
-        for doubt in run.manifest["warnings"]:
-            progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
+    with RunProgress("cells") as progress:
+        try:
+            folder = run_study(name, config, output, progress)
+            run = read_run(folder)
+            for doubt in run.manifest["warnings"]:
+                progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
+            progress.stage("drawing")
+            _show(run, as_json=json_)
+        except (S2AError, KeyboardInterrupt):
+            if progress.folder is not None:
+                progress.say(f"cells so far: {progress.folder}")
+            raise
+
+
+def _show(run: Run, *, as_json: bool) -> None:
+    """Write tables and figure, and print what the user asked for."""
+    from rich.console import Console
+
+    from s2a_bench.report.studies import study_tables, table_files
+    from s2a_bench.report.study_figures import write_study_figure
+    from s2a_bench.report.study_machine import study_to_json
+    from s2a_bench.report.table_files import write_texts
+    from s2a_bench.report.terminal import lay_out
+
+    tables = study_tables(run)
+    write_texts(run, table_files(tables), {})
+    write_study_figure(run)
+    if as_json:
+        json.dump(study_to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
+        sys.stdout.write("\n")
+        return
     terminal = Console()
     console = terminal if terminal.is_terminal else Console(width=WIDTH)
-    for table in study_tables(run):
+    for table in tables:
         console.print(lay_out(table))
         for note in table.notes:
             console.print(note, markup=False, highlight=False)
         console.print()
-    console.print(f"run folder: {folder}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"run folder: {run.path}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _recording(name: str) -> tuple[float, ...]:

@@ -22,7 +22,7 @@ from s2a_bench.plan.parser import BadLine, Event, Parser, Problem, SkillParsed
 from s2a_bench.plan.prompt import prompt
 from s2a_bench.plan.skill_file import SKILL_SETS, load_skills, parse_skills
 from s2a_bench.plan.skillset import Argument, Call, Durations, Gap, Skill, SkillSet, Value
-from s2a_bench.plan.validity import Ask, Validity, measure_validity, score
+from s2a_bench.plan.validity import Ask, Validity, arms, measure_validity, score
 
 __all__ = [
     "GRANULARITIES",
@@ -44,6 +44,7 @@ __all__ = [
     "Tokenize",
     "Validity",
     "Value",
+    "arms",
     "choose_format",
     "grammar",
     "load_skills",

@@ -55,6 +55,11 @@ def score(format_: Format, answers: Iterable[Iterable[str]], n_skills: int) -> V
     return Validity(count, skills, dict(problems), as_ordered)
 
 
+def arms(format_: Format, n_skills: int, tokenize: Tokenize | None = None) -> dict[str, str]:
+    """Return the GBNF grammar of each way to ask: "grammar", and "free" with none."""
+    return {"grammar": grammar(format_, n_skills, tokenize), "free": ""}
+
+
 def measure_validity(
     ask: Ask, format_: Format, n_skills: int, *, answers: int = 32, tokenize: Tokenize | None = None
 ) -> dict[str, Validity]:
@@ -62,7 +67,7 @@ def measure_validity(
 
     ``tokenize`` pins the grammar to the model's tokens, as in `grammar`.
     """
-    texts = {"grammar": grammar(format_, n_skills, tokenize), "free": ""}
     return {
-        name: score(format_, (ask(text, seed) for seed in range(answers)), n_skills) for name, text in texts.items()
+        name: score(format_, (ask(text, seed) for seed in range(answers)), n_skills)
+        for name, text in arms(format_, n_skills, tokenize).items()
     }

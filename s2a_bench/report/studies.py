@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 ONLINE: Final = "stream-to-act"
 HARD: Final = 0.8
 """rho above which starting when a skill arrives is not safe."""
+POOLED, WORST, START, END = 0.01, 0.02, 0.05, 0.06
+"""What is wanted of stream-to-act: P(any stall) of all plans and of every setting, mean start and end regret."""
 LEVELS: Final = (0.01, 0.05, 0.20)
 """Shares of stalled plans at which a frontier's regret is read off."""
 WORLD: Final = ["tokens_per_s", "tokens_per_skill", "n_skills", "t_nom_s"]
@@ -43,12 +46,12 @@ def targets(rows: pd.DataFrame) -> list[Target]:
     hard = rows[rows["rho"] > HARD]
     stalled, plans = int(rows["stalled"].sum()), int(rows["plans"].sum())
     return [
-        Target("P(any stall), pooled, upper end of 95 %", upper_bound(stalled, plans, 0.975), 0.01),
-        Target("P(any stall), worst setting", float(rows["p_any_stall"].max()), 0.02),
-        Target("start regret, all settings", float(rows["start_regret"].mean()), 0.05),
-        Target("start regret, rho > .8", float(hard["start_regret"].mean()), 0.05),
-        Target("end regret, all settings", float(rows["end_regret"].mean()), 0.06),
-        Target("end regret, rho > .8", float(hard["end_regret"].mean()), 0.06),
+        Target("P(any stall), pooled, upper end of 95 %", upper_bound(stalled, plans, 0.975), POOLED),
+        Target("P(any stall), worst setting", float(rows["p_any_stall"].max()), WORST),
+        Target("start regret, all settings", float(rows["start_regret"].mean()), START),
+        Target("start regret, rho > .8", float(hard["start_regret"].mean()), START),
+        Target("end regret, all settings", float(rows["end_regret"].mean()), END),
+        Target("end regret, rho > .8", float(hard["end_regret"].mean()), END),
     ]
 
 
@@ -71,6 +74,11 @@ def study_tables(run: Run) -> list[TextTable]:
     if name not in _TABLES:
         raise StoreError(f"{run.path} holds no study; run s2a-bench study first")
     return list(_TABLES[name](rows))
+
+
+def table_files(tables: Iterable[TextTable]) -> dict[str, TextTable]:
+    """Name each table's file after its title: "Most stalls" -> most-stalls."""
+    return {re.sub(r"[^a-z0-9]+", "-", table.title.lower()).strip("-"): table for table in tables}
 
 
 def _targets(rows: pd.DataFrame) -> Iterator[TextTable]:

@@ -20,17 +20,20 @@ if TYPE_CHECKING:
 
 
 class CsvFile:
-    """One table's CSV, open for appending; it must not exist before."""
+    """One table's CSV, open for appending."""
 
-    def __init__(self, path: Path, columns: Iterable[str]) -> None:
-        """Create the file and write its header."""
+    def __init__(self, path: Path, columns: Iterable[str], *, reopen: bool = False) -> None:
+        """Create the file, which must not exist, with its header; ``reopen`` goes on after its last whole record."""
         self.path = path
         try:
-            self._file = path.open("xb", buffering=0)
+            self._file = path.open("r+b" if reopen else "xb", buffering=0)
         except OSError as error:
             raise StoreError(f"cannot create {path}: {error.strerror}; choose another --output") from error
-        self._end = 0
-        self._write(",".join(columns) + "\n")
+        self._end = len(whole_records(self._file.read())) if reopen else 0
+        self._file.truncate(self._end)
+        self._file.seek(self._end)
+        if not self._end:
+            self._write(",".join(columns) + "\n")
 
     def append(self, table: Table[Row], rows: Iterable[Row]) -> None:
         """Write rows in one system call."""

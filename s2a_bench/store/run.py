@@ -79,6 +79,20 @@ class RunWriter:
             run.append(table, [])
         return run
 
+    @classmethod
+    def reopen(cls, path: Path) -> RunWriter:
+        """Go on writing a run folder that nobody else writes, with its manifest and the whole records of its tables.
+
+        Raises StoreError where it is no run folder, another version's, or cannot be written.
+        """
+        manifest = manifests.read(path) | {"state": "running", "error": None, "finished": None}
+        run = cls(path, manifest)
+        for name, table in TABLES.items():
+            (path / f"{name}.parquet").unlink(missing_ok=True)
+            if (path / f"{name}.csv").exists():
+                run._files[name] = CsvFile(path / f"{name}.csv", table.columns, reopen=True)
+        return run
+
     @property
     def manifest(self) -> dict[str, Any]:
         """The manifest as last written; change it through `update`."""

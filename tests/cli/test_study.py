@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
+import jsonschema
 import pytest
 
 from s2a_bench.store.run import read_run
+
+ROOT = Path(__file__).parent.parent.parent
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -39,6 +43,25 @@ def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
     assert (rows["plans"] == 100).all()
     for name in ("N -2", "L x 1.25", "gap x 2"):
         assert name in done.stdout
+    for name in ("figures/misfit.png", "figures/misfit.pdf", "tables/wrong-beliefs.md", "tables/wrong-beliefs.tex"):
+        assert (folder / name).stat().st_size > 0
+
+
+def test_json_is_one_object_that_keeps_its_schema(tmp_path: Path) -> None:
+    done = run("misfit", "--plans", "50", "--calibration-plans", "100", "--json", "--output", str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    schema = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
+    jsonschema.validate(found, schema)
+    assert found["command"] == "study-misfit"
+    assert [doubt["code"] for doubt in found["warnings"]] == ["few-calibration-plans"]
+    rows = read_run(Path(found["run"])).tables["studies"]
+    assert [cell["p_any_stall"] for cell in found["cells"]] == list(rows["p_any_stall"])
+    assert [cell["condition"] for cell in found["cells"]] == list(rows["condition"])
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(found | {"targets": []}, schema)  # another study's
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(found | {"cells": [{**found["cells"][0], "p_stall": 0}]}, schema)
 
 
 @pytest.mark.parametrize(

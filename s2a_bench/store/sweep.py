@@ -1,0 +1,55 @@
+"""A sweep as read: one row a cell with its settings, and the run folder of each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from s2a_bench.errors import StoreError
+from s2a_bench.store.run import Run, read_run
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COMMAND = "sweep"
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One sweep: the manifest, every attempt, and the cells.
+
+    ``attempts`` is the table `CELLS` as it was written. ``cells`` has one row a cell and repeat, the latest attempt,
+    and one column more for every setting, by its flag's name.
+    """
+
+    path: Path
+    manifest: dict[str, Any]
+    attempts: pd.DataFrame
+    cells: pd.DataFrame
+
+    def runs(self) -> Iterator[tuple[dict[str, Any], Run]]:
+        """Yield the settings and the run of every finished cell, in the cells' order."""
+        for row in self.cells[self.cells["state"] == "finished"].to_dict("records"):
+            yield json.loads(row["settings"]), read_run(self.path / row["folder"])
+
+
+def is_sweep(manifest: dict[str, Any]) -> bool:
+    """Tell whether a run folder is a sweep's."""
+    return bool(manifest.get("command") == COMMAND)
+
+
+def read_sweep(path: Path) -> Sweep:
+    """Read a sweep's folder, at any moment of its life; raises StoreError where it is none."""
+    import pandas as pd
+
+    run = read_run(path)
+    if not is_sweep(run.manifest):
+        raise StoreError(f"{path} is the folder of a {run.manifest['command']} run, not of a sweep")
+    attempts = run.tables["cells"]
+    cells = attempts.drop_duplicates(["cell", "repeat"], keep="last").sort_values(["cell", "repeat"], ignore_index=True)
+    settings = pd.DataFrame([json.loads(text) for text in cells["settings"]], index=cells.index)
+    new = [name for name in settings.columns if name not in cells.columns]
+    return Sweep(Path(path), run.manifest, attempts, cells.join(settings[new]))
