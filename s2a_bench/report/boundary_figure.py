@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -58,9 +59,14 @@ def build_boundary(run: Run) -> Figure:
     return figure
 
 
+def boundary_figures(run: Run) -> dict[str, Callable[[], Figure]]:
+    """Return the figure by its file's name."""
+    return {"boundary": lambda: build_boundary(run)}
+
+
 def write_boundary_figure(run: Run) -> list[Path]:
     """Write ``figures/boundary.png`` and ``.pdf``."""
-    return save(run.path / "figures", {"boundary": lambda: build_boundary(run)})
+    return save(run.path / "figures", boundary_figures(run))
 
 
 def _shade_regions(axes: Axes, tokens: np.ndarray, lines: dict[str, float], low: float, high: float) -> None:

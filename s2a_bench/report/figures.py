@@ -121,16 +121,21 @@ def build_distribution(run: Run) -> Figure:
     return figure
 
 
-def write_figures(run: Run, against_paper: bool = False) -> list[Path]:
-    """Write ``figures/*.png`` and ``*.pdf``; the paper's values only when asked for. No samples, no figures."""
+def latency_figures(run: Run, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
+    """Return every figure by its file's name; the paper's values only when asked for. No samples, no figures."""
     if not _shown(run)[0]:
-        return []
-    builders: dict[str, Callable[[], Figure]] = {
+        return {}
+    return {
         "latency_bars": lambda: build_latency_bars(run, against_paper=against_paper),
         "stage_breakdown": lambda: build_stage_breakdown(run),
         "distribution": lambda: build_distribution(run),
     }
-    return save(run.path / "figures", builders)
+
+
+def write_figures(run: Run, against_paper: bool = False) -> list[Path]:
+    """Write ``figures/*.png`` and ``*.pdf``; without samples nothing."""
+    builders = latency_figures(run, against_paper)
+    return save(run.path / "figures", builders) if builders else []
 
 
 def _shown(run: Run) -> tuple[list[Cell], str]:

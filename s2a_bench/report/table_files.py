@@ -15,14 +15,19 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
 
-def write_tables(run: Run) -> list[Path]:
-    """Write ``tables/``: the text tables as .md and .tex, and stages, summary and ratios in full as .csv."""
+def latency_tables(run: Run) -> dict[str, TextTable]:
+    """Return every table of a latency run by its file's name."""
     tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
     if tokens := token_table(run):
         tables["tokens"] = tokens
     if frames := frame_table(run):
         tables["frames"] = frames
-    return write_texts(run, tables, csv_texts(run))
+    return tables
+
+
+def write_tables(run: Run) -> list[Path]:
+    """Write ``tables/``: the text tables as .md and .tex, and stages, summary and ratios in full as .csv."""
+    return write_texts(run, latency_tables(run), csv_texts(run))
 
 
 def write_texts(run: Run, tables: Mapping[str, TextTable], csvs: Mapping[str, str]) -> list[Path]:

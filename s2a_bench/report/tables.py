@@ -218,7 +218,7 @@ def _engine_notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
 
 def _latex_row(row: tuple[str, ...]) -> str:
     """Write one row of a LaTeX table."""
-    escapes = {"_": "\\_", "%": "\\%", "&": "\\&", "#": "\\#", "±": "$\\pm$", ABSENT: "--"}
+    escapes = {"_": "\\_", "%": "\\%", "&": "\\&", "#": "\\#", "±": "$\\pm$", ">": "$>$", ABSENT: "--"}
     texts = ("".join(escapes.get(char, char) for char in text) for text in row)
     # A booktabs row that opens with a bracket would be read as an option of the row before it.
     return " & ".join(f"{{{text}}}" if text.startswith("[") else text for text in texts) + " \\\\"

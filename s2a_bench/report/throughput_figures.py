@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -125,18 +126,21 @@ def build_rate_by_position(run: Run) -> Figure:
     return figure
 
 
-def write_throughput_figures(run: Run, *, against_paper: bool = False) -> list[Path]:
-    """Write ``figures/*.png`` and ``*.pdf``; the paper's values only when asked for. No rates, no figures."""
+def throughput_figures(run: Run, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
+    """Return every figure by its file's name; the paper's values only when asked for. No rates, no figures."""
     if not any(speed.values(RATIO_METRIC).size for speed in speeds_of(run)):
-        return []
-    return save(
-        run.path / "figures",
-        {
-            "throughput_bars": lambda: build_throughput_bars(run, against_paper=against_paper),
-            "gaps": lambda: build_gap_distribution(run),
-            "positions": lambda: build_rate_by_position(run),
-        },
-    )
+        return {}
+    return {
+        "throughput_bars": lambda: build_throughput_bars(run, against_paper=against_paper),
+        "gaps": lambda: build_gap_distribution(run),
+        "positions": lambda: build_rate_by_position(run),
+    }
+
+
+def write_throughput_figures(run: Run, *, against_paper: bool = False) -> list[Path]:
+    """Write ``figures/*.png`` and ``*.pdf``; without rates nothing."""
+    builders = throughput_figures(run, against_paper=against_paper)
+    return save(run.path / "figures", builders) if builders else []
 
 
 def _title(run: Run, speeds: list[Speed], what: str) -> str:

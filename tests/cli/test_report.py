@@ -1,0 +1,101 @@
+"""`s2a-bench report` as a user runs it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.bench.timeline import run_timeline
+from s2a_bench.bench.timeline_config import TimelineConfig
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+class Quiet:
+    """Progress that nobody looks at."""
+
+    def opened(self, folder: Path) -> None: ...
+    def stage(self, text: str) -> None: ...
+    def expect(self, samples: int) -> None: ...
+    def advance(self) -> None: ...
+
+
+@pytest.fixture(scope="module")
+def timeline(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
+    return run_timeline(config, tmp_path_factory.mktemp("timeline"), Quiet())
+
+
+def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "s2a_bench", "report", *map(str, arguments)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=200, cwd=cwd, env=environment)
+
+
+def test_a_run_becomes_a_page_in_the_current_folder_and_again(timeline: Path, tmp_path: Path) -> None:
+    for _ in range(2):
+        done = run(timeline, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout == "page: report.html\n"
+        assert done.stderr == ""
+    assert (tmp_path / "report.html").read_text().startswith("<!doctype html>")
+
+
+def test_what_is_asked_for_is_written_and_nothing_else(timeline: Path, tmp_path: Path) -> None:
+    before = sorted(timeline.rglob("*"))
+    done = run(timeline, "--latex", "tex", "--csv", "csv", "--markdown", "all.md", "--against", "paper", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("the paper's claims: ")
+    assert "20 no run given, 4 confirmed, 2 not confirmed" in done.stdout
+    assert {path.name for path in tmp_path.iterdir()} == {"tex", "csv", "all.md"}
+    assert sorted(timeline.rglob("*")) == before
+
+
+def test_an_unfinished_run_is_told_on_standard_error(timeline: Path, tmp_path: Path) -> None:
+    manifest = (timeline / "manifest.json").read_text()
+    cut = tmp_path / "cut"
+    cut.mkdir()
+    for file in timeline.iterdir():
+        if file.is_file():
+            (cut / file.name).write_bytes(file.read_bytes())
+    (cut / "manifest.json").write_text(manifest.replace('"state": "finished"', '"state": "running"'))
+    done = run(cut, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "warning: timeline on" in done.stderr
+    assert "has not finished" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["/no/such/folder"], 1, "error: /no/such/folder is no run folder"),
+        (["{here}"], 1, "is no run folder"),
+        (["{run}", "--against", "rivals"], 2, "--against: 'rivals' should be paper; two runs are compared with"),
+        (["{run}", "--output", "{here}"], 2, "--output: {here} is a folder; name a file"),
+        (["{run}", "--output", "{here}/mine.html"], 2, "s2a-bench report did not write it; name another file"),
+        (["{run}", "--markdown", "{here}/mine.html"], 2, "--markdown: {here}/mine.html is there"),
+        (["{run}", "--latex", "{here}/mine.html"], 2, "--latex: {here}/mine.html is a file; name a folder"),
+        (["{run}", "--output", "/proc/nowhere/page.html"], 1, "cannot write /proc/nowhere/page.html"),
+        ([], 2, "Missing argument"),
+    ],
+)
+def test_wrong_use_is_one_line(timeline: Path, tmp_path: Path, arguments: list[str], code: int, message: str) -> None:
+    (tmp_path / "mine.html").write_text("mine")
+    filled = [each.format(here=tmp_path, run=timeline) for each in arguments]
+    done = run(*filled, cwd=tmp_path)
+    assert done.returncode == code
+    (line,) = done.stderr.splitlines()
+    assert message.format(here=tmp_path) in line
+    assert (tmp_path / "mine.html").read_text() == "mine"
+
+
+def test_a_damaged_manifest_is_one_line(timeline: Path, tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text((timeline / "manifest.json").read_text()[:100])
+    done = run(tmp_path, cwd=tmp_path)
+    assert done.returncode == 1
+    assert "manifest.json is damaged" in done.stderr
+    assert "Traceback" not in done.stderr
