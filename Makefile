@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-policy test check check-platforms setup clean
+.PHONY: bench bench-policy bench-ray test check check-platforms setup clean
 
 # The main job: a real model first, then the transports alone (no model), with JPEG and with raw pixels.
 bench: setup
@@ -17,6 +17,11 @@ bench: setup
 # Timelines per second on one core; wants a quiet machine.
 bench-policy: setup
 	$(BIN)/python -m s2a_bench.bench.policy_speed
+
+# A million Monte Carlo timelines on 1, 2, 4 ... processes, with and without Ray: equal check sums, and the scaling.
+bench-ray: setup
+	$(BIN)/python -m pip install --quiet -e '.[ray]' -c constraints.txt
+	$(BIN)/python -m s2a_bench.bench.sweep.scaling
 
 test: setup
 	$(BIN)/python -m pytest

@@ -85,11 +85,11 @@ class Target:
 
 
 TARGETS = (
-    Target("3.10", "x86_64", 35, "Ubuntu 22.04, Humble", ("dev",)),
-    Target("3.11", "x86_64", 36, "Debian 12", ("dev",)),
-    Target("3.12", "x86_64", 39, "Ubuntu 24.04, Jazzy", ("dev",)),
-    Target("3.10", "aarch64", 35, "JetPack 6"),
-    Target("3.12", "aarch64", 39, "Jazzy in a container"),
+    Target("3.10", "x86_64", 35, "Ubuntu 22.04, Humble", ("dev", "ray")),
+    Target("3.11", "x86_64", 36, "Debian 12", ("dev", "ray")),
+    Target("3.12", "x86_64", 39, "Ubuntu 24.04, Jazzy", ("dev", "ray")),
+    Target("3.10", "aarch64", 35, "JetPack 6", ("ray",)),
+    Target("3.12", "aarch64", 39, "Jazzy in a container", ("ray",)),
 )
 
 

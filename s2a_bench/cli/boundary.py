@@ -33,6 +33,9 @@ def boundary(
     plans: Annotated[int | None, typer.Option(help="plans a point [default: 1; with jitter 2000]")] = None,
     seed: Annotated[int, typer.Option(help="seed of everything that is drawn")] = 0,
     output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
+    data_only: Annotated[
+        bool, typer.Option("--data-only", help="write no tables and figures into the run folder")
+    ] = False,
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Show at which rates and granularities naive execution never stalls: by formula, and by trying every point."""
@@ -56,7 +59,9 @@ def boundary(
     with RunProgress() as progress:
         try:
             folder = run_boundary(config, output, progress)
-            progress.stage("drawing")
+            if not data_only:
+                progress.stage("drawing")
+                _draw(folder)
             _show(folder, as_json=json_)
         except (S2AError, KeyboardInterrupt):
             if progress.folder is not None:
@@ -64,20 +69,28 @@ def boundary(
             raise
 
 
-def _show(folder: Path, *, as_json: bool) -> None:
-    """Write tables and figure, and print what the user asked for."""
-    from rich.console import Console
-
-    from s2a_bench.report.boundary import boundary_csv, boundary_tables, boundary_to_json
+def _draw(folder: Path) -> None:
+    """Write tables and figure."""
+    from s2a_bench.report.boundary import boundary_csv, boundary_tables
     from s2a_bench.report.boundary_figure import write_boundary_figure
     from s2a_bench.report.table_files import write_texts
+    from s2a_bench.store.run import read_run
+
+    run = read_run(folder)
+    write_texts(run, boundary_tables(run), boundary_csv(run))
+    write_boundary_figure(run)
+
+
+def _show(folder: Path, *, as_json: bool) -> None:
+    """Print what the user asked for."""
+    from rich.console import Console
+
+    from s2a_bench.report.boundary import boundary_tables, boundary_to_json
     from s2a_bench.report.terminal import lay_out
     from s2a_bench.store.run import read_run
 
     run = read_run(folder)
     tables = boundary_tables(run)
-    write_texts(run, tables, boundary_csv(run))
-    write_boundary_figure(run)
     if as_json:
         json.dump(boundary_to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
         sys.stdout.write("\n")

@@ -81,6 +81,9 @@ def latency(
     output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
     against: Annotated[str, typer.Option(help="paper: draw the paper's figures beside ours")] = "",
     quick: Annotated[bool, typer.Option("--quick", help="fewer samples: a first look")] = False,
+    data_only: Annotated[
+        bool, typer.Option("--data-only", help="write no tables and figures into the run folder")
+    ] = False,
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", help="also what measuring costs, and the environment")] = False,
 ) -> None:
@@ -136,27 +139,36 @@ def latency(
     with RunProgress() as progress:
         try:
             folder = run_latency(config, output, progress)
-            progress.stage("drawing")
-            _show(folder, progress, as_json=json_, against_paper=against == "paper", verbose=verbose)
+            if not data_only:
+                progress.stage("drawing")
+                _draw(folder, against_paper=against == "paper")
+            _show(folder, progress, as_json=json_, verbose=verbose)
         except (S2AError, KeyboardInterrupt):
             if progress.folder is not None:
                 progress.say(f"samples so far: {progress.folder}")
             raise
 
 
-def _show(folder: Path, progress: RunProgress, *, as_json: bool, against_paper: bool, verbose: bool) -> None:
-    """Write tables and figures, and print what the user asked for."""
-    from rich.console import Console
-
+def _draw(folder: Path, *, against_paper: bool) -> None:
+    """Write tables and figures."""
     from s2a_bench.report.figures import write_figures
-    from s2a_bench.report.machine import to_json
     from s2a_bench.report.table_files import write_tables
-    from s2a_bench.report.terminal import renderables
     from s2a_bench.store.run import read_run
 
     run = read_run(folder)
     write_tables(run)
     write_figures(run, against_paper=against_paper)
+
+
+def _show(folder: Path, progress: RunProgress, *, as_json: bool, verbose: bool) -> None:
+    """Print what the user asked for."""
+    from rich.console import Console
+
+    from s2a_bench.report.machine import to_json
+    from s2a_bench.report.terminal import renderables
+    from s2a_bench.store.run import read_run
+
+    run = read_run(folder)
     for doubt in run.manifest["warnings"]:
         progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
     if as_json:

@@ -16,7 +16,8 @@ PLAIN_STEPS = 5
 class RunProgress:
     """Progress of one run, on standard error. Use as a context manager."""
 
-    def __init__(self) -> None:
+    def __init__(self, unit: str = "samples") -> None:
+        self._unit = unit
         self.console = Console(stderr=True)
         self.folder: Path | None = None
         self._bar = Progress(
@@ -70,4 +71,4 @@ class RunProgress:
         step = max(1, self._total // PLAIN_STEPS)
         if self._bar.disable and self._done % step == 0:
             left_s = (now_ns() - self._started_ns) / 1e9 / self._done * (self._total - self._done)
-            self.say(f"  {self._done} of {self._total} samples, about {left_s:.0f} s left")
+            self.say(f"  {self._done} of {self._total} {self._unit}, about {left_s:.0f} s left")

@@ -77,6 +77,9 @@ def throughput(
     output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
     against: Annotated[str, typer.Option(help="paper: draw the paper's table II beside ours")] = "",
     quick: Annotated[bool, typer.Option("--quick", help="fewer and shorter answers: a first look")] = False,
+    data_only: Annotated[
+        bool, typer.Option("--data-only", help="write no tables and figures into the run folder")
+    ] = False,
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Measure tokens a second: prefill, time to first token, every gap between tokens, decode rate by position."""
@@ -138,29 +141,39 @@ def throughput(
     with RunProgress() as progress:
         try:
             folder = run_throughput(config, output, progress)
-            progress.stage("drawing")
-            _show(folder, progress, as_json=json_, against_paper=against == "paper")
+            if not data_only:
+                progress.stage("drawing")
+                _draw(folder, against_paper=against == "paper")
+            _show(folder, progress, as_json=json_)
         except (S2AError, KeyboardInterrupt):
             if progress.folder is not None:
                 progress.say(f"samples so far: {progress.folder}")
             raise
 
 
-def _show(folder: Path, progress: RunProgress, *, as_json: bool, against_paper: bool) -> None:
-    """Write tables and figures, and print what the user asked for."""
-    from rich.console import Console
-
+def _draw(folder: Path, *, against_paper: bool) -> None:
+    """Write tables and figures."""
     from s2a_bench.report.table_files import write_texts
-    from s2a_bench.report.terminal import lay_out
     from s2a_bench.report.throughput_figures import write_throughput_figures
-    from s2a_bench.report.throughput_machine import throughput_to_json
     from s2a_bench.report.throughput_tables import throughput_csv, throughput_tables
     from s2a_bench.store.run import read_run
 
     run = read_run(folder)
-    tables = throughput_tables(run)
-    write_texts(run, tables, throughput_csv(run))
+    write_texts(run, throughput_tables(run), throughput_csv(run))
     write_throughput_figures(run, against_paper=against_paper)
+
+
+def _show(folder: Path, progress: RunProgress, *, as_json: bool) -> None:
+    """Print what the user asked for."""
+    from rich.console import Console
+
+    from s2a_bench.report.terminal import lay_out
+    from s2a_bench.report.throughput_machine import throughput_to_json
+    from s2a_bench.report.throughput_tables import throughput_tables
+    from s2a_bench.store.run import read_run
+
+    run = read_run(folder)
+    tables = throughput_tables(run)
     for doubt in run.manifest["warnings"]:
         progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
     if as_json:

@@ -135,12 +135,13 @@ def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
 FLAGS = {
     "rate": "value",
     "live": "switch",
+    "film": "toggle",
     "name": "argument",
     "profile": "value",
     "seed": "value",
     "data-only": "switch",
 }
-COMMAND = Command("fly", FLAGS, lambda _: None, ("live",))  # type: ignore[arg-type]
+COMMAND = Command("fly", FLAGS, lambda _: None, {"live": True})  # type: ignore[arg-type]
 
 
 def plan_of(*settings: dict[str, Any], repeats: int = 1, rest_s: float = 0.0, seed: int = 0, **of: Any) -> Plan:
@@ -150,7 +151,10 @@ def plan_of(*settings: dict[str, Any], repeats: int = 1, rest_s: float = 0.0, se
 def test_a_cell_is_the_command_line_that_its_command_reads() -> None:
     (cell,) = plan_of({"rate": [3, 4.5], "live": False, "name": "x"}, seed=7).cells
     assert cell.argv == ("fly", "x", "--rate=3,4.5", "--seed=7", "--data-only")
+    assert cell.settings == {"rate": "3,4.5", "live": False, "name": "x"}
     assert cell.virtual
+    (cell,) = plan_of({"film": False}).cells
+    assert cell.argv[1] == "--no-film"
     (cell,) = plan_of({"live": True}).cells
     assert cell.argv == ("fly", "--live", "--seed=0", "--data-only")
     assert not cell.virtual
@@ -165,7 +169,7 @@ def test_cells_of_one_repeat_share_its_seed_so_that_they_are_compared_on_the_sam
     ("setting", "message"),
     [
         ({"rat": 1}, "s.toml: 'rat' is no flag of s2a-bench fly; did you mean rate?"),
-        ({"zzz": 1}, "s.toml: 'zzz' is no flag of s2a-bench fly; it has board, live, name, profile, rate"),
+        ({"zzz": 1}, "s.toml: 'zzz' is no flag of s2a-bench fly; it has board, film, live, name, profile, rate"),
         ({"live": 1}, "s.toml: live: 1 should be true or false"),
         ({"rate": True}, "s.toml: rate: True should be text or a number"),
         ({"rate": [{"a": 1}]}, "s.toml: rate: {'a': 1} should be text or a number"),
@@ -311,7 +315,7 @@ def test_every_cell_is_kept_once_with_its_settings_and_its_run(folder: Path) -> 
     assert [setting["rate"] for setting, _ in runs] == [1, 1, 2, 2, 3, 3]
     assert all(run.manifest["command"] == "fly" for _, run in runs)
     assert sweep.manifest["machines"] == {"h": {"host": "h", "cpu": "c"}}
-    assert not (folder / ".under-way" / "0001-r1").exists()
+    assert not (folder / ".under-way").exists()
     assert (folder / "cells.parquet").exists()
 
 

@@ -18,7 +18,17 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["latency", "--help"], ["model", "--help"], ["--version"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"],
+        ["latency", "--help"],
+        ["throughput", "--help"],
+        ["model", "--help"],
+        ["profile", "--help"],
+        ["--version"],
+    ],
+)
 def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
     code = (
         "import sys\nsys.argv = ['s2a-bench', *sys.argv[1:]]\nfrom s2a_bench.cli import main\n"
@@ -43,6 +53,15 @@ def test_every_flag_of_latency_is_explained() -> None:
     flags += " runs warmup mode fps max-tokens seed output record ros action json verbose against"
     for flag in flags.split():
         assert f"--{flag}" in text
+
+
+def test_every_flag_of_throughput_is_explained() -> None:
+    text = run("throughput", "--help").stdout
+    flags = "transport source size payload http ros action url dialect api-key-env extra-body served-model llama-server"
+    flags += " engine profile gaps model mmproj threads gpu-layers batch context kv-type flash-attention sampling"
+    flags += " reference runs warmup max-tokens prompt grammar seed timeout output against quick json sample-resources"
+    for flag in flags.split():
+        assert f"--{flag} " in text
 
 
 def test_the_version_is_printed() -> None:

@@ -1,0 +1,73 @@
+"""How a sweep sees the other commands: their flags, their parser, and a way to run one in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from s2a_bench.errors import UsageError
+
+if TYPE_CHECKING:
+    from s2a_bench.bench.sweep import Command
+
+REAL: dict[str, dict[str, Any] | None] = {
+    "latency": None,
+    "throughput": None,
+    "timeline": {"live": True, "real-time": True},
+    "ccrb": {"simulator": "carla"},
+    "boundary": {},
+    "study": {},
+}
+"""Commands that can be swept -> the settings with which they measure; else they compute. None: they always measure."""
+ENTRY = f"{__name__}:run"
+"""Where a worker finds `run`."""
+
+
+def command_of(name: str, key: str = "command") -> Command:
+    """Describe a command; raises UsageError for one that cannot be swept."""
+    from s2a_bench.bench.sweep import Command
+
+    known = [each for each in REAL if each in _commands()]
+    if name not in known:
+        raise UsageError(f"{key}: '{name}' is none of {', '.join(known)}")
+    flags: dict[str, Any] = {}
+    for parameter in _commands()[name].params:
+        if parameter.param_type_name == "argument":
+            flags[parameter.name] = "argument"
+            continue
+        long = next(flag for flag in parameter.opts if flag.startswith("--"))
+        kind = "value" if not parameter.is_flag else "toggle" if parameter.secondary_opts else "switch"
+        flags[long.removeprefix("--")] = kind
+    return Command(name, flags, lambda argv: _check(name, argv), REAL[name])
+
+
+def run(argv: Sequence[str]) -> None:
+    """Run a command as ``s2a-bench ARGV`` does; raises S2AError."""
+    from s2a_bench.cli import ParseError
+
+    try:
+        _commands()[argv[0]].main(args=list(argv[1:]), prog_name=f"s2a-bench {argv[0]}", standalone_mode=False)
+    except ParseError as error:
+        raise UsageError(error.format_message()) from error
+
+
+def _check(name: str, argv: Sequence[str]) -> None:
+    """Parse arguments and run nothing."""
+    from s2a_bench.cli import ParseError
+
+    try:
+        _commands()[name].make_context(name, list(argv))
+    except ParseError as error:
+        raise UsageError(error.format_message()) from error
+
+
+@cache
+def _commands() -> dict[str, Any]:
+    """Return the commands as the parser has them."""
+    from typer.main import get_command
+
+    from s2a_bench.cli import app
+
+    group: Any = get_command(app)
+    return dict(group.commands)

@@ -1,0 +1,330 @@
+"""`s2a-bench sweep` as a user runs it: killed, interrupted, resumed, refused, on another machine, as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pandas as pd
+import pytest
+
+from s2a_bench.store.run import read_run
+from s2a_bench.store.sweep import Sweep, read_sweep
+
+ROOT = Path(__file__).parent.parent.parent
+WAIT_S = 120
+
+MANY = """
+command = "timeline"
+repeats = 2
+seed = 3
+[settings]
+jitter = "lognormal:cv=0.2"
+plans = 200
+epsilon = 0.05
+calibration-plans = 40
+[grid]
+profile = ["rtx-4080", "jetson-agx-orin"]
+tokens-per-skill = [6, 1]
+policy = ["naive", "wait-then-act", "stream-to-act"]
+[[exclude]]
+profile = "rtx-4080"
+policy = ["wait-then-act", "stream-to-act"]
+"""
+CELLS = 2 * (2 * 3 + 2)
+
+
+def sweep(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "s2a_bench", "sweep", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+def schema() -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
+    return found
+
+
+@pytest.fixture
+def many(tmp_path: Path) -> Path:
+    path = tmp_path / "many.toml"
+    path.write_text(MANY)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Sweep:
+    """The same sweep, run in one go."""
+    place = tmp_path_factory.mktemp("whole")
+    (place / "many.toml").write_text(MANY)
+    sweep(place / "many.toml", "--output", place / "results")
+    return read_sweep(only(place / "results"))
+
+
+def only(output: Path) -> Path:
+    (folder,) = output.iterdir()
+    return folder
+
+
+def begin(file: Path, output: Path, finished: int) -> tuple[subprocess.Popen[str], Path]:
+    """Start a sweep and return when so many cells are finished."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "s2a_bench", "sweep", str(file), "--output", str(output), "--jobs", "2"],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    until = time.monotonic() + WAIT_S
+    while time.monotonic() < until and process.poll() is None:
+        rows = [path.read_bytes().count(b"\n") - 1 for path in output.glob("*/cells.csv")]
+        if rows and rows[0] >= finished:
+            break
+        time.sleep(0.01)
+    assert process.poll() is None, process.communicate()
+    return process, only(output)
+
+
+def children(pid: int) -> list[int]:
+    """Return the worker processes of a sweep."""
+    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(part) for part in text.split()]
+
+
+def numbers(found: Sweep) -> pd.DataFrame:
+    """Return every timeline of a sweep, by its cell."""
+    rows = [run.tables["timelines"].assign(seed=run.manifest["seeds"]["plans"]) for _, run in found.runs()]
+    return pd.concat(rows, ignore_index=True)
+
+
+@pytest.mark.slow
+def test_killed_in_the_middle_it_goes_on_with_every_cell_exactly_once(many: Path, whole: Sweep) -> None:
+    output = many.parent / "results"
+    process, folder = begin(many, output, 4)
+    workers = children(process.pid)
+    assert len(workers) >= 2
+    process.kill()
+    process.communicate()
+    until = time.monotonic() + WAIT_S
+    while any(Path(f"/proc/{pid}").exists() for pid in workers) and time.monotonic() < until:
+        time.sleep(0.01)
+    assert not [pid for pid in workers if Path(f"/proc/{pid}").exists()]  # nothing works on unseen
+    before = (folder / "cells.csv").read_bytes()
+    kept = read_sweep(folder)
+    assert kept.manifest["state"] == "running"
+    assert 4 <= len(kept.cells) < CELLS
+    assert len(list(kept.runs())) == len(kept.cells)
+
+    done = sweep("--resume", folder)
+    assert f"{CELLS} of {CELLS} cells finished" in done.stdout
+    found = read_sweep(folder)
+    assert (folder / "cells.csv").read_bytes().startswith(before)
+    assert len(found.attempts) == len(found.cells) == CELLS
+    assert set(found.cells["state"]) == {"finished"}
+    assert set(found.cells["attempt"]) == {1}
+    assert {(row.cell, row.repeat) for row in found.cells.itertuples()} == {
+        (row.cell, row.repeat) for row in whole.cells.itertuples()
+    }
+    assert {path.name for path in (folder / "cells").iterdir()} == {
+        f"{row.cell}-r{row.repeat}" for row in found.cells.itertuples()
+    }
+    assert all(run.manifest["state"] == "finished" for _, run in found.runs())
+    pd.testing.assert_frame_equal(numbers(found), numbers(whole))  # as if nothing had happened
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_a_folder_that_goes_on(many: Path) -> None:
+    process, folder = begin(many, many.parent / "results", 2)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the sweep and to its workers
+    _, said = process.communicate(timeout=WAIT_S)
+    assert process.returncode == 130
+    assert "Traceback" not in said
+    assert f"go on with: s2a-bench sweep --resume {folder}" in said
+    assert said.splitlines()[-1] == "interrupted"
+    assert read_run(folder).manifest["state"] == "interrupted"
+    sweep("--resume", folder)
+    found = read_sweep(folder)
+    assert len(found.attempts) == CELLS
+    assert found.manifest["state"] == "finished"
+
+
+def test_repeats_have_draws_of_their_own_and_policies_share_them(whole: Sweep) -> None:
+    found = numbers(whole)
+    orin = found[(found["board"] == "jetson-agx-orin") & (found["tokens_per_skill"] == 6)]
+    first = orin[orin["seed"] == 3].groupby("policy")["last_arrival_ns"].apply(list)
+    assert set(orin["seed"]) == {3, 4}
+    assert first["naive"] == first["stream-to-act"] == first["wait-then-act"]
+    assert first["naive"] != orin[orin["seed"] == 4].groupby("policy")["last_arrival_ns"].apply(list)["naive"]
+
+
+def test_the_settings_are_columns_beside_the_state(whole: Sweep) -> None:
+    assert set(whole.cells["profile"]) == {"rtx-4080", "jetson-agx-orin"}
+    assert set(whole.cells["tokens-per-skill"]) == {6, 1}
+    counts = whole.cells.groupby("profile").size()
+    assert dict(counts) == {"rtx-4080": 4, "jetson-agx-orin": 12}
+    argv = json.loads(whole.cells["argv"][0])
+    assert argv[0] == "timeline"
+    assert "--plans=200" in argv
+
+
+def test_a_changed_file_and_another_machine_are_refused_with_one_line(whole: Sweep, tmp_path: Path) -> None:
+    changed = tmp_path / "changed.toml"
+    changed.write_text(MANY.replace("plans = 200", "plans = 201"))
+    done = sweep(changed, "--resume", whole.path, code=2)
+    assert len(done.stderr.splitlines()) == 1
+    assert "was another one" in done.stderr
+    manifest = json.loads((whole.path / "manifest.json").read_text())
+    (tmp_path / "sweep.toml").write_text(MANY)
+    manifest["environment"] |= {"cpu": "Z80", "host": "elsewhere"}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    done = sweep("--resume", tmp_path, code=2)
+    assert len(done.stderr.splitlines()) == 1
+    assert "was elsewhere" in done.stderr
+    assert "was Z80" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_failed_cell_keeps_its_error_and_is_retried_when_told(tmp_path: Path) -> None:
+    file, output = tmp_path / "f.toml", tmp_path / "results"
+    file.write_text(
+        'command = "timeline"\n[settings]\nprofile = "rtx-4080"\n[grid]\nplans = [1, 5]\n'  # 5 equal plans are refused
+    )
+    done = sweep(file, "--output", output, code=1)
+    assert "1 of 2 cells failed" in done.stderr
+    assert "--plans: without --jitter" in done.stdout.replace("\n", " ")
+    folder = only(output)
+    (failed,) = read_sweep(folder).cells.query("state == 'failed'").to_dict("records")
+    assert failed["error"].startswith("--plans: without --jitter or --t-nom-cv all plans are the same")
+    assert failed["folder"] == ""
+    sweep("--resume", folder, code=1)
+    assert len(read_sweep(folder).attempts) == 2
+    sweep("--resume", folder, "--retry-failed", code=1)
+    attempts = read_sweep(folder).attempts
+    assert list(attempts[attempts["state"] == "failed"]["attempt"]) == [1, 2]
+    assert len(attempts) == 3
+
+
+def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp_path: Path) -> None:
+    file = tmp_path / "m.toml"
+    file.write_text(
+        'command = "latency"\n[settings]\nengine = "echo"\ntransport = "loopback"\nruns = 3\nwarmup = 0\n'
+        '[grid]\nsource = ["synthetic", "video:/no/such/file.mp4"]\n'
+    )
+    done = sweep(file, "--output", tmp_path / "results", "--json", code=1)
+    found = json.loads(done.stdout)
+    jsonschema.validate(found, schema())
+    good, bad = found["cells"]
+    assert (good["state"], good["error"], good["virtual"]) == ("finished", None, False)
+    assert len(read_run(Path(good["run"])).samples) == 3
+    assert not (Path(good["run"]) / "figures").exists()
+    assert bad["state"] == "failed"
+    assert "/no/such/file.mp4" in bad["error"]
+    assert found["state"] == "failed"
+
+
+def test_dry_run_prints_cells_and_time_and_leaves_nothing(many: Path) -> None:
+    output = many.parent / "results"
+    done = sweep(many, "--dry-run", "--output", output)
+    lines = done.stdout.splitlines()
+    assert sum("s2a-bench timeline" in line for line in lines) == CELLS
+    assert [line.split("-r")[1][0] for line in lines[:CELLS]] == ["1"] * (CELLS // 2) + ["2"] * (CELLS // 2)
+    assert lines[-2] == f"{CELLS} of {CELLS} cells to run, {CELLS} virtual and 0 measured"
+    assert "was run for it and took" in lines[-1]
+    assert not output.exists()
+    found = json.loads(sweep(many, "--dry-run", "--json", "--output", output).stdout)
+    jsonschema.validate(found, schema())
+    assert {cell["state"] for cell in found["cells"]} == {"planned"}
+    assert found["expected"]["s"] > 0
+
+
+def test_dry_run_of_measured_cells_says_that_nobody_knows_and_a_killed_sweep_what_is_left(whole: Sweep) -> None:
+    done = sweep("quick", "--dry-run", "--output", whole.path / "nowhere")
+    assert "time to expect: not known: no sweep of this command has run here" in done.stdout
+    done = sweep("--resume", whole.path, "--dry-run")
+    assert f"0 of {CELLS} cells to run" in done.stdout
+
+
+@pytest.mark.slow
+def test_the_papers_sweep_is_36_timelines(tmp_path: Path) -> None:
+    found = json.loads(sweep("paper", "--json", "--output", tmp_path).stdout)
+    jsonschema.validate(found, schema())
+    assert len(found["cells"]) == 36
+    table = numbers(read_sweep(Path(found["run"])))
+    naive = table[
+        (table["policy"] == "naive") & (table["board"] == "jetson-agx-orin") & (table["tokens_per_skill"] == 6)
+    ]
+    assert list(naive["stalls"]) == [7]
+    assert list(naive["stall_ns"]) == [1_750_000_000]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "name a sweep file, or the folder of a sweep with --resume"),
+        (["nothing"], "'nothing' is none of paper, quick, and no path"),
+        (["none.toml"], "cannot read the sweep file none.toml"),
+        (["paper", "--retry-failed"], "--retry-failed: name the sweep's folder with --resume"),
+        (["paper", "--ray", "local", "--board", "x"], "--board and --ray are two things"),
+        (["--resume", "/nowhere"], "/nowhere is no run folder"),
+    ],
+)
+def test_wrong_use_is_one_line(arguments: list[str], message: str) -> None:
+    done = sweep(*arguments, code=1 if "/nowhere" in arguments else 2)
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('command = "fly"', "command: 'fly' is none of latency, throughput, timeline"),
+        (
+            'command = "timeline"\n[settings]\npolicies = "naive"',
+            "'policies' is no flag of s2a-bench timeline; did you mean policy?",
+        ),
+        ('command = "timeline"\n[settings]\nt-min = "soon"', "t-min=soon: Invalid value for '--t-min'"),
+        ('command = "latency"\n[settings]\nboard = "orin"', "--board: "),
+    ],
+)
+def test_a_wrong_file_is_one_line_and_leaves_no_folder(text: str, message: str, tmp_path: Path) -> None:
+    file, output = tmp_path / "wrong.toml", tmp_path / "results"
+    file.write_text(text)
+    done = sweep(file, "--output", output, code=2)
+    assert message in done.stderr
+    assert str(file) in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not output.exists()
+
+
+def test_without_ray_the_flag_says_how_to_install_it(tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['ray'] = None\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "s2a_bench", "sweep", "paper", "--ray", "local", "--output", str(tmp_path / "results")],
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=WAIT_S,
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "pip install -e '.[ray]' -c constraints.txt" in done.stderr
+
+
+def test_every_flag_is_explained_and_help_is_light() -> None:
+    code = (
+        "import sys\nfrom s2a_bench.cli import main\nsys.argv = ['s2a-bench', 'sweep', '--help']\ntry:\n    main()\n"
+        "finally:\n    sys.stderr.write(str([n for n in ('numpy', 'pandas', 'ray') if n in sys.modules]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=WAIT_S)
+    assert done.stderr == "[]"
+    for flag in ("resume", "retry-failed", "dry-run", "board", "ray", "jobs", "output", "json"):
+        assert f"--{flag}" in done.stdout
