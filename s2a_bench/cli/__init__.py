@@ -12,7 +12,21 @@ from typing import Any
 import typer
 
 from s2a_bench import __version__
-from s2a_bench.cli import latency, model, serve
+from s2a_bench.cli import (
+    boundary,
+    ccrb,
+    compare,
+    doctor,
+    latency,
+    model,
+    profile,
+    report,
+    serve,
+    study,
+    sweep,
+    throughput,
+    timeline,
+)
 from s2a_bench.errors import S2AError
 
 INTERRUPTED = 130
@@ -27,8 +41,18 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.command("doctor")(doctor.doctor)
 app.command("latency")(latency.latency)
-app.add_typer(model.app, name="model", help="Make and inspect model files.")
+app.command("throughput")(throughput.throughput)
+app.command("study")(study.study)
+app.command("timeline")(timeline.timeline)
+app.command("boundary")(boundary.boundary)
+app.command("ccrb")(ccrb.ccrb)
+app.command("sweep")(sweep.sweep)
+app.command("compare")(compare.compare)
+app.command("report")(report.report)
+app.add_typer(model.app, name="model", help="Fetch, make and inspect model files.")
+app.add_typer(profile.app, name="profile", help="Measure this machine as a hardware profile, and look at profiles.")
 app.add_typer(serve.app, name="serve", help="Serve a model over HTTP, or as a ROS 2 node.")
 
 

@@ -1,0 +1,179 @@
+"""`s2a-bench ccrb`: the driving scenario under each policy."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from s2a_bench.cli.options import WIDTH, listed, numbers
+from s2a_bench.errors import S2AError
+
+if TYPE_CHECKING:
+    from s2a_bench.bench.ccrb_config import CcrbConfig
+    from s2a_bench.cli.progress import RunProgress
+
+
+def ccrb(
+    policy: Annotated[
+        str, typer.Option(help="naive, wait-then-act, stream-to-act, and those for study; several with commas")
+    ] = "naive,wait-then-act,stream-to-act",
+    profile: Annotated[str, typer.Option(help="the board: a name of 'profile list', or a path")] = "jetson-agx-orin",
+    rate: Annotated[float | None, typer.Option(help="a board of which only the tokens/s are known")] = None,
+    prompt_time: Annotated[
+        float | None, typer.Option(help="seconds before decoding, c [default: the profile's; with --rate 0]")
+    ] = None,
+    tokens_per_skill: Annotated[int, typer.Option(help="L, the delimiter included")] = 6,
+    skills: Annotated[int, typer.Option(help="N, speed set-points down to rest")] = 5,
+    t_nom: Annotated[
+        float | None, typer.Option(help="seconds a set-point takes [default: the skill set's 0.8]")
+    ] = None,
+    speed: Annotated[float, typer.Option(help="of all three cars in the beginning, km/h")] = 50.0,
+    plan_decel: Annotated[
+        float | None, typer.Option(help="m/s^2 that the plan brakes with [default: as needed to come to rest]")
+    ] = None,
+    front_gap: Annotated[float, typer.Option(help="m to the lead; Euro NCAP: 12 or 40")] = 40.0,
+    lead_decel: Annotated[float, typer.Option(help="m/s^2 of the lead; Euro NCAP: 2 or 6")] = 2.0,
+    rear_gap: Annotated[float, typer.Option(help="m to the car behind")] = 14.0,
+    reaction: Annotated[float, typer.Option(help="seconds until the car behind reacts")] = 1.3,
+    gap_behaviour: Annotated[
+        str, typer.Option(help="what the ego does while no skill is valid: stop, coast, hold, cruise")
+    ] = "stop",
+    follower: Annotated[str, typer.Option(help="the law of the car behind: careful, idm")] = "careful",
+    simulator: Annotated[
+        str, typer.Option(help="longitudinal (along the lane), embedded (highway-env), carla")
+    ] = "longitudinal",
+    host: Annotated[str, typer.Option(help="carla: where the server is, HOST or HOST:PORT")] = "localhost:2000",
+    reflex: Annotated[bool, typer.Option("--reflex", help="let the ego brake by itself below the plan")] = False,
+    ttc: Annotated[
+        bool, typer.Option("--ttc", help="add s2a-ttc: stream-to-act that starts by the lead's deadline")
+    ] = False,
+    lane_change: Annotated[
+        bool, typer.Option("--lane-change", help="end the plan with a lane change; not along the lane")
+    ] = False,
+    phase: Annotated[
+        bool, typer.Option("--phase", help="also the phase diagram over rate and rear gap, for every gap behaviour")
+    ] = False,
+    phase_rates: Annotated[str, typer.Option(help="tokens/s of the phase diagram: from, to")] = "2,12",
+    phase_gaps: Annotated[str, typer.Option(help="m to the car behind in the phase diagram: from, to")] = "6,30",
+    random: Annotated[int, typer.Option(help="also as many random scenarios; 0: none")] = 0,
+    seed: Annotated[int, typer.Option(help="seed of everything that is drawn")] = 0,
+    animation: Annotated[
+        bool, typer.Option("--animation/--no-animation", help="write the animation (GIF, MP4): half a minute")
+    ] = False,
+    openscenario: Annotated[
+        Path | None, typer.Option(help="also write the scenario as an OpenSCENARIO file, its road beside it")
+    ] = None,
+    output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
+    data_only: Annotated[
+        bool, typer.Option("--data-only", help="write no tables and figures into the run folder")
+    ] = False,
+    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+) -> None:
+    """Drive car-to-car rear braking with a car behind, under each policy, in virtual time: who hits whom, and when."""
+    from s2a_bench.bench.ccrb import run_ccrb
+    from s2a_bench.bench.ccrb_config import CcrbConfig
+    from s2a_bench.cli.progress import RunProgress
+
+    config = CcrbConfig(
+        policies=listed(policy),
+        profile=profile,
+        rate=rate,
+        prompt_s=prompt_time,
+        tokens_per_skill=tokens_per_skill,
+        n_skills=skills,
+        t_nom_s=t_nom,
+        speed_kmh=speed,
+        plan_decel_mps2=plan_decel,
+        front_gap_m=front_gap,
+        lead_decel_mps2=lead_decel,
+        rear_gap_m=rear_gap,
+        reaction_s=reaction,
+        gap=gap_behaviour,
+        follower=follower,
+        simulator=simulator,
+        reflex=reflex,
+        ttc=ttc,
+        lane_change=lane_change,
+        phase=phase,
+        phase_rates=numbers("--phase-rates", phase_rates),
+        phase_gaps_m=numbers("--phase-gaps", phase_gaps),
+        random=random,
+        seed=seed,
+    )
+    config.check()
+    with RunProgress() as progress:
+        try:
+            settings: dict[str, Any] = {"host": host} if simulator == "carla" else {}
+            if openscenario is not None:
+                _write_scenario(config, openscenario, progress)
+            folder = run_ccrb(config, output, progress, **settings)
+            if not data_only:
+                progress.stage("drawing")
+                _draw(folder, progress, animated=animation)
+            _show(folder, progress, as_json=json_)
+        except (S2AError, KeyboardInterrupt):
+            if progress.folder is not None:
+                progress.say(f"roll-outs so far: {progress.folder}")
+            raise
+
+
+def _write_scenario(config: CcrbConfig, path: Path, progress: RunProgress) -> None:
+    """Write the OpenSCENARIO file and its road."""
+    from s2a_bench.bench.ccrb_plans import prepare
+    from s2a_bench.scenario.openscenario import write_openscenario
+
+    ready = prepare(config)
+    for written in write_openscenario(path, config.cars, ready.driving, ready.schedules):
+        progress.say(f"scenario: {written}")
+
+
+def _draw(folder: Path, progress: RunProgress, *, animated: bool) -> None:
+    """Write tables, figures and animation."""
+    from s2a_bench.report.ccrb_figures import write_ccrb_figures
+    from s2a_bench.report.ccrb_tables import ccrb_csv, ccrb_tables
+    from s2a_bench.report.table_files import write_texts
+    from s2a_bench.store.run import read_run
+
+    run = read_run(folder)
+    write_texts(run, ccrb_tables(run), ccrb_csv(run))
+    write_ccrb_figures(run)
+    if animated:
+        from s2a_bench.report.ccrb_animation import write_animation
+
+        progress.stage("drawing the animation")
+        for path in write_animation(run):
+            progress.say(f"animation: {path}")
+
+
+def _show(folder: Path, progress: RunProgress, *, as_json: bool) -> None:
+    """Print what the user asked for."""
+    from rich.console import Console
+
+    from s2a_bench.report.ccrb import words
+    from s2a_bench.report.ccrb_machine import ccrb_to_json
+    from s2a_bench.report.ccrb_tables import ccrb_tables
+    from s2a_bench.report.terminal import lay_out
+    from s2a_bench.store.run import read_run
+
+    run = read_run(folder)
+    tables = ccrb_tables(run)
+    if speed := run.manifest.get("studies", {}).get("rollouts_per_cpu_s"):
+        progress.say(f"{run.manifest['studies']['rollouts']} roll-outs, {speed:.0f} a second of processor time")
+    if as_json:
+        json.dump(ccrb_to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
+        sys.stdout.write("\n")
+        return
+    terminal = Console()
+    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    for table in tables.values():
+        console.print(lay_out(table))
+        for note in table.notes:
+            console.print(note, markup=False, highlight=False)
+        console.print()
+    for line in words(run):
+        console.print(line, markup=False, highlight=False)
+    console.print(f"run folder: {folder}", highlight=False, markup=False, soft_wrap=True)

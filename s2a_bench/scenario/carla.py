@@ -1,0 +1,166 @@
+"""CARLA behind the same seam: three cars on a straight stretch of its map, in synchronous mode.
+
+**This adapter has never been run against a CARLA server**: none can be had where the project is built. It is kept thin,
+written to the client API of 0.9.16 (extra ``carla``), and tested against a stand-in of that API. Each step sets the
+cars' target velocities, which CARLA's physics then follow; positions are read back from the server. Lane changes are
+left to the embedded simulator. The server's settings are put back at the end.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+import numpy as np
+
+from s2a_bench.errors import SimulatorError, UsageError
+from s2a_bench.scenario import EGO, LEAD, REAR, ROLES, Command, State
+
+if TYPE_CHECKING:
+    from s2a_bench.policy import Floats
+
+STEP_S: Final = 0.02
+"""CARLA wants a tenth of a second at most; the finer the step, the longer a roll-out takes."""
+TIMEOUT_S: Final = 10.0
+STRAIGHT_M: Final = 250.0
+LOOK_M: Final = 10.0
+MOST_TURN_DEG: Final = 1.0
+SETTLE_TICKS: Final = 50
+"""Cars are dropped from a little above the road."""
+LONGEST_M: Final = 10.0
+"""No car is longer."""
+DROP_M: Final = 0.5
+BLUEPRINT: Final = "vehicle.tesla.model3"
+
+
+class Carla:
+    """A CARLA server's world, which is ours while we use it."""
+
+    name: ClassVar[str] = "carla"
+    steers: ClassVar[bool] = False
+    most: ClassVar[int | None] = 1
+
+    def __init__(self, host: str = "localhost:2000", step_s: float = STEP_S, timeout_s: float = TIMEOUT_S) -> None:
+        self.step_s = step_s
+        self._cars: dict[int, Any] = {}
+        self._speed = np.zeros(3)
+        try:
+            import carla
+        except ImportError as error:
+            raise SimulatorError(
+                "--simulator carla: the package carla is not installed; pip install 's2a-bench[carla]' "
+                "(x86-64, Python 3.10 to 3.12)"
+            ) from error
+        self._carla: Any = carla
+        name, _, port = host.partition(":")
+        if port and not port.isdecimal():
+            raise UsageError(f"--host: '{host}' should be HOST or HOST:PORT")
+        try:
+            client = carla.Client(name, int(port or 2000))
+            client.set_timeout(timeout_s)
+            self._world: Any = client.get_world()
+            self._before: Any = self._world.get_settings()
+            settings = self._world.get_settings()
+            settings.synchronous_mode, settings.fixed_delta_seconds = True, step_s
+            self._world.apply_settings(settings)
+        except RuntimeError as error:
+            raise SimulatorError(
+                f"--host {host}: no CARLA server answers ({error}); start one, as ./CarlaUE4.sh -RenderOffScreen"
+            ) from error
+
+    def place(self, position_m: Floats, speed_mps: Floats) -> State:
+        """Spawn the three cars on a straight lane, let them settle, and set them going."""
+        self._remove_cars()
+        start = self._straight()
+        self._along, self._right = start.transform.get_forward_vector(), start.transform.get_right_vector()
+        # The ego first: where the others go hangs on how long a car is.
+        behind_m = float(position_m[EGO, 0] - position_m[REAR, 0]) + LONGEST_M
+        self._cars = {EGO: self._spawn(EGO, start, behind_m)}
+        self._length_m = 2 * float(self._cars[EGO].bounding_box.extent.x)
+        for car, lengths in ((LEAD, 1), (REAR, -1)):
+            away_m = float(position_m[car, 0] - position_m[EGO, 0]) + lengths * self._length_m
+            self._cars[car] = self._spawn(car, start, behind_m + away_m)
+        self._speed = np.zeros(3)
+        for _ in range(SETTLE_TICKS):
+            self._tick()
+        self._speed = speed_mps[:, 0].astype(float)
+        self._tick()  # the cars move from here on, together: gaps stay
+        self._origin: Any = self._cars[EGO].get_location()
+        self._offset_m = float(position_m[EGO, 0])
+        return self._state()
+
+    def step(self, command: Command) -> State:
+        """Set the speeds that the accelerations lead to, and let the server pass one step."""
+        self._speed = np.maximum(self._speed + command.acceleration_mps2[:, 0] * self.step_s, 0.0)
+        self._tick()
+        return self._state()
+
+    def close(self) -> None:
+        """Remove the cars and put the server's settings back."""
+        self._remove_cars()
+        if self._before is not None:
+            self._world.apply_settings(self._before)
+            self._before = None
+
+    def _tick(self) -> None:
+        """Send the speeds and wait for the server."""
+        for car, actor in self._cars.items():
+            speed = float(self._speed[car])
+            along = actor.get_transform().get_forward_vector()
+            actor.set_target_velocity(self._carla.Vector3D(along.x * speed, along.y * speed, actor.get_velocity().z))
+        try:
+            self._world.tick()
+        except RuntimeError as error:
+            raise SimulatorError(f"CARLA: the server has gone away ({error}); start it again") from error
+
+    def _state(self) -> State:
+        """Read where the cars are, along and across the straight."""
+        position, lateral, speed = np.zeros((3, 1)), np.zeros((3, 1)), np.zeros((3, 1))
+        for car, actor in self._cars.items():
+            at, velocity = actor.get_location(), actor.get_velocity()
+            # From centre to centre, a car's length more than from bumper to bumper.
+            shift = {LEAD: -self._length_m, EGO: 0.0, REAR: self._length_m}[car]
+            position[car] = _dot(at, self._origin, self._along) + shift + self._offset_m
+            lateral[car] = -_dot(at, self._origin, self._right)
+            speed[car] = max(velocity.x * self._along.x + velocity.y * self._along.y, 0.0)
+        return State(position, speed, lateral)
+
+    def _spawn(self, car: int, start: Any, ahead_m: float) -> Any:
+        """Put a car on the lane, so far ahead of the waypoint."""
+        blueprint = self._world.get_blueprint_library().find(BLUEPRINT)
+        blueprint.set_attribute("role_name", ROLES[car])
+        place = start.next(ahead_m)[0].transform
+        place.location.z += DROP_M
+        actor = self._world.try_spawn_actor(blueprint, place)
+        if actor is None:
+            raise SimulatorError(f"CARLA: there is no room to spawn the {ROLES[car]} car; reload the map")
+        return actor
+
+    def _straight(self) -> Any:
+        """Find a waypoint with a straight lane ahead."""
+        world_map = self._world.get_map()
+        for spawn in world_map.get_spawn_points():
+            first = world_map.get_waypoint(spawn.location)
+            here, straight = first, True
+            for _ in range(int(STRAIGHT_M / LOOK_M)):
+                ahead = here.next(LOOK_M)
+                turn = ahead and ahead[0].transform.rotation.yaw - first.transform.rotation.yaw
+                if not ahead or abs((turn + 180) % 360 - 180) > MOST_TURN_DEG:
+                    straight = False
+                    break
+                here = ahead[0]
+            if straight:
+                return first
+        raise SimulatorError(
+            f"CARLA: this map has no straight lane of {STRAIGHT_M:g} m at a spawn point; load another, as Town04"
+        )
+
+    def _remove_cars(self) -> None:
+        """Destroy what we spawned."""
+        for actor in self._cars.values():
+            actor.destroy()
+        self._cars = {}
+
+
+def _dot(at: Any, origin: Any, direction: Any) -> float:
+    """Return how far a place lies from another along a direction, in the plane."""
+    return float((at.x - origin.x) * direction.x + (at.y - origin.y) * direction.y)

@@ -1,0 +1,214 @@
+"""One roll-out, or M in lock step: the laws of the three cars carried out in a simulator until all is decided."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from s2a_bench.errors import UsageError
+from s2a_bench.policy import Schedule
+from s2a_bench.scenario import EGO, LEAD, REAR, Command, Simulator, State
+from s2a_bench.scenario.ccrb import LEAD_JERK_MPS3, Cars, DrivingPlan
+from s2a_bench.scenario.ego import DONE, Ego
+from s2a_bench.scenario.follower import Seen, follower
+from s2a_bench.scenario.lockstep import LockStep
+from s2a_bench.scenario.outcome import Outcomes, Watch
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from s2a_bench.policy import Floats
+
+AFTER_S: Final = 25.0
+"""How long after the plan a roll-out goes on at most; nearly all are decided earlier."""
+RECORD_S: Final = 0.01
+LOOK_STEPS: Final = 40
+"""Every so many steps it is asked whether all is decided."""
+RESTING_MPS: Final = 0.01
+DROP_SHARE: Final = 0.2
+"""Roll-outs that are decided stay until so many are."""
+PASSED_M: Final = 10.0
+"""An ego this far ahead of the lead, beside it, has passed it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """What was seen every `RECORD_S`: arrays of shape (steps, 3, M), for the ego alone of shape (steps, M)."""
+
+    time_s: Floats
+    position_m: Floats
+    speed_mps: Floats
+    lateral_m: Floats
+    acceleration_mps2: Floats
+    phase: NDArray[np.int64]
+    skill: NDArray[np.int64]
+    """Which skill runs or ran last, from 0 on; -1 before the first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Driven:
+    """What came of a drive."""
+
+    outcomes: Outcomes
+    trajectory: Trajectory | None
+
+
+def drive(
+    simulator: Simulator,
+    cars: Cars,
+    plan: DrivingPlan,
+    schedule: Schedule,
+    *,
+    record: bool = False,
+    resting_mps: float = RESTING_MPS,
+) -> Driven:
+    """Drive M roll-outs, as many as the schedule has columns, and say what became of them.
+
+    They end when the trailing car, last of all, is slower than ``resting_mps``: the careful driver creeps up for ever.
+
+    ``schedule`` has the shape (N, M); the numbers of ``cars`` are single or of shape (M,). Raises UsageError where the
+    simulator cannot do it: lane changes along a lane, many roll-outs in a world for one.
+    """
+    rollouts = np.broadcast_shapes(schedule.start_s.shape, (1, 1))[1]
+    if any(plan.lane) and not simulator.steers:
+        raise UsageError(
+            f"--lane-change: the simulator '{simulator.name}' knows one lane only; take --simulator embedded"
+        )
+    if simulator.most is not None and rollouts > simulator.most:
+        raise UsageError(f"--simulator: '{simulator.name}' runs {simulator.most} roll-out at a time, not {rollouts}")
+    return _Drive(simulator, cars, plan, schedule, rollouts).run(record=record, resting_mps=resting_mps)
+
+
+class _Drive:
+    """The loop and its memory."""
+
+    def __init__(self, simulator: Simulator, cars: Cars, plan: DrivingPlan, schedule: Schedule, rollouts: int) -> None:
+        self._simulator = simulator
+        self._ego = Ego(cars, plan, schedule, rollouts)
+        self._rear = follower(cars, rollouts)
+        self._lead_decel = np.broadcast_to(np.asarray(cars.lead_decel_mps2, float), (rollouts,))
+        position, speed = np.zeros((3, rollouts)), np.empty((3, rollouts))
+        position[LEAD], position[REAR] = cars.front_gap_m, -np.asarray(cars.rear_gap_m, float)
+        speed[:] = cars.speed_mps
+        self._delay = Delay(position, speed, np.asarray(cars.reaction_s, float), simulator.step_s)
+        self._state = simulator.place(position, speed)
+        self._acceleration = np.zeros((3, rollouts))
+        self._watch = Watch(self._state)
+        self._outcomes = self._watch.outcomes()
+        self._left = np.arange(rollouts)
+        self._seen_at_rest = np.zeros(rollouts, bool)
+        self._records: list[tuple[State, Floats, NDArray[np.int64], NDArray[np.int64]]] = []
+
+    def run(self, *, record: bool, resting_mps: float) -> Driven:
+        """Step until all is decided."""
+        step_s = self._simulator.step_s
+        every = max(round(RECORD_S / step_s), 1)
+        last = int((float(self._ego.end_s.max()) + AFTER_S) / step_s)
+        for step in range(last):
+            self._decide(step * step_s)
+            if record and step % every == 0:
+                now = (self._state, self._acceleration.copy(), self._ego.phase, self._ego.index.copy())
+                self._records.append(now)
+            self._state = self._simulator.step(Command(self._acceleration, self._ego.lane))
+            self._ego.stopped(self._state.speed_mps[EGO])
+            self._watch.see(self._state)
+            if step % LOOK_STEPS == 0 and not self._go_on(self._decided(resting_mps), record=record):
+                break
+        self._outcomes.put(self._left, self._watch.outcomes())
+        return Driven(self._outcomes, self._trajectory(every * step_s) if record else None)
+
+    def _go_on(self, decided: NDArray[np.bool_], *, record: bool) -> bool:
+        """Let roll-outs drop out, many at a time, that are decided; tell whether any is left."""
+        share = decided.mean()
+        if share == 1:
+            return False
+        if record or share < DROP_SHARE or not isinstance(self._simulator, LockStep):
+            return True
+        self._outcomes.put(self._left, self._watch.outcomes())
+        columns = np.flatnonzero(~decided)
+        self._simulator.keep(columns)
+        for part in (self._ego, self._rear, self._delay, self._watch):
+            part.keep(columns)
+        self._left = self._left[columns]
+        self._seen_at_rest = self._seen_at_rest[columns]
+        self._lead_decel = self._lead_decel[columns]
+        self._acceleration = self._acceleration[:, columns]
+        now = self._state
+        self._state = State(now.position_m[:, columns], now.speed_mps[:, columns], now.lateral_m[:, columns])
+        return True
+
+    def _decide(self, now_s: float) -> None:
+        """Ask the three cars' laws for the next step."""
+        state, step_s, acceleration = self._state, self._simulator.step_s, self._acceleration
+        seen = self._delay.see(state, self._ego.acceleration_mps2)
+        self._seen_at_rest = seen.ego_speed_mps <= 0
+        lead = acceleration[LEAD]
+        np.maximum(lead - LEAD_JERK_MPS3 * step_s, -self._lead_decel, out=lead)
+        lead_decel = np.where(state.speed_mps[LEAD] > 0, -lead, 0.0)
+        gap = state.position_m[LEAD] - state.position_m[EGO]
+        acceleration[EGO] = self._ego.decide(
+            now_s, state.speed_mps[EGO], gap, state.speed_mps[LEAD], lead_decel, step_s
+        )
+        acceleration[REAR] = self._rear.acceleration(seen, step_s)
+
+    def _decided(self, resting_mps: float) -> NDArray[np.bool_]:
+        """Tell in which roll-outs nothing can happen any more."""
+        speed = self._state.speed_mps
+        over = self._ego.phase == DONE
+        # Until the driver behind has seen the ego at rest, he may stop and go again.
+        calm = (speed[REAR] < resting_mps) & (self._acceleration[REAR] <= 0) & self._seen_at_rest
+        behind = self._watch.rear.crashed | calm
+        resting = over & (speed[EGO] <= 0) & behind
+        passed = over & (self._watch.front.gap_m < -PASSED_M)
+        decided: NDArray[np.bool_] = self._watch.front.crashed | resting | passed
+        return decided
+
+    def _trajectory(self, step_s: float) -> Trajectory:
+        """Stack the records."""
+        states = [state for state, *_ in self._records]
+        return Trajectory(
+            time_s=np.arange(len(states), dtype=np.float64) * step_s,
+            position_m=np.stack([state.position_m for state in states]),
+            speed_mps=np.stack([state.speed_mps for state in states]),
+            lateral_m=np.stack([state.lateral_m for state in states]),
+            acceleration_mps2=np.stack([acceleration for _, acceleration, *_ in self._records]),
+            phase=np.stack([phase for *_, phase, _ in self._records]),
+            skill=np.stack([skill for *_, skill in self._records]),
+        )
+
+
+class Delay(LockStep):
+    """Remembers what was, each roll-out with its own delay; before the beginning all cars drove at a steady speed."""
+
+    def __init__(self, position_m: Floats, speed_mps: Floats, delay_s: Floats, step_s: float) -> None:
+        rollouts = position_m.shape[1]
+        self._steps = np.broadcast_to(np.rint(delay_s / step_s).astype(np.int64), (rollouts,))
+        self._same = bool((self._steps == self._steps[0]).all())
+        self._size = int(self._steps.max()) + 1
+        self._columns = np.arange(rollouts)
+        before = np.arange(-self._size, 0)[:, np.newaxis] * step_s
+        # What is seen together lies together: with delays of their own, roll-outs read from all over the memory.
+        self._past = np.zeros((self._size, rollouts, 3))
+        self._past[..., 0] = position_m[EGO] + before * speed_mps[EGO]
+        self._past[..., 1] = speed_mps[EGO]
+        self._head = -1
+
+    def keep(self, columns: NDArray[np.int64]) -> None:
+        """Go on with these roll-outs only."""
+        self._past = np.ascontiguousarray(self._past[:, columns])
+        self._steps = self._steps[columns]
+        self._columns = np.arange(len(columns))
+
+    def see(self, state: State, ego_acceleration: Floats) -> Seen:
+        """Remember the present, and return it beside what the driver behind reacts to."""
+        self._head = (self._head + 1) % self._size
+        now = self._past[self._head]
+        now[:, 0], now[:, 1], now[:, 2] = state.position_m[EGO], state.speed_mps[EGO], ego_acceleration
+        if self._same:
+            then = self._past[(self._head - self._steps[0]) % self._size]
+        else:
+            then = self._past[(self._head - self._steps) % self._size, self._columns]
+        then = np.ascontiguousarray(then.T)
+        return Seen(then[0], then[1], then[2], state.position_m[REAR], state.speed_mps[REAR])

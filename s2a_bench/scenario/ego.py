@@ -1,0 +1,128 @@
+"""The ego's control: it follows the set-points of whichever skill runs, and does something in between.
+
+A speed loop of .3 s around the set-point, which falls evenly within a skill, with that slope as feed-forward; then
+limits of jerk and acceleration. Before the first skill, and after a plan that did not stop it, the ego keeps its speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from s2a_bench.errors import UsageError
+from s2a_bench.plan.skillset import GAPS, Gap
+from s2a_bench.policy import Schedule
+from s2a_bench.scenario.braking import needed
+from s2a_bench.scenario.ccrb import EGO_JERK_MPS3, EGO_LEAST_MPS2, EGO_LOOP_S, EGO_MOST_MPS2, Cars, DrivingPlan
+from s2a_bench.scenario.lockstep import LockStep
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from s2a_bench.policy import Floats
+
+WAITING, ACTING, GAP, DONE = 0, 1, 2, 3
+PHASES: Final = ("waiting", "acting", "gap", "done")
+REFLEX_MPS2, REFLEX_TTC_S = 4.0, 1.5
+"""The reflex brakes fully where more than this is required, or contact is nearer."""
+
+BETWEEN: dict[Gap, Callable[[Floats, Floats, Floats], Floats]] = {
+    "stop": lambda speed, _slope, _first: np.full(speed.shape, EGO_LEAST_MPS2),
+    "coast": lambda speed, _slope, _first: np.zeros(speed.shape),
+    "hold": lambda _speed, slope, _first: slope,
+    "cruise": lambda speed, _slope, first: (first - speed) / EGO_LOOP_S,
+}
+"""Gap behaviour -> wanted acceleration, of the speed, the last skill's slope, and v0."""
+
+
+class Ego(LockStep):
+    """Controls the ego of M roll-outs through one schedule each."""
+
+    def __init__(self, cars: Cars, plan: DrivingPlan, schedule: Schedule, rollouts: int) -> None:
+        gaps = np.broadcast_to(np.asarray(cars.gap), (rollouts,))
+        if unknown := set(gaps.tolist()) - set(GAPS):
+            raise UsageError(f"--gap-behaviour: '{min(unknown)}' is none of {', '.join(GAPS)}")
+        shape = (len(plan.lane), rollouts)
+        self._start_s = np.broadcast_to(np.asarray(schedule.start_s, float), shape)
+        self._duration_s = np.broadcast_to(np.asarray(schedule.duration_s, float), shape)
+        self._points = np.broadcast_to(plan.set_point_mps, (shape[0] + 1, rollouts))
+        self._lanes = (0, *plan.lane)
+        self._gaps = gaps
+        self._between = {gap: rule for gap, rule in BETWEEN.items() if (gaps == gap).any()}
+        self._reflex = Reflex(rollouts) if cars.reflex else None
+        self._index = np.full(rollouts, -1)
+        self._next_s = self._start_s[0].copy()
+        self._from_s, self._until_s = np.zeros(rollouts), np.full(rollouts, -np.inf)
+        self._level, self._slope = self._points[0].copy(), np.zeros(rollouts)
+        self.phase = np.full(rollouts, WAITING)
+        self.acceleration_mps2 = np.zeros(rollouts)
+        self.end_s = self._start_s[-1] + self._duration_s[-1]
+
+    @property
+    def index(self) -> NDArray[np.int64]:
+        """Return the skill that runs or ran last, from 0 on; -1 before the first."""
+        return self._index
+
+    @property
+    def lane(self) -> NDArray[np.int64]:
+        """Return the lane to steer for."""
+        return np.take(self._lanes, self._index + 1)
+
+    def decide(
+        self, now_s: float, speed: Floats, gap_m: Floats, lead_mps: Floats, lead_decel: Floats, step_s: float
+    ) -> Floats:
+        """Return the ego's acceleration in m/s^2 for the next step, shape (M,)."""
+        self._advance(now_s)
+        wanted = self._level + self._slope * (now_s - self._from_s)
+        wish = np.where(self.phase == ACTING, self._slope + (wanted - speed) / EGO_LOOP_S, 0.0)
+        between = self.phase == GAP
+        if between.any():
+            for gap, rule in self._between.items():
+                wish = np.where(between & (self._gaps == gap), rule(speed, self._slope, self._points[0]), wish)
+        wish = np.clip(wish, EGO_LEAST_MPS2, EGO_MOST_MPS2)
+        if self._reflex is not None:
+            wish = self._reflex.limit(wish, speed, gap_m, lead_mps, lead_decel)
+        most = EGO_JERK_MPS3 * step_s
+        self.acceleration_mps2 = self.acceleration_mps2 + np.clip(wish - self.acceleration_mps2, -most, most)
+        return self.acceleration_mps2
+
+    def stopped(self, speed: Floats) -> None:
+        """Let go of the brake where the car has come to rest."""
+        self.acceleration_mps2 = np.where((speed <= 0) & (self.acceleration_mps2 < 0), 0.0, self.acceleration_mps2)
+
+    def _advance(self, now_s: float) -> None:
+        """Take up the next skill where its time has come, and tell the phases."""
+        now_s += 1e-12
+        while (due := now_s >= self._next_s).any():
+            columns = np.flatnonzero(due)
+            index = self._index[columns] + 1
+            self._index[columns] = index
+            duration = self._duration_s[index, columns]
+            self._from_s[columns] = self._start_s[index, columns]
+            self._until_s[columns] = self._from_s[columns] + duration
+            self._level[columns] = self._points[index, columns]
+            change = self._points[index + 1, columns] - self._level[columns]
+            self._slope[columns] = np.divide(change, duration, out=np.zeros(change.shape), where=duration > 0)
+            last = index == len(self._start_s) - 1
+            self._next_s[columns] = np.where(
+                last, np.inf, self._start_s[np.minimum(index + 1, len(self._start_s) - 1), columns]
+            )
+        after = np.where(np.isinf(self._next_s), DONE, GAP)
+        running = np.where(now_s < self._until_s, ACTING, after)
+        self.phase = np.where(self._index < 0, WAITING, running)
+
+
+class Reflex(LockStep):
+    """A layer below the plan: full braking once contact is near, until the ego is no faster than the lead."""
+
+    def __init__(self, rollouts: int) -> None:
+        self._braking = np.zeros(rollouts, bool)
+
+    def limit(self, wish: Floats, speed: Floats, gap_m: Floats, lead_mps: Floats, lead_decel: Floats) -> Floats:
+        """Return the plan's wish, or full braking."""
+        closing = speed - lead_mps
+        alarm = (needed(speed, gap_m, lead_mps, lead_decel) > REFLEX_MPS2) | (gap_m < closing * REFLEX_TTC_S)
+        self._braking = (self._braking | alarm) & (closing > 0)
+        return np.where(self._braking, EGO_LEAST_MPS2, wish)
