@@ -1,7 +1,8 @@
 """A program that answers like llama.cpp's ``llama-bench -o json`` (build 0c1e570, 2026) without any model.
 
 Run as a script it takes llama-bench's long flags, refuses unknown ones as llama-bench does, and "decodes" at
-``S2A_STAND_IN_RATE`` tokens a second; ``S2A_STAND_IN_FAULT`` is one of crash, garbage, empty.
+``S2A_STAND_IN_RATE`` tokens a second; ``S2A_STAND_IN_FAULT`` is one of crash, garbage, empty, old (it
+reads ``--flash-attn`` as 0 or 1, as all did before 2026).
 """
 
 from __future__ import annotations
@@ -69,6 +70,7 @@ def main() -> int:
         "type_k": given["--cache-type-k"],
         "type_v": given["--cache-type-v"],
         "n_gpu_layers": given["--n-gpu-layers"],
+        "flash_attn": False if fault == "old" else {"auto": -1, "off": 0, "on": 1}[str(given["--flash-attn"])],
         "n_prompt": given["--n-prompt"],
         "n_gen": n_gen,
         "n_depth": given.get("--n-depth", 0),

@@ -5,14 +5,10 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from s2a_bench.bench import environment
 from s2a_bench.profile import Profile
-
-NVPMODEL_STATUS = Path("/var/lib/nvpmodel/status")
-NVPMODEL_CONF = Path("/etc/nvpmodel.conf")
 
 KIND = ("model", "gpu", "cpu", "cores")
 """What a board is known by: device tree, GPU, CPU, and how many cores may be used."""
@@ -25,11 +21,11 @@ def board_facts() -> dict[str, Any]:
     known = environment.collect()
     facts = {
         "model": known.get("board"),
-        "gpu": _gpu(),
+        "gpu": next((gpu.get("name") for gpu in known.get("gpus", [])), None),
         "cpu": known.get("cpu"),
         "cores": len(os.sched_getaffinity(0)),
         "memory_bytes": known.get("memory_bytes"),
-        "power_mode": _power_mode(),
+        "power_mode": known.get("power_mode"),
         "governor": known.get("governor"),
     }
     return {key: value for key, value in facts.items() if value}
@@ -57,33 +53,3 @@ def _same(key: str, wanted: Any, found: Any) -> bool:
         return bool(wanted == found)
     words, here = (re.sub(r"^nvidia\s+", "", text.lower()).split() for text in (wanted, found))
     return words == (here[: len(words)] if key == "model" else here)
-
-
-def _gpu() -> str | None:
-    """Name the first NVIDIA GPU."""
-    try:
-        import pynvml
-
-        pynvml.nvmlInit()
-    except Exception:  # noqa: BLE001 - no driver, no library: there is no GPU to name
-        return None
-    try:
-        name = pynvml.nvmlDeviceGetName(pynvml.nvmlDeviceGetHandleByIndex(0))
-        return name.decode() if isinstance(name, bytes) else str(name)
-    except pynvml.NVMLError:
-        return None
-    finally:
-        pynvml.nvmlShutdown()
-
-
-def _power_mode() -> str | None:
-    """Name a Jetson's power mode: the number in nvpmodel's status, by its name in nvpmodel's configuration."""
-    try:
-        number = re.search(r"pmode:(\d+)", NVPMODEL_STATUS.read_text())
-        if number is None:
-            return None
-        mode = int(number[1])
-        name = re.search(rf"POWER_MODEL\s+ID={mode}\s+NAME=(\S+)", NVPMODEL_CONF.read_text())
-    except OSError:
-        return None
-    return name[1] if name else str(mode)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -132,7 +133,7 @@ def capture(config: CaptureConfig, stage: Callable[[str], None], advance: Callab
         stage("loading the model")
         engine = open_model(config.engine)
         stack.callback(engine.close)
-        before = Counters.read()
+        before = Counters.read(uses_dds=False)
         asked = answers(engine, config)
         stack.callback(asked.close)  # type: ignore[attr-defined]  # a generator
         recorded = []
@@ -140,7 +141,7 @@ def capture(config: CaptureConfig, stage: Callable[[str], None], advance: Callab
             stage("warming up" if number < config.warmup else "measuring")
             recorded.append(next(asked))
             advance()
-        doubts += Counters.read().doubts_since(before)
+        doubts += Counters.read(uses_dds=False).doubts_since(before)
         described = engine.describe()
     stage("fitting the gaps")
     warnings = [f"{doubt.code}: {doubt.message}; {doubt.advice}" for doubt in doubts]
@@ -224,16 +225,25 @@ def write_profile(tables: dict[str, Any], path: Path, *, force: bool) -> Profile
     """Write the file and return what it reads as; raises UsageError where it is there already, else StoreError."""
     text = to_toml(tables)
     profile = parse_profile(path.stem, text, f"profile {path}")
-    if path.exists() and not force:
-        raise UsageError(refusal(path))
+    make_room(path, force=force)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise StoreError(f"--output: cannot write {path}: {error.strerror or error}") from error
+        raise _unwritable(path, error.strerror or str(error)) from error
     return profile
 
 
-def refusal(path: Path) -> str:
-    """Say that a profile is there already."""
-    return f"{path} exists already; give another NAME or --output, or --force to replace it"
+def make_room(path: Path, *, force: bool) -> None:
+    """Make the file's folder, before anything is measured in vain; raises as `write_profile`."""
+    if path.exists() and not force:
+        raise UsageError(f"{path} exists already; give another NAME or --output, or --force to replace it")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error.strerror or str(error)) from error
+    if not os.access(path.parent, os.W_OK):
+        raise _unwritable(path, "the folder may not be written to")
+
+
+def _unwritable(path: Path, why: str) -> StoreError:
+    return StoreError(f"--output: cannot write {path}: {why}")

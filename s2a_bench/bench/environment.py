@@ -10,7 +10,7 @@ from typing import Any
 
 from s2a_bench import __version__
 from s2a_bench.bench.doctor import Machine
-from s2a_bench.bench.doctor.gpu import current_power_mode, nvml
+from s2a_bench.bench.doctor.gpu import current_power_mode, identity, nvml
 from s2a_bench.clock import clock_id
 
 PACKAGES = (
@@ -79,9 +79,7 @@ def collect() -> dict[str, Any]:
 def _gpus() -> list[dict[str, Any]]:
     """Name the NVIDIA GPUs with their driver."""
     with nvml() as (lib, gpus):
-        return [
-            {"name": str(lib.nvmlDeviceGetName(gpu)), "driver": str(lib.nvmlSystemGetDriverVersion())} for gpu in gpus
-        ]
+        return [facts for gpu in gpus if (facts := identity(lib, gpu))]
 
 
 def _read(path: str) -> str:

@@ -8,7 +8,7 @@ from itertools import product
 from typing import Any, Final
 
 from s2a_bench.bench.plan import LatencyConfig
-from s2a_bench.bench.ranges import require
+from s2a_bench.bench.ranges import LEAST_T_NOM_S, require
 from s2a_bench.errors import UsageError
 from s2a_bench.plan import Durations, SkillSet, load_skills
 from s2a_bench.policy import PlanShape, Timing
@@ -87,7 +87,7 @@ class LiveConfig:
             raise UsageError("--policy: name at least one")
         require("--tokens-per-skill", self.tokens_per_skill, 1)
         require("--n-skills", self.n_skills, 1)
-        require("--t-nom", self.t_nom_s, 0, above=True)
+        require("--t-nom", self.t_nom_s, LEAST_T_NOM_S)
         require("--t-min (a factor of T_nom)", [self.t_min], 0, 1, above=True)
         require("--t-max (a factor of T_nom)", [self.t_max], 1)
         require("--plans", [self.plans], 1)

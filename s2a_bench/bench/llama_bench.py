@@ -32,6 +32,7 @@ class LlamaBench:
         self._program = program
         self._writer = writer
         self._depth = depth
+        self._flash_attention = config.engine.flash_attention
         self._command = [str(program), *llama_flags(config.engine), "--output", "json", "--repetitions", "1"]
         self._command += ["--n-prompt", "0", "--n-gen", str(config.max_tokens)]
 
@@ -72,6 +73,11 @@ class LlamaBench:
         except (ValueError, KeyError, TypeError, IndexError) as error:
             raise EngineError(
                 f"--reference {self._program}: its answer is not llama-bench's JSON of one test ({error!r}); "
-                "a llama-bench of 2025 or later is needed"
+                "a llama-bench of 2026 is needed"
             ) from error
+        if isinstance(test.get("flash_attn"), bool) and self._flash_attention != "off":
+            raise EngineError(
+                f"--reference {self._program}: it is too old to know --flash-attn {self._flash_attention}, reads that "
+                "as off and would be compared with something else; take a newer one, or --flash-attention off"
+            )
         return dict(test)

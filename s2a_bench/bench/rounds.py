@@ -133,8 +133,9 @@ class _Sources:
 def _measure(task: Task, config: LatencyConfig, sources: _Sources, writer: RunWriter, progress: Progress) -> None:
     """Start the servers, measure all blocks, and write down what there is to doubt."""
     machine = Machine(output=writer.path)
-    doubts = before_run(config.width, config.height, uses_dds="ros" in config.transports, machine=machine)
-    before = Counters.read()
+    uses_dds = "ros" in config.transports
+    doubts = before_run(config.width, config.height, uses_dds=uses_dds, machine=machine)
+    before = Counters.read(uses_dds=uses_dds)
     guard = SampleGuard()
     with ExitStack() as stack:
         progress.stage(f"starting {len(config.transports)} servers")
@@ -156,7 +157,7 @@ def _measure(task: Task, config: LatencyConfig, sources: _Sources, writer: RunWr
                     last = guard.last_error(session.cell.name)
                     raise TransportError(f"no request of {session.cell.name} succeeded, at last with {last}")
         finally:
-            doubts += [*guard.doubts(), *Counters.read().doubts_since(before)]
+            doubts += [*guard.doubts(), *Counters.read(uses_dds=uses_dds).doubts_since(before)]
             sampler.flush(writer)
             writer.update(warnings=[doubt.to_manifest() for doubt in doubts], resources=sampler.describe())
 

@@ -9,7 +9,7 @@ from itertools import product
 from pathlib import Path
 from typing import Final
 
-from s2a_bench.bench.ranges import require
+from s2a_bench.bench.ranges import LEAST_T_NOM_S, require
 from s2a_bench.bench.timeline_plans import NO_JITTER, Board, board_of_profile, board_of_rate
 from s2a_bench.bench.timeline_rows import Setting
 from s2a_bench.errors import UsageError
@@ -84,7 +84,7 @@ class TimelineConfig:
                 raise UsageError(f"{flag}: name at least one")
         require("--tokens-per-skill", self.tokens_per_skill, 1)
         require("--n-skills", self.n_skills, 1)
-        require("--t-nom", self.t_nom_s, 0, above=True)
+        require("--t-nom", self.t_nom_s, LEAST_T_NOM_S)
         require("--t-min (a factor of T_nom)", [self.t_min], 0, 1, above=True)
         require("--t-max (a factor of T_nom)", [self.t_max], 1)
         require("--t-nom-cv", [self.t_nom_cv], 0, MOST_CV)

@@ -28,6 +28,8 @@ KEPT_PLANS: Final = 10
 SAMPLE_S: Final = 0.01
 """How finely the speed is sampled that jerk and SPARC are taken from."""
 
+SHORTEST_MOTION_S: Final = 1e-9
+"""Shorter motions have no jerk and no SPARC: no sample of theirs moves."""
 LONGEST_MOTION_S: Final = 1000.0
 """Longer motions have none of these: their samples would fill the memory."""
 
@@ -194,11 +196,11 @@ def _numbers(found: Metrics, place: int) -> dict[str, Any]:
 
 
 def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> dict[str, float]:
-    """Return jerk and smoothness of one timeline, under the model of `speed_profile`; nothing of a long one."""
+    """Return jerk and smoothness of one timeline, under the model of `speed_profile`; none if too long or too short."""
     start_s, duration_s, nominal_s = (
         np.ascontiguousarray(values[:, place]) for values in align(schedule.start_s, schedule.duration_s, nominal_s)
     )
-    if start_s[-1] + duration_s[-1] - start_s[0] > LONGEST_MOTION_S:
+    if not SHORTEST_MOTION_S <= start_s[-1] + duration_s[-1] - start_s[0] <= LONGEST_MOTION_S:
         return {}
     speed = speed_profile(start_s, duration_s, nominal_s, SAMPLE_S)
     return {

@@ -54,12 +54,15 @@ class Counters:
     realtime_offset_ns: int = 0
 
     @staticmethod
-    def read() -> Counters:
-        """Read them all."""
+    def read(*, uses_dds: bool = True) -> Counters:
+        """Read them all; without DDS the packets that the machine dropped were somebody else's."""
         throttles = [_number(path) or 0 for path in _cpu_files("thermal_throttle/core_throttle_count")]
         suspended = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(time.CLOCK_MONOTONIC)
         return Counters(
-            _receive_buffer_errors(), sum(throttles) if throttles else None, suspended, realtime_offset_ns()
+            _receive_buffer_errors() if uses_dds else None,
+            sum(throttles) if throttles else None,
+            suspended,
+            realtime_offset_ns(),
         )
 
     def doubts_since(self, before: Counters) -> list[Doubt]:

@@ -45,7 +45,7 @@ def capture(
     json_: Json = False,
 ) -> None:
     """Measure this machine: rate, time to first token and every gap between tokens, for other machines to replay."""
-    from s2a_bench.bench.capture import CaptureConfig, refusal, write_profile
+    from s2a_bench.bench.capture import CaptureConfig, make_room, write_profile
     from s2a_bench.bench.capture import capture as measure
     from s2a_bench.bench.plan import DEFAULT_PROMPT
     from s2a_bench.cli.progress import RunProgress
@@ -57,8 +57,7 @@ def capture(
     config = CaptureConfig(name, engine, source, width, height, requests, warmup, tokens, text, seed)
     config.check()
     path = output / f"{name}.toml"
-    if path.exists() and not force:
-        raise UsageError(refusal(path))
+    make_room(path, force=force)
     with RunProgress() as progress:
         progress.expect(requests + warmup)
         tables = measure(config, progress.stage, progress.advance)

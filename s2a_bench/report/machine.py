@@ -55,12 +55,14 @@ def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
 
 
 def about_cell(cell: Cell, run: Run) -> dict[str, Any]:
-    """Return what the cells of all commands say about themselves."""
+    """Return what the cells of all commands say about themselves; ``dummy`` where it is known."""
+    model = run.manifest.get("model", {})
     return {
         "cell": cell.name,
         **cell.about,
-        "profile": run.manifest.get("model", {}).get("profile"),
+        "profile": model.get("profile"),
         "emulated": cell.emulated,
+        **({"dummy": model["dummy"]} if "dummy" in model else {}),
         "n": cell.n,
         "errors": cell.errors,
         "warmups": cell.warmups,

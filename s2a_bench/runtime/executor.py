@@ -83,7 +83,8 @@ class Executor:
             events = self._inbox.wait(None if wake_ns == NEVER else wake_ns)
             for event in events:
                 self._hear(event)
-            due_ns = min([wake_ns, *(event.at_ns for event in events[-1:])])
+            # Of several events the first: they piled up because this thread was late, which is jitter too.
+            due_ns = min([wake_ns, *(event.at_ns for event in events)])
         return self.record
 
     def _hear(self, event: Event) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
 from typing import Any
 
 import pytest
 
-from s2a_bench.bench import board
+from s2a_bench.bench import environment
 from s2a_bench.bench.board import board_facts, differences, matches
 from s2a_bench.inference.profiles import load_profile
 from s2a_bench.jitter import Constant
@@ -62,14 +62,9 @@ def test_this_machine_is_its_own_kind_of_board() -> None:
     assert matches(profile(**here), here)
 
 
-def test_the_power_mode_has_the_name_that_nvpmodel_gives_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(board, "NVPMODEL_STATUS", tmp_path / "status")
-    monkeypatch.setattr(board, "NVPMODEL_CONF", tmp_path / "conf")
-    assert "power_mode" not in board_facts()
-    (tmp_path / "status").write_text("pmode:0002 fmode:quiet")
-    (tmp_path / "conf").write_text("< POWER_MODEL ID=0 NAME=MAXN >\nA\n< POWER_MODEL ID=2 NAME=MODE_30W >\n")
-    assert board_facts()["power_mode"] == "MODE_30W"
-    (tmp_path / "status").write_text("pmode:0007")
-    assert board_facts()["power_mode"] == "7"
-    (tmp_path / "status").write_text("off")
-    assert "power_mode" not in board_facts()
+def test_gpu_and_power_mode_are_what_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    known: dict[str, Any] = {"gpus": [{"name": "RTX", "driver": "1"}, {"name": "T4"}], "power_mode": "MODE_30W"}
+    monkeypatch.setattr(environment, "collect", lambda: known)
+    assert board_facts() == {"gpu": "RTX", "power_mode": "MODE_30W", "cores": len(os.sched_getaffinity(0))}
+    known.clear()
+    assert board_facts() == {"cores": len(os.sched_getaffinity(0))}

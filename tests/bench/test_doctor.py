@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.bench import doctor
+from s2a_bench.bench import doctor, environment
 from s2a_bench.bench.doctor import BEFORE_RUN, CHECKS, LEVELS, Finding, Machine, examine, worst
 from s2a_bench.bench.doctor.gpu import current_power_mode
 from s2a_bench.bench.warnings import before_run
@@ -96,7 +96,7 @@ def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     give_nvml(monkeypatch)
 
 
-def give_nvml(monkeypatch: pytest.MonkeyPatch, *cards: SimpleNamespace) -> None:
+def give_nvml(monkeypatch: pytest.MonkeyPatch, *cards: SimpleNamespace, driver: str = "550.54") -> None:
     class NVMLError(Exception): ...
 
     def start() -> None:
@@ -108,6 +108,11 @@ def give_nvml(monkeypatch: pytest.MonkeyPatch, *cards: SimpleNamespace) -> None:
             raise NVMLError("Not Supported")
         return int(card.persistence)
 
+    def driver_version() -> str:
+        if not driver:
+            raise NVMLError("Not Supported")
+        return driver
+
     fake = SimpleNamespace(
         NVMLError=NVMLError,
         nvmlInit=start,
@@ -117,7 +122,7 @@ def give_nvml(monkeypatch: pytest.MonkeyPatch, *cards: SimpleNamespace) -> None:
         nvmlDeviceGetName=lambda card: card.name,
         nvmlDeviceGetMemoryInfo=lambda _card: SimpleNamespace(free=15 << 30, total=16 << 30),
         nvmlDeviceGetPersistenceMode=persistence,
-        nvmlSystemGetDriverVersion=lambda: "550.54",
+        nvmlSystemGetDriverVersion=driver_version,
         nvmlDeviceGetCurrentClocksThrottleReasons=lambda card: card.reasons,
     )
     monkeypatch.setitem(sys.modules, "pynvml", fake)
@@ -436,3 +441,9 @@ def test_a_command_that_is_missing_or_fails_says_nothing() -> None:
     assert doctor._run(["/no/such/program"]) is None
     assert doctor._run(["false"]) is None
     assert doctor._run(["echo", "here"]) == "here\n"
+
+
+def test_a_gpu_whose_driver_tells_no_version_is_still_named(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    give_nvml(monkeypatch, card("Orin (nvgpu)"), driver="")  # as NVML on a Jetson
+    assert see(make({}), "gpu").message.startswith("Orin (nvgpu), ")
+    assert environment.collect()["gpus"] == [{"name": "Orin (nvgpu)"}]

@@ -313,7 +313,7 @@ def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
         ({"skills": "juggling"}, "--skills: 'juggling' is none of"),
         ({"n_skills": (0,)}, "--n-skills: 0 should be 1 or more"),
         ({"plans": 0}, "--plans: 0 should be 1 or more"),
-        ({"t_nom_s": (0.0,)}, "--t-nom: 0 should be above 0"),
+        ({"t_nom_s": (0.0,)}, "--t-nom: 0 should be 1e-06 or more"),
         ({"robot": "kuka"}, "--robot: 'kuka' is none of timed, ros"),
         ({"robot": "ros"}, "--robot ros: one robot follows one policy"),
         ({"tokens_per_skill": (4,)}, "--engine replay writes plans of the household skills in 6 tokens a skill"),

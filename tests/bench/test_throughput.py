@@ -159,6 +159,7 @@ def test_without_threads_the_reference_has_those_of_this_process() -> None:
         ("crash", "exit code 1: main: error: failed to load model 'x.gguf'"),
         ("garbage", "not llama-bench's JSON"),
         ("empty", "not llama-bench's JSON"),
+        ("old", "too old to know --flash-attn auto"),
     ],
 )
 def test_a_reference_that_fails_says_so_in_one_line(

@@ -16,10 +16,11 @@ from s2a_bench.bench.timeline import run_timeline
 from s2a_bench.bench.timeline_config import TimelineConfig, settings
 from s2a_bench.bench.timeline_plans import board_of_profile, gaps_of
 from s2a_bench.bench.timeline_policies import draw, learn
-from s2a_bench.bench.timeline_rows import KEPT_PLANS
+from s2a_bench.bench.timeline_rows import KEPT_PLANS, Setting, timeline_rows
 from s2a_bench.bench.timeline_traces import recordings
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.jitter import Constant, Lognormal, Markov, Recorded
+from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.conformal import Calibration
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.profile import Profile
@@ -189,6 +190,7 @@ def test_jitter_that_is_wrong_is_named(jitter: str, message: str) -> None:
         (TimelineConfig(n_skills=(8, 0)), "--n-skills: 0"),
         (TimelineConfig(tokens_per_skill=(0,)), "--tokens-per-skill: 0"),
         (TimelineConfig(t_nom_s=(1.0, -1.0)), "--t-nom: -1"),
+        (TimelineConfig(t_nom_s=(1e-9,)), "--t-nom: 1e-09"),
         (TimelineConfig(t_min=1.2), "--t-min .* 1.2 should be above 0 and at most 1"),
         (TimelineConfig(t_max=0.9), "--t-max .* 0.9 should be 1 or more"),
         (TimelineConfig(t_nom_cv=0.6), "--t-nom-cv: 0.6"),
@@ -307,3 +309,10 @@ def test_a_plan_of_hours_has_no_sampled_motion(tmp_path: Path) -> None:
 def test_more_tokens_than_memory_holds_are_refused() -> None:
     with pytest.raises(UsageError, match="--n-skills, --tokens-per-skill: 1000000 tokens a plan"):
         TimelineConfig(n_skills=(1000,), tokens_per_skill=(1000,)).check()
+
+
+def test_a_skill_that_fails_at_once_has_a_row_and_no_motion() -> None:
+    second = np.ones((1, 1))
+    setting = Setting("", "live", 5.0, None, 6, 4, 1.0, mode="live", emulated=False)
+    (row,) = timeline_rows(setting, "naive", Plans(second, second, second, second), Schedule(second, 0 * second), ["a"])
+    assert (row.start_ns, row.end_ns, row.sparc, row.rms_jerk) == (10**9, 10**9, None, None)

@@ -101,3 +101,8 @@ def test_what_cannot_be_read_is_no_doubt() -> None:
 def test_this_machine_can_be_read() -> None:
     now = Counters.read()
     assert now.doubts_since(now) == []
+
+
+def test_packets_lost_by_others_are_no_doubt_about_a_run_without_dds() -> None:
+    assert Counters.read().receive_buffer_errors is not None
+    assert Counters.read(uses_dds=False).receive_buffer_errors is None

@@ -129,6 +129,13 @@ def test_capture_measures_this_machine_which_match_then_finds(home: Path) -> Non
     assert "profiles/here.toml exists already; give another NAME or --output, or --force" in again.stderr
 
 
+def test_where_nothing_can_be_written_nothing_is_measured(home: Path) -> None:
+    (home / "file").write_text("")
+    done = run(home, "profile", "capture", "here", "--output", "file/profiles")
+    assert done.returncode == 1
+    assert done.stderr == "error: --output: cannot write file/profiles/here.toml: Not a directory\n"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -10,11 +10,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from s2a_bench.clock import VirtualClock
 from s2a_bench.policy import Plans, PlanShape, Start, Stepper, policy
 from s2a_bench.policy.naive import Naive, Queue
 from s2a_bench.policy.schedule import safe_start
-from s2a_bench.runtime.events import AbortAsked, Requested, SkillCame, StreamBroke, StreamEnded, TokenCame
+from s2a_bench.runtime.events import AbortAsked, Event, Requested, SkillCame, StreamBroke, StreamEnded, TokenCame
+from s2a_bench.runtime.executor import Executor
 from s2a_bench.runtime.record import Record
+from s2a_bench.runtime.timed import TimedRobot
 from tests.conformance.policy import one, seeded
 from tests.runtime.drive import (
     EVERY_POLICY,
@@ -247,3 +250,28 @@ def test_minutes_are_computed_and_not_waited_for() -> None:
     arrivals = np.cumsum(np.full(32, 60.0)).tolist()
     record, _ = run(plan(arrivals), 32, silence_s=100.0)
     assert ends(record)[-1] == pytest.approx(32 * 60 + 1)
+
+
+class LateInbox:
+    """Hands everything over at once, when a thread that was kept from running looks at last."""
+
+    def __init__(self, clock: VirtualClock, events: list[Event], seen_ns: int) -> None:
+        self._clock, self._events, self._seen_ns = clock, events, seen_ns
+
+    def put(self, event: Event) -> None:
+        self._events.append(event)
+
+    def wait(self, until_ns: int | None) -> list[Event]:
+        found, self._events = self._events, []
+        self._clock.sleep_until_ns(self._seen_ns if found else until_ns or 0)
+        return found
+
+
+def test_being_late_for_several_events_is_jitter_since_the_first() -> None:
+    clock = VirtualClock()
+    came_ns = 10_000_000
+    skill = SkillCame(came_ns, call("wave", 1.0, 1.0, 1.0))
+    events: list[Event] = [Requested(came_ns), TokenCame(came_ns), skill, TokenCame(came_ns + 8_000_000)]
+    inbox = LateInbox(clock, events, came_ns + 9_000_000)
+    record = Executor(Naive(), shape(1), TimedRobot(), inbox, clock).run()
+    assert [run.jitter_ns for run in record.skills] == [9_000_000]

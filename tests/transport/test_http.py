@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
-from threading import Thread
+from itertools import count
+from threading import Event, Thread, get_ident
 
 import cv2
 import httpx
@@ -16,9 +17,9 @@ import pytest
 
 from s2a_bench.errors import PortInUse
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Route, open_client, open_server
+from s2a_bench.transport import Handler, Route, open_client, open_server
 from s2a_bench.transport.http import dialect
-from s2a_bench.types import Request
+from s2a_bench.types import Request, Token
 from tests.conformance.transport import Recorder, ask, yuyv_frame
 
 
@@ -27,8 +28,9 @@ def handler() -> Recorder:
     return Recorder(["go", "_to"])
 
 
-@pytest.fixture
-def url(handler: Recorder) -> Iterator[str]:
+@contextmanager
+def serving(handler: Handler) -> Iterator[str]:
+    """Serve for as long as the context lasts."""
     with ExitStack() as stack:
         server = open_server(Route("http"), handler)
         thread = Thread(target=server.serve)
@@ -36,6 +38,12 @@ def url(handler: Recorder) -> Iterator[str]:
         stack.callback(thread.join)
         stack.callback(server.stop)
         yield server.address
+
+
+@pytest.fixture
+def url(handler: Recorder) -> Iterator[str]:
+    with serving(handler) as address:
+        yield address
 
 
 def stages(url: str, variant: str, payload: str) -> set[str]:
@@ -148,6 +156,8 @@ def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: Reco
         (dialect.PATHS["as-deployed"], b"{", 422, "JSON"),
         (dialect.PATHS["best-effort"], b"{", 400, "no JSON"),
         (dialect.PATHS["best-effort"], b"{}", 400, "messages"),
+        (dialect.PATHS["best-effort"], b'{"messages": [], "max_tokens": "many"}', 400, "max_tokens"),
+        (dialect.PATHS["best-effort"], b'{"messages": [{"content": [{"type": "text", "text": 3}]}]}', 400, "messages"),
         (dialect.PATHS["binary"], b"", 400, "s2a-request"),
     ],
 )
@@ -155,6 +165,61 @@ def test_a_bad_body_is_refused_with_the_reason(url: str, path: str, body: bytes,
     answer = httpx.post(url + path, content=body, headers={"content-type": "application/json"})
     assert answer.status_code == status
     assert message in answer.json()["error"]["message"]
+
+
+@pytest.mark.parametrize("header", ["[1]", '{"prompt": 3}', '{"seed": [1]}'])
+def test_a_bad_header_of_a_binary_request_is_refused(url: str, header: str) -> None:
+    headers = {dialect.PARAMETERS_HEADER: header}
+    assert httpx.post(url + dialect.PATHS["binary"], headers=headers).status_code == 400
+
+
+def test_an_answer_that_nobody_reads_any_more_ends_on_its_own_thread() -> None:
+    threads: list[int] = []
+    gone, ended = Event(), Event()
+
+    def endless(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        try:
+            for index in count():
+                threads.append(get_ident())
+                yield Token(index, "go")
+                if index:
+                    gone.wait(30)
+        finally:
+            threads.append(get_ident())
+            ended.set()
+
+    body = {"messages": [{"role": "user", "content": "plan"}], "stream": True}
+    with serving(endless) as url:
+        with httpx.stream("POST", url + "/v1/chat/completions", json=body) as answer:
+            next(answer.iter_bytes())
+        gone.set()
+        assert ended.wait(30)
+    assert threads[-1] == threads[-2]  # not the loop's: the end may wait for the engine
+
+
+def test_stopping_in_the_middle_of_an_answer_leaves_no_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    over = Event()
+
+    def slow(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        yield Token(0, "go")
+        over.wait(30)
+        yield Token(1, "on")
+
+    server = open_server(Route("http"), slow)
+    thread = Thread(target=server.serve)
+    thread.start()
+    body = {"messages": [{"role": "user", "content": "plan"}], "stream": True}
+    with httpx.stream("POST", server.address + "/v1/chat/completions", json=body) as answer:
+        pieces = answer.iter_bytes()
+        next(pieces)
+        server.stop()
+        with pytest.raises(httpx.RemoteProtocolError):
+            list(pieces)
+    over.set()
+    thread.join()
+    said = capsys.readouterr().err
+    assert "graceful shutdown exceeded" in said
+    assert "Traceback" not in said
 
 
 @pytest.mark.parametrize("uri", ["http://example.org/x.jpg", "data:image/jpeg;base64,AAAA", "data:image/png;base64,%"])

@@ -27,9 +27,24 @@ def nvml() -> Iterator[tuple[Any, list[Any]]]:
         yield pynvml, []
         return
     try:
-        yield pynvml, [pynvml.nvmlDeviceGetHandleByIndex(place) for place in range(pynvml.nvmlDeviceGetCount())]
+        gpus = []
+        with suppress(pynvml.NVMLError):
+            gpus = [pynvml.nvmlDeviceGetHandleByIndex(place) for place in range(pynvml.nvmlDeviceGetCount())]
+        yield pynvml, gpus
     finally:
         pynvml.nvmlShutdown()
+
+
+def identity(lib: Any, card: Any) -> dict[str, str]:
+    """Name a GPU and its driver, as far as NVML tells: a Jetson's knows next to nothing."""
+    facts = {}
+    for key, ask in (
+        ("name", lambda: lib.nvmlDeviceGetName(card)),
+        ("driver", lib.nvmlSystemGetDriverVersion),
+    ):
+        with suppress(lib.NVMLError):
+            facts[key] = str(ask())
+    return facts
 
 
 def is_jetson(machine: Machine) -> bool:
@@ -73,16 +88,17 @@ def gpu(machine: Machine) -> Finding:
 
 def _cards(lib: Any, gpus: list[Any]) -> Finding:
     """Describe the cards that NVML knows."""
-    told, sleepy = [], False
+    told, sleepy, driver = [], False, ""
     for card in gpus:
-        text = str(lib.nvmlDeviceGetName(card))
+        known = identity(lib, card)
+        text, driver = known.get("name", "a GPU without a name"), known.get("driver", "unknown")
         with suppress(lib.NVMLError):
             memory = lib.nvmlDeviceGetMemoryInfo(card)
             text += f", {memory.free / GIB:.1f} of {memory.total / GIB:.1f} GiB free"
         with suppress(lib.NVMLError):
             sleepy = sleepy or not lib.nvmlDeviceGetPersistenceMode(card)
         told.append(text)
-    message = f"{'; '.join(told)}; driver {lib.nvmlSystemGetDriverVersion()}"
+    message = f"{'; '.join(told)}; driver {driver}"
     if sleepy:
         return Finding("gpu", "advice", f"{message}; the driver unloads between runs", "sudo nvidia-smi -pm 1")
     return Finding("gpu", "state", message)

@@ -11,7 +11,8 @@ import asyncio
 import errno
 import socket
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterator
+from contextlib import closing, suppress
 from itertools import chain
 from typing import Any, Literal
 
@@ -82,7 +83,8 @@ def _received(app: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[No
                 trace.mark("network")
             return event
 
-        await app(scope, timed_receive, send)
+        with suppress(asyncio.CancelledError):  # uvicorn cancels what is under way when it stops: no error of ours
+            await app(scope, timed_receive, send)
 
     return wrapped
 
@@ -144,9 +146,11 @@ def _answer_binary(handler: Handler, body: bytes, http_request: HttpRequest) -> 
         fields = dialect.FAST.loads(http_request.headers.get(dialect.PARAMETERS_HEADER, ""))
     except ValueError as error:
         raise RequestFailed(f"header {dialect.PARAMETERS_HEADER} is no JSON: {error}") from error
+    if not (isinstance(fields, dict) and isinstance(prompt := fields.get("prompt", ""), str)):
+        raise RequestFailed(f"header {dialect.PARAMETERS_HEADER} should be an object whose prompt is text")
     trace.mark("json_parse")
     images = (decoded(http_request.headers.get("content-type", ""), body, trace),) if body else ()
-    return _respond(handler, fields, fields.get("prompt", ""), images, trace, dialect.FAST)
+    return _respond(handler, fields, prompt, images, trace, dialect.FAST)
 
 
 def _answer(handler: Handler, fields: dict[str, Any], trace: Trace, codec: dialect.Codec) -> Response:
@@ -165,9 +169,10 @@ def _answer(handler: Handler, fields: dict[str, Any], trace: Trace, codec: diale
                 data = codec.from_base64(text)
                 trace.mark("base64_decode")
                 images.append(decoded(media_type, data, trace))
+        prompt = "\n".join(texts)
     except (ValueError, KeyError, TypeError) as error:  # binascii.Error is a ValueError
         raise RequestFailed(f"messages: {error!r}") from error
-    return _respond(handler, fields, "\n".join(texts), tuple(images), trace, codec)
+    return _respond(handler, fields, prompt, tuple(images), trace, codec)
 
 
 def _respond(
@@ -179,14 +184,17 @@ def _respond(
     codec: dialect.Codec,
 ) -> Response:
     """Start the answer, so that a refusal still has its status code, then stream it or send it whole."""
-    request = Request(
-        id=str(fields.get("request_id") or "chatcmpl-0"),
-        prompt=prompt,
-        images=images,
-        max_tokens=int(fields.get("max_tokens") or 32),
-        grammar=str(fields.get("grammar") or ""),
-        seed=int(fields.get("seed") or 0),
-    )
+    try:
+        request = Request(
+            id=str(fields.get("request_id") or "chatcmpl-0"),
+            prompt=prompt,
+            images=images,
+            max_tokens=int(fields.get("max_tokens") or 32),
+            grammar=str(fields.get("grammar") or ""),
+            seed=int(fields.get("seed") or 0),
+        )
+    except (ValueError, TypeError) as error:
+        raise RequestFailed(f"max_tokens, seed: {error}") from error
     tokens = handler(request, trace)
     first = list(next_of(tokens))
     if fields.get("stream"):
@@ -211,20 +219,21 @@ def _respond(
     )
 
 
-async def _relayed(events: Iterator[bytes]) -> AsyncIterator[bytes]:
+async def _relayed(events: Generator[bytes, None, None]) -> AsyncIterator[bytes]:
     """Run an answer on one thread and yield what it has written since: a thread's turn a token would cost 50 us each.
 
-    When the client has gone, the answer ends at its next event.
+    When the client has gone, the answer ends at its next event, on its thread: ending may wait for the engine.
     """
     loop, written, waiting = asyncio.get_running_loop(), asyncio.Event(), deque[bytes]()
     gone = False
 
     def run() -> None:
-        for event in events:
-            waiting.append(event)
-            if gone:
-                return
-            loop.call_soon_threadsafe(written.set)
+        with closing(events):
+            for event in events:
+                waiting.append(event)
+                if gone:
+                    return
+                loop.call_soon_threadsafe(written.set)
 
     answer = asyncio.ensure_future(run_in_threadpool(run))
     answer.add_done_callback(lambda _: written.set())
@@ -246,7 +255,9 @@ def next_of(tokens: Iterator[Token]) -> Iterator[Token]:
         return
 
 
-def _events(request: Request, tokens: Iterator[Token], trace: Trace, codec: dialect.Codec) -> Iterator[bytes]:
+def _events(
+    request: Request, tokens: Iterator[Token], trace: Trace, codec: dialect.Codec
+) -> Generator[bytes, None, None]:
     """Yield the server-sent events of an answer; an engine that fails on the way ends it with an error event."""
     count = 0
     try:
