@@ -48,18 +48,20 @@ def run_ccrb(config: CcrbConfig, output: Path, progress: Progress, **settings: o
         with RunWriter.create(output, "ccrb", manifest, (ROLLOUTS, TRAJECTORIES, SKILLS, TOKENS)) as writer:
             progress.opened(writer.path)
             progress.stage("driving the operating point")
-            _drive_point(config, prepare(config), world, writer)
+            ready = prepare(config)
+            tokens_s = ready.plans.token_s
+            assert tokens_s is not None  # noqa: S101 - drawn plans have tokens
+            writer.append(TOKENS, token_rows(ready.setting.name, tokens_s, [ready.request_id]))
+            drive_point(config, ready, world, writer)
             _drive_studies(config, writer, progress)
             return writer.path
     finally:
         world.close()
 
 
-def _drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: RunWriter) -> None:
+def drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: RunWriter) -> None:
     """Drive the policies one after the other, and keep everything."""
     setting = ready.setting
-    request_id = setting.request_id(0)
-    writer.append(TOKENS, token_rows(setting.name, ready.token_s, [request_id]))
     for name, schedule in ready.schedules.items():
         driven = drive(world, config.cars, ready.driving, schedule, record=True)
         path = driven.trajectory
@@ -73,7 +75,7 @@ def _drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: 
         }
         writer.append(ROLLOUTS, rollout_rows(about, schedule, driven.outcomes, motion=motion_of(path)))
         texts = [skill_texts(ready.driving)]
-        writer.append(SKILLS, skill_rows(cell, ready.plans, schedule, [request_id], texts=texts))
+        writer.append(SKILLS, skill_rows(cell, ready.plans, schedule, [ready.request_id], texts=texts))
         writer.append(TRAJECTORIES, trajectory_rows(cell, path))
 
 
@@ -115,7 +117,7 @@ def _about(config: CcrbConfig, ready: Prepared, world: Simulator) -> dict[str, A
         "draw": 0,
         "board": setting.board,
         "title": setting.title,
-        "emulated": True,
+        "emulated": setting.emulated,
         "simulator": world.name,
         "follower": config.follower,
         "gap_behaviour": config.gap,

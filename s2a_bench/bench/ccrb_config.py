@@ -152,7 +152,7 @@ class CcrbConfig:
         whole_s = board.prompt_s + self.tokens_per_skill * (self.n_skills + 1) / board.tokens_per_s
         if whole_s > LONG_S:
             raise UsageError(
-                f"--rate or --profile: the whole plan takes {whole_s:.0f} s to arrive, "
+                f"--rate, --pace or --profile: the whole plan takes {whole_s:.0f} s to arrive, "
                 f"which is no driving; at most {LONG_S:.0f} s"
             )
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,13 +12,10 @@ from s2a_bench.bench.ccrb_config import CcrbConfig
 from s2a_bench.bench.timeline_config import settings
 from s2a_bench.bench.timeline_policies import draw, learn
 from s2a_bench.bench.timeline_rows import Setting
-from s2a_bench.policy import Plans, Schedule
+from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.scenario.ccrb import KMH, DrivingPlan, braking_plan, plan_decel, start_deadline
 from s2a_bench.scenario.ttc import NAME as TTC
 from s2a_bench.scenario.ttc import ttc_aware
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +23,7 @@ class Prepared:
     """One plan, ready to be driven by every policy."""
 
     setting: Setting
-    token_s: Floats
+    request_id: str
     plans: Plans
     schedules: dict[str, Schedule]
     late: bool | None
@@ -36,13 +34,21 @@ class Prepared:
 
 
 def prepare(config: CcrbConfig) -> Prepared:
-    """Let the board's tokens come, and ask the policies."""
+    """Let the board's tokens come, and ask the policies; they are the plans' ``token_s``."""
     board, setting = next(settings(config.timeline))
     known = learn(config.timeline, board, setting)
-    token_s, plans = draw(config.timeline, board, setting, 1, "plans")
+    _, plans = draw(config.timeline, board, setting, 1, "plans")
+    policies = {name: known.prepare(name) for name in config.policies}
+    return complete(config, setting, setting.request_id(0), plans, policies)
+
+
+def complete(
+    config: CcrbConfig, setting: Setting, request_id: str, plans: Plans, policies: Mapping[str, Policy]
+) -> Prepared:
+    """Ask the policies about a plan, drawn or heard, and lay out what is driven."""
     if config.lane_change:
         plans = with_lane_change(plans, config)
-    schedules = {name: known.prepare(name).schedule(plans) for name in config.policies}
+    schedules = {name: policy.schedule(plans) for name, policy in policies.items()}
     decel = float(plan_decel(config.cars, config.n_skills, config.durations.nominal_s, lane_change=config.lane_change))
     if config.plan_decel_mps2 is not None:
         decel = config.plan_decel_mps2
@@ -54,7 +60,7 @@ def prepare(config: CcrbConfig) -> Prepared:
     driving = braking_plan(
         config.cars, config.n_skills, config.durations.nominal_s, decel_mps2=decel, lane_change=config.lane_change
     )
-    return Prepared(setting, token_s, plans, schedules, late, driving, decel, deadline_s)
+    return Prepared(setting, request_id, plans, schedules, late, driving, decel, deadline_s)
 
 
 def with_lane_change(plans: Plans, config: CcrbConfig) -> Plans:

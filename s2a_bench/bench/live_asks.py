@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from s2a_bench.policy import PlanShape, Policy, Timing
 from s2a_bench.policy import policy as policy_of
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
 from s2a_bench.policy.stream_to_act import StreamToAct
+
+if TYPE_CHECKING:
+    from s2a_bench.policy import Floats
 
 ROOM: Final = 16
 """Tokens a skill that a model of unknown tokenizer may need for the paper's format."""
@@ -79,8 +82,16 @@ def prior_of(arrivals_ns: Sequence[Sequence[int]], rate: float | None) -> GapPri
     gaps_s = np.array([float(gap) for times in arrivals_ns for gap in np.diff(times)]) / 1e9
     if gaps_s.size > 1 and gaps_s.mean() > 0:
         mean_s = float(gaps_s.mean())
-        return GapPrior(mean_s, PLAN_CV, max(float(gaps_s.std(ddof=1)) / mean_s, LEAST_CV))
+        return GapPrior(mean_s, PLAN_CV, max(_spread_s(gaps_s) / mean_s, LEAST_CV))
     return None if rate is None else GapPrior(1 / rate, PLAN_CV, 2 * PLAN_CV)
+
+
+def _spread_s(gaps_s: Floats) -> float:
+    """Return sigma of a gap: of single gaps or, where gaps come in bursts and that says more, from sums over blocks."""
+    size = max(1, round(gaps_s.size**0.5))
+    blocks = gaps_s[: gaps_s.size // size * size].reshape(-1, size).sum(axis=1)
+    of_blocks = float(blocks.std(ddof=1)) / size**0.5 if blocks.size > 1 else 0.0
+    return max(float(gaps_s.std(ddof=1)), of_blocks)
 
 
 def prepare(name: str, prior: GapPrior | None) -> Policy:

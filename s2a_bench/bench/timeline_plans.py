@@ -53,6 +53,8 @@ class Board:
 def board_of_profile(profile: Profile, jitter: str, prompt_s: float | None) -> Board:
     """Take a profile's rate and, unless ``prompt_s`` is given, its c; its spreads only with ``--jitter profile``."""
     assumed = "assumed" if "prompt_s" in profile.assumed else "measured"
+    gaps = _gaps(jitter, profile)
+    recorded = isinstance(gaps, Recorded)  # it holds each answer's own rate already
     return Board(
         name=profile.name,
         title=profile.title,
@@ -60,9 +62,9 @@ def board_of_profile(profile: Profile, jitter: str, prompt_s: float | None) -> B
         tokens_per_s=profile.tokens_per_s,
         prompt_s=profile.prompt_s if prompt_s is None else prompt_s,
         prompt_origin=assumed if prompt_s is None else "given",
-        gaps=_gaps(jitter, profile),
+        gaps=gaps,
         prompt_cv=profile.prompt_cv if jitter == AS_PROFILE else 0.0,
-        rate_cv=profile.rate_cv if jitter == AS_PROFILE else 0.0,
+        rate_cv=profile.rate_cv if jitter == AS_PROFILE and not recorded else 0.0,
     )
 
 

@@ -10,18 +10,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from s2a_bench.cli.options import WIDTH, listed, numbers
-from s2a_bench.errors import S2AError
+from s2a_bench.cli.timeline_live import given_live, live_config, refuse_with_live, refuse_without_live
+from s2a_bench.errors import S2AError, UsageError
 
 if TYPE_CHECKING:
     from s2a_bench.bench.ccrb_config import CcrbConfig
+    from s2a_bench.bench.live_config import LiveConfig
     from s2a_bench.cli.progress import RunProgress
+
+PROFILE = "jetson-agx-orin"
+REPLAY_TOKENS = 6
+"""Tokens a skill of ``--engine replay``, which writes household plans whatever it is asked."""
 
 
 def ccrb(
     policy: Annotated[
         str, typer.Option(help="naive, wait-then-act, stream-to-act, and those for study; several with commas")
     ] = "naive,wait-then-act,stream-to-act",
-    profile: Annotated[str, typer.Option(help="the board: a name of 'profile list', or a path")] = "jetson-agx-orin",
+    profile: Annotated[str, typer.Option(help="the board: a name of 'profile list', or a path")] = PROFILE,
     rate: Annotated[float | None, typer.Option(help="a board of which only the tokens/s are known")] = None,
     prompt_time: Annotated[
         float | None, typer.Option(help="seconds before decoding, c [default: the profile's; with --rate 0]")
@@ -61,6 +67,19 @@ def ccrb(
     phase_gaps: Annotated[str, typer.Option(help="m to the car behind in the phase diagram: from, to")] = "6,30",
     random: Annotated[int, typer.Option(help="also as many random scenarios; 0: none")] = 0,
     seed: Annotated[int, typer.Option(help="seed of everything that is drawn")] = 0,
+    live: Annotated[
+        bool, typer.Option("--live", help="take the tokens of a model that really answers, about the rendered scene")
+    ] = False,
+    transport: Annotated[
+        str | None, typer.Option(help="--live: ros, ros/action, http, http/VARIANT, loopback [default: ros]")
+    ] = None,
+    pace: Annotated[
+        float | None, typer.Option(help="--live: hold the answer back to so many tokens/s [default: the model's own]")
+    ] = None,
+    engine: Annotated[str | None, typer.Option(help="--live: llama, replay (EMULATED) [default: llama]")] = None,
+    model: Annotated[str | None, typer.Option(help="--live: GGUF model [default: the tiny dummy]")] = None,
+    mmproj: Annotated[str | None, typer.Option(help="--live: GGUF vision tower that goes with --model")] = None,
+    threads: Annotated[int | None, typer.Option(min=0, help="--live: CPU threads of the model [default: all]")] = None,
     animation: Annotated[
         bool, typer.Option("--animation/--no-animation", help="write the animation (GIF, MP4): half a minute")
     ] = False,
@@ -74,10 +93,19 @@ def ccrb(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Drive car-to-car rear braking with a car behind, under each policy, in virtual time: who hits whom, and when."""
-    from s2a_bench.bench.ccrb import run_ccrb
     from s2a_bench.bench.ccrb_config import CcrbConfig
     from s2a_bench.cli.progress import RunProgress
 
+    for_live = {"transport": transport, "pace": pace, "engine": engine}
+    given = given_live({**for_live, "model": model, "mmproj": mmproj, "threads": threads})
+    if live:
+        modelled: dict[str, tuple[Any, Any]] = {"rate": (rate, None), "prompt-time": (prompt_time, None)}
+        modelled |= {"phase": (phase, False), "random": (random, 0), "openscenario": (openscenario, None)}
+        modelled |= {} if engine == "replay" else {"profile": (profile, PROFILE)}
+        refuse_with_live(modelled)
+        rate = pace  # what is known of the plan's length beforehand
+    else:
+        refuse_without_live(given)
     config = CcrbConfig(
         policies=listed(policy),
         profile=profile,
@@ -104,13 +132,16 @@ def ccrb(
         random=random,
         seed=seed,
     )
+    asked = _asked(config, given) if live else None
     config.check()
+    if asked is not None:
+        asked.check()
     with RunProgress() as progress:
         try:
             settings: dict[str, Any] = {"host": host} if simulator == "carla" else {}
             if openscenario is not None:
                 _write_scenario(config, openscenario, progress)
-            folder = run_ccrb(config, output, progress, **settings)
+            folder = _run(config, asked, output, progress, settings)
             if not data_only:
                 progress.stage("drawing")
                 _draw(folder, progress, animated=animation)
@@ -119,6 +150,40 @@ def ccrb(
             if progress.folder is not None:
                 progress.say(f"roll-outs so far: {progress.folder}")
             raise
+
+
+def _asked(config: CcrbConfig, given: dict[str, Any]) -> LiveConfig:
+    """Word what is asked of the model; raises UsageError naming the flag."""
+    from s2a_bench.bench.ccrb_config import SKILL_SET
+
+    replayed = given.get("engine") == "replay"
+    if replayed and config.tokens_per_skill != REPLAY_TOKENS:
+        raise UsageError(f"--engine replay writes {REPLAY_TOKENS} tokens a skill; leave out --tokens-per-skill")
+    return live_config(
+        {**given, "skills": "household" if replayed else SKILL_SET},
+        policy=",".join(config.policies),
+        profile=config.profile if replayed else "",
+        tokens_per_skill=str(config.tokens_per_skill),
+        n_skills=str(config.n_skills + config.lane_change),
+        t_nom="",
+        t_min=0.8,
+        t_max=1.5,
+        plans=1,
+        seed=config.seed,
+    )
+
+
+def _run(
+    config: CcrbConfig, asked: LiveConfig | None, output: Path, progress: RunProgress, settings: dict[str, Any]
+) -> Path:
+    """Run with modelled tokens, or with those that a model is asked for."""
+    if asked is None:
+        from s2a_bench.bench.ccrb import run_ccrb
+
+        return run_ccrb(config, output, progress, **settings)
+    from s2a_bench.bench.ccrb_live import run_ccrb_live
+
+    return run_ccrb_live(config, asked, output, progress, **settings)
 
 
 def _write_scenario(config: CcrbConfig, path: Path, progress: RunProgress) -> None:
@@ -161,6 +226,8 @@ def _show(folder: Path, progress: RunProgress, *, as_json: bool) -> None:
 
     run = read_run(folder)
     tables = ccrb_tables(run)
+    for doubt in run.manifest.get("warnings", []):
+        progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
     if speed := run.manifest.get("studies", {}).get("rollouts_per_cpu_s"):
         progress.say(f"{run.manifest['studies']['rollouts']} roll-outs, {speed:.0f} a second of processor time")
     if as_json:

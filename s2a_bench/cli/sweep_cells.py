@@ -15,7 +15,7 @@ REAL: dict[str, dict[str, Any] | None] = {
     "latency": None,
     "throughput": None,
     "timeline": {"live": True, "real-time": True},
-    "ccrb": {"simulator": "carla"},
+    "ccrb": {"simulator": "carla", "live": True},
     "boundary": {},
     "study": {},
 }

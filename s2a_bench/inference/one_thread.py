@@ -27,7 +27,7 @@ class _Answer:
     """The tokens of one request on their way from the engine's thread to the one that asked."""
 
     def __init__(self) -> None:
-        self._wanted = True
+        self.wanted = True
         self._tokens: SimpleQueue[Token | None] = SimpleQueue()
         self._places: SimpleQueue[None] = SimpleQueue()  # a semaphore, but one in C
         for _ in range(AHEAD):
@@ -45,7 +45,7 @@ class _Answer:
     def _room(self) -> bool:
         """Wait for a place, and tell whether a token is still wanted."""
         self._places.get()
-        return self._wanted
+        return self.wanted
 
     def read(self) -> Iterator[Token]:
         """Yield the tokens until the engine has no more."""
@@ -55,7 +55,7 @@ class _Answer:
 
     def cancel(self) -> None:
         """Want no more."""
-        self._wanted = False
+        self.wanted = False
         self._places.put(None)
 
 
@@ -87,6 +87,8 @@ class OneThreadEngine:
             yield from answer.read()
             if answer is not self._answer:
                 raise EngineError("a later request took over the engine; one request at a time")
+            if not answer.wanted:
+                raise EngineError("the engine was closed before its answer was complete")
             writing.result()
         finally:
             answer.cancel()

@@ -116,15 +116,54 @@ def law_of(run: Run) -> str:
 
 def origin_notes(run: Run) -> tuple[str, ...]:
     """Say what the numbers are made of, and which laws they hang on."""
-    asked, board = configuration(run), run.manifest["boards"][0]
+    asked = configuration(run)
+    notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
+    notes.append(f"Rear: {law_of(run)}.")
+    notes.append(f"Front: while no skill is valid the ego does '{asked['gap']}'; the reflex layer is {_switch(asked)}.")
+    return tuple(notes)
+
+
+def tokens_line(run: Run) -> str:
+    """Say in one line where the tokens come from."""
+    if (live := run.manifest.get("live")) is None:
+        return f"EMULATED tokens, {run.manifest['boards'][0]['tokens_per_s']:g}/s."
+    kind = "EMULATED (replayed)" if live["emulated"] else "LIVE"
+    pace = live.get("paced_tokens_per_s")
+    paced = f", paced to {pace:g} tokens/s (the rate is set)" if pace else ""
+    return f"{kind} tokens over {live['transport']}{paced}; car simulated."
+
+
+def token_times_s(run: Run) -> list[float]:
+    """Return when the tokens of the shown plan arrived, in s from the request."""
+    request_id = run.tables["skills"]["request_id"].iloc[0]
+    tokens = run.tables["tokens"]
+    zero_ns = run.manifest.get("request", {}).get("requested_ns", 0)
+    return [(int(at_ns) - zero_ns) / 1e9 for at_ns in tokens[tokens["request_id"] == request_id]["client_ns"]]
+
+
+def _live_notes(run: Run) -> list[str]:
+    """Say what is real of a run on a model's tokens, and what is not."""
+    live = run.manifest["live"]
+    rate = rollouts_of(run, "point")["tokens_per_s"].iloc[0]
+    notes = [tokens_line(run)]
+    if "paced_tokens_per_s" not in live:
+        notes = [f"{notes[0]} {rate:g} tokens/s came."]
+    notes.append("Open loop: one request at t = 0 about the rendered scene; the road does not change the answer.")
+    driven = "the set-points driven are those of the scenario."
+    dummy = f"Dummy weights: what the plan says means nothing; {driven}"
+    notes.append(dummy if live.get("dummy") else f"What the plan says is not driven; {driven}")
+    return notes
+
+
+def _emulated_notes(run: Run) -> list[str]:
+    """Say what modelled tokens are made of."""
+    board = run.manifest["boards"][0]
     rates = {"paper": "the paper's rate (table II)", "measured": "a measured rate", "given": "a rate as given"}
     rate = f"{rates[board['origin']]}, {board['tokens_per_s']:g}/s"
     notes = [f"EMULATED: no model answered; tokens come evenly at {rate}."]
     if board["prompt_origin"] == "assumed":
         notes.append(f"c = {board['prompt_s']:g} s before decoding is an assumption of ours.")
-    notes.append(f"Rear: {law_of(run)}.")
-    notes.append(f"Front: while no skill is valid the ego does '{asked['gap']}'; the reflex layer is {_switch(asked)}.")
-    return tuple(notes)
+    return notes
 
 
 def words(run: Run) -> list[str]:

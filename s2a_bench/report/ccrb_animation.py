@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.errors import StoreError
-from s2a_bench.report.ccrb import SAID, law_of, rollouts_of
+from s2a_bench.report.ccrb import SAID, law_of, rollouts_of, tokens_line
 from s2a_bench.report.ccrb_figures import path_of
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES
 from s2a_bench.scenario.render import Camera
@@ -57,8 +57,7 @@ def frames_of(run: Run, frames_a_s: int = FRAMES_A_S) -> list[Image]:
     """Draw every frame of the animation."""
     panels = [Panel(run, row) for row in rollouts_of(run, "point").to_dict("records")]
     until_s = max(panel.until_s for panel in panels)
-    rate = run.manifest["boards"][0]["tokens_per_s"]
-    foot = f"EMULATED tokens, {rate:g}/s. Yellow: lead, green: ego, blue: car behind, red: impact.\n{law_of(run)}"
+    foot = f"{tokens_line(run)} Yellow: lead, green: ego, blue: car behind, red: impact.\n{law_of(run)}"
     return [_frame(panels, step / frames_a_s, foot) for step in range(int(until_s * frames_a_s) + 1)]
 
 

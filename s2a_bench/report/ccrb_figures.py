@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from s2a_bench.report.ccrb import SAID, configuration, has, origin_notes, rollouts_of
+from s2a_bench.report.ccrb import SAID, configuration, has, origin_notes, rollouts_of, token_times_s
 from s2a_bench.report.ccrb_phase_figure import build_phase
 from s2a_bench.report.draw import LINE_CHARS, new_figure, save
 from s2a_bench.report.style import WIDTH_IN
@@ -47,6 +47,7 @@ def build_scenario(run: Run) -> Figure:
     title = "\n".join(textwrap.fill(line, chars, break_on_hyphens=False) for line in lines)
     figure = new_figure(4.6, title, WIDE_IN)
     grid = figure.subplots(3, len(rows), squeeze=False, sharex=True, sharey="row")
+    token_s = token_times_s(run)
     until_s = max(float(path["time_s"].iloc[-1]) for path in paths.values())
     for column, row in enumerate(rows):
         path, cell = paths[row["policy"]], row["cell"]
@@ -56,13 +57,16 @@ def build_scenario(run: Run) -> Figure:
             _shade(axes, path, skills[cell])
             axes.set_xlim(0, until_s)
         _draw_cars(above, path, "position_m")
+        # Along the lower edge, whatever the positions.
+        edge = above.get_xaxis_transform()
+        above.plot(token_s, [0.04] * len(token_s), "|", color="#555555", markersize=5, transform=edge, clip_on=False)
         _draw_cars(grid[1, column], path, "speed_kmh")
         _draw_gaps(grid[2, column], path, row)
         grid[2, column].set_xlabel("time from the request (s)")
     for axes, label in zip(grid[:, 0], ("position (m)", "speed (km/h)", "gap (m)"), strict=True):
         axes.set_ylabel(label)
     grid[2, 0].set_ylim(bottom=0)
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=6)
+    figure.legend(handles=_legend(), loc="outside lower center", ncols=4)
     return figure
 
 
@@ -158,4 +162,5 @@ def _legend() -> list[object]:
     lines: list[object] = [
         Line2D([], [], color=colour, linestyle=style, label=names[car]) for car, (colour, style) in LOOKS.items()
     ]
+    lines.append(Line2D([], [], color="#555555", marker="|", linestyle="", label="a token arrives"))
     return lines + [Patch(label=_CAPTIONS[name], **look) for name, look in _PHASES.items()]

@@ -22,7 +22,8 @@ def ccrb_to_json(run: Run) -> dict[str, Any]:
     """
     cells = [_cell(row) for row in rollouts_of(run, "point").to_dict("records")]
     studies = [_study(run, study, gap) for study in ("phase", "random") if has(run, study) for gap in GAPS]
-    return frame(run, cells, [], follower_law=law_of(run), studies=studies)
+    live = {"live": run.manifest["live"]} if "live" in run.manifest else {}
+    return frame(run, cells, [], **live, follower_law=law_of(run), studies=studies)
 
 
 def _cell(row: dict[Any, Any]) -> dict[str, Any]:

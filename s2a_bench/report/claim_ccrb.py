@@ -15,7 +15,7 @@ _CCRB_RUN: Final = "s2a-bench ccrb"
 
 def _outcome(policy: str, run: Run) -> Finding | None:
     """Judge what becomes of the cars under one policy at the operating point."""
-    from s2a_bench.report.ccrb import PAPER, SAID, configuration, law_of, rollouts_of
+    from s2a_bench.report.ccrb import PAPER, SAID, configuration, law_of, rollouts_of, tokens_line
 
     rows = rollouts_of(run, "point")
     rows = rows[rows["policy"] == policy]
@@ -24,8 +24,9 @@ def _outcome(policy: str, run: Run) -> Finding | None:
     row, asked = rows.iloc[0], configuration(run)
     speed = "" if row["outcome"] == "none" else f" at {row['impact_speed_mps']:.1f} m/s"
     said = (
-        f"Ours: {SAID[str(row['outcome'])]}{speed}. EMULATED, one operating point: R = {row['tokens_per_s']:g}, "
-        f"front gap {asked['front_gap_m']:g} m, rear gap {asked['rear_gap_m']:g} m, gap behaviour {asked['gap']}; "
+        f"Ours: {SAID[str(row['outcome'])]}{speed}. {tokens_line(run)} At one operating point: "
+        f"R = {row['tokens_per_s']:g}, front gap {asked['front_gap_m']:g} m, rear gap {asked['rear_gap_m']:g} m, "
+        f"gap behaviour {asked['gap']}; "
         f"{law_of(run)}."
     )
     return Finding(CONFIRMED if row["outcome"] == PAPER[policy] else REFUTED, said)

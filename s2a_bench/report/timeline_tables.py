@@ -162,6 +162,9 @@ def _common(cells: Sequence[Timelines]) -> str:
     return "" if len(shapes) != 1 else ", N = {}, T_nom = {:g} s".format(*next(iter(shapes)))
 
 
+ONLINE_LIVE = ("stream-to-act", "live")
+
+
 def _plan_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
     """Say how many plans there are, and what stream-to-act knew before them."""
     notes = []
@@ -175,6 +178,9 @@ def _plan_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
         plans_each = next(iter(calibrations.values()))["plans"]
         kind = "recorded" if run.manifest["configuration"].get("calibrate") else "other"
         notes.append(f"stream-to-act: lambda {span}, calibrated on {plans_each} {kind} plans a setting.")
+    elif live_cautions := {cell.about("caution") for cell in cells if (cell.policy, cell.about("mode")) == ONLINE_LIVE}:
+        span = ", ".join(f"{caution:g}" for caution in sorted(live_cautions))
+        notes.append(f"stream-to-act: lambda {span}, not calibrated; its prior comes from the warm-ups, or the pace.")
     elif any((cell.policy, cell.about("mode")) == ("stream-to-act", "virtual") for cell in cells):
         notes.append("Nothing varies, and stream-to-act's prior knows it: online it starts at S0.")
     return tuple(notes)

@@ -267,7 +267,8 @@ class RolloutRow:
     ``late`` says that s2a-ttc could not keep the deadline ``deadline_ns`` (S_front) without stalls; null for others.
     Studies end when the outcome is decided, and have no least rear gap but that of an impact.
     Impact speeds are null without that impact, times to collision where the cars never closed in, the required
-    deceleration (DRAC, to the lead) with a front impact, motion where no trajectory is kept.
+    deceleration (DRAC, to the lead) with a front impact, motion where no trajectory is kept, ``prompt_s`` where a model
+    took what it took.
     """
 
     cell: str
@@ -283,7 +284,7 @@ class RolloutRow:
     reflex: bool
     lane_change: bool
     tokens_per_s: float
-    prompt_s: float
+    prompt_s: float | None
     tokens_per_skill: int
     n_skills: int
     t_nom_s: float

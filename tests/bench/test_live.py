@@ -352,6 +352,16 @@ def test_the_prior_is_learned_from_warm_ups_and_else_from_the_pace() -> None:
     assert learned.token_cv == pytest.approx(np.std([0.1, 0.2, 0.3], ddof=1) / 0.2)
 
 
+def test_a_prior_knows_bursts_that_single_gaps_hide() -> None:
+    slow_then_fast = np.cumsum([0.0, *[0.3] * 8, *[0.1] * 8]) * 1e9
+    alternating = np.cumsum([0.0, *[0.3, 0.1] * 8]) * 1e9
+    burst, even = (prior_of([times.astype(int).tolist()], None) for times in (slow_then_fast, alternating))
+    assert burst is not None
+    assert even is not None
+    assert even.token_cv == pytest.approx(np.std([0.3, 0.1] * 8, ddof=1) / 0.2)
+    assert burst.token_cv > 1.9 * even.token_cv  # four blocks of four: 1.2, 1.2, .4, .4 s
+
+
 def test_skills_keep_their_own_durations_unless_they_are_given(config: LiveConfig) -> None:
     (own,) = asks_of(replace(config, t_nom_s=()), None)
     times = [call.skill.durations.nominal_s for call in own.skills.calls]

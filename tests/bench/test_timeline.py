@@ -158,6 +158,12 @@ def test_a_recording_is_played_where_a_profile_has_one() -> None:
     assert board_of_profile(profile, "none", None).gaps == Constant(0.2)
 
 
+def test_a_recording_already_holds_the_spread_between_answers() -> None:
+    parametric = Profile("p", "P", "measured", 5.0, 1.0, 0.0, Lognormal(0.2, 0.5), rate_cv=0.1)
+    assert board_of_profile(parametric, "profile", None).rate_cv == 0.1
+    assert board_of_profile(replace(parametric, trace_s=(0.1, 0.3)), "profile", None).rate_cv == 0
+
+
 def test_jitter_is_read_with_its_parameters() -> None:
     assert gaps_of("none", 0.5) == Constant(0.5)
     assert gaps_of("lognormal:cv=0.3", 0.5) == Lognormal(0.5, 0.3)

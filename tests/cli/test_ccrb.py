@@ -65,6 +65,21 @@ def test_the_animation_has_frames_of_the_right_size(tmp_path: Path) -> None:
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) > 100
 
 
+def test_a_live_run_prints_one_object_and_leaves_a_whole_folder(tmp_path: Path) -> None:
+    flags = ("--live", "--transport", "loopback", "--pace", "40", "--threads", "1", "--skills", "3", "--ttc")
+    done = run(*flags, "--json", "--output", str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    whole = json.loads(done.stdout)
+    jsonschema.validate(whole, SCHEMA)
+    assert [cell["policy"] for cell in whole["cells"]] == ["naive", "wait-then-act", "stream-to-act", "s2a-ttc"]
+    assert {(cell["emulated"], cell["profile"]) for cell in whole["cells"]} == {(False, None)}
+    assert (whole["live"]["transport"], whole["live"]["paced_tokens_per_s"]) == ("loopback", 40.0)
+    folder = Path(whole["run"])
+    for name in ("figures/scenario.png", "tables/outcomes.md", "samples.csv", "tokens.csv"):
+        assert (folder / name).stat().st_size > 0, name
+    assert "LIVE tokens over loopback, paced to 40 tokens/s" in (folder / "tables" / "outcomes.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
@@ -74,6 +89,20 @@ def test_the_animation_has_frames_of_the_right_size(tmp_path: Path) -> None:
         (["--openscenario", "x.txt"], 2, "--openscenario: x.txt should end in .xosc"),
         (["--lane-change"], 2, "--lane-change: the longitudinal simulator knows one lane"),
         (["--simulator", "carla", "--host", "localhost:1"], 1, "carla"),
+        (["--pace", "4.8"], 2, "--pace is about a model that answers; it needs --live"),
+        (["--transport", "ros"], 2, "--transport is about a model that answers; it needs --live"),
+        (["--live", "--rate", "9"], 2, "--rate is about tokens that are modelled; leave it out with --live"),
+        (["--live", "--prompt-time", "0.2"], 2, "--prompt-time is about tokens that are modelled"),
+        (["--live", "--profile", "rtx-4080"], 2, "--profile is about tokens that are modelled"),
+        (["--live", "--phase"], 2, "--phase is about tokens that are modelled; leave it out with --live"),
+        (["--live", "--random", "9"], 2, "--random is about tokens that are modelled; leave it out with --live"),
+        (["--live", "--openscenario", "x.xosc"], 2, "--openscenario is about tokens that are modelled"),
+        (["--live", "--pace", "-1"], 2, "--pace: -1 should be above 0"),
+        (["--live", "--pace", "0.01"], 2, "the whole plan takes"),
+        (["--live", "--transport", "pigeon"], 2, "--transport: 'pigeon' is none of http, ros, loopback"),
+        (["--live", "--engine", "echo"], 2, "--engine echo writes no plans"),
+        (["--live", "--engine", "replay", "--pace", "5"], 2, "--engine replay has its profile's rate"),
+        (["--live", "--engine", "replay", "--tokens-per-skill", "4"], 2, "--engine replay writes 6 tokens a skill"),
     ],
 )
 def test_wrong_use_is_one_line(arguments: list[str], code: int, message: str, tmp_path: Path) -> None:
