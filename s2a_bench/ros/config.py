@@ -21,6 +21,10 @@ TUNED_INTERNAL = '<Internal><SocketReceiveBufferSize max="16MB"/></Internal>'
 """Fragments of nearly the largest UDP datagram, and the receive buffer the kernel allows: half the time for a VGA
 image, and no lost fragments at 1920x1080 (shared/LIMITS.md)."""
 
+PATIENT = "<InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
+"""Cyclone 11 stops announcing itself to addresses where nobody has answered for 30 s; a peer that finds others by
+multicast alone, as Fast DDS does on a subnet, and starts later than that would never be met on loopback."""
+
 
 def domain_id(environ: Mapping[str, str]) -> int:
     """Return the DDS domain ROS_DOMAIN_ID names, 0 without it; raises UsageError for what is no domain."""
@@ -53,5 +57,5 @@ def configuration(environ: Mapping[str, str], tuning: Tuning) -> str | None:
         f'<CycloneDDS><Domain id="any"><General>{general}</General>'
         f"{TUNED_INTERNAL if tuning == 'tuned' else ''}"
         "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
-        f"<SPDPInterval>1s</SPDPInterval><Peers>{listed}</Peers></Discovery></Domain></CycloneDDS>"
+        f"<SPDPInterval>1s</SPDPInterval>{PATIENT}<Peers>{listed}</Peers></Discovery></Domain></CycloneDDS>"
     )

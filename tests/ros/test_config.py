@@ -72,3 +72,9 @@ def test_the_domain_is_ros_domain_id(text: str, expected: int) -> None:
 def test_a_domain_that_is_none_is_named(text: str) -> None:
     with pytest.raises(UsageError, match="ROS_DOMAIN_ID"):
         domain_id({"ROS_DOMAIN_ID": text})
+
+
+def test_addresses_where_nobody_answers_yet_are_not_given_up() -> None:
+    xml = configuration({}, "tuned")
+    assert xml is not None
+    assert "<InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>" in xml
