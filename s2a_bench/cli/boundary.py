@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from s2a_bench.cli.options import WIDTH, listed, numbers, whole_numbers
+from s2a_bench.cli.options import listed, numbers, whole_numbers
+from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError
 
 
@@ -83,8 +83,6 @@ def _draw(folder: Path) -> None:
 
 def _show(folder: Path, *, as_json: bool) -> None:
     """Print what the user asked for."""
-    from rich.console import Console
-
     from s2a_bench.report.boundary import boundary_tables, boundary_to_json
     from s2a_bench.report.terminal import lay_out
     from s2a_bench.store.run import read_run
@@ -92,11 +90,9 @@ def _show(folder: Path, *, as_json: bool) -> None:
     run = read_run(folder)
     tables = boundary_tables(run)
     if as_json:
-        json.dump(boundary_to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(boundary_to_json(run))
         return
-    terminal = Console()
-    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    console = open_console()
     for table in tables.values():
         console.print(lay_out(table))
     for note in tables["boards"].notes:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from s2a_bench.cli.options import WIDTH, listed, numbers
+from s2a_bench.cli.options import listed, numbers
+from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import print_json
 from s2a_bench.cli.timeline_live import given_live, live_config, refuse_with_live, refuse_without_live
 from s2a_bench.errors import S2AError, UsageError
 
@@ -216,8 +216,6 @@ def _draw(folder: Path, progress: RunProgress, *, animated: bool) -> None:
 
 def _show(folder: Path, progress: RunProgress, *, as_json: bool) -> None:
     """Print what the user asked for."""
-    from rich.console import Console
-
     from s2a_bench.report.ccrb import words
     from s2a_bench.report.ccrb_machine import ccrb_to_json
     from s2a_bench.report.ccrb_tables import ccrb_tables
@@ -231,11 +229,9 @@ def _show(folder: Path, progress: RunProgress, *, as_json: bool) -> None:
     if speed := run.manifest.get("studies", {}).get("rollouts_per_cpu_s"):
         progress.say(f"{run.manifest['studies']['rollouts']} roll-outs, {speed:.0f} a second of processor time")
     if as_json:
-        json.dump(ccrb_to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(ccrb_to_json(run))
         return
-    terminal = Console()
-    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    console = open_console()
     for table in tables.values():
         console.print(lay_out(table))
         for note in table.notes:

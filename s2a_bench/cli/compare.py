@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from s2a_bench.cli.options import WIDTH, listed
+from s2a_bench.cli.options import listed
+from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import print_json
 from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
@@ -40,8 +41,6 @@ def compare(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Compare run B with run A: effect sizes with intervals, one stated test, gates for CI (exit code 3)."""
-    from rich.console import Console
-
     from s2a_bench.report.compare import compare as compare_runs
     from s2a_bench.report.compare import metrics_of, open_comparison, read_side, shown_metrics
     from s2a_bench.report.compare_doubts import doubts
@@ -65,11 +64,9 @@ def compare(
         _say(f"note [{doubt.code}]: {doubt.message}; {doubt.advice}")
     written = write_comparison(output, compared, whole) if output else []
     if json_:
-        json.dump(whole, sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(whole)
     else:
-        terminal = Console()
-        console = terminal if terminal.is_terminal else Console(width=WIDTH)
+        console = open_console()
         table = compare_table(compared)
         console.print(lay_out(table))
         for line in (*table.notes, *(f"written: {path}" for path in written)):

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from s2a_bench.cli.options import WIDTH, file_text, listed, size_of, text_or_file
+from s2a_bench.cli.options import file_text, listed, size_of, text_or_file
+from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError, UsageError
 
 if TYPE_CHECKING:
@@ -162,8 +162,6 @@ def _draw(folder: Path, *, against_paper: bool) -> None:
 
 def _show(folder: Path, progress: RunProgress, *, as_json: bool, verbose: bool) -> None:
     """Print what the user asked for."""
-    from rich.console import Console
-
     from s2a_bench.report.machine import to_json
     from s2a_bench.report.terminal import renderables
     from s2a_bench.store.run import read_run
@@ -172,11 +170,9 @@ def _show(folder: Path, progress: RunProgress, *, as_json: bool, verbose: bool) 
     for doubt in run.manifest["warnings"]:
         progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
     if as_json:
-        json.dump(to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(to_json(run))
         return
-    terminal = Console()
-    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    console = open_console()
     for part in renderables(run):
         console.print(part)
     if verbose:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from s2a_bench.cli.model_validity import validity
-from s2a_bench.cli.options import WIDTH
+from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import print_json
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -74,7 +73,7 @@ def fetch(
         read_header(file.path, "model fetch")
     command = _latency_command(done)
     if json_:
-        _print_json(_fetched_json(done, command))
+        print_json(_fetched_json(done, command))
         return
     for file in done.files:
         typer.echo(file.path)
@@ -117,8 +116,6 @@ def info(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Say what is in a GGUF file: shapes, types, vision tower, vocabulary, chat template, licence, hash."""
-    from rich.console import Console
-
     from s2a_bench.cli.model_text import as_json, renderables
     from s2a_bench.inference.fetch_names import HUB_MODELS, fetched
     from s2a_bench.inference.gguf_info import describe
@@ -129,18 +126,12 @@ def info(
     found = [(describe(path, "model info"), sha256(path) if hash_ else remembered_sha256(path)) for path in paths]
     if json_:
         files = [as_json(facts, hash_known) for facts, hash_known in found]
-        _print_json({"schema": SCHEMA, "command": "model info", "files": files})
+        print_json({"schema": SCHEMA, "command": "model info", "files": files})
         return
-    terminal = Console()
-    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    console = open_console()
     for facts, hash_known in found:
         for part in renderables(facts, hash_known):
             console.print(part, soft_wrap=isinstance(part, str), highlight=False, markup=False)
-
-
-def _print_json(content: dict[str, Any]) -> None:
-    json.dump(content, sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
-    sys.stdout.write("\n")
 
 
 def _bytes_bar(*, disable: bool = False) -> Progress:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from s2a_bench.cli.options import WIDTH, listed, text_or_file
+from s2a_bench.cli.options import listed, text_or_file
+from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError
 
 
@@ -61,8 +61,6 @@ def validity(
 
 def _show(folder: Path, *, as_json: bool) -> None:
     """Write the tables, and print what the user asked for."""
-    from rich.console import Console
-
     from s2a_bench.report.table_files import write_texts
     from s2a_bench.report.terminal import lay_out
     from s2a_bench.report.validity import validity_tables, validity_to_json
@@ -72,11 +70,9 @@ def _show(folder: Path, *, as_json: bool) -> None:
     tables = validity_tables(run)
     write_texts(run, tables, {})
     if as_json:
-        json.dump(validity_to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(validity_to_json(run))
         return
-    terminal = Console()
-    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    console = open_console()
     for table in tables.values():
         console.print(lay_out(table))
     for note in tables["validity"].notes:

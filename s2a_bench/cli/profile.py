@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from s2a_bench.cli.options import WIDTH, size_of, text_or_file
+from s2a_bench.cli.options import size_of, text_or_file
+from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def list_(json_: Json = False) -> None:
         origin = profile.origin + (", dummy" if _dummy(profile) else "")
         row = (profile.name, profile.title, origin, f"{profile.tokens_per_s:.3g}", ttft, _gaps(profile, full=False))
         table.add_row(*map(Text, row))
-    _console().print(table)
+    open_console().print(table)
 
 
 @app.command("show")
@@ -197,13 +198,6 @@ def _line(profile: Profile) -> str:
 def _distances(profile: Profile) -> str:
     fit = profile.facts["fit"]
     return ", ".join(f"{name} {max(gap, fit['distance_sum'][name]):.3f}" for name, gap in fit["distance_gap"].items())
-
-
-def _console() -> Any:
-    from rich.console import Console
-
-    terminal = Console()
-    return terminal if terminal.is_terminal else Console(width=WIDTH)
 
 
 def _print(line: str) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from s2a_bench.cli.options import WIDTH
+from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError
 
 if TYPE_CHECKING:
@@ -55,8 +54,6 @@ def study(
 
 def _show(run: Run, *, as_json: bool) -> None:
     """Write tables and figure, and print what the user asked for."""
-    from rich.console import Console
-
     from s2a_bench.report.studies import study_tables, table_files
     from s2a_bench.report.study_figures import write_study_figure
     from s2a_bench.report.study_machine import study_to_json
@@ -67,11 +64,9 @@ def _show(run: Run, *, as_json: bool) -> None:
     write_texts(run, table_files(tables), {})
     write_study_figure(run)
     if as_json:
-        json.dump(study_to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(study_to_json(run))
         return
-    terminal = Console()
-    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    console = open_console()
     for table in tables:
         console.print(lay_out(table))
         for note in table.notes:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from s2a_bench.cli.options import listed
+from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError, UsageError
 
 if TYPE_CHECKING:
@@ -131,7 +130,7 @@ def _show_plan(plan: Plan, jobs: int, resume: Path | None, output: Path, *, as_j
     workers = _workers(plan, "", jobs)
     expected = expect(cells, plan.rest_s, jobs, earlier(output, plan.command), workers)
     if as_json:
-        _print_json(sweep_text.plan_to_json(cells, expected, collect()))
+        print_json(sweep_text.plan_to_json(cells, expected, collect()))
         return
     sweep_text.print_plan(plan, cells, expected)
 
@@ -143,11 +142,6 @@ def _show(folder: Path, *, as_json: bool) -> None:
 
     found = read_sweep(folder)
     if as_json:
-        _print_json(sweep_text.sweep_to_json(found))
+        print_json(sweep_text.sweep_to_json(found))
         return
     sweep_text.print_sweep(found)
-
-
-def _print_json(value: dict[str, Any]) -> None:
-    json.dump(value, sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
-    sys.stdout.write("\n")

@@ -7,10 +7,9 @@ import shlex
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
 from rich.table import Table
 
-from s2a_bench.cli.options import WIDTH
+from s2a_bench.cli.output import console as open_console
 
 if TYPE_CHECKING:
     from s2a_bench.bench.sweep import Cell
@@ -23,7 +22,7 @@ MINUTE_S, HOUR_S = 60, 3600
 
 def print_plan(plan: Plan, cells: Sequence[Cell], expected: Expected) -> None:
     """Print every cell as the command that it is, and the time to expect."""
-    console = _console()
+    console = open_console()
     for cell in cells:
         where = f"  on {cell.board}" if cell.board else ""
         console.print(
@@ -42,7 +41,7 @@ def print_plan(plan: Plan, cells: Sequence[Cell], expected: Expected) -> None:
 
 def print_sweep(sweep: Sweep) -> None:
     """Print the failed cells, and a line for all."""
-    console = _console()
+    console = open_console()
     cells = sweep.cells
     failed = cells[cells["state"] == "failed"]
     if len(failed):
@@ -125,8 +124,3 @@ def duration(seconds: float) -> str:
     if seconds < HOUR_S:
         return f"{seconds / MINUTE_S:.0f} min"
     return f"{seconds / HOUR_S:.1f} h"
-
-
-def _console() -> Console:
-    terminal = Console()
-    return terminal if terminal.is_terminal else Console(width=WIDTH)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from s2a_bench.cli.options import WIDTH, listed, numbers, whole_numbers
+from s2a_bench.cli.options import listed, numbers, whole_numbers
+from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import print_json
 from s2a_bench.cli.timeline_live import given_live, live_config, refuse_with_live, refuse_without_live
 from s2a_bench.errors import S2AError, UsageError
 
@@ -211,8 +211,6 @@ def draw(folder: Path) -> None:
 
 def show(folder: Path, progress: RunProgress, *, as_json: bool, per_skill: bool) -> None:
     """Print what the user asked for of any run of timelines."""
-    from rich.console import Console
-
     from s2a_bench.report.terminal import lay_out
     from s2a_bench.report.timeline_machine import timelines_to_json
     from s2a_bench.report.timeline_tables import timeline_tables
@@ -224,11 +222,9 @@ def show(folder: Path, progress: RunProgress, *, as_json: bool, per_skill: bool)
     for doubt in run.manifest["warnings"]:
         progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
     if as_json:
-        json.dump(timelines_to_json(run), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(timelines_to_json(run))
         return
-    terminal = Console()
-    console = terminal if terminal.is_terminal else Console(width=WIDTH)
+    console = open_console()
     one_setting = len({cell.setting for cell in timelines_of(run)}) == 1
     for name, table in tables.items():
         if name != "skills" or per_skill or one_setting:
