@@ -16,12 +16,12 @@ bench: setup
 
 # Timelines per second on one core; wants a quiet machine.
 bench-policy: setup
-	$(BIN)/python -m s2a_bench.bench.policy_speed
+	$(BIN)/python -m benchmarks.policy_speed
 
 # A million Monte Carlo timelines on 1, 2, 4 ... processes, with and without Ray: equal check sums, and the scaling.
 bench-ray: setup
 	$(BIN)/python -m pip install --quiet -e '.[ray]' -c constraints.txt
-	$(BIN)/python -m s2a_bench.bench.sweep.scaling
+	$(BIN)/python -m benchmarks.sweep_scaling
 
 test: setup
 	$(BIN)/python -m pytest

@@ -121,3 +121,8 @@ def _divide(above: Any, below: Any) -> float | None:
 def _finite(value: float) -> float | None:
     """Return the value, or None where it is no number."""
     return value if math.isfinite(value) else None
+
+
+def summary_of(values: NDArray[np.float64]) -> Summary | None:
+    """Summarise values; None where there are none."""
+    return summarise(values) if values.size else None

@@ -7,6 +7,8 @@ import os
 import pytest
 from hypothesis import settings
 
+from tests.made_runs import black_box, make_row, make_run, plausible  # noqa: F401 - fixtures
+
 settings.register_profile("s2a", deadline=None)  # these machines are shared: time is not judged
 settings.load_profile("s2a")
 

@@ -15,19 +15,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from s2a_bench.bench.boundary import BoundaryConfig, run_boundary
-from s2a_bench.bench.studies import StudyConfig, run_study
-from s2a_bench.bench.timeline import run_timeline
-from s2a_bench.bench.timeline_config import TimelineConfig
+from s2a_bench.experiments.boundary.run import BoundaryConfig, run_boundary
+from s2a_bench.experiments.boundary.view.figure import build_boundary
+from s2a_bench.experiments.study.run import StudyConfig, run_study
+from s2a_bench.experiments.study.view.figures import build_frontier, build_targets
+from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.experiments.timeline.run import run_timeline
+from s2a_bench.experiments.timeline.view.cells import timelines_of
+from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
-from s2a_bench.report.boundary_figure import build_boundary
-from s2a_bench.report.draw import new_figure
-from s2a_bench.report.study_figures import build_frontier, build_targets
-from s2a_bench.report.style import paper_column
-from s2a_bench.report.timeline_figures import build_timelines, policy_colours
-from s2a_bench.report.timelines import timelines_of
 from s2a_bench.store.run import Run, read_run
+from s2a_bench.writers.figures import new_figure
+from s2a_bench.writers.style import paper_column
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -39,8 +39,8 @@ def boundary(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Show at which rates and granularities naive execution never stalls: by formula, and by trying every point."""
-    from s2a_bench.bench.boundary import BoundaryConfig, run_boundary
     from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.experiments.boundary.run import BoundaryConfig, run_boundary
 
     config = BoundaryConfig(
         profiles=listed(profile),
@@ -71,10 +71,10 @@ def boundary(
 
 def _draw(folder: Path) -> None:
     """Write tables and figure."""
-    from s2a_bench.report.boundary import boundary_csv, boundary_tables
-    from s2a_bench.report.boundary_figure import write_boundary_figure
-    from s2a_bench.report.table_files import write_texts
+    from s2a_bench.experiments.boundary.view.figure import write_boundary_figure
+    from s2a_bench.experiments.boundary.view.tables import boundary_csv, boundary_tables
     from s2a_bench.store.run import read_run
+    from s2a_bench.writers.files import write_texts
 
     run = read_run(folder)
     write_texts(run, boundary_tables(run), boundary_csv(run))
@@ -83,9 +83,9 @@ def _draw(folder: Path) -> None:
 
 def _show(folder: Path, *, as_json: bool) -> None:
     """Print what the user asked for."""
-    from s2a_bench.report.boundary import boundary_tables, boundary_to_json
-    from s2a_bench.report.terminal import lay_out
+    from s2a_bench.experiments.boundary.view.tables import boundary_tables, boundary_to_json
     from s2a_bench.store.run import read_run
+    from s2a_bench.writers.terminal import lay_out
 
     run = read_run(folder)
     tables = boundary_tables(run)

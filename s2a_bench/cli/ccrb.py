@@ -14,9 +14,9 @@ from s2a_bench.cli.timeline_live import given_live, live_config, refuse_with_liv
 from s2a_bench.errors import S2AError, UsageError
 
 if TYPE_CHECKING:
-    from s2a_bench.bench.ccrb_config import CcrbConfig
-    from s2a_bench.bench.live_config import LiveConfig
     from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.experiments.ccrb.config import CcrbConfig
+    from s2a_bench.experiments.timeline.live.config import LiveConfig
 
 PROFILE = "jetson-agx-orin"
 REPLAY_TOKENS = 6
@@ -93,8 +93,8 @@ def ccrb(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Drive car-to-car rear braking with a car behind, under each policy, in virtual time: who hits whom, and when."""
-    from s2a_bench.bench.ccrb_config import CcrbConfig
     from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.experiments.ccrb.config import CcrbConfig
 
     for_live = {"transport": transport, "pace": pace, "engine": engine}
     given = given_live({**for_live, "model": model, "mmproj": mmproj, "threads": threads})
@@ -154,7 +154,7 @@ def ccrb(
 
 def _asked(config: CcrbConfig, given: dict[str, Any]) -> LiveConfig:
     """Word what is asked of the model; raises UsageError naming the flag."""
-    from s2a_bench.bench.ccrb_config import SKILL_SET
+    from s2a_bench.experiments.ccrb.config import SKILL_SET
 
     replayed = given.get("engine") == "replay"
     if replayed and config.tokens_per_skill != REPLAY_TOKENS:
@@ -178,17 +178,17 @@ def _run(
 ) -> Path:
     """Run with modelled tokens, or with those that a model is asked for."""
     if asked is None:
-        from s2a_bench.bench.ccrb import run_ccrb
+        from s2a_bench.experiments.ccrb.run import run_ccrb
 
         return run_ccrb(config, output, progress, **settings)
-    from s2a_bench.bench.ccrb_live import run_ccrb_live
+    from s2a_bench.experiments.ccrb.live import run_ccrb_live
 
     return run_ccrb_live(config, asked, output, progress, **settings)
 
 
 def _write_scenario(config: CcrbConfig, path: Path, progress: RunProgress) -> None:
     """Write the OpenSCENARIO file and its road."""
-    from s2a_bench.bench.ccrb_plans import prepare
+    from s2a_bench.experiments.ccrb.plans import prepare
     from s2a_bench.scenario.openscenario import write_openscenario
 
     ready = prepare(config)
@@ -198,16 +198,16 @@ def _write_scenario(config: CcrbConfig, path: Path, progress: RunProgress) -> No
 
 def _draw(folder: Path, progress: RunProgress, *, animated: bool) -> None:
     """Write tables, figures and animation."""
-    from s2a_bench.report.ccrb_figures import write_ccrb_figures
-    from s2a_bench.report.ccrb_tables import ccrb_csv, ccrb_tables
-    from s2a_bench.report.table_files import write_texts
+    from s2a_bench.experiments.ccrb.view.figures import write_ccrb_figures
+    from s2a_bench.experiments.ccrb.view.tables import ccrb_csv, ccrb_tables
     from s2a_bench.store.run import read_run
+    from s2a_bench.writers.files import write_texts
 
     run = read_run(folder)
     write_texts(run, ccrb_tables(run), ccrb_csv(run))
     write_ccrb_figures(run)
     if animated:
-        from s2a_bench.report.ccrb_animation import write_animation
+        from s2a_bench.experiments.ccrb.view.animation import write_animation
 
         progress.stage("drawing the animation")
         for path in write_animation(run):
@@ -216,11 +216,11 @@ def _draw(folder: Path, progress: RunProgress, *, animated: bool) -> None:
 
 def _show(folder: Path, progress: RunProgress, *, as_json: bool) -> None:
     """Print what the user asked for."""
-    from s2a_bench.report.ccrb import words
-    from s2a_bench.report.ccrb_machine import ccrb_to_json
-    from s2a_bench.report.ccrb_tables import ccrb_tables
-    from s2a_bench.report.terminal import lay_out
+    from s2a_bench.experiments.ccrb.view.as_json import ccrb_to_json
+    from s2a_bench.experiments.ccrb.view.outcomes import words
+    from s2a_bench.experiments.ccrb.view.tables import ccrb_tables
     from s2a_bench.store.run import read_run
+    from s2a_bench.writers.terminal import lay_out
 
     run = read_run(folder)
     tables = ccrb_tables(run)

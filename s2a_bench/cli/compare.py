@@ -15,7 +15,7 @@ from s2a_bench.cli.output import print_json
 from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
-    from s2a_bench.report.compare_gates import Judgement
+    from s2a_bench.report.compare.gates import Judgement
 
 TRIPPED = 3
 """Exit code where a gate trips."""
@@ -41,14 +41,14 @@ def compare(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Compare run B with run A: effect sizes with intervals, one stated test, gates for CI (exit code 3)."""
-    from s2a_bench.report.compare import compare as compare_runs
-    from s2a_bench.report.compare import metrics_of, open_comparison, read_side, shown_metrics
-    from s2a_bench.report.compare_doubts import doubts
-    from s2a_bench.report.compare_files import write_comparison
-    from s2a_bench.report.compare_gates import judge, read_gate
-    from s2a_bench.report.compare_machine import compare_to_json
-    from s2a_bench.report.compare_tables import compare_table
-    from s2a_bench.report.terminal import lay_out
+    from s2a_bench.report.compare.as_json import compare_to_json
+    from s2a_bench.report.compare.comparison import compare as compare_runs
+    from s2a_bench.report.compare.comparison import metrics_of, open_comparison, read_side, shown_metrics
+    from s2a_bench.report.compare.doubts import doubts
+    from s2a_bench.report.compare.files import write_comparison
+    from s2a_bench.report.compare.gates import judge, read_gate
+    from s2a_bench.report.compare.tables import compare_table
+    from s2a_bench.writers.terminal import lay_out
 
     gates = [read_gate(text) for text in fail_if or ()]
     if strict and not gates:
@@ -76,8 +76,8 @@ def compare(
 
 def _gate_code(judgements: Sequence[Judgement]) -> int:
     """Say what the gates found, and return the exit code: a tripped gate before one that cannot be judged."""
-    from s2a_bench.report import compare_gates
-    from s2a_bench.report.compare_tables import change_text
+    from s2a_bench.report.compare import gates as compare_gates
+    from s2a_bench.report.compare.tables import change_text
 
     for one in judgements:
         line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {change_text(one.comparison)}"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from s2a_bench.bench.doctor import Finding
+    from s2a_bench.machine.doctor import Finding
 
 STYLES = {"state": "green", "advice": "cyan", "warning": "yellow", "error": "bold red"}
 
@@ -22,7 +22,7 @@ def doctor(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> int:
     """Check this machine: state, advice, warnings (with the command that mends them) and errors, one line each."""
-    from s2a_bench.bench.doctor import LEVELS, Machine, examine, worst
+    from s2a_bench.machine.doctor import LEVELS, Machine, examine, worst
 
     findings = examine(replace(Machine(), output=output))
     if json_:
@@ -39,7 +39,7 @@ def _show(findings: list[Finding]) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    from s2a_bench.bench.doctor import LEVELS
+    from s2a_bench.machine.doctor import LEVELS
 
     console = Console()
     wide = max(len(finding.code) for finding in findings)
@@ -57,9 +57,9 @@ def _as_json(findings: list[Finding]) -> dict[str, Any]:
     """Return the object of ``--json``: every finding, and the warnings and errors as runs store them."""
     from dataclasses import asdict
 
-    from s2a_bench.bench import environment
-    from s2a_bench.bench.doctor import worst
-    from s2a_bench.bench.warnings import doubts_of
+    from s2a_bench.harness.warnings import doubts_of
+    from s2a_bench.machine import environment
+    from s2a_bench.machine.doctor import worst
     from s2a_bench.store.schema import SCHEMA
 
     return {

@@ -88,9 +88,9 @@ def latency(
     verbose: Annotated[bool, typer.Option("--verbose", help="also what measuring costs, and the environment")] = False,
 ) -> None:
     """Measure what the transport costs: HTTP/JSON + Base64 against ROS 2-native, every stage, one interleaved run."""
-    from s2a_bench.bench.latency import run_latency
-    from s2a_bench.bench.plan import DEFAULT_PROMPT, LatencyConfig
     from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.experiments.latency.run import run_latency
+    from s2a_bench.harness.plan import DEFAULT_PROMPT, LatencyConfig
     from s2a_bench.inference import EngineConfig
     from s2a_bench.ros.config import domain_id
 
@@ -151,8 +151,8 @@ def latency(
 
 def _draw(folder: Path, *, against_paper: bool) -> None:
     """Write tables and figures."""
-    from s2a_bench.report.figures import write_figures
-    from s2a_bench.report.table_files import write_tables
+    from s2a_bench.experiments.latency.view.figures import write_figures
+    from s2a_bench.experiments.latency.view.files import write_tables
     from s2a_bench.store.run import read_run
 
     run = read_run(folder)
@@ -162,8 +162,8 @@ def _draw(folder: Path, *, against_paper: bool) -> None:
 
 def _show(folder: Path, progress: RunProgress, *, as_json: bool, verbose: bool) -> None:
     """Print what the user asked for."""
-    from s2a_bench.report.machine import to_json
-    from s2a_bench.report.terminal import renderables
+    from s2a_bench.experiments.latency.view.as_json import to_json
+    from s2a_bench.experiments.latency.view.terminal import renderables
     from s2a_bench.store.run import read_run
 
     run = read_run(folder)

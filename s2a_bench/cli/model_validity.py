@@ -35,8 +35,8 @@ def validity(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Count the valid skills in a model's plans, with a grammar and without (the paper's hallucination control)."""
-    from s2a_bench.bench.validity import ValidityConfig, run_validity
     from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.experiments.model_validity.run import ValidityConfig, run_validity
     from s2a_bench.inference import EngineConfig
 
     config = ValidityConfig(
@@ -61,10 +61,10 @@ def validity(
 
 def _show(folder: Path, *, as_json: bool) -> None:
     """Write the tables, and print what the user asked for."""
-    from s2a_bench.report.table_files import write_texts
-    from s2a_bench.report.terminal import lay_out
-    from s2a_bench.report.validity import validity_tables, validity_to_json
+    from s2a_bench.experiments.model_validity.view import validity_tables, validity_to_json
     from s2a_bench.store.run import read_run
+    from s2a_bench.writers.files import write_texts
+    from s2a_bench.writers.terminal import lay_out
 
     run = read_run(folder)
     tables = validity_tables(run)

@@ -15,7 +15,7 @@ from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
-    from s2a_bench.profile import Profile
+    from s2a_bench.boards.profile import Profile
 
 app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, add_completion=False)
 
@@ -46,10 +46,10 @@ def capture(
     json_: Json = False,
 ) -> None:
     """Measure this machine: rate, time to first token and every gap between tokens, for other machines to replay."""
-    from s2a_bench.bench.capture import CaptureConfig, make_room, write_profile
-    from s2a_bench.bench.capture import capture as measure
-    from s2a_bench.bench.plan import DEFAULT_PROMPT
     from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.experiments.profile_capture.run import CaptureConfig, make_room, write_profile
+    from s2a_bench.experiments.profile_capture.run import capture as measure
+    from s2a_bench.harness.plan import DEFAULT_PROMPT
     from s2a_bench.inference import EngineConfig
 
     width, height = size_of(size)
@@ -100,8 +100,8 @@ def list_(json_: Json = False) -> None:
 @app.command("show")
 def show(name: Annotated[str, typer.Argument(help="a name of 'profile list', or a path")], json_: Json = False) -> None:
     """Show one profile: its numbers, where they are from, and what is known of board, model and fit."""
-    from s2a_bench.inference.profile_file import read_profile
-    from s2a_bench.inference.profiles import find_profile
+    from s2a_bench.boards.file import read_profile
+    from s2a_bench.boards.search import find_profile
 
     path = find_profile(name)
     profile = read_profile(path)
@@ -124,7 +124,7 @@ def show(name: Annotated[str, typer.Argument(help="a name of 'profile list', or 
 @app.command("match")
 def match(json_: Json = False) -> None:
     """Say which profiles are of a board like this one; exit code 1 where none is."""
-    from s2a_bench.bench.board import board_facts, differences, matches
+    from s2a_bench.machine.board import board_facts, differences, matches
 
     board = board_facts()
     found = [(profile, path) for profile, path in _readable() if matches(profile, board)]
@@ -144,8 +144,8 @@ def match(json_: Json = False) -> None:
 
 def _readable() -> list[tuple[Profile, Path]]:
     """Read the profiles that can be given by name, and name those that cannot be read."""
-    from s2a_bench.inference.profile_file import read_profile
-    from s2a_bench.inference.profiles import profile_files
+    from s2a_bench.boards.file import read_profile
+    from s2a_bench.boards.search import profile_files
 
     found = []
     for path in profile_files().values():
@@ -158,7 +158,7 @@ def _readable() -> list[tuple[Profile, Path]]:
 
 def _facts(profile: Profile, path: Path) -> dict[str, Any]:
     """Return a profile as plain data; the recording as its length."""
-    from s2a_bench.jitter import to_table
+    from s2a_bench.boards.gaps import to_table
 
     plain = {key: value for key, value in asdict(profile).items() if key not in {"trace_s", "gaps"}}
     rest = {"file": str(path), "ttft_s": _ttft_s(profile), "dummy": _dummy(profile), "recorded": len(profile.trace_s)}
@@ -179,7 +179,7 @@ def _origin(profile: Profile) -> str:
 
 def _gaps(profile: Profile, *, full: bool = True) -> str:
     """Name the family, with its parameters where ``full``, and how many gaps were recorded."""
-    from s2a_bench.jitter import to_table
+    from s2a_bench.boards.gaps import to_table
 
     table = to_table(profile.gaps)
     numbers = "".join(f" {key} {value:.3g}" for key, value in table.items() if full and isinstance(value, int | float))

@@ -27,9 +27,9 @@ def report(
     """Make one self-contained page of runs, and their tables and figures for a paper. Measures nothing."""
     from rich.console import Console
 
-    from s2a_bench.report.html.chapters import read_chapters
-    from s2a_bench.report.html.files import Outputs, make_report, write_report
-    from s2a_bench.report.html.page import tally
+    from s2a_bench.report.page.chapters import read_chapters
+    from s2a_bench.report.page.files import Outputs, make_report, write_report
+    from s2a_bench.report.page.page import tally
 
     if against not in {"", "paper"}:
         raise UsageError(f"--against: '{against}' should be paper; two runs are compared with s2a-bench compare")

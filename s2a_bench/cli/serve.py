@@ -103,7 +103,7 @@ def ros(
     config: Config = None,
 ) -> None:
     """Serve the action generate_response (llama_msgs) with the camera's newest frame at hand, until interrupted."""
-    from s2a_bench.bench.plan import ROS_NAME, TUNINGS
+    from s2a_bench.harness.plan import ROS_NAME, TUNINGS
     from s2a_bench.ros.config import domain_id
     from s2a_bench.transport import QOS_PROFILES, Route
 
@@ -197,9 +197,9 @@ def _engine(settings: dict[str, Any]) -> EngineConfig:
 
 def _run(route: Route, settings: dict[str, Any], ready: Callable[[str], str]) -> None:
     """Serve until SIGINT or SIGTERM, then end cleanly with exit code 0."""
-    from s2a_bench.bench.serving import engine_handler
-    from s2a_bench.bench.tuning import keep_large_blocks, limit_threads
+    from s2a_bench.harness.serving import engine_handler
     from s2a_bench.inference import open_engine
+    from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
     from s2a_bench.transport import open_server
 
     limit_threads()

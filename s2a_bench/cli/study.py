@@ -33,8 +33,8 @@ def study(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Study when to act on drawn plans: nothing is measured, everything repeats by its seed."""
-    from s2a_bench.bench.studies import StudyConfig, run_study
     from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.experiments.study.run import StudyConfig, run_study
     from s2a_bench.store.run import read_run
 
     config = StudyConfig(seed, plans, calibration_plans, epsilon, jobs, _recording(profile))
@@ -54,11 +54,11 @@ def study(
 
 def _show(run: Run, *, as_json: bool) -> None:
     """Write tables and figure, and print what the user asked for."""
-    from s2a_bench.report.studies import study_tables, table_files
-    from s2a_bench.report.study_figures import write_study_figure
-    from s2a_bench.report.study_machine import study_to_json
-    from s2a_bench.report.table_files import write_texts
-    from s2a_bench.report.terminal import lay_out
+    from s2a_bench.experiments.study.view.as_json import study_to_json
+    from s2a_bench.experiments.study.view.figures import write_study_figure
+    from s2a_bench.experiments.study.view.tables import study_tables, table_files
+    from s2a_bench.writers.files import write_texts
+    from s2a_bench.writers.terminal import lay_out
 
     tables = study_tables(run)
     write_texts(run, table_files(tables), {})
@@ -77,8 +77,8 @@ def _show(run: Run, *, as_json: bool) -> None:
 
 def _recording(name: str) -> tuple[float, ...]:
     """Return a profile's recorded gaps."""
+    from s2a_bench.boards.search import load_profile
     from s2a_bench.errors import UsageError
-    from s2a_bench.inference.profiles import load_profile
 
     if not name:
         return ()

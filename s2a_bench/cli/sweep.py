@@ -15,8 +15,8 @@ from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError, UsageError
 
 if TYPE_CHECKING:
-    from s2a_bench.bench.sweep import Workers
-    from s2a_bench.bench.sweep.plan import Plan
+    from s2a_bench.sweep import Workers
+    from s2a_bench.sweep.plan import Plan
 
 
 def sweep(
@@ -43,10 +43,10 @@ def sweep(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Run a command once for every cell of a grid; every finished cell is kept at once, and a sweep can go on later."""
-    from s2a_bench.bench.sweep.file import find_sweep
-    from s2a_bench.bench.sweep.run import COPY, SweepRun, check_resume, only_one, start_sweep
     from s2a_bench.cli.progress import RunProgress
     from s2a_bench.store.run import RunWriter
+    from s2a_bench.sweep.file import find_sweep
+    from s2a_bench.sweep.run import COPY, SweepRun, check_resume, only_one, start_sweep
 
     if retry_failed and resume is None:
         raise UsageError("--retry-failed: name the sweep's folder with --resume")
@@ -97,9 +97,9 @@ def _boards_before(folder: Path | None) -> tuple[str, ...]:
 
 def _plan(source: Path, boards: Sequence[str] | None) -> Plan:
     """Read a sweep file as cells."""
-    from s2a_bench.bench.sweep.file import read_sweep_file
-    from s2a_bench.bench.sweep.plan import plan_sweep
     from s2a_bench.cli.sweep_cells import command_of
+    from s2a_bench.sweep.file import read_sweep_file
+    from s2a_bench.sweep.plan import plan_sweep
 
     found = read_sweep_file(source)
     return plan_sweep(found, command_of(found.command, f"{source}: command"), boards)
@@ -109,8 +109,8 @@ def _workers(plan: Plan, ray: str, jobs: int) -> Workers:
     """Choose where cells run."""
     from pkgutil import resolve_name
 
-    from s2a_bench.bench.sweep import WORKERS
     from s2a_bench.cli.sweep_cells import ENTRY
+    from s2a_bench.sweep import WORKERS
 
     made: Any = resolve_name(WORKERS["ray" if ray else "here"])
     workers: Workers = made(ENTRY, ray, plan, jobs)
@@ -119,11 +119,11 @@ def _workers(plan: Plan, ray: str, jobs: int) -> Workers:
 
 def _show_plan(plan: Plan, jobs: int, resume: Path | None, output: Path, *, as_json: bool) -> None:
     """Print what would run, and how long it would take."""
-    from s2a_bench.bench.environment import collect
-    from s2a_bench.bench.sweep.run import pending
-    from s2a_bench.bench.sweep.timing import earlier, expect
     from s2a_bench.cli import sweep_text
+    from s2a_bench.machine.environment import collect
     from s2a_bench.store.sweep import read_sweep
+    from s2a_bench.sweep.run import pending
+    from s2a_bench.sweep.timing import earlier, expect
 
     rows = read_sweep(resume).attempts.to_dict("records") if resume else []
     cells = pending(plan, rows, retry_failed=False)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
-    from s2a_bench.bench.sweep import Command
+    from s2a_bench.sweep import Command
 
 REAL: dict[str, dict[str, Any] | None] = {
     "latency": None,
@@ -26,7 +26,7 @@ ENTRY = f"{__name__}:run"
 
 def command_of(name: str, key: str = "command") -> Command:
     """Describe a command; raises UsageError for one that cannot be swept."""
-    from s2a_bench.bench.sweep import Command
+    from s2a_bench.sweep import Command
 
     known = [each for each in REAL if each in _commands()]
     if name not in known:

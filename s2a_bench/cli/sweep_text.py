@@ -12,10 +12,10 @@ from rich.table import Table
 from s2a_bench.cli.output import console as open_console
 
 if TYPE_CHECKING:
-    from s2a_bench.bench.sweep import Cell
-    from s2a_bench.bench.sweep.plan import Plan
-    from s2a_bench.bench.sweep.timing import Expected
     from s2a_bench.store.sweep import Sweep
+    from s2a_bench.sweep import Cell
+    from s2a_bench.sweep.plan import Plan
+    from s2a_bench.sweep.timing import Expected
 
 MINUTE_S, HOUR_S = 60, 3600
 

@@ -83,9 +83,9 @@ def throughput(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Measure tokens a second: prefill, time to first token, every gap between tokens, decode rate by position."""
-    from s2a_bench.bench.plan import DEFAULT_PROMPT, LatencyConfig
-    from s2a_bench.bench.throughput import ThroughputConfig, run_throughput
     from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.experiments.throughput.run import ThroughputConfig, run_throughput
+    from s2a_bench.harness.plan import DEFAULT_PROMPT, LatencyConfig
     from s2a_bench.inference import EngineConfig
     from s2a_bench.ros.config import domain_id
 
@@ -153,10 +153,10 @@ def throughput(
 
 def _draw(folder: Path, *, against_paper: bool) -> None:
     """Write tables and figures."""
-    from s2a_bench.report.table_files import write_texts
-    from s2a_bench.report.throughput_figures import write_throughput_figures
-    from s2a_bench.report.throughput_tables import throughput_csv, throughput_tables
+    from s2a_bench.experiments.throughput.view.figures import write_throughput_figures
+    from s2a_bench.experiments.throughput.view.tables import throughput_csv, throughput_tables
     from s2a_bench.store.run import read_run
+    from s2a_bench.writers.files import write_texts
 
     run = read_run(folder)
     write_texts(run, throughput_tables(run), throughput_csv(run))
@@ -165,10 +165,10 @@ def _draw(folder: Path, *, against_paper: bool) -> None:
 
 def _show(folder: Path, progress: RunProgress, *, as_json: bool) -> None:
     """Print what the user asked for."""
-    from s2a_bench.report.terminal import lay_out
-    from s2a_bench.report.throughput_machine import throughput_to_json
-    from s2a_bench.report.throughput_tables import throughput_tables
+    from s2a_bench.experiments.throughput.view.as_json import throughput_to_json
+    from s2a_bench.experiments.throughput.view.tables import throughput_tables
     from s2a_bench.store.run import read_run
+    from s2a_bench.writers.terminal import lay_out
 
     run = read_run(folder)
     tables = throughput_tables(run)

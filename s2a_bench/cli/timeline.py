@@ -112,7 +112,7 @@ def timeline(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live."""
-    from s2a_bench.bench.timeline_config import TimelineConfig
+    from s2a_bench.experiments.timeline.config import TimelineConfig
 
     for_live = {"transport": transport, "pace": pace, "skills": skills, "task": task, "robot": robot, "engine": engine}
     for_live |= {"model": model, "mmproj": mmproj, "threads": threads, "gpu-layers": gpu_layers, "source": source}
@@ -137,7 +137,7 @@ def timeline(
             seed=seed,
         )
         asked.check()
-        from s2a_bench.bench.live import run_live
+        from s2a_bench.experiments.timeline.live.run import run_live
 
         execute(lambda view: run_live(asked, output, view), as_json=json_, per_skill=per_skill, data_only=data_only)
         return
@@ -164,13 +164,13 @@ def timeline(
     )
     config.check()
     if real_time:
-        from s2a_bench.bench.real_time import run_real_time
+        from s2a_bench.experiments.timeline.real_time import run_real_time
 
         execute(
             lambda view: run_real_time(config, output, view), as_json=json_, per_skill=per_skill, data_only=data_only
         )
     else:
-        from s2a_bench.bench.timeline import run_timeline
+        from s2a_bench.experiments.timeline.run import run_timeline
 
         execute(
             lambda view: run_timeline(config, output, view), as_json=json_, per_skill=per_skill, data_only=data_only
@@ -197,11 +197,11 @@ def execute(run: Callable[[TimelineView], Path], *, as_json: bool, per_skill: bo
 
 def draw(folder: Path) -> None:
     """Write tables, figures and trace of any run of timelines."""
-    from s2a_bench.report.chrome_trace import write_trace
-    from s2a_bench.report.table_files import write_texts
-    from s2a_bench.report.timeline_figures import write_timeline_figures
-    from s2a_bench.report.timeline_tables import timeline_csv, timeline_tables
+    from s2a_bench.experiments.timeline.view.chrome_trace import write_trace
+    from s2a_bench.experiments.timeline.view.figures import write_timeline_figures
+    from s2a_bench.experiments.timeline.view.tables import timeline_csv, timeline_tables
     from s2a_bench.store.run import read_run
+    from s2a_bench.writers.files import write_texts
 
     run = read_run(folder)
     write_texts(run, timeline_tables(run), timeline_csv(run))
@@ -211,11 +211,11 @@ def draw(folder: Path) -> None:
 
 def show(folder: Path, progress: RunProgress, *, as_json: bool, per_skill: bool) -> None:
     """Print what the user asked for of any run of timelines."""
-    from s2a_bench.report.terminal import lay_out
-    from s2a_bench.report.timeline_machine import timelines_to_json
-    from s2a_bench.report.timeline_tables import timeline_tables
-    from s2a_bench.report.timelines import timelines_of
+    from s2a_bench.experiments.timeline.view.as_json import timelines_to_json
+    from s2a_bench.experiments.timeline.view.cells import timelines_of
+    from s2a_bench.experiments.timeline.view.tables import timeline_tables
     from s2a_bench.store.run import read_run
+    from s2a_bench.writers.terminal import lay_out
 
     run = read_run(folder)
     tables = timeline_tables(run)

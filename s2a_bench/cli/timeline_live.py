@@ -11,7 +11,7 @@ from s2a_bench.cli.options import listed, numbers, size_of, text_or_file, whole_
 from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
-    from s2a_bench.bench.live_config import LiveConfig
+    from s2a_bench.experiments.timeline.live.config import LiveConfig
 
 DEFAULTS: dict[str, Any] = {
     "transport": "ros",
@@ -67,8 +67,8 @@ def live_config(
     seed: int,
 ) -> LiveConfig:
     """Make the configuration of a live run; raises UsageError naming the flag."""
-    from s2a_bench.bench.live_config import LiveConfig
-    from s2a_bench.bench.plan import LatencyConfig
+    from s2a_bench.experiments.timeline.live.config import LiveConfig
+    from s2a_bench.harness.plan import LatencyConfig
     from s2a_bench.inference import EngineConfig
     from s2a_bench.ros.config import domain_id
 

@@ -15,7 +15,7 @@ from s2a_bench.cli.progress import RunProgress
 from s2a_bench.clock import now_ns
 
 if TYPE_CHECKING:
-    from s2a_bench.bench.execution import Scene
+    from s2a_bench.experiments.timeline.execution import Scene
     from s2a_bench.runtime.record import Record
 
 REFRESHES_HZ = 8

@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator
 from itertools import accumulate, count, islice
 from typing import TYPE_CHECKING, TypeAlias
 
+from s2a_bench.boards.gaps import Constant, Gaps, Lognormal, Recorded, to_table
+from s2a_bench.boards.profile import Profile
+from s2a_bench.boards.search import load_profile
 from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import EngineError, UsageError
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.profiles import load_profile
-from s2a_bench.jitter import Constant, Gaps, Lognormal, Recorded, to_table
-from s2a_bench.profile import Profile
 from s2a_bench.types import Request, Token
 
 if TYPE_CHECKING:

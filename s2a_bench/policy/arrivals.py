@@ -10,7 +10,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from s2a_bench.jitter import Gaps
+    from s2a_bench.boards.gaps import Gaps
     from s2a_bench.policy import Floats
 
 

@@ -18,7 +18,7 @@ from s2a_bench.policy.evaluate import TOLERANCE_S, evaluate
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from s2a_bench.jitter import Gaps
+    from s2a_bench.boards.gaps import Gaps
     from s2a_bench.policy import Floats
 
     Flags: TypeAlias = NDArray[np.bool_]

@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
+from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
-from s2a_bench.profile import Profile
 
 if TYPE_CHECKING:
     import numpy as np

@@ -1,1 +1,1 @@
-"""How it is shown: tables and figures, made from what the store holds; never measures."""
+"""Over runs of all experiments: the page, comparisons, and the paper's claims."""

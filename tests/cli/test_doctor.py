@@ -11,9 +11,9 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from s2a_bench.bench import doctor as bench
-from s2a_bench.bench.doctor import CHECKS, Finding, Level
 from s2a_bench.cli import doctor
+from s2a_bench.machine import doctor as bench
+from s2a_bench.machine.doctor import CHECKS, Finding, Level
 from s2a_bench.store.run import Run, read_run
 
 ROOT = Path(__file__).parent.parent.parent

@@ -17,7 +17,7 @@ import jsonschema
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.report.cells import cells_of
+from s2a_bench.experiments.latency.view.cells import cells_of
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.trace import budget
 

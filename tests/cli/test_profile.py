@@ -14,7 +14,7 @@ import httpx
 import jsonschema
 import pytest
 
-from s2a_bench.inference.profile_file import read_profile, to_toml
+from s2a_bench.boards.file import read_profile, to_toml
 from s2a_bench.store.run import read_run
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-profile-1.json").read_text())

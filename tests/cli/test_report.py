@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from s2a_bench.bench.timeline import run_timeline
-from s2a_bench.bench.timeline_config import TimelineConfig
+from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.experiments.timeline.run import run_timeline
 
 ROOT = Path(__file__).parent.parent.parent
 

@@ -16,9 +16,9 @@ import pytest
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.store.run import read_run
+from s2a_bench.testing.transport import ask, yuyv_frame
 from s2a_bench.transport import Route, open_client
 from s2a_bench.types import Request
-from tests.conformance.transport import ask, yuyv_frame
 
 ONE_BY_ONE = ("--feedback-interval", "0")
 """The echo engine is faster than any model: without this its tokens share feedbacks."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conformance.transport import Recorder
+from s2a_bench.testing.transport import Recorder
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, LlamaServer, Ollama, answering
 

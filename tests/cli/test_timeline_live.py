@@ -10,7 +10,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from s2a_bench.inference.profile_file import to_toml
+from s2a_bench.boards.file import to_toml
 from s2a_bench.store.run import read_run
 
 SCHEMA = json.loads((Path(__file__).parent.parent.parent / "docs" / "schema" / "s2a-bench-1.json").read_text())

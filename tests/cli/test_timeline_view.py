@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from s2a_bench.bench.execution import Scene
 from s2a_bench.cli.timeline_view import STALL, TimelineView, draw, summary
+from s2a_bench.experiments.timeline.execution import Scene
 from s2a_bench.runtime.events import AbortAsked, StreamBroke
 from s2a_bench.runtime.record import Record
 from tests.runtime.drive import ns, plan, run

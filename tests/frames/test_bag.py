@@ -17,7 +17,7 @@ from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.frames import open_source
 from s2a_bench.frames.bag import COMPRESSED_IMAGE, IMAGE, Recording
 from s2a_bench.frames.convert import yuyv_to_bgr
-from tests.conformance.frame_source import FrameSourceContract, MakeSource
+from s2a_bench.testing.frame_source import FrameSourceContract, MakeSource
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 SHAPES = {"yuv422_yuy2": (48, 64, 2), "bgr8": (48, 64, 3), "rgb8": (48, 64, 3), "mono8": (48, 64)}

@@ -11,7 +11,7 @@ from s2a_bench.errors import SourceError
 from s2a_bench.frames import images
 from s2a_bench.frames.convert import encode_jpeg, encode_png
 from s2a_bench.frames.images import ImageFolder
-from tests.conformance.frame_source import FrameSourceContract, MakeSource
+from s2a_bench.testing.frame_source import FrameSourceContract, MakeSource
 
 
 @pytest.fixture

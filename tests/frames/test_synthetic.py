@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from s2a_bench.errors import UsageError
 from s2a_bench.frames.convert import decode_image, encode_jpeg, to_bgr
 from s2a_bench.frames.synthetic import SyntheticCamera
+from s2a_bench.testing.frame_source import FrameSourceContract, MakeSource
 from s2a_bench.types import Frame
-from tests.conformance.frame_source import FrameSourceContract, MakeSource
 
 
 class TestContract(FrameSourceContract):

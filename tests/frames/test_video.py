@@ -11,7 +11,7 @@ import pytest
 
 from s2a_bench.errors import SourceError
 from s2a_bench.frames.video import VideoFile
-from tests.conformance.frame_source import FrameSourceContract, MakeSource
+from s2a_bench.testing.frame_source import FrameSourceContract, MakeSource
 
 GREYS = [40, 80, 120, 160]
 

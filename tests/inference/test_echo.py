@@ -2,7 +2,7 @@ import pytest
 
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.echo import EchoEngine
-from tests.conformance.engine import EngineSuite, ask
+from s2a_bench.testing.engine import EngineSuite, ask
 
 
 class TestEcho(EngineSuite):

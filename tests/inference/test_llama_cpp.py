@@ -11,8 +11,8 @@ from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.dummy import write_dummy
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.llama_gbnf import GrammarSampler
+from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
 from s2a_bench.types import Frame, Request
-from tests.conformance.engine import EngineSuite, ask, rgb_frame
 
 PLAN = r"""
 root ::= "[" skill ("," skill){2} "]"

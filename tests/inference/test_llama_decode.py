@@ -14,8 +14,8 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.llama_decode import GreedySampler, bindings
 from s2a_bench.inference.llama_settings import SAMPLINGS
+from s2a_bench.testing.engine import ask, rgb_frame
 from s2a_bench.types import Frame, Request
-from tests.conformance.engine import ask, rgb_frame
 
 
 @pytest.fixture(scope="module", params=["model", "greedy"])

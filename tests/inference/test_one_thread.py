@@ -12,8 +12,8 @@ from s2a_bench.errors import EngineError, ModelError
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.echo import EchoEngine
 from s2a_bench.inference.one_thread import AHEAD, OneThreadEngine
+from s2a_bench.testing.engine import EngineSuite
 from s2a_bench.types import Request, Token
-from tests.conformance.engine import EngineSuite
 
 
 class TestOneThread(EngineSuite):

@@ -11,8 +11,8 @@ from s2a_bench.clock import VirtualClock
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.echo import EchoEngine
 from s2a_bench.inference.paced import PacedEngine
+from s2a_bench.testing.engine import EngineSuite
 from s2a_bench.types import Request, Token
-from tests.conformance.engine import EngineSuite
 
 SECOND = 10**9
 
@@ -85,7 +85,7 @@ def test_it_says_what_the_rate_is_and_else_what_the_engine_says() -> None:
 
 
 def test_a_server_process_is_told_the_pace() -> None:
-    from s2a_bench.bench.serving import ServerJob
+    from s2a_bench.harness.serving import ServerJob
     from s2a_bench.transport import Route
 
     job = ServerJob(Route("http"), EngineConfig(model=Path("m.gguf"), pace=4.8))

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from s2a_bench.boards.file import to_toml
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import EngineError, UsageError
 from s2a_bench.inference import Engine, EngineConfig, open_engine
-from s2a_bench.inference.profile_file import to_toml
 from s2a_bench.inference.replay import GAPS, ReplayEngine, check_replay
 from s2a_bench.plan import Parser, SkillParsed, load_skills, paper_format
+from s2a_bench.testing.engine import EngineSuite, ask
 from s2a_bench.types import Request
-from tests.conformance.engine import EngineSuite, ask
 
 RECORDED_NS = [[111, 222], [1_000_001, 2_000_003, 3_000_007], [5_000_011, 7_000_013]]
 PLAYED_NS = [gap for row in RECORDED_NS[1:] for gap in row]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from s2a_bench.jitter import Constant, Lognormal
+from s2a_bench.boards.gaps import Constant, Lognormal
 from s2a_bench.policy.arrivals import fragments, tokens, uniform
 
 

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from s2a_bench.jitter import Constant, Lognormal
+from s2a_bench.boards.gaps import Constant, Lognormal
 from s2a_bench.policy import Plans
 from s2a_bench.policy import policy as build
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.boundary import Grid, analytic, naive_is_stall_free, simulate, slowest_rate
 from s2a_bench.policy.metrics import measure
-from tests.conformance.policy import draw
+from s2a_bench.testing.policy import draw
 
 GRID = Grid((1, 2, 4, 6), (0.58, 2.0, 3.1, 4.8, 6.5, 34.2))
 

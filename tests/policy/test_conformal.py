@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from s2a_bench.bench.worlds import World
+from s2a_bench.boards.gaps import Markov
 from s2a_bench.errors import UsageError
-from s2a_bench.jitter import Markov
+from s2a_bench.experiments.study.worlds import World
 from s2a_bench.policy import Plans
 from s2a_bench.policy.conformal import GRID, Tracker, calibrate, choose, coarse, scores, stalled, take, upper_bound
 from s2a_bench.policy.estimator import GapPrior

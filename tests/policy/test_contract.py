@@ -10,7 +10,7 @@ from s2a_bench.policy import POLICIES, Policy
 from s2a_bench.policy import policy as build
 from s2a_bench.policy.robust import RobustStart
 from s2a_bench.policy.stream_to_act import StreamToAct
-from tests.conformance.policy import PolicySuite
+from s2a_bench.testing.policy import PolicySuite
 
 
 @pytest.mark.parametrize("name", POLICIES)

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from s2a_bench.boards.gaps import Lognormal, Markov
+from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
-from s2a_bench.jitter import Lognormal, Markov
 from s2a_bench.policy.estimator import GapPrior
-from s2a_bench.profile import Profile
 
 
 def by_integration(prior: GapPrior, gaps: list[float]) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.evaluate import evaluate
 from s2a_bench.policy.metrics import measure
 from s2a_bench.policy.schedule import CHUNK
-from tests.conformance.policy import draw
+from s2a_bench.testing.policy import draw
 from tests.policy import plain
 
 

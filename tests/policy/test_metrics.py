@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from s2a_bench.policy import Plans, Schedule, policy
 from s2a_bench.policy.metrics import fluidity, measure, queue_wait, stalls
-from tests.conformance.policy import draw
+from s2a_bench.testing.policy import draw
 from tests.policy import plain
 
 

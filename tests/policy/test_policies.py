@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Plans, PlanShape, Start, Timing, policy
-from tests.conformance.policy import EXACT, step
+from s2a_bench.testing.policy import EXACT, step
 
 SKILL = Timing(1.0, 0.8, 1.5)
 

@@ -15,7 +15,7 @@ from s2a_bench.policy import Plans, PlanShape, Timing
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.robust import RobustStart
 from s2a_bench.policy.schedule import safe_start
-from tests.conformance.policy import EXACT, draw, one, step
+from s2a_bench.testing.policy import EXACT, draw, one, step
 
 BOUND = 1.3
 

@@ -15,7 +15,7 @@ from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.policy.stream_to_act import MeanStart, OnlineStepper, QuantileStart, StreamToAct
-from tests.conformance.policy import EXACT, Stream, draw, follow
+from s2a_bench.testing.policy import EXACT, Stream, draw, follow
 
 SHAPE = PlanShape(4, 2, Timing(1.0, 0.8, 1.5), expected_cv=0.2)
 PRIOR = GapPrior(0.5, 0.1, 0.2)

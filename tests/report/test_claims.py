@@ -9,13 +9,14 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.bench.boundary import BoundaryConfig, run_boundary
-from s2a_bench.bench.ccrb import run_ccrb
-from s2a_bench.bench.ccrb_config import CcrbConfig
-from s2a_bench.bench.timeline import run_timeline
-from s2a_bench.bench.timeline_config import TimelineConfig
-from s2a_bench.report.claim_checks import CLAIMS, is_board
-from s2a_bench.report.claims import CONFIRMED, NO_RUN, REFUTED, UNTESTABLE, Judged, claim_table, judge_claims
+from s2a_bench.experiments.boundary.run import BoundaryConfig, run_boundary
+from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.run import run_ccrb
+from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.experiments.timeline.run import run_timeline
+from s2a_bench.report.claims.checks import CLAIMS, is_board
+from s2a_bench.report.claims.claim import CONFIRMED, NO_RUN, REFUTED, UNTESTABLE
+from s2a_bench.report.claims.verdicts import Judged, claim_table, judge_claims
 from s2a_bench.store.run import Run, RunWriter, read_run
 from s2a_bench.store.schema import SampleRow, TokenRow
 

@@ -17,8 +17,8 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import Accepted, Feedback, Middleware, Rejected, Result, llama, open_middleware
 from s2a_bench.ros import messages as ros
-from tests.conformance.action import NAME, ActionContract, event, offer, receive, send, start, text_of
-from tests.conformance.middleware import Join
+from s2a_bench.testing.action import NAME, ActionContract, event, offer, receive, send, start, text_of
+from s2a_bench.testing.middleware import Join
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 

@@ -10,7 +10,7 @@ import pytest
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import MIDDLEWARES, Middleware, QoS, open_middleware
 from s2a_bench.ros.messages import type_hash
-from tests.conformance.middleware import Join, MiddlewareContract
+from s2a_bench.testing.middleware import Join, MiddlewareContract
 
 cyclonedds = pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 

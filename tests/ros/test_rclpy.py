@@ -8,8 +8,8 @@ from contextlib import ExitStack
 import pytest
 
 from s2a_bench.ros import Middleware, open_middleware
-from tests.conformance.action import ActionContract
-from tests.conformance.middleware import Join, MiddlewareContract
+from s2a_bench.testing.action import ActionContract
+from s2a_bench.testing.middleware import Join, MiddlewareContract
 
 pytest.importorskip("rclpy", reason="rclpy comes with ROS 2, not from PyPI")
 

@@ -29,9 +29,9 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Result, default_middleware, llama, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Goals, Status
+from s2a_bench.testing.action import NAME, ActionContract
+from s2a_bench.testing.middleware import Join, MiddlewareContract
 from s2a_bench.types import Frame
-from tests.conformance.action import NAME, ActionContract
-from tests.conformance.middleware import Join, MiddlewareContract
 
 GRAPH: list[Node] = []
 Verdict = Enum("Verdict", ["REJECT", "ACCEPT"])

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.bench.live_config import LiveConfig
 from s2a_bench.cli.timeline_live import DEFAULTS
 from s2a_bench.clock import VirtualClock, now_ns
+from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.plan import load_skills
 from s2a_bench.runtime import ENTRY_POINTS, events
 from s2a_bench.runtime.callables import Motion

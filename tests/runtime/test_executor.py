@@ -18,7 +18,7 @@ from s2a_bench.runtime.events import AbortAsked, Event, Requested, SkillCame, St
 from s2a_bench.runtime.executor import Executor
 from s2a_bench.runtime.record import Record
 from s2a_bench.runtime.timed import TimedRobot
-from tests.conformance.policy import one, seeded
+from s2a_bench.testing.policy import one, seeded
 from tests.runtime.drive import (
     EVERY_POLICY,
     ZERO_NS,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.bench.ccrb_config import CcrbConfig
-from s2a_bench.bench.ccrb_plans import prepare, skill_texts
+from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.plans import prepare, skill_texts
 from s2a_bench.plan import load_skills
 from s2a_bench.policy import Plans
 from s2a_bench.policy.arrivals import uniform

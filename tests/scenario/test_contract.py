@@ -9,7 +9,7 @@ import pytest
 
 from s2a_bench.scenario import Simulator, simulator
 from s2a_bench.scenario.carla import Carla
-from tests.conformance.simulator import SimulatorSuite
+from s2a_bench.testing.simulator import SimulatorSuite
 from tests.scenario.carla_stand_in import World, package
 
 

@@ -11,9 +11,9 @@ import pytest
 
 pytest.importorskip("scenariogeneration", reason="no wheel of pyclothoids on this platform")
 
-from s2a_bench.bench.ccrb_config import CcrbConfig
-from s2a_bench.bench.ccrb_plans import prepare
 from s2a_bench.errors import SimulatorError, UsageError
+from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.plans import prepare
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.openscenario import problems, write_openscenario
 

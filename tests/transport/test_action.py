@@ -19,10 +19,10 @@ from s2a_bench.ros import ActionServer, Result, ServerGoal, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
+from s2a_bench.testing.transport import Recorder, ask, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Route, open_client, open_server
 from s2a_bench.types import Request, Token
-from tests.conformance.transport import Recorder, ask, yuyv_frame
 
 NODE = "/llama_ros/generate_response"
 Node = Callable[..., list[ServerGoal]]

@@ -12,10 +12,10 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied
+from s2a_bench.testing.transport import yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import Route, open_client
 from s2a_bench.types import Request
-from tests.conformance.transport import yuyv_frame
 
 Script = list[bytes]
 Serve = Callable[..., str]

@@ -9,8 +9,8 @@ from threading import Thread
 
 import pytest
 
+from s2a_bench.testing.transport import Connect, TransportContract
 from s2a_bench.transport import Client, Handler, Route, open_client, open_server
-from tests.conformance.transport import Connect, TransportContract
 
 
 def connector(route: Route) -> Iterator[Connect]:

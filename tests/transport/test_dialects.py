@@ -12,11 +12,11 @@ import pytest
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import decode_image, encode_png, to_bgr
+from s2a_bench.testing.transport import Connect, Recorder, TransportContract, ask, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Route, open_client
 from s2a_bench.transport.http.dialects import DIALECTS
 from s2a_bench.types import Request, Token
-from tests.conformance.transport import Connect, Recorder, TransportContract, ask, yuyv_frame
 from tests.servers.sockets import CLOSE, Received, Reply, chunk, head, kept_head, serving
 from tests.servers.speakers import SPEAKERS, Cloud, Gemini, LlamaServer, Ollama, Speaker, answering
 

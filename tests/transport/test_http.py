@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import PortInUse
+from s2a_bench.testing.transport import Recorder, ask, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Handler, Route, open_client, open_server
-from s2a_bench.transport.http import dialect
+from s2a_bench.transport.http import own as dialect
 from s2a_bench.types import Request, Token
-from tests.conformance.transport import Recorder, ask, yuyv_frame
 
 
 @pytest.fixture

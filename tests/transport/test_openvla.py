@@ -11,10 +11,10 @@ import pytest
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import yuyv_to_rgb
+from s2a_bench.testing.transport import ask, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Route, open_client
 from s2a_bench.types import Frame, Request, Token
-from tests.conformance.transport import ask, yuyv_frame
 from tests.servers.sockets import Received, Reply, head, serving
 
 ACTION = np.array([0.5, -0.25, 0.0, 1e-3, 0.0, 0.0, 1.0])

@@ -14,11 +14,11 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
+from s2a_bench.testing.transport import Recorder, ask, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import Client, Handler, Route, open_client, open_server
 from s2a_bench.transport.ros.camera import CAMERA
 from s2a_bench.types import Frame, Request, Token
-from tests.conformance.transport import Recorder, ask, yuyv_frame
 
 
 @pytest.fixture

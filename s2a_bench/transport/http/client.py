@@ -19,7 +19,7 @@ from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Route
 from s2a_bench.transport.credentials import read_key
-from s2a_bench.transport.http import dialect
+from s2a_bench.transport.http import own
 from s2a_bench.transport.http.detect import body_of, detected
 from s2a_bench.transport.http.dialects import OWN, Event, Picture, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
@@ -40,7 +40,7 @@ class HttpClient:
         self.camera = None
         self._route = route
         self._alive = alive
-        self._codec = dialect.CODECS[route.variant]
+        self._codec = own.CODECS[route.variant]
         self._key = read_key(route.api_key_env)
         self._client = self._new_client() if route.connection != "client-per-request" else None
         self._dialect = open_dialect(self._dialect_name())
@@ -51,7 +51,7 @@ class HttpClient:
             self._headers["connection"] = "close"
 
     def _own_url(self) -> str:
-        return self._route.address.rstrip("/") + dialect.PATHS[self._route.variant]
+        return self._route.address.rstrip("/") + own.PATHS[self._route.variant]
 
     def _dialect_name(self) -> str:
         """Return the dialect that the route names, our own server's, or what the server says."""
@@ -119,7 +119,7 @@ class HttpClient:
 
     def _pack(self, request: Request, trace: Trace) -> tuple[bytes, dict[str, str]]:
         """Build the body, marking each stage."""
-        if self._route.variant == dialect.BINARY:
+        if self._route.variant == own.BINARY:
             body, headers = self._pack_binary(request, trace)
         else:
             pictures = []
@@ -139,10 +139,10 @@ class HttpClient:
         media_type, data = "application/octet-stream", None
         for frame in request.images[:1]:
             media_type, data = encoded(frame, self._route.payload, trace)
-        fields = dialect.parameters(request, self._route.model)
-        fields |= {**dialect.own_parameters(request), "prompt": request.prompt}
+        fields = own.parameters(request, self._route.model)
+        fields |= {**own.own_parameters(request), "prompt": request.prompt}
         header = json.dumps(fields)  # headers are ASCII, which the standard library's JSON is
-        headers = {**self._headers, "content-type": media_type, dialect.PARAMETERS_HEADER: header}
+        headers = {**self._headers, "content-type": media_type, own.PARAMETERS_HEADER: header}
         return data.tobytes() if data is not None else b"", headers
 
     def _tokens(self, response: httpx.Response, trace: Trace, headers_ns: int, packed_ns: int) -> Iterator[Token]:

@@ -27,7 +27,7 @@ from pydantic import BaseModel
 from s2a_bench.errors import EngineError, PortInUse, RequestFailed, S2AError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Route
-from s2a_bench.transport.http import dialect
+from s2a_bench.transport.http import own
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.types import Frame, Request, Token
 
@@ -110,11 +110,11 @@ def application(handler: Handler) -> FastAPI:
     def models() -> dict[str, Any]:
         return {"object": "list", "data": [{"id": "s2a", "object": "model", "owned_by": "s2a-bench"}]}
 
-    @app.post(dialect.PATHS[dialect.AS_DEPLOYED])
+    @app.post(own.PATHS[own.AS_DEPLOYED])
     def as_deployed(body: ChatRequest, http_request: HttpRequest) -> Response:
         trace: Trace = http_request.state.trace
         trace.mark("json_parse")
-        return _answer(handler, body.model_dump(), trace, dialect.STANDARD)
+        return _answer(handler, body.model_dump(), trace, own.STANDARD)
 
     async def best_effort(http_request: HttpRequest) -> Response:
         body = await http_request.body()
@@ -124,36 +124,36 @@ def application(handler: Handler) -> FastAPI:
         body = await http_request.body()
         return await run_in_threadpool(_answer_binary, handler, body, http_request)
 
-    app.add_route(dialect.PATHS[dialect.BEST_EFFORT], best_effort, methods=["POST"])
-    app.add_route(dialect.PATHS[dialect.BINARY], binary, methods=["POST"])
+    app.add_route(own.PATHS[own.BEST_EFFORT], best_effort, methods=["POST"])
+    app.add_route(own.PATHS[own.BINARY], binary, methods=["POST"])
     return app
 
 
 def _answer_json(handler: Handler, body: bytes, trace: Trace) -> Response:
     """Answer a JSON body that nobody has validated."""
     try:
-        fields = dialect.FAST.loads(body)
+        fields = own.FAST.loads(body)
     except ValueError as error:
         raise RequestFailed(f"the body is no JSON: {error}") from error
     trace.mark("json_parse")
-    return _answer(handler, fields, trace, dialect.FAST)
+    return _answer(handler, fields, trace, own.FAST)
 
 
 def _answer_binary(handler: Handler, body: bytes, http_request: HttpRequest) -> Response:
     """Answer a body that is the picture itself."""
     trace: Trace = http_request.state.trace
     try:
-        fields = dialect.FAST.loads(http_request.headers.get(dialect.PARAMETERS_HEADER, ""))
+        fields = own.FAST.loads(http_request.headers.get(own.PARAMETERS_HEADER, ""))
     except ValueError as error:
-        raise RequestFailed(f"header {dialect.PARAMETERS_HEADER} is no JSON: {error}") from error
+        raise RequestFailed(f"header {own.PARAMETERS_HEADER} is no JSON: {error}") from error
     if not (isinstance(fields, dict) and isinstance(prompt := fields.get("prompt", ""), str)):
-        raise RequestFailed(f"header {dialect.PARAMETERS_HEADER} should be an object whose prompt is text")
+        raise RequestFailed(f"header {own.PARAMETERS_HEADER} should be an object whose prompt is text")
     trace.mark("json_parse")
     images = (decoded(http_request.headers.get("content-type", ""), body, trace),) if body else ()
-    return _respond(handler, fields, prompt, images, trace, dialect.FAST)
+    return _respond(handler, fields, prompt, images, trace, own.FAST)
 
 
-def _answer(handler: Handler, fields: dict[str, Any], trace: Trace, codec: dialect.Codec) -> Response:
+def _answer(handler: Handler, fields: dict[str, Any], trace: Trace, codec: own.Codec) -> Response:
     """Decode the pictures of the messages and answer."""
     images: list[Frame] = []
     texts: list[str] = []
@@ -165,7 +165,7 @@ def _answer(handler: Handler, fields: dict[str, Any], trace: Trace, codec: diale
                 if part["type"] != "image_url":
                     texts.append(part["text"])
                     continue
-                media_type, text = dialect.split_data_uri(part["image_url"]["url"])
+                media_type, text = own.split_data_uri(part["image_url"]["url"])
                 data = codec.from_base64(text)
                 trace.mark("base64_decode")
                 images.append(decoded(media_type, data, trace))
@@ -181,7 +181,7 @@ def _respond(
     prompt: str,
     images: tuple[Frame, ...],
     trace: Trace,
-    codec: dialect.Codec,
+    codec: own.Codec,
 ) -> Response:
     """Start the answer, so that a refusal still has its status code, then stream it or send it whole."""
     try:
@@ -214,7 +214,7 @@ def _respond(
                 }
             ],
             "usage": _usage(trace, len(whole)),
-            "s2a": dialect.remote_to_json(trace.to_remote()),
+            "s2a": own.remote_to_json(trace.to_remote()),
         }
     )
 
@@ -255,24 +255,22 @@ def next_of(tokens: Iterator[Token]) -> Iterator[Token]:
         return
 
 
-def _events(
-    request: Request, tokens: Iterator[Token], trace: Trace, codec: dialect.Codec
-) -> Generator[bytes, None, None]:
+def _events(request: Request, tokens: Iterator[Token], trace: Trace, codec: own.Codec) -> Generator[bytes, None, None]:
     """Yield the server-sent events of an answer; an engine that fails on the way ends it with an error event."""
     count = 0
     try:
         for token in tokens:
-            event = dialect.chunk(request.id, {"content": token.text})
+            event = own.chunk(request.id, {"content": token.text})
             event["choices"][0]["token"] = token.id
             yield b"data: " + codec.dumps(event) + b"\n\n"
             count += 1
     except S2AError as error:
         yield b"data: " + codec.dumps({"error": {"message": str(error), "type": type(error).__name__}}) + b"\n\n"
         return
-    finish = dialect.chunk(request.id, {}, _finish_reason(request, count))
+    finish = own.chunk(request.id, {}, _finish_reason(request, count))
     yield b"data: " + codec.dumps(finish) + b"\n\n"
-    remote = dialect.remote_to_json(trace.to_remote())
-    last = dialect.chunk(request.id, {}, usage=_usage(trace, count), s2a=remote)
+    remote = own.remote_to_json(trace.to_remote())
+    last = own.chunk(request.id, {}, usage=_usage(trace, count), s2a=remote)
     yield b"data: " + codec.dumps(last) + b"\n\ndata: [DONE]\n\n"
 
 

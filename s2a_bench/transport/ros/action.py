@@ -29,7 +29,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import CameraSink, Route
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join, wait_until
-from s2a_bench.transport.ros.topic import READER_QOS, TOKEN_QOS, marks_message, remote_of, token_message
+from s2a_bench.transport.ros.wire import READER_QOS, TOKEN_QOS, marks_message, remote_of, token_message
 from s2a_bench.types import Request, Token
 
 ACTION = "/generate_response"

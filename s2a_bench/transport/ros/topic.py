@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, TransportError
-from s2a_bench.ros import Middleware, QoS
+from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.trace import Remote, Trace
+from s2a_bench.trace import Trace
 from s2a_bench.transport import Route
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join, wait_until
+from s2a_bench.transport.ros.wire import (
+    READER_QOS,
+    REQUEST_QOS,
+    TOKEN_QOS,
+    marks_message,
+    remote_of,
+    request_message,
+    token_message,
+)
 from s2a_bench.types import Request, Token
-
-REQUEST_QOS = QoS(depth=10)
-READER_QOS = QoS(depth=0)
-"""Our readers keep all: history is local, and a burst of tokens overruns ROS's default of 10."""
-TOKEN_QOS = QoS(depth=1000)
-"""Our writers keep the last: one that keeps all blocks for as long as a reader does not read."""
 
 
 class TopicClient:
@@ -152,60 +155,3 @@ class TopicJob:
         """Publish the end of the answer, with the marks."""
         marks = marks_message(self._id, self.trace.to_remote())
         self._front.send(self._id, Token(self._sent, "", -1), [marks], error or self._error)
-
-
-def request_message(request: Request, images: Sequence[Any] = (), compressed_images: Sequence[Any] = ()) -> Any:
-    """Turn a request into s2a_msgs/Request, with pictures as messages."""
-    return ros.message(
-        ros.REQUEST,
-        id=request.id,
-        prompt=request.prompt,
-        grammar=request.grammar,
-        max_tokens=request.max_tokens,
-        seed=request.seed,
-        images=images,
-        compressed_images=compressed_images,
-    )
-
-
-def token_message(request_id: str, token: Token, *, last: bool, error: str = "", marks: Sequence[Any] = ()) -> Any:
-    """Turn a token into s2a_msgs/Token; ``last`` ends the answer, with marks or an error."""
-    return ros.message(
-        ros.TOKEN,
-        id=request_id,
-        index=token.index,
-        text=token.text,
-        token=token.id,
-        last=last,
-        error=error,
-        marks=marks,
-    )
-
-
-def marks_message(request_id: str, remote: Remote) -> Any:
-    """Turn a server's marks into s2a_msgs/Marks."""
-    return ros.message(
-        ros.MARKS,
-        id=request_id,
-        clock=remote.clock,
-        stages=[stage for stage, _ in remote.marks],
-        stamps=ros.int64_array(stamp for _, stamp in remote.marks),
-        token_stamps=ros.int64_array(remote.token_ns),
-        frame_stamp=remote.frame_stamp_ns,
-        frame_stages=[stage for stage, _ in remote.frame_marks],
-        frame_stamps=ros.int64_array(stamp for _, stamp in remote.frame_marks),
-        fact_names=list(remote.facts),
-        fact_values=ros.float64_array(remote.facts.values()),
-    )
-
-
-def remote_of(marks: Any) -> Remote:
-    """Read a server's marks from s2a_msgs/Marks."""
-    return Remote(
-        clock=marks.clock,
-        marks=list(zip(marks.stages, marks.stamps.tolist(), strict=True)),
-        token_ns=marks.token_stamps.tolist(),
-        frame_stamp_ns=int(marks.frame_stamp),
-        frame_marks=list(zip(marks.frame_stages, marks.frame_stamps.tolist(), strict=True)),
-        facts=dict(zip(marks.fact_names, marks.fact_values.tolist(), strict=True)),
-    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 from uuid import uuid4
 
-from s2a_bench.transport.http import dialect
+from s2a_bench.transport.http import own as dialect
 from s2a_bench.transport.http.dialects import OWN, Event, Picture
 from s2a_bench.transport.http.dialects.common import Chat, endpoint, numbers, refuse_grammar, text_of
 from s2a_bench.types import Request

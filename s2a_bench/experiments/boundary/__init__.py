@@ -1,0 +1,1 @@
+"""Where naive execution is stall-free, over tokens per skill and rate."""

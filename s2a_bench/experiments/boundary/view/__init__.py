@@ -1,0 +1,1 @@
+"""How a boundary run is shown: its tables, figure and JSON."""

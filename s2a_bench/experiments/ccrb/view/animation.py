@@ -1,0 +1,181 @@
+"""The animation of a CCRB run: the policies below one another, drawn by highway-env; GIF and MP4."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from s2a_bench.errors import StoreError
+from s2a_bench.experiments.ccrb.view.figures import path_of
+from s2a_bench.experiments.ccrb.view.outcomes import SAID, law_of, rollouts_of, tokens_line
+from s2a_bench.scenario import EGO, LEAD, REAR, ROLES
+from s2a_bench.scenario.render import Camera
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from numpy.typing import NDArray
+    from PIL.Image import Image
+    from PIL.ImageFont import FreeTypeFont
+
+    from s2a_bench.store.run import Run
+
+FRAMES_A_S: Final = 20
+WIDTH, ROAD_HEIGHT, TEXT_HEIGHT, FOOT_HEIGHT = 880, 96, 46, 40
+"""Pixels; even numbers, as video codecs want."""
+LAST_S: Final = 2.0
+"""How long the last picture stands."""
+_REST_MPS: Final = 0.1
+_PHASES: Final = {"waiting": "no skill yet: keeps its speed", "gap": "STALL: no skill is valid", "done": "plan done"}
+_HITS: Final[dict[str, frozenset[int]]] = {
+    "front": frozenset({LEAD, EGO}),
+    "rear": frozenset({EGO, REAR}),
+    "both": frozenset({EGO, REAR}),
+}
+_INK, _PAPER, _RED, _FAINT = (20, 20, 20), (255, 255, 255), (200, 60, 0), (110, 110, 110)
+
+
+def write_animation(run: Run) -> list[Path]:
+    """Write ``figures/scenario.gif`` and ``.mp4`` in real time; raises StoreError where that fails.
+
+    A panel stops at its first impact: what comes after one is not modelled.
+    """
+    frames = list(frames_of(run))
+    folder = run.path / "figures"
+    gif, film = folder / "scenario.gif", folder / "scenario.mp4"
+    try:
+        folder.mkdir(exist_ok=True)
+        _write_gif(gif, frames)
+        _write_film(film, frames)
+    except OSError as error:
+        raise StoreError(f"cannot write {folder}: {error}; the roll-outs are kept") from error
+    return [gif, film]
+
+
+def frames_of(run: Run, frames_a_s: int = FRAMES_A_S) -> list[Image]:
+    """Draw every frame of the animation."""
+    panels = [Panel(run, row) for row in rollouts_of(run, "point").to_dict("records")]
+    until_s = max(panel.until_s for panel in panels)
+    foot = f"{tokens_line(run)} Yellow: lead, green: ego, blue: car behind, red: impact.\n{law_of(run)}"
+    return [_frame(panels, step / frames_a_s, foot) for step in range(int(until_s * frames_a_s) + 1)]
+
+
+class Panel:
+    """One policy's road with a line of text above it."""
+
+    def __init__(self, run: Run, row: dict[Any, Any]) -> None:
+        self._row = row
+        self._path = path_of(run, row["cell"])
+        skills = run.tables["skills"]
+        self._texts = skills[skills["cell"] == row["cell"]]["text"].tolist()
+        self._camera = Camera(WIDTH, ROAD_HEIGHT)
+        self._heading = _headings(self._path)
+        self._hit_at = _first_impact(self._path, row["outcome"])
+        moving = self._path[[f"{car}_speed_mps" for car in ROLES]].max(axis=1) > _REST_MPS
+        resting = int(moving[moving].index[-1]) if moving.any() else 0
+        self._last = resting if self._hit_at is None else self._hit_at
+        self.until_s = float(self._path["time_s"][self._last])
+
+    def draw(self, at_s: float) -> tuple[NDArray[np.uint8], str, str, bool]:
+        """Return the road's pixels, who drives it, what happens, and whether that is an impact."""
+        step_s = float(self._path["time_s"][1]) if len(self._path) > 1 else 1.0
+        place = min(round(at_s / step_s), self._last)
+        now = self._path.iloc[place]
+        hit = self._hit_at is not None and place >= self._hit_at
+        position = np.array([now[f"{car}_position_m"] for car in ROLES], dtype=float)
+        lateral, heading = np.zeros(3), np.zeros(3)
+        lateral[EGO], heading[EGO] = now["ego_lateral_m"], self._heading[place]
+        crashed = _HITS[self._row["outcome"]] if hit else frozenset[int]()
+        picture = self._camera.picture(position, lateral, heading, crashed)
+        facts = (
+            f"{float(now['time_s']):5.2f} s   ego {float(now['ego_speed_kmh']):4.1f} km/h   "
+            f"front gap {max(float(now['front_gap_m']), 0):4.1f} m   rear gap {max(float(now['rear_gap_m']), 0):4.1f} m"
+        )
+        return picture, f"{self._row['policy']}   {facts}", self._said(now, hit=hit), hit
+
+    def _said(self, now: Any, *, hit: bool) -> str:
+        """Say what the ego does, or what happened to it."""
+        if hit:
+            speed = self._row["rear_impact_mps" if self._row["outcome"] in {"rear", "both"} else "front_impact_mps"]
+            first = "rear" if self._row["outcome"] == "both" else self._row["outcome"]
+            return f"{SAID[first]}: {speed:.1f} m/s"
+        if now["phase"] == "acting":
+            return f"skill {int(now['skill']) + 1}: {self._texts[int(now['skill'])]}"
+        return _PHASES[now["phase"]]
+
+
+def _frame(panels: list[Panel], at_s: float, foot: str) -> Image:
+    """Put the panels below one another."""
+    from PIL import Image, ImageDraw
+
+    height = len(panels) * (TEXT_HEIGHT + ROAD_HEIGHT) + FOOT_HEIGHT
+    frame = Image.new("RGB", (WIDTH, height), _PAPER)
+    pen = ImageDraw.Draw(frame)
+    for place, panel in enumerate(panels):
+        top = place * (TEXT_HEIGHT + ROAD_HEIGHT)
+        picture, facts, said, hit = panel.draw(at_s)
+        pen.text((8, top + 5), facts, _INK, font=_font(14))
+        pen.text((8, top + 25), said, _RED if hit or said.startswith("STALL") else _FAINT, font=_font(14))
+        frame.paste(Image.fromarray(picture), (0, top + TEXT_HEIGHT))
+    pen.text((8, height - FOOT_HEIGHT + 6), foot, _FAINT, font=_font(11))
+    return frame
+
+
+def _first_impact(path: pd.DataFrame, outcome: str) -> int | None:
+    """Return the row of the first impact; None without one. The last row before contact counts as well."""
+    if outcome == "none":
+        return None
+    side = "front" if outcome == "front" else "rear"
+    touching = path.index[path[f"{side}_gap_m"] <= 0]
+    return int(touching[0]) if len(touching) else len(path) - 1
+
+
+def _headings(path: pd.DataFrame) -> NDArray[np.float64]:
+    """Return the ego's heading in rad, to the left, from how far it moves sideways on its way."""
+    along = np.gradient(path["ego_position_m"].to_numpy(dtype="float64")) if len(path) > 1 else np.ones(1)
+    aside = np.gradient(path["ego_lateral_m"].to_numpy(dtype="float64")) if len(path) > 1 else np.zeros(1)
+    return np.where(np.abs(along) > 1e-6, np.arctan2(aside, np.maximum(along, 1e-6)), 0.0)  # noqa: PLR2004 - at rest
+
+
+def _font(size: int) -> FreeTypeFont:
+    """Return the font that matplotlib brings."""
+    from matplotlib import font_manager
+    from PIL import ImageFont
+
+    return ImageFont.truetype(font_manager.findfont("DejaVu Sans Mono" if size > 12 else "DejaVu Sans"), size)  # noqa: PLR2004
+
+
+def _write_gif(path: Path, frames: list[Image]) -> None:
+    """Write a GIF at half the frames: its times are hundredths, and viewers slow down what is faster."""
+    from PIL.Image import Dither
+
+    palette = _stacked(frames[0], frames[-1]).quantize(64)  # the colours of an impact come last
+    shown = [frame.quantize(palette=palette, dither=Dither.NONE) for frame in [*frames[::2], frames[-1]]]
+    times = [2000 // FRAMES_A_S] * (len(shown) - 1) + [round(1000 * LAST_S)]
+    shown[0].save(path, save_all=True, append_images=shown[1:], duration=times, loop=0, optimize=False)
+
+
+def _stacked(*frames: Image) -> Image:
+    """Put pictures below one another."""
+    from PIL import Image
+
+    sheet = Image.new("RGB", (frames[0].width, sum(frame.height for frame in frames)))
+    for place, frame in enumerate(frames):
+        sheet.paste(frame, (0, place * frame.height))
+    return sheet
+
+
+def _write_film(path: Path, frames: list[Image]) -> None:
+    """Write an MP4 with OpenCV's MPEG-4 encoder."""
+    import cv2
+
+    size = frames[0].size
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_A_S, size)
+    if not film.isOpened():
+        raise OSError("this OpenCV cannot write MP4")
+    try:
+        for frame in [*frames, *[frames[-1]] * int(LAST_S * FRAMES_A_S)]:
+            film.write(np.ascontiguousarray(np.asarray(frame)[..., ::-1]))
+    finally:
+        film.release()

@@ -1,0 +1,1 @@
+"""What the transport costs, stage by stage."""

@@ -1,0 +1,18 @@
+"""The latency run: what each transport adds between a frame and its first token."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.progress import Progress
+from s2a_bench.harness.rounds import Task, run_requests
+
+
+def run_latency(config: LatencyConfig, output: Path, progress: Progress) -> Path:
+    """Measure and return the run folder; whatever happens, the samples so far are in it.
+
+    Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
+    """
+    config.check()
+    return run_requests(Task("latency"), config, output, progress)

@@ -1,0 +1,1 @@
+"""How a latency run is shown: its cells, tables, figures, CSV and JSON."""

@@ -1,0 +1,60 @@
+"""The tables of a run for programs: CSV in long form, one row a value, every digit kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratios, seed_of, stages_present
+from s2a_bench.stats import summary_of
+from s2a_bench.trace import STAGES
+from s2a_bench.writers.csv_text import csv_text
+
+if TYPE_CHECKING:
+    from s2a_bench.stats import Summary
+    from s2a_bench.store.run import Run
+
+_SUMMARY = ("n", "median", "mean", "sd", "p90", "p99")
+_METRICS = ("e2e_without_inference", "e2e", "ttft", "frame_age")
+
+
+def csv_texts(run: Run) -> dict[str, str]:
+    """Return file name -> CSV text: stages.csv, summary.csv, ratios.csv; times in ms, what is absent has no row."""
+    cells = cells_of(run)
+    found = ratios(cells, seed_of(run))
+    return {
+        "stages.csv": csv_text(("cell", "group", "stage", *_SUMMARY, "emulated"), _stages(cells)),
+        "summary.csv": csv_text(("cell", "metric", "errors", "warmups", *_SUMMARY, "emulated"), _summaries(cells)),
+        "ratios.csv": csv_text(
+            ("metric", "of", "to", "value", "ci95_low", "ci95_high", "emulated"),
+            (
+                (f"{metric}_ms", of.name, to.name, ratio.value, ratio.low, ratio.high, of.emulated or to.emulated)
+                for metric, of, to, ratio in found
+            ),
+        ),
+    }
+
+
+def _stages(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
+    """Yield a row a cell and stage, the residual last."""
+    for cell in cells:
+        for stage in (*stages_present([cell]), "residual"):
+            if summary := summary_of(cell.values_ms(stage)):
+                yield cell.name, STAGES.get(stage, ""), stage, *_values(summary), cell.emulated
+
+
+def _summaries(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
+    """Yield a row a cell and metric; a cell in which everything failed has one row, without numbers."""
+    for cell in cells:
+        metrics = {f"{metric}_ms": cell.values_ms(metric) for metric in _METRICS}
+        metrics |= {"itl_ms": cell.itl_ms(), "residual_share": cell.residual_shares()}
+        found = {name: summary for name, values in metrics.items() if (summary := summary_of(values))}
+        for name, summary in found.items():
+            yield cell.name, name, cell.errors, cell.warmups, *_values(summary), cell.emulated
+        if not found:
+            yield cell.name, "", cell.errors, cell.warmups, 0, *[None] * (len(_SUMMARY) - 1), cell.emulated
+
+
+def _values(summary: Summary) -> tuple[object, ...]:
+    """Return a summary's values in the order of the header."""
+    return tuple(getattr(summary, name) for name in _SUMMARY)

@@ -1,0 +1,56 @@
+"""The machine's view of a run: the ``--json`` object of every measuring command; times in ms, for people."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, groups_present, ratios, seed_of, stages_present
+from s2a_bench.writers.as_json import frame, ratio_entry, summaries
+
+if TYPE_CHECKING:
+    from s2a_bench.store.run import Run
+
+
+def to_json(run: Run) -> dict[str, Any]:
+    """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
+    cells = cells_of(run)
+    found = ratios(cells, seed_of(run))
+    return frame(
+        run,
+        [{**about_cell(cell, run), **_cell(cell)} for cell in cells],
+        [ratio_entry(f"{metric}_ms", cell.name, base.name, ratio) for metric, cell, base, ratio in found],
+    )
+
+
+def about_cell(cell: Cell, run: Run) -> dict[str, Any]:
+    """Return what the cells of all commands say about themselves; ``dummy`` where it is known."""
+    model = run.manifest.get("model", {})
+    return {
+        "cell": cell.name,
+        **cell.about,
+        "profile": model.get("profile"),
+        "emulated": cell.emulated,
+        **({"dummy": model["dummy"]} if "dummy" in model else {}),
+        "n": cell.n,
+        "errors": cell.errors,
+        "warmups": cell.warmups,
+    }
+
+
+def _cell(cell: Cell) -> dict[str, Any]:
+    """Return one cell's numbers; a metric that no sample has is an absent key."""
+    alone = [cell]
+    whole: dict[str, Any] = {
+        "residual_flagged": cell.flagged(),
+        "stages_ms": summaries((stage, cell.values_ms(stage)) for stage in stages_present(alone)),
+        "groups_ms": summaries((group, cell.group_ms(group)) for group in groups_present(alone)),
+    }
+    metrics = ("e2e", "e2e_without_inference", "ttft", "frame_age")
+    whole |= summaries((f"{metric}_ms", cell.values_ms(metric)) for metric in metrics)
+    return whole | summaries(
+        [
+            ("itl_ms", cell.itl_ms()),
+            ("token_delay_ms", cell.token_delay_ms()),
+            ("residual_share", cell.residual_shares()),
+        ]
+    )

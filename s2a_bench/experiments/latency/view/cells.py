@@ -1,0 +1,203 @@
+"""What a run says about each of its cells: the samples that count, their summaries, and the ratios between cells.
+
+Warm-ups and failed samples are counted and take part in no summary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from s2a_bench.stats import Ratio, ratio_of_medians
+from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT, STAGES
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    from s2a_bench.store.run import Run
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+RATIO_METRICS = ("e2e_without_inference", "e2e")
+"""What cells are compared by: columns of the samples, less the unit."""
+
+_ORDER = ("http", "ros", "loopback", "as-deployed", "best-effort", "binary", "topic", "action")
+_NS_PER_MS = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One cell of a run; ``good`` holds the samples that count, in the order in which they were taken."""
+
+    name: str
+    about: dict[str, str]
+    good: pd.DataFrame
+    tokens: pd.DataFrame
+    warmups: int
+    errors: int
+
+    @property
+    def n(self) -> int:
+        """Count the samples that count."""
+        return len(self.good)
+
+    @property
+    def pipeline(self) -> str:
+        """Name the transport."""
+        return self.about["pipeline"]
+
+    @property
+    def emulated(self) -> bool:
+        """Tell whether a replayed profile answered."""
+        return self.about["engine"] == "replay"
+
+    def values_ms(self, metric: str) -> Floats:
+        """Return the values of a stage, or of another column less ``_ns``, in ms."""
+        return numbers_ms(self.good[f"{metric}_ns"])
+
+    @property
+    def has_ingest(self) -> bool:
+        """Tell whether the server is a llama-server, seen from outside."""
+        return bool(self.values_ms("ingest").size)
+
+    def group_ms(self, group: str) -> Floats:
+        """Return the sums, in ms, of the stages of a group; a sample without such stages has none."""
+        names = [f"{stage}_ns" for stage, of in STAGES.items() if of == group]
+        return _numbers(self.good[names].sum(axis=1, min_count=1)) / _NS_PER_MS
+
+    def residual_shares(self) -> Floats:
+        """Return the residuals as shares of e2e without inference."""
+        return _numbers(self.good["residual_share"])
+
+    def flagged(self) -> int:
+        """Count the samples whose residual is too large a share."""
+        return int((self.residual_shares() > RESIDUAL_LIMIT).sum())
+
+    def itl_ms(self) -> Floats:
+        """Return the times between a token and the next as the client saw them, of all requests, in ms."""
+        tokens = self.tokens[self.tokens["request_id"].isin(self.good["request_id"])]
+        ordered = tokens.sort_values(["request_id", "index"])
+        return _numbers(ordered.groupby("request_id")["client_ns"].diff()) / _NS_PER_MS
+
+    def token_delay_ms(self) -> Floats:
+        """Return the times from a token's leaving the engine to the client's seeing it, of all requests, in ms."""
+        tokens = self.tokens[self.tokens["request_id"].isin(self.good["request_id"])]
+        return numbers_ms(tokens["client_ns"] - tokens["engine_ns"])
+
+    def by_block(self, metric: str) -> dict[int, list[float]]:
+        """Return the values of a metric in ms by the block in which they were taken."""
+        blocks: dict[int, list[float]] = {}
+        there = self.good[self.good[f"{metric}_ns"].notna()]
+        for block, value in zip(there["block"], there[f"{metric}_ns"], strict=True):
+            blocks.setdefault(int(block), []).append(float(value) / _NS_PER_MS)
+        return blocks
+
+
+def numbers_ms(column: pd.Series[Any]) -> Floats:
+    """Return a column of ns in ms, the missing values left out."""
+    return _numbers(column) / _NS_PER_MS
+
+
+def cells_of(run: Run) -> list[Cell]:
+    """Split a run into its cells: HTTP, ROS, loopback, then by name."""
+    samples, tokens = run.samples, run.tokens
+    names = sorted(samples["cell"].unique(), key=lambda name: ([_rank(part) for part in name.split("/")], name))
+    return [_cell(name, samples[samples["cell"] == name], tokens[tokens["cell"] == name]) for name in names]
+
+
+def ratios(cells: list[Cell], seed: int) -> Iterator[tuple[str, Cell, Cell, Ratio]]:
+    """Yield metric, cell, base and ratio: every HTTP cell over every ROS cell, every cell over loopback.
+
+    A pair is left out where a cell lacks the metric, as e2e without inference behind a black box.
+    """
+    for metric in RATIO_METRICS:
+        for base in cells:
+            for cell in cells:
+                http_to_ros = (cell.pipeline, base.pipeline) == ("http", "ros")
+                to_loopback = base.pipeline == "loopback" != cell.pipeline
+                if (http_to_ros or to_loopback) and (ratio := ratio_between(cell, base, metric, seed)):
+                    yield metric, cell, base, ratio
+
+
+def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | None:
+    """Divide the medians of two cells; block by block where both have the same number of samples in each block.
+
+    None where they cannot be compared: a llama-server's `ingest` slices and resizes the picture, which our engine
+    counts as inference, so that only e2e means the same on both sides.
+    """
+    if metric == "e2e_without_inference" and cell.has_ingest != base.has_ingest:
+        return None
+    return ratio_of_blocks(cell.by_block(metric), base.by_block(metric), seed)
+
+
+def ratio_of_blocks(above: dict[int, list[float]], below: dict[int, list[float]], seed: int) -> Ratio | None:
+    """Divide the medians of values by block; paired where both have as many in each block, None where one has none."""
+    if not above or not below:
+        return None
+    shapes = {len(values) for values in (*above.values(), *below.values())}
+    if above.keys() == below.keys() and len(shapes) == 1:
+        blocks = sorted(above)
+        return ratio_of_medians([above[block] for block in blocks], [below[block] for block in blocks], seed=seed)
+    values, others = ([value for block in blocks.values() for value in block] for blocks in (above, below))
+    return ratio_of_medians(values, others, seed=seed, paired=False)
+
+
+def seed_of(run: Run) -> int:
+    """Return the seed of the bootstrap: the manifest's ``seeds.bootstrap``, else 0."""
+    return int(run.manifest.get("seeds", {}).get("bootstrap") or 0)
+
+
+def engine_note(run: Run, cells: list[Cell]) -> str:
+    """Say what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
+    engines = {cell.about["engine"] for cell in cells}
+    notes = []
+    if "echo" in engines:
+        notes.append("echo engine")
+    if "replay" in engines:
+        notes.append(_emulated(run.manifest.get("model") or {}))
+    if "llama" in engines and (run.manifest.get("model") or {}).get("dummy"):
+        notes.append("dummy weights")
+    return ", ".join(notes)
+
+
+def _emulated(model: dict[str, Any]) -> str:
+    """Say which board was played, how, and where its rate is from."""
+    note = f"EMULATED: replayed profile {model.get('profile', '')}".rstrip()
+    said = [f"{model['gaps']} gaps"] if "gaps" in model else []
+    said += ["the paper's rate"] if model.get("origin") == "paper" else []
+    said += ["recorded with dummy weights"] if model.get("dummy") else []
+    return f"{note} ({', '.join(said)})" if said else note
+
+
+def groups_present(cells: list[Cell]) -> list[str]:
+    """List the groups that some sample has, in the order of the path."""
+    return [group for group in GROUPS if any(cell.group_ms(group).size for cell in cells)]
+
+
+def stages_present(cells: list[Cell]) -> list[str]:
+    """List the stages that some sample has, in the order of the path."""
+    return [stage for stage in STAGES if any(cell.values_ms(stage).size for cell in cells)]
+
+
+def _cell(name: str, samples: pd.DataFrame, tokens: pd.DataFrame) -> Cell:
+    """Sort the samples of one cell into those that count and those that are only counted."""
+    about = {
+        key: str(samples[key].iloc[0])
+        for key in ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
+    }
+    failed = samples["error"] != ""
+    good = samples[~samples["warmup"] & ~failed]
+    return Cell(name, about, good, tokens, int(samples["warmup"].sum()), int((failed & ~samples["warmup"]).sum()))
+
+
+def _rank(part: str) -> int:
+    """Place a part of a cell's name."""
+    return _ORDER.index(part) if part in _ORDER else len(_ORDER)
+
+
+def _numbers(column: pd.Series[Any]) -> Floats:
+    """Return the values that are there as floats."""
+    return column.dropna().to_numpy(dtype="float64")

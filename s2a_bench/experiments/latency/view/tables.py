@@ -1,0 +1,155 @@
+"""The tables of a run for people: text, rounded to three digits, as Markdown and LaTeX."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from s2a_bench.experiments.latency.view.cells import (
+    Cell,
+    cells_of,
+    engine_note,
+    groups_present,
+    ratio_between,
+    seed_of,
+    stages_present,
+)
+from s2a_bench.stats import summary_of
+from s2a_bench.trace import RESIDUAL_LIMIT, STAGES
+from s2a_bench.writers.tables import ABSENT, TextTable, interval, mean_sd, number
+
+if TYPE_CHECKING:
+    from s2a_bench.experiments.latency.view.cells import Floats
+    from s2a_bench.stats import Summary
+    from s2a_bench.store.run import Run
+
+TITLES = {"e2e_without_inference": "End to end without inference", "e2e": "End to end"}
+"""What is compared, and how it is called."""
+
+
+_FOOT = ("residual", "e2e_without_inference", "inference", "e2e")
+
+
+def stage_table(run: Run, *, full: bool = True) -> TextTable:
+    """Lay out the stages in the order of the path, a column a cell: the median, and mean ± sd where ``full``.
+
+    Inference stands below the residual, so that what is compared, e2e without inference, reads as one sum.
+    """
+    cells = cells_of(run)
+    rows: list[tuple[str, ...]] = []
+    last = ""
+
+    def add(group: str, name: str, values: list[Floats]) -> None:
+        rows.append((group, name, *(_entry(summary_of(found), full) for found in values)))
+
+    for stage in stages_present(cells):
+        if stage != "inference":
+            group = STAGES[stage]
+            add("" if group == last else group, stage, [cell.values_ms(stage) for cell in cells])
+            last = group
+    below = len(rows)
+    for metric in _FOOT:
+        add("", metric.replace("_", " "), [cell.values_ms(metric) for cell in cells])
+    title = "Stages in ms: median (mean ± sd)" if full else "Stages in ms: medians"
+    return TextTable(
+        title,
+        ("group", "stage", *(cell.name for cell in cells)),
+        rows,
+        2,
+        frozenset({below + 1}),
+        _notes(run, cells),
+    )
+
+
+def group_table(run: Run) -> TextTable:
+    """Lay out the groups as columns and the cells as rows: for runs of many cells."""
+    cells = cells_of(run)
+    groups = [group for group in groups_present(cells) if group != "inference"]
+    rows = []
+    for cell in cells:
+        values = [cell.group_ms(group) for group in groups]
+        values += [cell.values_ms(metric) for metric in _FOOT[1:]]
+        rows.append((cell.name, *(_entry(summary_of(found), full=False) for found in values)))
+    header = ("cell", *groups, "e2e w/o infer.", "infer.", "e2e")
+    return TextTable("Groups of stages in ms: medians", header, rows, 1, notes=_notes(run, cells))
+
+
+def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
+    """Lay out what a publication quotes: n, spread, percentiles, and the ratios to ROS and to loopback."""
+    cells = cells_of(run)
+    bases = [cell for cell in cells if cell.pipeline in {"ros", "loopback"} and cell.values_ms(metric).size]
+    rows = []
+    for cell in cells:
+        summary = summary_of(cell.values_ms(metric))
+        numbers = (
+            [mean_sd(summary), number(summary.median), number(summary.p90), number(summary.p99)]
+            if summary
+            else [ABSENT] * 4
+        )
+        over = [_ratio(cell, base, metric, seed_of(run)) for base in bases]
+        rows.append((cell.name, str(cell.n), str(cell.errors), *numbers, *over))
+    header = ("cell", "n", "errors", "mean ± sd", "median", "p90", "p99", *(f"ratio to {base.name}" for base in bases))
+    title = f"{TITLES[metric]} in ms; ratios of medians [95 % interval]"
+    return TextTable(title, header, rows, 1, notes=_notes(run, cells))
+
+
+def token_table(run: Run) -> TextTable | None:
+    """Lay out what happens to every token after it left the engine; None where no server tells when that was."""
+    cells = [cell for cell in cells_of(run) if cell.token_delay_ms().size]
+    if not cells:
+        return None
+    rows = []
+    for cell in cells:
+        delay, gap = summary_of(cell.token_delay_ms()), summary_of(cell.itl_ms())
+        row = [number(value) for value in (delay.median, delay.p90, delay.p99)] if delay else [ABSENT] * 3
+        row += [number(value) for value in (gap.median, gap.p99)] if gap else [ABSENT] * 2
+        rows.append((cell.name, *row))
+    header = ("cell", "delay median", "p90", "p99", "gap median", "gap p99")
+    title = "Tokens in ms: engine to client (delay), and from one to the next (gap)"
+    return TextTable(title, header, rows, 1, notes=_engine_notes(run, cells))
+
+
+def _entry(summary: Summary | None, full: bool) -> str:
+    """Write one entry of the stage table."""
+    if summary is None:
+        return ABSENT
+    return f"{number(summary.median)} ({mean_sd(summary)})" if full else number(summary.median)
+
+
+def _ratio(cell: Cell, base: Cell, metric: str, seed: int) -> str:
+    """Write the ratio of a cell to a base, where that is a comparison: loopback over ROS is none."""
+    if cell.name == base.name:
+        return "1"
+    if base.pipeline == "ros" and cell.pipeline != "http":
+        return ABSENT
+    return interval(ratio_between(cell, base, metric, seed))
+
+
+def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
+    """Say what a reader must know besides the numbers."""
+    counts = sorted({cell.n for cell in cells})
+    span = " to ".join(str(count) for count in dict.fromkeys((*counts[:1], *counts[-1:])))
+    notes = [f"n = {span} samples a cell, warm-ups left out." if counts else "No samples."]
+    if sizes := sorted({cell.about["size"] for cell in cells}):
+        payloads = dict.fromkeys(
+            f"{cell.pipeline} {cell.about['payload']}" for cell in cells if cell.about["payload"] not in {"none", ""}
+        )
+        notes.append(f"{', '.join(sizes)}; payload: {', '.join(payloads) or 'none'}.")
+    notes += _engine_notes(run, cells)
+    if any(cell.has_ingest for cell in cells):
+        notes.append(
+            "A llama-server's ingest slices and resizes the picture, which our engine counts as inference: compare e2e."
+        )
+    if flagged := sum(cell.flagged() for cell in cells):
+        notes.append(
+            f"{flagged} of {sum(cell.n for cell in cells)} samples have a residual above {RESIDUAL_LIMIT:.0%}"
+            " of e2e without inference."
+        )
+    if failed := sum(cell.errors for cell in cells):
+        notes.append(f"{failed} samples failed and are in no number here; samples.csv says why.")
+    return tuple(notes)
+
+
+def _engine_notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
+    """Say what did not really answer, as a sentence."""
+    note = engine_note(run, cells)
+    return (f"{note[0].upper()}{note[1:]}.",) if note else ()

@@ -1,0 +1,1 @@
+"""How many of a model's skills are valid, with a grammar and without."""

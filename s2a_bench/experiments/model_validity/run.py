@@ -1,0 +1,166 @@
+"""How many of a model's skills are valid, with a grammar and without: plans asked of a model in this process."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from s2a_bench.errors import UsageError
+from s2a_bench.harness.ranges import require
+from s2a_bench.inference import Engine, EngineConfig, open_engine
+from s2a_bench.inference.models import resolve
+from s2a_bench.inference.tokenizer import Tokenizer
+from s2a_bench.machine import environment
+from s2a_bench.plan import Cost, Format, SkillSet, arms, choose_format, load_skills, paper_format, prompt, score
+from s2a_bench.store.run import RunWriter
+from s2a_bench.store.schema import VALIDITY, ValidityRow
+from s2a_bench.types import Request
+
+if TYPE_CHECKING:
+    from s2a_bench.harness.progress import Progress
+
+COMMAND: Final = "model validity"
+PAPER: Final = "paper"
+"""The paper's format, among the tokens a skill that are asked for."""
+ROOM: Final = 2
+"""An answer may have as many times the tokens of the longest plan: without a grammar a model uses more words."""
+TEMPLATE_TOKENS: Final = 256
+"""What a chat template may put around a prompt."""
+
+
+@dataclass(frozen=True)
+class ValidityConfig:
+    """Which model is asked for which plans, and how often."""
+
+    engine: EngineConfig = EngineConfig()  # noqa: RUF009 - frozen
+    skills: str = "household"
+    tokens_per_skill: tuple[str, ...] = (PAPER,)
+    """`PAPER`, or whole numbers."""
+    n_skills: int = 8
+    answers: int = 32
+    """Of each format, with the grammar and without."""
+    task: str = ""
+    """What the robot should do, in the user's words."""
+    max_tokens: int | None = None
+    """The most tokens of an answer; None: `ROOM` times what the longest plan costs."""
+    seed: int = 0
+    """Answer k is drawn with this seed + k."""
+
+    def check(self) -> None:
+        """Refuse what makes no sense; raises UsageError naming the flag."""
+        require("--n-skills", [self.n_skills], 1, 100)
+        require("--answers", [self.answers], 1, 1_000_000)
+        require("--seed", [self.seed], 0)
+        if self.max_tokens is not None:
+            require("--max-tokens", [self.max_tokens], 1)
+        if not self.tokens_per_skill:
+            raise UsageError(f"--tokens-per-skill: name at least one, as {PAPER},6,1")
+        for name in self.tokens_per_skill:
+            if name != PAPER and not name.isdecimal():
+                raise UsageError(f"--tokens-per-skill: '{name}' should be {PAPER} or a whole number")
+
+    def format(self, name: str, skills: SkillSet, tokenize: Tokenizer) -> Format:
+        """Return the format that costs so many tokens a skill; raises UsageError where the model has none."""
+        return paper_format(skills) if name == PAPER else choose_format(skills, int(name), tokenize, self.n_skills)
+
+
+@dataclass(frozen=True)
+class _Ask:
+    """One format, ready to be asked for."""
+
+    name: str
+    format: Format
+    cost: Cost
+    prompt: str
+    grammars: dict[str, str]
+    max_tokens: int
+
+    def to_manifest(self) -> dict[str, Any]:
+        """Say what is asked for."""
+        return {
+            "name": self.name,
+            "skill_set": self.format.skills.name,
+            "wording": self.format.name,
+            "example": self.format.line(1, self.format.texts[0]),
+            "tokens_per_skill": asdict(self.cost),
+            "prompt": self.prompt,
+            "max_tokens": self.max_tokens,
+        }
+
+
+def run_validity(config: ValidityConfig, output: Path, progress: Progress) -> Path:
+    """Ask for all plans and return the run folder; raises S2AError for what a user can mend.
+
+    A model gets the same prompt and the same seeds with the grammar and without. Rows are kept answer by answer.
+    """
+    config.check()
+    skills = load_skills(config.skills)
+    progress.stage("reading the model's headers")
+    model, mmproj = resolve(config.engine)
+    tokenize = Tokenizer(model)
+    asks = [_ask(config, name, skills, tokenize) for name in config.tokens_per_skill]
+    longest = max(len(tokenize(ask.prompt)) + ask.max_tokens for ask in asks) + TEMPLATE_TOKENS
+    chosen = replace(config.engine, model=model, mmproj=mmproj, context=max(config.engine.context, longest))
+    manifest = {
+        "configuration": {**asdict(config), "engine": asdict(chosen)},
+        "environment": environment.collect(),
+        "seeds": {"sampling": config.seed},
+        "formats": [ask.to_manifest() for ask in asks],
+    }
+    with RunWriter.create(output, COMMAND, manifest, (VALIDITY,)) as writer:
+        progress.opened(writer.path)
+        progress.stage("loading the model")
+        with closing(open_engine(chosen)) as engine:
+            writer.update(model=engine.describe())
+            progress.expect(len(asks) * 2 * config.answers)
+            for ask in asks:
+                progress.stage(f"{ask.name}: {ask.format.name}")
+                for seed in range(config.seed, config.seed + config.answers):
+                    for arm in ask.grammars:
+                        writer.append(VALIDITY, [_answer(engine, config, ask, arm, seed)])
+                        progress.advance()
+        return writer.path
+
+
+def _ask(config: ValidityConfig, name: str, skills: SkillSet, tokenize: Tokenizer) -> _Ask:
+    """Word one format for the model."""
+    format_ = config.format(name, skills, tokenize)
+    cost = format_.cost(tokenize, config.n_skills)
+    return _Ask(
+        name,
+        format_,
+        cost,
+        prompt(format_, config.n_skills, config.task),
+        arms(format_, config.n_skills, tokenize),
+        config.max_tokens or ROOM * config.n_skills * cost.most,
+    )
+
+
+def _answer(engine: Engine, config: ValidityConfig, ask: _Ask, arm: str, seed: int) -> ValidityRow:
+    """Ask for one plan and read it."""
+    request = Request(
+        f"{ask.name}-{arm}-{seed}",
+        ask.prompt,
+        max_tokens=ask.max_tokens,
+        grammar=ask.grammars[arm],
+        seed=seed,
+    )
+    pieces = [token.text for token in engine.generate(request)]
+    found = score(ask.format, [pieces], config.n_skills)
+    return ValidityRow(
+        format=ask.name,
+        wording=ask.format.name,
+        skill_set=ask.format.skills.name,
+        n_skills=config.n_skills,
+        grammar=bool(ask.grammars[arm]),
+        seed=seed,
+        tokens=len(pieces),
+        cut=len(pieces) == ask.max_tokens,
+        lines=found.skills + sum(found.problems.values()),
+        skills=found.skills,
+        problems=dict(found.problems),
+        as_ordered=bool(found.as_ordered),
+        text="".join(pieces),
+    )

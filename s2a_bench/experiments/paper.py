@@ -1,0 +1,63 @@
+"""The paper's claims, as data; drawn only when asked for, and never as a measurement of ours."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+LABEL = "paper (Jetson AGX Orin), another machine"
+"""How the paper's values are called wherever they are shown."""
+
+CAVEAT = "The paper does not say that inference is left out; its figures allow nothing else."
+
+
+@dataclass(frozen=True, slots=True)
+class PaperLatency:
+    """One bar of the paper's figure 4: mean and standard deviation over its runs."""
+
+    name: str
+    mean_ms: float
+    sd_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class PaperThroughput:
+    """One row of the paper's table II: tokens/s, the mean of 10 runs, on a board."""
+
+    name: str
+    tokens_per_s: float
+
+
+def paper_latency() -> tuple[PaperLatency, PaperLatency]:
+    """Return HTTP/JSON and ROS-native as claimed in section V-B."""
+    orin = _reference()["latency"]["orin_agx"]
+    return (
+        PaperLatency("HTTP/JSON", orin["http_json_mean_ms"], orin["http_json_sd_ms"]),
+        PaperLatency("ROS-native", orin["ros_native_mean_ms"], orin["ros_native_sd_ms"]),
+    )
+
+
+def paper_throughput() -> tuple[PaperThroughput, ...]:
+    """Return the three boards of table II (section V-D); no spread is given there."""
+    table = _reference()["throughput"]
+    return (
+        PaperThroughput("RTX 4080", table["rtx_4080"]),
+        PaperThroughput("Jetson AGX Orin", table["jetson_agx_orin"]),
+        PaperThroughput("Jetson Orin Nano", table["jetson_orin_nano"]),
+    )
+
+
+def paper_colours() -> dict[str, str]:
+    """Return policy -> the name of its colour in the paper's figure 5."""
+    return dict(_reference()["timeline"]["colours"])
+
+
+def _reference() -> dict[str, Any]:
+    return tomllib.loads(files("s2a_bench.experiments").joinpath("paper_reference.toml").read_text(encoding="utf-8"))

@@ -1,0 +1,249 @@
+"""Measure this machine as a hardware profile: requests with ever new pictures, every gap between tokens kept."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from s2a_bench.boards.file import parse_profile, to_toml
+from s2a_bench.boards.fit import fit_gaps
+from s2a_bench.boards.gaps import to_table
+from s2a_bench.boards.profile import Profile
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import EngineError, StoreError, UsageError
+from s2a_bench.frames import open_source
+from s2a_bench.frames.convert import bgr_to_rgb, to_bgr
+from s2a_bench.harness.plan import DEFAULT_PROMPT
+from s2a_bench.harness.warnings import Counters, before_run
+from s2a_bench.inference import Engine, EngineConfig
+from s2a_bench.machine import environment
+from s2a_bench.machine.board import board_facts
+from s2a_bench.machine.tuning import limit_threads
+from s2a_bench.types import Frame, Request
+
+LEAST_GAPS = 40
+_MODEL_FACTS = (
+    "name",
+    "architecture",
+    "model_type",
+    "quantisation",
+    "parameters",
+    "dummy",
+    "model",
+    "model_sha256",
+    "mmproj",
+    "mmproj_sha256",
+    "llama_cpp_python",
+    "threads",
+    "gpu_layers",
+    "context",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureConfig:
+    """What ``s2a-bench profile capture`` is asked to do."""
+
+    name: str
+    engine: EngineConfig = field(default_factory=EngineConfig)
+    source: str = "synthetic"
+    width: int = 640
+    height: int = 480
+    requests: int = 20
+    warmup: int = 3
+    tokens: int = 64
+    prompt: str = DEFAULT_PROMPT
+    seed: int = 0
+
+    def check(self) -> None:
+        """Raise UsageError, naming the flag, for what makes no sense."""
+        if not self.name or self.name.startswith(".") or set(self.name) & set("/\\\0\n"):
+            raise UsageError(f"NAME: {self.name!r} should be a plain file name without .toml")
+        for flag, value, least in (
+            ("--requests", self.requests, 1),
+            ("--warmup", self.warmup, 0),
+            ("--tokens", self.tokens, 2),
+        ):
+            if value < least:
+                raise UsageError(f"{flag}: {value} should be {least} or more")
+        if self.requests * (self.tokens - 1) < LEAST_GAPS:
+            raise UsageError(
+                f"--requests {self.requests} of --tokens {self.tokens} make {self.requests * (self.tokens - 1)} gaps; "
+                f"a profile needs {LEAST_GAPS}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One request as timed: to its first token, and from each token to the next."""
+
+    ttft_ns: int
+    gaps_ns: list[int]
+
+
+def answers(engine: Engine, config: CaptureConfig) -> Iterator[Answer]:
+    """Ask again and again, each time about a new picture and with a new seed, and yield the times."""
+    with ExitStack() as stack:
+        source = open_source(config.source, config.width, config.height, seed=config.seed)
+        stack.callback(source.close)
+        number = 0
+        while True:
+            request = Request(
+                f"capture-{number}", config.prompt, (_rgb(source.read()),), config.tokens, seed=config.seed + number
+            )
+            yield _timed(engine, request)
+            number += 1
+
+
+def _rgb(frame: Frame) -> Frame:
+    return replace(frame, encoding="rgb8", data=bgr_to_rgb(to_bgr(frame)))
+
+
+def _timed(engine: Engine, request: Request) -> Answer:
+    """Answer one request; raises EngineError for an empty answer."""
+    started = now_ns()
+    times = [now_ns() for _ in engine.generate(request)]
+    if not times:
+        raise EngineError(f"request {request.id}: the answer was empty; give another --prompt")
+    return Answer(times[0] - started, [after - before for before, after in pairwise(times)])
+
+
+def open_model(config: EngineConfig) -> Engine:
+    """Open llama.cpp on this very thread: tokens handed over by another are seen late, and then several at once."""
+    from s2a_bench.inference.llama_cpp import LlamaCppEngine
+
+    return LlamaCppEngine(config)
+
+
+def capture(config: CaptureConfig, stage: Callable[[str], None], advance: Callable[[], None]) -> dict[str, Any]:
+    """Measure, and return the profile as the tables of its file.
+
+    Raises EngineError where the model's answers are too short to time.
+    """
+    config.check()
+    limit_threads()
+    doubts = before_run(config.width, config.height, uses_dds=False)
+    with ExitStack() as stack:
+        stage("loading the model")
+        engine = open_model(config.engine)
+        stack.callback(engine.close)
+        before = Counters.read(uses_dds=False)
+        asked = answers(engine, config)
+        stack.callback(asked.close)  # type: ignore[attr-defined]  # a generator
+        recorded = []
+        for number in range(config.warmup + config.requests):
+            stage("warming up" if number < config.warmup else "measuring")
+            recorded.append(next(asked))
+            advance()
+        doubts += Counters.read(uses_dds=False).doubts_since(before)
+        described = engine.describe()
+    stage("fitting the gaps")
+    warnings = [f"{doubt.code}: {doubt.message}; {doubt.advice}" for doubt in doubts]
+    return document(config, recorded, described, warnings)
+
+
+def document(
+    config: CaptureConfig, recorded: list[Answer], model: dict[str, Any], warnings: list[str]
+) -> dict[str, Any]:
+    """Turn timed answers, warm-ups first, into the tables of a profile's file."""
+    import numpy as np
+
+    counted = recorded[config.warmup :]
+    rows = [[gap / 1e9 for gap in answer.gaps_ns] for answer in counted]
+    total = sum(map(len, rows))
+    if total < LEAST_GAPS:
+        raise EngineError(
+            f"the answers were short: {total} gaps in {len(counted)} requests, a profile needs {LEAST_GAPS}; "
+            "give more --requests, or a --prompt that asks for more"
+        )
+    fit = fit_gaps(rows)
+    mean_s = sum(map(sum, rows)) / total
+    ttft = np.array([answer.ttft_ns for answer in counted]) / 1e9
+    prompt_s = max(0.0, float(ttft.mean()) - mean_s)
+    spread = float(ttft.std(ddof=1)) if len(ttft) > 1 else 0.0
+    board = board_facts()
+    known = environment.collect()
+    return {
+        "title": f"{board.get('model') or board.get('gpu') or board.get('cpu') or known['host']}",
+        "origin": "measured",
+        "tokens_per_s": 1 / mean_s,
+        "prompt_s": prompt_s,
+        "prompt_cv": spread / prompt_s if prompt_s else 0.0,
+        "rate_cv": rate_cv(rows),
+        "gaps": to_table(fit.gaps),
+        "board": board,
+        "model": {key: model[key] for key in _MODEL_FACTS if key in model},
+        "capture": {
+            "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "engine": config.engine.name,
+            "requests": config.requests,
+            "warmup": config.warmup,
+            "tokens": config.tokens,
+            "source": config.source,
+            "size": f"{config.width}x{config.height}",
+            "prompt": config.prompt,
+            "seed": config.seed,
+            "gaps": total,
+            "ttft_mean_s": float(ttft.mean()),
+            "warnings": warnings,
+        },
+        "fit": {
+            "family": fit.family,
+            "criterion": "KS distance of gaps, and of sums of 6, to the half of the requests that the fit has not seen",
+            "lag1": round(fit.lag1, 4),
+            "distance_gap": {name: round(gap, 4) for name, (gap, _) in fit.distances.items()},
+            "distance_sum": {name: round(total, 4) for name, (_, total) in fit.distances.items()},
+        },
+        "environment": {key: value for key, value in known.items() if key not in {"cpu", "board", "governor"}},
+        "trace": {
+            "warmups": config.warmup,
+            "ttft_ns": [answer.ttft_ns for answer in recorded],
+            "gaps_ns": [answer.gaps_ns for answer in recorded],
+        },
+    }
+
+
+def rate_cv(rows: list[list[float]]) -> float:
+    """Return the spread of requests' mean gaps beyond what independent gaps would make, as a share of the mean."""
+    import numpy as np
+
+    long = [row for row in rows if len(row) > 1]
+    if len(long) < 2:  # noqa: PLR2004 - one request has no spread
+        return 0.0
+    means = np.array([np.mean(row) for row in long])
+    within = np.mean([np.var(row, ddof=1) / len(row) for row in long])
+    return float(np.sqrt(max(0.0, means.var(ddof=1) - within)) / means.mean())
+
+
+def write_profile(tables: dict[str, Any], path: Path, *, force: bool) -> Profile:
+    """Write the file and return what it reads as; raises UsageError where it is there already, else StoreError."""
+    text = to_toml(tables)
+    profile = parse_profile(path.stem, text, f"profile {path}")
+    make_room(path, force=force)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise _unwritable(path, error.strerror or str(error)) from error
+    return profile
+
+
+def make_room(path: Path, *, force: bool) -> None:
+    """Make the file's folder, before anything is measured in vain; raises as `write_profile`."""
+    if path.exists() and not force:
+        raise UsageError(f"{path} exists already; give another NAME or --output, or --force to replace it")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(path, error.strerror or str(error)) from error
+    if not os.access(path.parent, os.W_OK):
+        raise _unwritable(path, "the folder may not be written to")
+
+
+def _unwritable(path: Path, why: str) -> StoreError:
+    return StoreError(f"--output: cannot write {path}: {why}")

@@ -1,0 +1,1 @@
+"""Studies of the policies on drawn plans: targets, jitter, drift, wrong beliefs."""

@@ -1,0 +1,134 @@
+"""What happens when the machine drifts away from its calibration, and what tracking lambda makes of it.
+
+Plans follow one another: the machine keeps its speed for a quarter of them, then it drifts. Three ways to go on:
+*fixed* keeps prior and lambda; *tracked* follows lambda (`conformal.Tracker`); *refitted* also takes the prior from
+the last plans, anew every 50 plans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from s2a_bench.experiments.study.rows import row_of
+from s2a_bench.experiments.study.run import Cell, StudyConfig
+from s2a_bench.experiments.study.worlds import World, generator
+from s2a_bench.policy import Plans, online
+from s2a_bench.policy.conformal import GRID, TOLERANCE_S, Tracker, choose, scores, take
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy.metrics import Metrics, measure
+from s2a_bench.policy.stream_to_act import StreamToAct
+from s2a_bench.store.schema import StudyRow
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from s2a_bench.policy import Floats
+
+NAME: Final = "drift"
+PLANS: Final = 4000
+BLOCKS: Final = 8
+REFIT: Final = 50
+ARMS: Final = ("fixed", "tracked", "refitted")
+WORLDS: Final = (World(4.8, 0.5, 6, 8, 1.0), World(0.58, 3.0, 1, 8, 1.0))
+CAUTIONS: Final = (*GRID, float("inf"))
+
+
+def drifts(plans: int) -> dict[str, Floats]:
+    """Return by how much gaps are stretched, plan by plan, for each kind of drift."""
+    place = np.arange(plans) / plans
+    return {
+        "none": np.ones(plans),
+        "step x 1.3": np.where(place < 1 / 4, 1.0, 1.3),
+        "ramp to x 2": np.interp(place, [1 / 4, 3 / 4], [1.0, 2.0]),
+        "step x 0.7": np.where(place < 1 / 4, 1.0, 0.7),
+    }
+
+
+def cells(config: StudyConfig) -> Sequence[Cell]:
+    """List worlds and drifts."""
+    return [partial(cell, config, world, name) for world in WORLDS for name in drifts(1)]
+
+
+def cell(config: StudyConfig, world: World, drift: str) -> list[StudyRow]:
+    """Follow one sequence of plans in each of the three ways."""
+    rng = generator(config.seed, NAME, world, drift)
+    count = config.plans or PLANS
+    calibration = world.draw(rng, config.calibration_plans)
+    plans = world.draw(rng, count, drifts(count)[drift])
+    rows = []
+    for arm in ARMS:
+        caution, found = follow(calibration, plans, config.epsilon, arm)
+        for block, places in enumerate(np.array_split(np.arange(count), BLOCKS)):
+            rows.append(
+                row_of(
+                    NAME,
+                    world,
+                    StreamToAct.name,
+                    _at(found, places),
+                    caution=float(np.median(caution[places])),
+                    calibration_plans=config.calibration_plans,
+                    condition=f"{drift}, {arm}",
+                    block=block,
+                )
+            )
+    return rows
+
+
+def follow(calibration: Plans, plans: Plans, epsilon: float, arm: str) -> tuple[Floats, Metrics]:
+    """Decide the plans one after another; returns each plan's lambda and how it went.
+
+    What a stretch of plans would do at every lambda is computed at once, and lambda is picked from it plan by plan.
+    """
+    assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
+    policy = StreamToAct(GapPrior.fit(calibration.token_s))
+    score = scores(policy, calibration)
+    tracker, fixed = Tracker(score, epsilon), choose(score, epsilon).caution
+    window, count = calibration.arrival_s.shape[1], plans.arrival_s.shape[1]
+    seen = calibration.token_s
+    chosen, parts = [], []
+    for places in np.array_split(np.arange(count), max(1, count // REFIT) if arm == "refitted" else 1):
+        part = take(plans, places)
+        found = _at_every_caution(policy, part)
+        least = _scores(found.stalls > 0)
+        ranks = np.empty(places.size, dtype=np.intp)
+        for place, score_of_plan in enumerate(least):
+            ranks[place] = CAUTIONS.index(fixed if arm == "fixed" else tracker.caution)
+            tracker.learn(score_of_plan, stalled=bool(found.stalls[ranks[place], place]))
+        chosen += [CAUTIONS[rank] for rank in ranks]
+        parts.append(_at(found, ranks, np.arange(places.size)))
+        if arm == "refitted":
+            assert part.token_s is not None  # noqa: S101
+            seen = np.concatenate([seen, part.token_s], axis=1)[:, -window:]
+            policy = StreamToAct(GapPrior.fit(seen))
+    columns = [[getattr(part, item.name) for part in parts] for item in fields(Metrics)]
+    return np.array(chosen), Metrics(*map(np.concatenate, columns))
+
+
+def _at_every_caution(policy: StreamToAct, plans: Plans) -> Metrics:
+    """Return how each plan would go at each lambda: metrics of shape (lambdas, plans)."""
+    count = plans.arrival_s.shape[1]
+    copies = take(plans, np.tile(np.arange(count), len(CAUTIONS)))
+    schedule = online.schedule(policy.prior, np.repeat(CAUTIONS, count), copies, elastic=policy.elastic)
+    return _each(measure(copies, schedule, tolerance_s=TOLERANCE_S), lambda values: values.reshape(-1, count))
+
+
+def _scores(stalls: NDArray[np.bool_]) -> list[float]:
+    """Return the least lambda from which on each plan does not stall; ``stalls`` has the shape (lambdas, plans)."""
+    above = len(CAUTIONS) - np.argmax(stalls[::-1], axis=0)
+    ranks = np.where(stalls.any(axis=0), above, 0)
+    return [CAUTIONS[min(rank, len(CAUTIONS) - 1)] for rank in ranks]
+
+
+def _at(found: Metrics, *places: NDArray[np.intp]) -> Metrics:
+    """Pick elements of every array."""
+    return _each(found, lambda values: values[places])
+
+
+def _each(found: Metrics, change: Callable[[Any], Any]) -> Metrics:
+    """Change every array."""
+    return Metrics(*(change(getattr(found, item.name)) for item in fields(Metrics)))

@@ -1,0 +1,70 @@
+"""What rare stalls cost: P(any stall) against regret, for families of gaps, as lambda goes from 0 to waiting.
+
+The lambda that calibration would choose is tried once more, under the condition `CALIBRATED`: where a robot would be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+from s2a_bench.boards.gaps import Bursty, Gaps, Lognormal, Markov, Recorded
+from s2a_bench.experiments.study.rows import study_row
+from s2a_bench.experiments.study.run import Cell, StudyConfig
+from s2a_bench.experiments.study.worlds import TOKEN_CV, World, generator
+from s2a_bench.policy.conformal import GRID, calibrate
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy.stream_to_act import QuantileStart, StreamToAct
+from s2a_bench.store.schema import StudyRow
+
+NAME: Final = "frontier"
+PLANS: Final = 4000
+CALIBRATED: Final = "calibrated"
+
+WORLDS: Final = (
+    World(4.8, 0.5, 4, 8, 1.0),
+    World(4.8, 0.5, 6, 8, 1.0),
+    World(0.58, 3.0, 1, 8, 2.0),
+    World(0.58, 3.0, 6, 8, 1.0),
+)
+
+
+def families(mean_s: float, recording: Sequence[float] = ()) -> list[Gaps]:
+    """List the families: even; 2 % of the tokens in pauses of 10 times the gap; packets of 4; a recording, if any."""
+    listed: list[Gaps] = [
+        Lognormal(mean_s, TOKEN_CV),
+        Markov(mean_s, TOKEN_CV, pause_share=0.02, pause_ratio=10.0, pause_tokens=3.0),
+        Bursty(mean_s, TOKEN_CV, burst_tokens=4, within=0.1),
+    ]
+    if recording:
+        listed.append(Recorded(mean_s, tuple(recording)))
+    return listed
+
+
+def cells(config: StudyConfig) -> Sequence[Cell]:
+    """List worlds and families."""
+    return [
+        partial(cell, config, replace(world, gaps=gaps))
+        for world in WORLDS
+        for gaps in families(1 / world.tokens_per_s, config.recording)
+    ]
+
+
+def cell(config: StudyConfig, world: World) -> list[StudyRow]:
+    """Try every lambda on the same plans, for the elastic rule and the one that never stretches."""
+    rng = generator(config.seed, NAME, world)
+    calibration = world.draw(rng, config.calibration_plans)
+    assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
+    prior = GapPrior.fit(calibration.token_s)
+    plans = world.draw(rng, config.plans or PLANS)
+    cautions = (*GRID, math.inf)
+    found = [
+        study_row(NAME, world, kind(prior, caution), plans, calibration_plans=config.calibration_plans)
+        for kind in (StreamToAct, QuantileStart)
+        for caution in cautions
+    ]
+    chosen = cautions.index(calibrate(StreamToAct(prior), calibration, config.epsilon).caution)
+    return [*found, replace(found[chosen], condition=CALIBRATED)]

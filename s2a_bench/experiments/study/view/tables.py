@@ -1,0 +1,186 @@
+"""What the studies of the policies come to: targets met or not, frontiers, drift, and wrong beliefs, as tables."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from s2a_bench.errors import StoreError
+from s2a_bench.policy.conformal import upper_bound
+from s2a_bench.writers.tables import ABSENT, TextTable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from s2a_bench.store.run import Run
+
+ONLINE: Final = "stream-to-act"
+HARD: Final = 0.8
+"""rho above which starting when a skill arrives is not safe."""
+POOLED, WORST, START, END = 0.01, 0.02, 0.05, 0.06
+"""What is wanted of stream-to-act: P(any stall) of all plans and of every setting, mean start and end regret."""
+LEVELS: Final = (0.01, 0.05, 0.20)
+"""Shares of stalled plans at which a frontier's regret is read off."""
+WORLD: Final = ["tokens_per_s", "tokens_per_skill", "n_skills", "t_nom_s"]
+_DRAWN: Final = "Plans are drawn from models of the arrivals; nothing here is measured."
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """One thing that is wanted, and what was reached."""
+
+    what: str
+    value: float
+    limit: float
+
+    @property
+    def met(self) -> bool:
+        """Tell whether it was reached."""
+        return self.value <= self.limit
+
+
+def targets(rows: pd.DataFrame) -> list[Target]:
+    """Judge one policy's rows, one a setting, by the limits that stream-to-act has to keep."""
+    hard = rows[rows["rho"] > HARD]
+    stalled, plans = int(rows["stalled"].sum()), int(rows["plans"].sum())
+    return [
+        Target("P(any stall), pooled, upper end of 95 %", upper_bound(stalled, plans, 0.975), POOLED),
+        Target("P(any stall), worst setting", float(rows["p_any_stall"].max()), WORST),
+        Target("start regret, all settings", float(rows["start_regret"].mean()), START),
+        Target("start regret, rho > .8", float(hard["start_regret"].mean()), START),
+        Target("end regret, all settings", float(rows["end_regret"].mean()), END),
+        Target("end regret, rho > .8", float(hard["end_regret"].mean()), END),
+    ]
+
+
+def regret_at(points: pd.DataFrame, level: float, what: str = "start_regret") -> float:
+    """Return the least regret on one frontier (a world, family and policy) with P(any stall) <= ``level``.
+
+    Interpolates between values of lambda. A level beyond the frontier's end at lambda = 0 costs what that end costs.
+    """
+    import numpy as np
+
+    ordered = points.sort_values(["p_any_stall", what])
+    cheapest = np.minimum.accumulate(ordered[what].to_numpy(dtype=float))
+    return float(np.interp(level, ordered["p_any_stall"].to_numpy(dtype=float), cheapest))
+
+
+def study_tables(run: Run) -> list[TextTable]:
+    """Lay out a study's run; raises StoreError where the folder holds none."""
+    rows = run.tables["studies"]
+    name = str(rows["study"].iloc[0]) if len(rows) else ""
+    if name not in _TABLES:
+        raise StoreError(f"{run.path} holds no study; run s2a-bench study first")
+    return list(_TABLES[name](rows))
+
+
+def table_files(tables: Iterable[TextTable]) -> dict[str, TextTable]:
+    """Name each table's file after its title: "Most stalls" -> most-stalls."""
+    return {re.sub(r"[^a-z0-9]+", "-", table.title.lower()).strip("-"): table for table in tables}
+
+
+def _targets(rows: pd.DataFrame) -> Iterator[TextTable]:
+    """Show the targets, the policies side by side, and where the online rule has it hardest."""
+    online = rows[rows["policy"] == ONLINE]
+    judged = targets(online)
+    lines: list[tuple[str, ...]] = [
+        (each.what, f"{each.value:.2%}", f"{each.limit:.0%}", "met" if each.met else "MISSED") for each in judged
+    ]
+    note = f"{len(online)} settings, {int(online['plans'].sum()):,} plans. {_DRAWN}"
+    yield TextTable(f"Targets of {ONLINE}", ("", "reached", "wanted", ""), lines, 1, notes=(note,))
+    columns = {
+        "P(stall)": "p_any_stall",
+        "start": "start_regret",
+        "signed": "signed_start_regret",
+        "of wait": "start_regret_of_wait",
+        "end": "end_regret",
+        "end of wait": "end_regret_of_wait",
+    }
+    parts = {"all": rows, "rho > .8": rows[rows["rho"] > HARD]}
+    lines = [
+        (str(policy), scope, *(f"{each[column].mean():.2%}" for column in columns.values()))
+        for policy in rows["policy"].unique()
+        for scope, part in parts.items()
+        for each in (part[part["policy"] == policy],)
+    ]
+    notes = (
+        "Means over settings. start: max(0, s_1 - S0) / S0; signed: with its sign; end: (e_N - E) / E, E = S0 + P_N.",
+        "of wait: over t_N - S0, which a long time to first token does not flatter.",
+    )
+    yield TextTable("Policies", ("policy", "settings", *columns), lines, 2, notes=notes)
+    worst = online.sort_values("p_any_stall", ascending=False).head(5)
+    header = ("R", "L", "N", "T", "rho", "lambda", "P(stall)", "start", "end")
+    lines = [
+        (*_world(row), _caution(row), *(f"{row[name]:.2%}" for name in ("p_any_stall", "start_regret", "end_regret")))
+        for _, row in worst.iterrows()
+    ]
+    yield TextTable("Most stalls", header, lines, 0)
+
+
+def _frontier(rows: pd.DataFrame) -> Iterator[TextTable]:
+    """Show what each share of stalls costs."""
+    header = ("R", "L", "N", "T", "rho", "gaps", "policy", *(f"at {level:.0%}" for level in LEVELS))
+    lines = [
+        (
+            *_world(points.iloc[0]),
+            str(points["family"].iloc[0]),
+            str(points["policy"].iloc[0]),
+            *(f"{regret_at(points, level):+.0%}" for level in LEVELS),
+        )
+        for _, points in rows.groupby([*WORLD, "family", "policy"], sort=False)
+    ]
+    notes = (f"Start regret over S0 where that share of the plans stalls. {_DRAWN}",)
+    yield TextTable("Frontier: what rare stalls cost", header, lines, 7, notes=notes)
+
+
+def _drift(rows: pd.DataFrame) -> Iterator[TextTable]:
+    """Show P(any stall) block by block."""
+    blocks = sorted(int(block) for block in rows["block"].unique())
+    header = ("R", "L", "N", "T", "rho", "drift", *(str(block + 1) for block in blocks), "late start")
+    lines = [
+        (
+            *_world(points.iloc[0]),
+            str(points["condition"].iloc[0]),
+            *(f"{share:.1%}" for share in points.sort_values("block")["p_any_stall"]),
+            f"{points['start_regret'].mean():.0%}",
+        )
+        for _, points in rows.groupby([*WORLD, "condition"], sort=False)
+    ]
+    notes = (
+        "P(any stall) in one stretch of plans after the other; the drift begins with the third of eight.",
+        f"late start: mean start regret over S0. {_DRAWN}",
+    )
+    yield TextTable("Drift", header, lines, 6, notes=notes)
+
+
+def _misfit(rows: pd.DataFrame) -> Iterator[TextTable]:
+    """Show what each wrong belief costs."""
+    header = ("R", "L", "N", "T", "rho", "believed", "lambda", "P(stall)", "start", "signed", "end")
+    names = ("p_any_stall", "start_regret", "signed_start_regret", "end_regret")
+    lines = [
+        (*_world(row), str(row["condition"]), _caution(row), *(f"{row[name]:.1%}" for name in names))
+        for _, row in rows.iterrows()
+    ]
+    yield TextTable("Wrong beliefs", header, lines, 6, notes=(f"Calibrated with the right ones. {_DRAWN}",))
+
+
+_TABLES: Final[dict[str, Callable[[pd.DataFrame], Iterator[TextTable]]]] = {
+    "targets": _targets,
+    "frontier": _frontier,
+    "drift": _drift,
+    "misfit": _misfit,
+}
+
+
+def _world(row: pd.Series) -> tuple[str, ...]:
+    """Name a setting."""
+    return (*(f"{row[name]:g}" for name in WORLD), f"{row['rho']:.2f}")
+
+
+def _caution(row: pd.Series) -> str:
+    """Write lambda; absent where whole plans are waited for."""
+    import pandas as pd
+
+    return ABSENT if pd.isna(row["caution"]) else f"{row['caution']:g}"

@@ -1,0 +1,83 @@
+"""llama.cpp's own ``llama-bench`` as a reference: the same file and settings, one run of it a block.
+
+Its ``tg`` test decodes random tokens, samples nothing and turns nothing into text. It starts behind ``--n-depth``
+tokens, here as many as our prompts have, as attention costs more the longer the context is.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import EngineError
+from s2a_bench.harness.llama_flags import llama_flags
+from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.session import Place
+from s2a_bench.store.run import RunWriter
+from s2a_bench.store.schema import REFERENCE, ReferenceRow
+
+LONGEST_S = 7200
+"""A board that writes half a token a second still ends in time."""
+
+
+class LlamaBench:
+    """One turn of llama-bench a block; called with its place."""
+
+    def __init__(self, program: Path, config: LatencyConfig, writer: RunWriter, depth: Callable[[], int]) -> None:
+        """Prepare the command; ``depth`` tells how many tokens lie in the context before those that are timed."""
+        self._program = program
+        self._writer = writer
+        self._depth = depth
+        self._flash_attention = config.engine.flash_attention
+        self._command = [str(program), *llama_flags(config.engine), "--output", "json", "--repetitions", "1"]
+        self._command += ["--n-prompt", "0", "--n-gen", str(config.max_tokens)]
+
+    def __call__(self, place: Place) -> None:
+        """Run it once and keep what it says; raises EngineError where it fails."""
+        command = [*self._command, "--n-depth", str(self._depth())]
+        self._writer.update(reference={"command": command})
+        started_ns = now_ns()
+        test = self._run(command)
+        row = ReferenceRow(
+            block=place.block,
+            position=place.position,
+            warmup=place.warmup,
+            started_ns=started_ns,
+            finished_ns=now_ns(),
+            n_gen=test["n_gen"],
+            depth=test.get("n_depth", 0),
+            decode_ns=test["samples_ns"][0],
+            facts={name: test[name] for name in test if not name.startswith(("samples", "avg", "stddev"))},
+        )
+        self._writer.append(REFERENCE, [row])
+
+    def _run(self, command: list[str]) -> dict[str, Any]:
+        """Return the one test of llama-bench's JSON."""
+        try:
+            done = subprocess.run(  # noqa: S603 - the user's own program
+                command, capture_output=True, text=True, errors="replace", check=False, timeout=LONGEST_S
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise EngineError(f"--reference {self._program}: {error}") from error
+        said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1][:200]
+        if done.returncode:
+            raise EngineError(f"--reference {self._program}: exit code {done.returncode}: {said}")
+        try:
+            (test,) = json.loads(done.stdout)
+            if not (test["n_gen"] > 0 and test["samples_ns"][0] > 0):
+                raise ValueError("it generated nothing")
+        except (ValueError, KeyError, TypeError, IndexError) as error:
+            raise EngineError(
+                f"--reference {self._program}: its answer is not llama-bench's JSON of one test ({error!r}); "
+                "a llama-bench of 2026 is needed"
+            ) from error
+        if isinstance(test.get("flash_attn"), bool) and self._flash_attention != "off":
+            raise EngineError(
+                f"--reference {self._program}: it is too old to know --flash-attn {self._flash_attention}, reads that "
+                "as off and would be compared with something else; take a newer one, or --flash-attention off"
+            )
+        return dict(test)

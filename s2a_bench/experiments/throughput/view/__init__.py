@@ -1,0 +1,1 @@
+"""How a throughput run is shown: its cells, tables, figures and JSON."""

@@ -1,0 +1,51 @@
+"""The ``--json`` object of a throughput run: rates in tokens/s, times in ms."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from s2a_bench.experiments.latency.view.as_json import about_cell
+from s2a_bench.experiments.throughput.view.cells import (
+    METRICS,
+    RATIO_METRIC,
+    REFERENCE,
+    Speed,
+    ratios_of,
+    reference_depths,
+    reference_values,
+    speeds_of,
+)
+from s2a_bench.writers.as_json import frame, ratio_entry, summaries
+
+if TYPE_CHECKING:
+    from s2a_bench.store.run import Run
+
+
+def throughput_to_json(run: Run) -> dict[str, Any]:
+    """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
+    speeds = speeds_of(run)
+    ratios = [ratio_entry(RATIO_METRIC, of, to, ratio) for of, to, ratio in ratios_of(run, speeds)]
+    more = {"reference": _reference(run)} if reference_values(run) else {}
+    return frame(run, [{**about_cell(speed.cell, run), **_numbers(speed)} for speed in speeds], ratios, **more)
+
+
+def _numbers(speed: Speed) -> dict[str, Any]:
+    """Return one cell's numbers; a metric that no request has is an absent key."""
+    positions = [
+        {"first": first, "last": last, **summaries([(RATIO_METRIC, rates)])}
+        for (first, last), rates in speed.by_position().items()
+    ]
+    metrics = [*((metric, speed.values(metric)) for metric in METRICS), ("itl_ms", speed.cell.itl_ms())]
+    return {"t_eval": "engine" if speed.told else "client", **summaries(metrics), "positions": positions}
+
+
+def _reference(run: Run) -> dict[str, Any]:
+    """Return what llama-bench said, beside the command that was run."""
+    return {
+        "program": REFERENCE,
+        "command": run.manifest.get("reference", {}).get("command", []),
+        "depths": reference_depths(run),
+        **summaries([(RATIO_METRIC, np.asarray(reference_values(run)))]),
+    }

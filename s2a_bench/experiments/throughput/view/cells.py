@@ -1,0 +1,182 @@
+"""What a throughput run says about each of its cells: rates and times of every request, gaps, rates by position.
+
+The rate of a request is told twice. ``tokens_per_s`` is the paper's (section V-D): N_tokens / T_eval, T_eval being the
+engine's own time from the end of the prompt to the last token; where a server does not tell it, the other stands in.
+``decode_tokens_per_s`` is what the client saw: (n - 1) / (t_last - t_first), so that sending counts.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratio_of_blocks, seed_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from s2a_bench.experiments.latency.view.cells import Floats
+    from s2a_bench.stats import Ratio
+    from s2a_bench.store.run import Run
+
+METRICS = (
+    "tokens_per_s",
+    "decode_tokens_per_s",
+    "ttft_ms",
+    "prompt_ms",
+    "image_ms",
+    "prompt_eval_ms",
+    "prompt_tokens",
+    "prefill_tokens_per_s",
+    "tokens_per_joule",
+)
+"""The numbers of one request, by the names of ``--json``; one that a cell does not have is absent."""
+
+RATIO_METRIC = "decode_tokens_per_s"
+"""What cells and the reference are compared by."""
+
+REFERENCE = "llama-bench"
+"""How the reference is called where cells are listed."""
+
+_SAMPLE = ("request_id", "block", "ttft_ns", "facts")
+
+BIN = 32
+"""Tokens of one bin of the rates by position."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """One cell of a throughput run."""
+
+    cell: Cell
+
+    @property
+    def name(self) -> str:
+        """Name the cell."""
+        return self.cell.name
+
+    @cached_property
+    def requests(self) -> pd.DataFrame:
+        """Return a row a request that counts, with ``block`` and a column a metric; NaN where it has none."""
+        import pandas as pd
+
+        times = self.cell.tokens.groupby("request_id")["client_ns"].agg(["min", "max", "size"])
+        rows = []
+        good = self.cell.good
+        for request, block, ttft_ns, facts in zip(*(good[name] for name in _SAMPLE), strict=True):
+            first_ns, last_ns, events = (int(value) for value in times.loc[request])
+            numbers = _metrics(json.loads(str(facts)), events, (last_ns - first_ns) / 1e9)
+            rows.append({"block": block, **numbers, "ttft_ms": None if pd.isna(ttft_ns) else ttft_ns / 1e6})
+        return pd.DataFrame(rows, columns=["block", *METRICS, "tokens", "events", "told"])
+
+    def values(self, metric: str) -> Floats:
+        """Return the values of a metric, one a request that has it."""
+        return self.requests[metric].dropna().to_numpy(dtype="float64")
+
+    def by_block(self, metric: str) -> dict[int, list[float]]:
+        """Return the values of a metric by the block in which they were taken."""
+        there = self.requests[self.requests[metric].notna()]
+        return _by_block(there["block"], there[metric])
+
+    def by_position(self) -> dict[tuple[int, int], Floats]:
+        """Return (first, last token of a bin, from 0) -> decode rates there, one a request that got so far.
+
+        The gap before token i belongs to the bin of i; token 0 has none.
+        """
+        tokens = self.cell.tokens[self.cell.tokens["request_id"].isin(self.cell.good["request_id"])]
+        ordered = tokens.sort_values(["request_id", "index"])
+        gaps = ordered.assign(gap=ordered.groupby("request_id")["client_ns"].diff(), bin=ordered["index"] // BIN)
+        spent = gaps.dropna(subset="gap").groupby(["bin", "request_id"])["gap"].agg(["sum", "size"])
+        spent = spent[spent["sum"] > 0].reset_index()
+        found: dict[tuple[int, int], Floats] = {}
+        for place in sorted({int(place) for place in spent["bin"]}):
+            of_bin = spent[spent["bin"] == place]
+            rates = of_bin["size"].to_numpy(dtype="float64") / of_bin["sum"].to_numpy(dtype="float64") * 1e9
+            found[place * BIN, place * BIN + BIN - 1] = rates
+        return found
+
+    @property
+    def told(self) -> bool:
+        """Tell whether the engine said how long it evaluated; else the paper's rate is the client's."""
+        return bool(self.requests["told"].any())
+
+    @property
+    def joined(self) -> int:
+        """Count tokens that came together with another, as where a server holds back half a character."""
+        return int((self.requests["tokens"] - self.requests["events"]).clip(lower=0).sum())
+
+
+def _metrics(facts: dict[str, float], events: int, span_s: float) -> dict[str, Any]:
+    """Derive one request's numbers; the server's own count of tokens is used where it tells one."""
+    tokens = int(facts.get("predicted_n") or events)
+    found: dict[str, Any] = {"tokens": tokens, "events": events}
+    if tokens > 1 and span_s > 0:
+        found["decode_tokens_per_s"] = (tokens - 1) / span_s
+    found["told"] = bool(facts.get("predicted_ms"))
+    if found["told"]:
+        found["tokens_per_s"] = tokens / facts["predicted_ms"] * 1e3
+    elif "decode_tokens_per_s" in found:
+        found["tokens_per_s"] = found["decode_tokens_per_s"]
+    if "prompt_ms" in facts:
+        found["prompt_ms"] = facts["prompt_ms"]
+        if "prompt_eval_ms" in facts:
+            found |= {
+                "prompt_eval_ms": facts["prompt_eval_ms"],
+                "image_ms": facts["prompt_ms"] - facts["prompt_eval_ms"],
+            }
+        if facts.get("prompt_n") and facts["prompt_ms"] > 0:
+            found["prefill_tokens_per_s"] = facts["prompt_n"] / facts["prompt_ms"] * 1e3
+    if facts.get("prompt_n"):
+        found["prompt_tokens"] = facts["prompt_n"]
+    if facts.get("energy_j"):
+        found["tokens_per_joule"] = tokens / facts["energy_j"]
+    return found
+
+
+def _by_block(blocks: Iterable[Any], values: Iterable[Any]) -> dict[int, list[float]]:
+    """Collect values by their block."""
+    found: dict[int, list[float]] = {}
+    for block, value in zip(blocks, values, strict=True):
+        found.setdefault(int(block), []).append(float(value))
+    return found
+
+
+def speeds_of(run: Run) -> list[Speed]:
+    """Split a run into its cells: in-process first, then HTTP and ROS."""
+    speeds = [Speed(cell) for cell in cells_of(run)]
+    return sorted(speeds, key=lambda speed: speed.cell.pipeline != "loopback")
+
+
+def reference_by_block(run: Run) -> dict[int, list[float]]:
+    """Return llama-bench's tokens/s by block, its warm-ups left out."""
+    rows = run.tables["reference"]
+    counted = rows[~rows["warmup"]]
+    return _by_block(counted["block"], counted["n_gen"] / counted["decode_ns"] * 1e9)
+
+
+def reference_values(run: Run) -> list[float]:
+    """Return llama-bench's tokens/s in the order of the blocks."""
+    return [value for _, values in sorted(reference_by_block(run).items()) for value in values]
+
+
+def reference_depths(run: Run) -> list[int]:
+    """Return how many tokens lay before those that llama-bench timed: one number where all prompts are alike."""
+    rows = run.tables["reference"]
+    return sorted({int(depth) for depth in rows[~rows["warmup"]]["depth"]})
+
+
+def ratios_of(run: Run, speeds: list[Speed]) -> Iterator[tuple[str, str, Ratio]]:
+    """Yield cell, base and ratio: every cell to llama-bench where it ran, and every other cell to in-process."""
+    reference = reference_by_block(run)
+    base = next((speed for speed in speeds if speed.cell.pipeline == "loopback"), None)
+    for speed in speeds:
+        values = speed.by_block(RATIO_METRIC)
+        if ratio := ratio_of_blocks(values, reference, seed_of(run)):
+            yield speed.name, REFERENCE, ratio
+        if base is not None and speed is not base:
+            ratio = ratio_of_blocks(values, base.by_block(RATIO_METRIC), seed_of(run))
+            if ratio:
+                yield speed.name, base.name, ratio

@@ -1,0 +1,197 @@
+"""Really executing: several policies side by side on one stream of tokens, each with its executor, in real time."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.experiments.timeline.rows import Setting, skill_rows, timeline_rows
+from s2a_bench.experiments.timeline.run import finite
+from s2a_bench.harness.progress import Progress
+from s2a_bench.harness.warnings import Doubt
+from s2a_bench.plan import Gap
+from s2a_bench.policy import Plans, PlanShape, Policy, Schedule
+from s2a_bench.policy.evaluate import TOLERANCE_S
+from s2a_bench.runtime import Robot
+from s2a_bench.runtime.events import AbortAsked, Event, LiveInbox
+from s2a_bench.runtime.executor import Executor
+from s2a_bench.runtime.record import Record, SkillRun
+from s2a_bench.stats import summarise
+from s2a_bench.store.run import RunWriter
+from s2a_bench.store.schema import SKILLS, TIMELINES
+
+SWITCH_S: Final = 0.0005
+"""How soon Python's threads give way to one another: at the usual 5 ms a busy thread would make starts that late."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What can be watched while it happens: the records grow."""
+
+    title: str
+    records: Sequence[Record]
+    n_skills: int
+    span_s: float
+    """About how long it takes."""
+
+
+class View(Progress, Protocol):
+    """Progress that can also show executions."""
+
+    def show(self, scene: Scene) -> AbstractContextManager[None]:
+        """Show a scene for as long as the context lasts."""
+        ...
+
+
+class SideBySide:
+    """One executor a policy, all told the same. Use as a context manager; leaving it early aborts them."""
+
+    def __init__(
+        self, policies: Sequence[Policy], shape: PlanShape, gap: Gap, robots: Sequence[Robot], silence_s: float
+    ) -> None:
+        """Prepare; one robot a policy."""
+        self._inboxes = [LiveInbox() for _ in policies]
+        clock = SystemClock()
+        self._executors = [
+            Executor(policy, shape, robot, inbox, clock, gap=gap, silence_s=silence_s)
+            for policy, robot, inbox in zip(policies, robots, self._inboxes, strict=True)
+        ]
+        self._pool = ThreadPoolExecutor(len(policies), "executor")
+        self._futures: list[Future[Record]] = []
+
+    @property
+    def records(self) -> list[Record]:
+        """Return the records, which grow."""
+        return [executor.record for executor in self._executors]
+
+    def tell(self, event: Event) -> None:
+        """Tell all executors."""
+        for inbox in self._inboxes:
+            inbox.put(event)
+
+    def finish(self) -> list[Record]:
+        """Wait until all plans have ended."""
+        return [future.result() for future in self._futures]
+
+    def __enter__(self) -> SideBySide:  # noqa: PYI034 - Self is typing's since 3.11
+        self._futures = [self._pool.submit(executor.run) for executor in self._executors]
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:
+            self.tell(AbortAsked(now_ns(), "the run was ended"))
+        self._pool.shutdown()
+
+
+@contextmanager
+def quick_switching() -> Iterator[None]:
+    """Let threads give way to one another soon."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+def keep(
+    writer: RunWriter,
+    setting: Setting,
+    plan: int,
+    request_id: str,
+    policies: Sequence[Policy],
+    records: Sequence[Record],
+) -> list[Doubt]:
+    """Write what happened as rows, as far as skills ran, and return what there is to doubt.
+
+    A rate of 0 says that too few tokens came to know it; then there are no rows.
+    """
+    for policy, record in zip(policies, records, strict=True):
+        cell = f"{setting.name}/{record.policy}"
+        writer.update(executions={f"{cell}/{plan}": _facts(record)})
+        if record.ran and record.requested_ns is not None and setting.tokens_per_s > 0:
+            plans, schedule, due_s = _arrays(record, record.requested_ns)
+            timeline = timeline_rows(
+                setting,
+                record.policy,
+                plans,
+                schedule,
+                [request_id],
+                first_plan=plan,
+                requested_ns=[record.requested_ns],
+                caution=finite(getattr(policy, "caution", None)),
+                tolerance_s=TOLERANCE_S,
+            )
+            texts = [[str(skill.call) for skill in record.ran]]
+            writer.append(TIMELINES, timeline)
+            writer.append(
+                SKILLS, skill_rows(cell, plans, schedule, [request_id], first_plan=plan, texts=texts, due_s=due_s)
+            )
+    return list(_doubts(setting, plan, records))
+
+
+def jitter_facts(records: Sequence[Record]) -> dict[str, float | int]:
+    """Summarise the start jitter of all skills that were started; empty where none was."""
+    values = [skill.jitter_ns / 1e6 for record in records for skill in record.skills]
+    if not values:
+        return {}
+    found = summarise(values)
+    return {"starts": found.n, "median_ms": found.median, "p99_ms": found.p99}
+
+
+def _arrays(record: Record, requested_ns: int) -> tuple[Plans, Schedule, Any]:
+    """Return what ran as arrays of shape (N, 1), in s from the request, and when each skill was due."""
+
+    def column(value: Callable[[SkillRun], float]) -> Any:
+        return np.array([[value(skill)] for skill in record.ran])
+
+    def since(at_ns: float) -> float:
+        return (at_ns - requested_ns) / 1e9
+
+    plans = Plans(
+        arrival_s=column(lambda skill: since(skill.arrival_ns)),
+        nominal_s=column(lambda skill: skill.call.skill.durations.nominal_s),
+        least_s=column(lambda skill: skill.call.skill.durations.least_s),
+        most_s=column(lambda skill: skill.call.skill.durations.most_s),
+    )
+    start_s = column(lambda skill: since(skill.start_ns))
+    duration_s = column(lambda skill: ((skill.end_ns or 0) - skill.start_ns) / 1e9)
+    return plans, Schedule(start_s, duration_s), column(lambda skill: since(skill.due_ns))
+
+
+def _facts(record: Record) -> dict[str, Any]:
+    """Return what the tables do not hold: how the plan ended, and every order with its time from the request, in ms."""
+    zero_ns = record.requested_ns or 0
+    return {
+        "outcome": record.outcome,
+        **({"why": record.why} if record.why else {}),
+        **({"extra_skills": record.extra} if record.extra else {}),
+        "arrived": len(record.arrivals),
+        "started": len(record.skills),
+        "start_jitter": jitter_facts([record]),
+        "orders": [[round((order.at_ns - zero_ns) / 1e6, 3), order.what, order.index + 1] for order in record.commands]
+        if record.requested_ns is not None
+        else [],
+    }
+
+
+def _doubts(setting: Setting, plan: int, records: Sequence[Record]) -> Iterator[Doubt]:
+    """Tell of a plan that was not completed; once where all policies met the same."""
+    ends: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        if record.outcome != "completed":
+            ends.setdefault((record.outcome or "unfinished", record.why), []).append(record)
+    for (outcome, why), same in ends.items():
+        ran = ", ".join(f"{record.policy} {len(record.ran)}" for record in same)
+        yield Doubt(
+            f"plan-{outcome}",
+            f"{setting.name}, plan {plan + 1}: {why}; the robots held after {ran} of {setting.n_skills} skills",
+            "their numbers are about the skills that ran; see 'executions' in manifest.json",
+        )

@@ -1,0 +1,1 @@
+"""Timelines on the stream of a model that answers."""

@@ -1,0 +1,193 @@
+"""A model to ask for plans: its server, a client, warm-ups, and requests whose tokens are told as they come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field, replace
+from itertools import count
+from typing import Any
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import S2AError, TransportError, UsageError
+from s2a_bench.experiments.timeline.live.asks import Ask, asks_of, prior_of
+from s2a_bench.experiments.timeline.live.config import LiveConfig
+from s2a_bench.frames import FrameSource
+from s2a_bench.harness.feed import RequestFeed
+from s2a_bench.harness.plan import plan_cells
+from s2a_bench.harness.progress import Progress
+from s2a_bench.harness.servers import ServerSet
+from s2a_bench.harness.session import Measured, Place, Session
+from s2a_bench.harness.warnings import Doubt, before_run
+from s2a_bench.inference.models import resolve
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.runtime.feed import PlanFeed
+from s2a_bench.store.run import RunWriter
+from s2a_bench.trace import Trace
+from s2a_bench.transport import Client, open_client
+from s2a_bench.types import Request, Token
+
+LATE = 1.05
+"""An answer that takes so many times what the pace allows was not paced, but slow."""
+
+
+class Tap:
+    """A client whose tokens are also told to whoever executes the plan."""
+
+    def __init__(self, client: Client) -> None:
+        """Stand before ``client``."""
+        self._client = client
+        self.camera = client.camera
+        self.plan: PlanFeed | None = None
+        """Who is told; nobody during warm-up."""
+
+    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
+        """Pass tokens on, and tell of each before that; time counts from the start of the capture."""
+        plan = self.plan
+        if plan is None:
+            yield from self._client.request(request, trace)
+            return
+        plan.requested(trace.marks[0][1])
+        try:
+            for token in self._client.request(request, trace):
+                plan.token(token.text, now_ns())
+                yield token
+        except S2AError as error:
+            plan.broke(f"{type(error).__name__}: {error}", now_ns())
+            raise
+        plan.ended(now_ns())
+
+    def describe(self) -> dict[str, str]:
+        """Say what the client says."""
+        return self._client.describe()
+
+    def close(self) -> None:
+        """Close the client."""
+        self._client.close()
+
+
+def word(config: LiveConfig, progress: Progress) -> tuple[LiveConfig, list[Ask]]:
+    """Find the model's files and word what it is asked, with the room that it needs; raises S2AError."""
+    requests = config.requests
+    if not config.paper_format:
+        progress.stage("reading the model's headers" if requests.engine.model else "the tiny dummy model")
+        model, mmproj = resolve(requests.engine)
+        requests = replace(requests, engine=replace(requests.engine, model=model, mmproj=mmproj))
+    asks = asks_of(config, requests.engine.model)
+    requests = replace(requests, max_tokens=max(ask.max_tokens for ask in asks))
+    return replace(config, requests=requests), asks
+
+
+@dataclass
+class Link:
+    """The way to one model, for one run."""
+
+    config: LiveConfig
+    """As `word` returned it."""
+    writer: RunWriter
+    progress: Progress
+    doubts: list[Doubt] = field(default_factory=list)
+    blocks: Iterator[int] = field(default_factory=count)
+    facts: dict[str, Any] = field(default_factory=dict)
+    """What the engine says about itself."""
+    rate: float | None = None
+    """Tokens/s: set, or as first seen."""
+    answers: int = 0
+    """Plans that came as they should."""
+
+    def connect(self, stack: ExitStack, source: FrameSource, robot: str) -> None:
+        """Start the server or find the one that runs, and open a client; ``robot`` is who will act, for the record."""
+        requests = self.config.requests
+        (transport,) = requests.transports
+        uses_dds = transport == "ros"
+        self.doubts += before_run(requests.width, requests.height, uses_dds=uses_dds)
+        self.progress.stage(f"starting the {transport} server")
+        self.servers = ServerSet(requests, stack, self.writer.path)
+        facts = self.servers.start()
+        self.facts = self.servers.model(facts)
+        (self.cell,) = plan_cells(requests, self.servers.addresses)
+        with self.servers.death_explained(transport):
+            client = open_client(self.cell.route, self.servers.alive(transport))
+        self.tap = stack.enter_context(closing(Tap(client)))
+        self.feed = RequestFeed(source, preencoded=requests.payload == "jpeg-preencoded")
+        self.rate = requests.engine.pace or None
+        self.writer.update(
+            servers=facts,
+            model=self.facts,
+            live={
+                "transport": self.cell.name,
+                "engine": self.facts.get("engine", "unknown"),
+                "emulated": self.emulated,
+                **({"dummy": self.facts["dummy"]} if "dummy" in self.facts else {}),
+                **({"paced_tokens_per_s": self.rate} if self.rate else {}),
+                "grammar": self.config.constrained,
+                "skills": self.config.skill_set.name,
+                "robot": robot,
+            },
+        )
+
+    @property
+    def emulated(self) -> bool:
+        """Tell whether the engine is the replay of a profile."""
+        return bool(self.facts.get("emulated", False))
+
+    def warm_up(self, ask: Ask) -> GapPrior | None:
+        """Ask as often as the configuration wants, and return what policies learn from that."""
+        warmups = self.config.requests.warmup
+        arrivals_ns = []
+        for _ in range(warmups):
+            self.progress.stage("warming up")
+            measured = self.ask(ask, 0, None)
+            arrivals_ns.append([token.client_ns for token in measured.tokens])
+            self.progress.advance()
+        prior = prior_of(arrivals_ns, self.rate)
+        if prior is not None:
+            self.rate = self.rate or 1 / prior.mean_s
+            about = {"mean_s": prior.mean_s, "plan_cv": prior.plan_cv, "token_cv": prior.token_cv}
+            self.writer.update(prior={**about, "warmups": warmups})
+        return prior
+
+    def ask(self, ask: Ask, plan: int, feed: PlanFeed | None) -> Measured:
+        """Make one request and keep its rows; raises what ends the run."""
+        requests = self.config.requests
+        asked = replace(
+            requests,
+            prompt=ask.prompt,
+            grammar=ask.grammar,
+            max_tokens=ask.max_tokens,
+            seed=requests.seed + plan,
+        )
+        self.tap.plan = feed
+        session = Session(self.cell, self.tap, self.feed, asked)
+        measured = session.measure(Place(next(self.blocks), 0, warmup=feed is None))
+        if feed is not None:  # the executors' times: the harness sees a token some microseconds later
+            tokens = [replace(row, client_ns=at_ns) for row, at_ns in zip(measured.tokens, feed.token_ns, strict=False)]
+            measured = replace(measured, tokens=tokens)
+            self.answers += not measured.sample.error
+        self.writer.sample(measured.sample)
+        self.writer.tokens(measured.tokens)
+        transport = self.cell.route.transport
+        self.servers.raise_if_dead(transport, suspect=measured.fatal is not None)
+        if isinstance(measured.fatal, UsageError) and "grammar" in str(measured.fatal):
+            raise UsageError(f"{measured.fatal} (here: --no-grammar)") from measured.fatal
+        if measured.fatal is not None:
+            raise measured.fatal
+        return measured
+
+    def saw(self, token_ns: Sequence[int]) -> None:
+        """Learn the rate from an answer if nobody set it, and doubt the pace where the model was slower."""
+        if len(token_ns) < 2:  # noqa: PLR2004 - no gap
+            return
+        came = (len(token_ns) - 1) / (token_ns[-1] - token_ns[0]) * 1e9
+        self.rate = self.rate or came
+        pace = self.config.requests.engine.pace
+        if pace and came * LATE < pace:
+            what = f"{came:.3g} tokens/s came, not the {pace:g} of --pace: the model is slower"
+            self.doubts.append(Doubt("pace-missed", what, "stop what else runs, try --threads 1, or a lower --pace"))
+
+    def require_answers(self) -> None:
+        """Raise TransportError where no plan came as it should."""
+        if not self.answers:
+            raise TransportError(
+                f"no request of {self.cell.name} succeeded; {self.writer.path / 'samples.csv'} says why"
+            )

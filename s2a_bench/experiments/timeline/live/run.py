@@ -1,0 +1,154 @@
+"""Live timelines: a model writes plans, over a real transport, and every policy executes them as they arrive.
+
+Tokens, parsing and execution are real. With ``--pace`` the server holds the tokens back to a rate: then the rate is
+set, and said to be; nothing is emulated unless the engine is the replay of a profile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import S2AError
+from s2a_bench.experiments.timeline.execution import Scene, SideBySide, View, jitter_facts, keep, quick_switching
+from s2a_bench.experiments.timeline.live.asks import Ask, prepare
+from s2a_bench.experiments.timeline.live.config import LiveConfig
+from s2a_bench.experiments.timeline.live.link import Link, word
+from s2a_bench.experiments.timeline.rows import Setting
+from s2a_bench.frames import FrameSource, open_source
+from s2a_bench.machine import environment
+from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
+from s2a_bench.plan import Parser
+from s2a_bench.policy import Policy
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.runtime import Robot, find_robot
+from s2a_bench.runtime.events import StreamBroke
+from s2a_bench.runtime.feed import PlanFeed
+from s2a_bench.runtime.record import Record
+from s2a_bench.store.run import RunWriter
+from s2a_bench.store.schema import SAMPLES, SKILLS, TIMELINES, TOKENS
+
+MODE = "live"
+
+
+def run_live(config: LiveConfig, output: Path, view: View) -> Path:
+    """Ask for plans, execute them, and return the run folder; raises S2AError for what a user can mend.
+
+    Whatever happens, the timelines so far are in the folder. KeyboardInterrupt passes through, after the robots hold.
+    """
+    config.check()
+    limit_threads()
+    if config.requests.dds_tuning == "tuned":
+        keep_large_blocks()
+    with ExitStack() as stack:
+        config, asks = word(config, view)
+        requests = config.requests
+        source = open_source(requests.source, requests.width, requests.height, fps=requests.fps, seed=requests.seed)
+        stack.callback(source.close)
+        manifest = {
+            "configuration": {**config.to_manifest(), "engine": requests.to_manifest()["engine"]},
+            "environment": environment.collect(),
+            "seeds": {"sampling": requests.seed, "source": requests.seed},
+        }
+        tables = (TIMELINES, SKILLS, SAMPLES, TOKENS)
+        writer = stack.enter_context(RunWriter.create(output, "timeline", manifest, tables))
+        view.opened(writer.path)
+        stack.enter_context(quick_switching())
+        run = _Live(Link(config, writer, view), view)
+        try:
+            run.connect(stack, source)
+            run.everything(asks)
+        finally:
+            run.conclude()
+        return writer.path
+
+
+@dataclass
+class _Live:
+    """One run under way."""
+
+    link: Link
+    view: View
+    records: list[Record] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Have at hand what is asked for."""
+        self.config = self.link.config
+
+    def connect(self, stack: ExitStack, source: FrameSource) -> None:
+        """Open the robots, then the way to the model."""
+        build = find_robot(self.config.robot)  # first, as a model may take long to load
+        self.robots: list[Robot] = [
+            stack.enter_context(closing(build(self.config.skill_set))) for _ in self.config.policies
+        ]
+        self.link.connect(stack, source, self.config.robot)
+
+    def everything(self, asks: Sequence[Ask]) -> None:
+        """Warm up, then ask for all plans."""
+        self.view.expect(self.config.requests.warmup + len(asks) * self.config.plans)
+        prior = self.link.warm_up(asks[0])
+        for ask in asks:
+            for plan in range(self.config.plans):
+                self._execute(ask, plan, prior)
+                self.view.advance()
+        self.link.require_answers()
+
+    def _execute(self, ask: Ask, plan: int, prior: GapPrior | None) -> None:
+        """Ask for one plan and let every policy execute it as it arrives."""
+        policies = [prepare(name, prior) for name in self.config.policies]
+        rate = self.link.rate
+        span_s = ask.n_skills * (ask.tokens_per_skill / rate if rate else 0.0) + ask.n_skills * ask.t_nom_s
+        self.view.stage(f"{self.link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
+        timeout_s = self.config.requests.timeout_s
+        side_by_side = SideBySide(policies, ask.shape, ask.skills.gap, self.robots, timeout_s)
+        feed = PlanFeed(Parser(ask.format), side_by_side.tell)
+        title = f"live {self.link.cell.name}, L = {ask.tokens_per_skill}{self._remarks()}"
+        request_id = ""
+        try:
+            with side_by_side, self.view.show(Scene(title, side_by_side.records, ask.n_skills, span_s)):
+                try:
+                    request_id = self.link.ask(ask, plan, feed).sample.request_id
+                except S2AError as error:  # the run ends, but not in the middle of a skill
+                    side_by_side.tell(StreamBroke(now_ns(), "stream-error", f"{type(error).__name__}: {error}"))
+                    side_by_side.finish()
+                    raise
+                side_by_side.finish()
+        finally:  # what an interruption leaves is kept too
+            self.records += side_by_side.records
+            self._keep(ask, plan, request_id, policies, side_by_side.records)
+
+    def _keep(self, ask: Ask, plan: int, request_id: str, policies: Sequence[Policy], records: list[Record]) -> None:
+        """Keep what the policies made of one plan."""
+        token_ns = max((record.token_ns for record in records), key=len)
+        self.link.saw(token_ns)
+        setting = self._setting(ask, self.link.rate or 0.0)
+        self.link.doubts += keep(self.link.writer, setting, plan, request_id, policies, records)
+
+    def _setting(self, ask: Ask, rate: float) -> Setting:
+        return Setting(
+            board="",
+            title=f"live {self.link.cell.name}",
+            tokens_per_s=float(f"{rate:.4g}"),
+            prompt_s=None,
+            tokens_per_skill=ask.tokens_per_skill,
+            n_skills=ask.n_skills,
+            t_nom_s=ask.t_nom_s,
+            mode=MODE,
+            emulated=self.link.emulated,
+        )
+
+    def _remarks(self) -> str:
+        """Say what is not as it seems."""
+        pace = self.config.requests.engine.pace
+        paced = f", paced to {pace:g} tokens/s" if pace else ""
+        dummy = ", dummy weights" if self.link.facts.get("dummy") else ""
+        return f"{paced}{dummy}{' (EMULATED)' if self.link.emulated else ''}"
+
+    def conclude(self) -> None:
+        """Write what is said of the whole run."""
+        self.link.writer.update(
+            start_jitter=jitter_facts(self.records), warnings=[doubt.to_manifest() for doubt in self.link.doubts]
+        )

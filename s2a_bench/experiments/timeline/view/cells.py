@@ -1,0 +1,187 @@
+"""What a timeline run says about each of its cells, however its plans were run: computed, emulated or live."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from s2a_bench.stats import summary_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from s2a_bench.experiments.latency.view.cells import Floats
+    from s2a_bench.stats import Summary
+    from s2a_bench.store.run import Run
+
+TIMES = (
+    "start",
+    "end",
+    "stall",
+    "longest_stall",
+    "mean_queue_wait",
+    "longest_queue_wait",
+    "mean_action_age",
+    "oldest_action",
+    "safe_start",
+    "last_arrival",
+    "safe_end",
+    "least_end",
+)
+"""Metrics in time, by their columns less ``_ns``."""
+
+NUMBERS = (
+    "stalls",
+    "stall_ratio",
+    "start_regret",
+    "signed_start_regret",
+    "start_regret_of_wait",
+    "end_regret",
+    "end_regret_of_wait",
+    "end_regret_elastic",
+    "speed_distortion",
+    "fluidity",
+    "rms_jerk",
+    "peak_jerk",
+    "sparc",
+)
+"""The other metrics, by their columns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Timelines:
+    """One cell: all plans of one policy in one setting. ``skills`` and ``tokens`` are those of its shown plan."""
+
+    rows: pd.DataFrame
+    skills: pd.DataFrame
+    tokens: pd.DataFrame
+
+    def about(self, column: str) -> Any:
+        """Return what all rows of the cell have in common; None where it is missing."""
+        import pandas as pd
+
+        value = self.rows[column].iloc[0]
+        return None if pd.isna(value) else value.item() if hasattr(value, "item") else value
+
+    @property
+    def policy(self) -> str:
+        """Name the policy."""
+        return str(self.about("policy"))
+
+    @property
+    def setting(self) -> tuple[str, int, int, float]:
+        """Return the title, L, N and T_nom in s."""
+        names = ("title", "tokens_per_skill", "n_skills", "t_nom_s")
+        return tuple(self.about(name) for name in names)
+
+    @property
+    def n(self) -> int:
+        """Count the plans."""
+        return len(self.rows)
+
+    def values(self, metric: str) -> Floats:
+        """Return a metric's values, times in s, one a plan that has it."""
+        if metric in TIMES:
+            return self.rows[f"{metric}_ns"].dropna().to_numpy(dtype="float64") / 1e9
+        return self.rows[metric].dropna().to_numpy(dtype="float64")
+
+    def summary(self, metric: str) -> Summary | None:
+        """Summarise a metric; None where no plan has it."""
+        return summary_of(self.values(metric))
+
+    def mean(self, metric: str) -> float | None:
+        """Return a metric's mean over the plans; None where no plan has it."""
+        values = self.values(metric)
+        return float(values.mean()) if values.size else None
+
+    @property
+    def p_any_stall(self) -> float:
+        """Return the share of plans that stall at all."""
+        return float(self.rows["any_stall"].astype("float64").mean())
+
+    @property
+    def token_s(self) -> Floats:
+        """Return when the tokens of the shown plan arrived, in s from the request."""
+        return (self.tokens["client_ns"].to_numpy(dtype="float64") - float(self.about("requested_ns"))) / 1e9
+
+    def moment_s(self, metric: str) -> float:
+        """Return a time of the shown plan in s."""
+        return float(self.rows[f"{metric}_ns"].iloc[0]) / 1e9
+
+
+def timelines_of(run: Run) -> list[Timelines]:
+    """Split a run into its cells, in the order in which they were run; the shown plan is the first."""
+    rows, skills, tokens = run.tables["timelines"], run.tables["skills"], run.tables["tokens"]
+    skills_of = dict(list(skills.groupby(["cell", "request_id"], sort=False)))
+    tokens_of = dict(list(tokens.groupby("request_id", sort=False)))
+    found = []
+    for name, mine in rows.groupby("cell", sort=False):
+        shown = mine["request_id"].iloc[0]
+        found.append(Timelines(mine, skills_of.get((name, shown), skills[:0]), tokens_of.get(shown, tokens[:0])))
+    return found
+
+
+def panels(cells: Sequence[Timelines]) -> Iterator[tuple[tuple[str, int, int, float], list[Timelines]]]:
+    """Yield each setting with its cells, a cell a policy."""
+    groups: dict[tuple[str, int, int, float], list[Timelines]] = {}
+    for cell in cells:
+        groups.setdefault(cell.setting, []).append(cell)
+    yield from groups.items()
+
+
+def origin_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
+    """Say what the timelines are made of: emulated or not, whose rates, what is assumed."""
+    boards = run.manifest.get("boards", [])
+    notes = []
+    if any(cell.about("emulated") and cell.about("mode") != "live" for cell in cells):
+        rates = {
+            "paper": "the paper's rates (table II)",
+            "measured": "measured rates",
+            "given": "rates as given",
+        }
+        whose = [rates[origin] for origin in dict.fromkeys(board["origin"] for board in boards)]
+        virtual = all(cell.about("mode") == "virtual" for cell in cells)
+        notes.append(
+            f"EMULATED{' in virtual time' if virtual else ', executed in real time'}: no model answered; tokens come "
+            f"at {' and '.join(whose) or 'given rates'}, {_jitter(run)}."
+        )
+    notes += _live_notes(run)
+    if assumed := [board for board in boards if board["prompt_origin"] == "assumed"]:
+        listed = ", ".join(f"{board['prompt_s']:g}" for board in assumed)
+        notes.append(
+            f"c = {listed} s before decoding is an assumption of ours: it shifts all policies of a board by as much."
+        )
+    return tuple(notes)
+
+
+def _jitter(run: Run) -> str:
+    """Say how evenly tokens come."""
+    jitter = run.manifest.get("configuration", {}).get("jitter", "none")
+    return {"none": "evenly", "profile": "with the profiles' jitter"}.get(jitter, f"with jitter {jitter}")
+
+
+def _live_notes(run: Run) -> list[str]:
+    """Say what is real in a live run, and what is not."""
+    live = run.manifest.get("live")
+    if not live:
+        return []
+    paced = (
+        f", paced to {live['paced_tokens_per_s']:g} tokens/s (the rate is set)" if "paced_tokens_per_s" in live else ""
+    )
+    dummy = " Dummy weights: what the plan says means nothing." if live.get("dummy") else ""
+    grammar = "held to its form by a grammar" if live["grammar"] else "without a grammar"
+    robot = "skills only take their time" if live["robot"] == "timed" else f"skills are carried out by {live['robot']}"
+    whose = "tokens of a server that runs already" if live["engine"] == "unknown" else "real tokens"
+    tokens = "EMULATED tokens" if live["emulated"] else f"LIVE: {whose}"
+    how = f"parsed and executed as they arrive, {grammar}; {robot}"
+    return [f"{tokens} over {live['transport']}{paced}, {how}.{dummy}"]
+
+
+def jitter_notes(run: Run) -> tuple[str, ...]:
+    """Say how late the executors' robots had their orders."""
+    found = run.manifest.get("start_jitter")
+    if not found:
+        return ()
+    median, p99 = (f"{found[name]:.2f} ms" for name in ("median_ms", "p99_ms"))
+    return (f"Start jitter on the system clock: median {median}, p99 {p99} over {found['starts']} starts.",)

@@ -1,0 +1,189 @@
+"""Figure 5 of the paper: what each policy does while tokens arrive, a panel a board and granularity; PNG and PDF."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from s2a_bench.experiments.paper import paper_colours
+from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, panels, timelines_of
+from s2a_bench.writers.figures import LINE_CHARS, new_figure, save
+from s2a_bench.writers.style import WIDTH_IN
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from s2a_bench.store.run import Run
+
+WIDE_IN: Final = 7.16
+"""Both columns of a two-column paper."""
+_LEGEND_COLUMNS: Final = {WIDTH_IN: 3, WIDE_IN: 6}
+
+_SHADES: Final = {"blue": "#0072B2", "orange": "#E69F00", "green": "#009E73"}
+"""The paper's colours as Okabe and Ito have them: the eye tells them apart, and so does a grey copy."""
+_OTHERS: Final = ("#56B4E9", "#CC79A7", "#D55E00", "#999999")
+_STALL_LOOK: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
+_VISIBLE_NS: Final = 20_000_000
+"""A stall or stretch below is rounding, or a real executor's jitter, and too narrow to be seen."""
+_LANE: Final = 0.7
+"""Height of a lane's bars."""
+
+
+def policy_colours(policies: Sequence[str]) -> dict[str, str]:
+    """Return a colour for every policy: the paper's where it has one."""
+    known = {name: _SHADES[colour] for name, colour in paper_colours().items()}
+    others = [name for name in policies if name not in known]
+    return known | {name: _OTHERS[place % len(_OTHERS)] for place, name in enumerate(others)}
+
+
+def build_timelines(run: Run, cells: Sequence[Timelines]) -> Figure:
+    """Draw the shown plan of every cell: boards side by side, granularities below one another, policies as lanes.
+
+    ``cells`` share plan length and T_nom. Every panel has its own time axis: boards differ by orders of magnitude.
+    """
+    groups = dict(panels(cells))
+    titles = list(dict.fromkeys(setting[0] for setting in groups))
+    lengths = list(dict.fromkeys(setting[1] for setting in groups))
+    policies = list(dict.fromkeys(cell.policy for cell in cells))
+    colours = policy_colours(policies)
+    width_in = WIDTH_IN if len(titles) == 1 else WIDE_IN
+    title = _title(run, cells, width_in)
+    lanes = len(policies) + 1
+    columns = _LEGEND_COLUMNS[width_in]
+    handles = _legend(cells)
+    foot_in = 0.55 + 0.17 * -(-len(handles) // columns)
+    figure = new_figure(foot_in + len(lengths) * (0.42 + 0.15 * lanes), title, width_in)
+    grid = figure.subplots(len(lengths), len(titles), squeeze=False)
+    for row, tokens in enumerate(lengths):
+        for column, board in enumerate(titles):
+            axes = grid[row, column]
+            group = next((group for setting, group in groups.items() if setting[:2] == (board, tokens)), None)
+            if group is None:
+                axes.set_axis_off()
+                continue
+            draw_panel(axes, group, colours, names=column == 0)
+            rate = f"{group[0].about('tokens_per_s'):g} tokens/s"
+            head = "" if row else f"{board if rate in board else f'{board}, {rate}'}\n"
+            axes.set_title(f"{head}L = {tokens} tokens/skill", loc="left", pad=2)
+            if row == len(lengths) - 1:
+                axes.set_xlabel("time from the request (s)")
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+    return figure
+
+
+def draw_panel(axes: Axes, cells: Sequence[Timelines], colours: dict[str, str], *, names: bool) -> None:
+    """Draw one setting: tokens on top where all policies share them, else above each policy's own skills."""
+    shared = len({cell.about("request_id") for cell in cells}) == 1
+    end_s = max(cell.moment_s("end") for cell in cells)
+    if shared:
+        _draw_tokens(axes, cells[0], 0.35, -0.35)
+    for lane, cell in enumerate(cells, start=1):
+        _draw_skills(axes, cell, lane, colours[cell.policy], end_s)
+        if not shared:
+            _draw_tokens(axes, cell, lane - _LANE / 2, lane - 0.5)
+        safe_s = cell.moment_s("safe_start")
+        axes.vlines(
+            safe_s, 0.5 if shared and lane == 1 else lane - 0.5, lane + 0.5, "black", (0, (2, 1.5)), linewidth=0.9
+        )
+    labels = (["tokens"] if shared else []) + [cell.policy for cell in cells]
+    first = 0 if shared else 1
+    axes.set_yticks(range(first, first + len(labels)), labels if names else [""] * len(labels))
+    axes.set_ylim(len(cells) + 0.55, first - 0.55)
+    axes.tick_params(axis="y", length=0)
+    axes.set_xlim(0, end_s * 1.02)
+
+
+def timeline_figures(run: Run) -> dict[str, Callable[[], Figure]]:
+    """Return every figure by its file's name: one for every plan length and T_nom."""
+    cells = [cell for cell in timelines_of(run) if len(cell.skills)]
+    shapes = list(dict.fromkeys(cell.setting[2:] for cell in cells))
+    builders: dict[str, Callable[[], Figure]] = {}
+    for n_skills, t_nom_s in shapes:
+        name = "timeline" if len(shapes) == 1 else f"timeline_N{n_skills}_T{t_nom_s:g}"
+        same = [cell for cell in cells if cell.setting[2:] == (n_skills, t_nom_s)]
+        builders[name] = partial(build_timelines, run, same)
+    return builders
+
+
+def write_timeline_figures(run: Run) -> list[Path]:
+    """Write ``figures/timeline*.png`` and ``.pdf``."""
+    return save(run.path / "figures", timeline_figures(run))
+
+
+def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: float) -> None:
+    """Draw one lane: a line while the robot waits, then skills (what is longer than planned is paler) and stalls."""
+    skills = cell.skills.to_dict("records")
+    axes.hlines(lane, 0, cell.moment_s("start"), "#BBBBBB", linewidth=0.8)
+    ink = "white" if _dark(colour) else "black"
+    for skill in skills:
+        start, end, stall, nominal = (skill[f"{name}_ns"] / 1e9 for name in ("start", "end", "stall", "nominal"))
+        if skill["stall_ns"] > _VISIBLE_NS:
+            axes.barh(lane, stall, _LANE, start - stall, zorder=3, **_STALL_LOOK)
+        axes.barh(lane, end - start, _LANE, start, color=colour, edgecolor="white", linewidth=0.4, label="skill")
+        if (end - start - nominal) * 1e9 > _VISIBLE_NS:
+            axes.barh(lane, end - start - nominal, _LANE, start + nominal, color="white", alpha=0.5, linewidth=0)
+        if end - start > 0.03 * end_s:  # else its number does not fit
+            axes.text(
+                start + min(end - start, nominal) / 2,
+                lane,
+                str(skill["index"] + 1),
+                color=ink,
+                fontsize=5,
+                ha="center",
+                va="center",
+            )
+
+
+def _draw_tokens(axes: Axes, cell: Timelines, low: float, high: float) -> None:
+    """Draw a tick a token, and a longer one where a skill is complete."""
+    middle = (low + high) / 2
+    axes.vlines(cell.token_s, low, middle, "#888888", linewidth=0.4)
+    arrivals_s = cell.skills["arrival_ns"].to_numpy(dtype="float64") / 1e9
+    axes.vlines(arrivals_s, low, high, "black", linewidth=0.8)
+
+
+def _legend(cells: Sequence[Timelines]) -> list[object]:
+    """Explain everything but the policies, which are named at their lanes."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    tick: dict[str, Any] = {"linestyle": "none", "marker": "|"}
+    handles: list[object] = [
+        Line2D([], [], color="#888888", markersize=4, label="token", **tick),
+        Line2D([], [], color="black", markersize=7, label="skill complete", **tick),
+        Line2D([], [], color="#BBBBBB", linewidth=0.8, label="not started"),
+        Line2D([], [], color="black", linewidth=0.9, linestyle=(0, (2, 1.5)), label="$S_0$"),
+    ]
+    if any((cell.skills["stall_ns"] > _VISIBLE_NS).any() for cell in cells):
+        handles.append(Patch(label="stall", **_STALL_LOOK))
+    if any(_stretched(cell) for cell in cells):
+        handles.append(Patch(facecolor="#B5B5B5", linewidth=0, label="stretched (paler)"))
+    return handles
+
+
+def _stretched(cell: Timelines) -> bool:
+    """Tell whether some skill is visibly longer than planned."""
+    longer_ns = cell.skills["end_ns"] - cell.skills["start_ns"] - cell.skills["nominal_ns"]
+    return bool((longer_ns > _VISIBLE_NS).any())
+
+
+def _title(run: Run, cells: Sequence[Timelines], width_in: float) -> str:
+    """Say what is drawn, and what it is made of."""
+    n_skills, t_nom_s = cells[0].setting[2:]
+    what = f"Execution timelines: N = {n_skills} skills, $T_\\mathrm{{nom}}$ = {t_nom_s:g} s"
+    if (plans := max(cell.n for cell in cells)) > 1:
+        what += f"; plan 1 of {plans}"
+    chars = round(LINE_CHARS * width_in / WIDTH_IN)
+    lines = [what, *origin_notes(run, cells)]
+    # Of mathematics less is drawn than written.
+    return "\n".join(textwrap.fill(line, chars + 14 * ("$" in line), break_on_hyphens=False) for line in lines)
+
+
+def _dark(colour: str) -> bool:
+    """Tell whether white is read better on it than black."""
+    red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
+    return 0.299 * red + 0.587 * green + 0.114 * blue < 128  # noqa: PLR2004 - half way

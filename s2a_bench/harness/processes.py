@@ -1,0 +1,218 @@
+"""Server processes seen from the harness: start, wait until ready, notice death, stop."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from pathlib import Path
+from selectors import EVENT_READ, DefaultSelector
+from typing import IO, Any
+
+import httpx
+
+from s2a_bench import errors
+from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.errors import EngineError, PortInUse, ServerDied, UsageError
+from s2a_bench.harness.llama_flags import llama_flags
+from s2a_bench.harness.serving import ServerJob
+from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.models import ModelFiles, load_headers, sha256
+
+READY_TIMEOUT_S = 600.0
+"""A model of several GB may have to come from a slow disk."""
+STOP_TIMEOUT_S = 3.0
+
+
+class ServerProcess(ABC):
+    """A child process that serves; use as a context manager."""
+
+    def __init__(self, name: str, command: list[str], log: Path) -> None:
+        """Start ``command``; whatever it prints goes to ``log``."""
+        self.name = name
+        self.log = log
+        self.address = ""
+        self.facts: dict[str, Any] = {}
+        self._log: IO[bytes] = log.open("wb")
+        self._process = subprocess.Popen(  # noqa: S603 - the command is ours or the user's own llama-server
+            command,
+            preexec_fn=_die_with_parent,  # noqa: PLW1509 - calls one C function, resolved before the fork
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE if self._speaks_json else self._log,
+            stderr=self._log,
+            start_new_session=True,  # Ctrl-C is the harness's to handle
+        )
+
+    _speaks_json = True
+
+    @abstractmethod
+    def wait_ready(self) -> None:
+        """Return when requests can be sent; raises ServerDied, or what the server says is wrong."""
+
+    @property
+    def pid(self) -> int:
+        """Return the process id."""
+        return self._process.pid
+
+    def alive(self) -> bool:
+        """Tell whether the process still runs."""
+        return self._process.poll() is None
+
+    def ends_within(self, timeout_s: float) -> bool:
+        """Give a process whose connections broke a moment to be seen as ended."""
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def death(self) -> ServerDied:
+        """Describe how the process ended, with the last line it wrote."""
+        code = self._process.poll()
+        how = f"killed by signal {-code}" if code is not None and code < 0 else f"exit code {code}"
+        lines = self.log.read_text(errors="replace").strip().splitlines()
+        last = f": {lines[-1][:200]}" if lines else ""
+        return ServerDied(f"the {self.name} server (pid {self.pid}) died, {how}{last}; its log is {self.log}")
+
+    def stop(self) -> None:
+        """Ask the process to stop, then make it; an impatient second Ctrl-C makes it at once."""
+        try:
+            self._ask_to_stop()
+            self._process.wait(STOP_TIMEOUT_S)
+        except (subprocess.TimeoutExpired, KeyboardInterrupt):
+            self._process.kill()
+            self._process.wait()
+        finally:
+            for pipe in (self._process.stdin, self._process.stdout):
+                if pipe is not None:
+                    pipe.close()
+            self._log.close()
+
+    def _ask_to_stop(self) -> None:
+        """Ask in the way that this server understands."""
+        self._process.terminate()
+
+    def __enter__(self) -> ServerProcess:  # noqa: PYI034 - Self is typing's since 3.11
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+class OwnServer(ServerProcess):
+    """Our instrumented server."""
+
+    def __init__(self, job: ServerJob, log: Path) -> None:
+        """Start it and tell it its job."""
+        super().__init__(job.route.transport, [sys.executable, "-m", "s2a_bench.harness.serving"], log)
+        assert self._process.stdin is not None  # noqa: S101 - opened as a pipe above
+        self._process.stdin.write(job.to_json().encode() + b"\n")
+        self._process.stdin.flush()
+
+    def _ask_to_stop(self) -> None:
+        """End its standard input."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+
+    def wait_ready(self) -> None:
+        """Read the one line it answers."""
+        stdout = self._process.stdout
+        assert stdout is not None  # noqa: S101 - opened as a pipe above
+        with DefaultSelector() as selector:
+            selector.register(stdout, EVENT_READ)
+            if not selector.select(READY_TIMEOUT_S):
+                raise ServerDied(f"the {self.name} server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
+        line = stdout.readline()
+        if not line:
+            with suppress(subprocess.TimeoutExpired):  # dumping core, perhaps
+                self._process.wait(STOP_TIMEOUT_S)
+            self._process.kill()
+            self._process.wait()
+            raise self.death()
+        answer = json.loads(line)
+        if "error" in answer:
+            kind = getattr(errors, answer["kind"], EngineError)
+            raise kind(answer["error"])
+        self.address = answer.pop("address")
+        self.facts = answer
+
+
+class LlamaServer(ServerProcess):
+    """llama.cpp's own server on the same model files: a black box."""
+
+    _speaks_json = False
+
+    def __init__(self, binary: Path, engine: EngineConfig, port: int, log: Path, *, has_grammar: bool) -> None:
+        """Start the binary on ``port``, or any free one for 0; raises UsageError when it cannot be run.
+
+        Without a grammar dummy weights, which end at random, are kept going to the token limit, as by our own engine.
+        """
+        if not (binary.is_file() and os.access(binary, os.X_OK)):
+            raise UsageError(f"--llama-server: {binary} is no program that can be run")
+        port = _free_port(port)
+        command = [str(binary), *llama_flags(engine), "--mmproj", str(engine.mmproj)]
+        command += ["--host", "127.0.0.1", "--port", str(port), "--ctx-size", str(engine.context), "--parallel", "1"]
+        if engine.gpu_layers == 0:
+            command.append("--no-mmproj-offload")
+        files = load_headers(engine)
+        if files.dummy and not has_grammar:
+            command.append("--ignore-eos")
+        super().__init__("llama-server", command, log)
+        self.address = f"http://127.0.0.1:{port}"
+        self.facts = {"command": command, "engine": {"engine": "llama-server", **_described(files)}}
+
+    def wait_ready(self) -> None:
+        """Poll ``/health`` until the model is loaded."""
+        clock = SystemClock()
+        deadline = now_ns() + int(READY_TIMEOUT_S * 1e9)
+        while now_ns() < deadline:
+            if not self.alive():
+                raise self.death()
+            try:
+                if httpx.get(self.address + "/health", trust_env=False).is_success and self.alive():
+                    return
+            except httpx.TransportError:
+                pass  # it does not listen yet
+            clock.sleep_until_ns(now_ns() + 100_000_000)
+        raise ServerDied(f"llama-server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
+
+
+def _described(files: ModelFiles) -> dict[str, Any]:
+    """Return what the manifest says about the model files of a server that says nothing itself."""
+    return {
+        "model": str(files.model.path),
+        "mmproj": str(files.mmproj.path),
+        "model_sha256": sha256(files.model.path),
+        "mmproj_sha256": sha256(files.mmproj.path),
+        "dummy": files.dummy,
+    }
+
+
+def _free_port(wanted: int) -> int:
+    """Return ``wanted``, or any port for 0, if it is free now; raises PortInUse."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", wanted))
+            probe.listen()
+        except OSError as error:
+            raise PortInUse(
+                f"--port: {wanted} cannot be had on 127.0.0.1 ({error.strerror}); choose another, or 0 for any free one"
+            ) from error
+        port: int = probe.getsockname()[1]
+        return port
+
+
+_prctl = ctypes.CDLL(None, use_errno=True).prctl
+PR_SET_PDEATHSIG = 1
+
+
+def _die_with_parent() -> None:
+    """Have the kernel end the child when the harness is gone, however it went."""
+    _prctl(PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -1,0 +1,57 @@
+"""`--record`: what travelled in a run, as ROS 2 topics in MCAP, whatever transport carried it.
+
+Frames go to ``<namespace>/camera/image_raw`` as they were captured, each cell's requests (without their pictures) to
+``<namespace>/<cell>/request`` and its tokens to ``<namespace>/<cell>/token``, stamped with ROS time. Nothing is written
+while a sample is measured; in stream mode, which has no pauses, a thread writes.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from s2a_bench.clock import realtime_offset_ns
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.record import Recorder
+from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA, FRAME_ID
+from s2a_bench.transport.ros.wire import request_message, token_message
+from s2a_bench.types import Frame, Request, Token
+
+
+class RunRecorder:
+    """The recording of one run. Use as a context manager."""
+
+    def __init__(self, path: Path, namespace: str, *, live: bool) -> None:
+        """Create the file; raises StoreError, naming ``--record``."""
+        self._recorder = Recorder(path, live=live)
+        self._namespace = namespace
+        self._offset_ns = realtime_offset_ns()
+
+    def frame(self, frame: Frame) -> None:
+        """Note a frame as the camera delivered it."""
+        stamp_ns = frame.stamp_ns + self._offset_ns
+        if frame.encoding in ros.CHANNELS:
+            message = ros.image_message(frame, stamp_ns, FRAME_ID)
+            self._recorder.write(self._namespace + CAMERA, ros.IMAGE, message, stamp_ns)
+        else:
+            message = ros.compressed_image_message(frame.data, stamp_ns, FRAME_ID)
+            self._recorder.write(self._namespace + COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE, message, stamp_ns)
+
+    def answer(self, cell: str, request: Request, asked_ns: int, tokens: list[tuple[Token, int]], error: str) -> None:
+        """Note a request and its tokens with the times at which the client saw them (CLOCK_MONOTONIC)."""
+        topic = f"{self._namespace}/{re.sub('[^A-Za-z0-9/]', '_', cell)}"
+        self._recorder.write(topic + "/request", ros.REQUEST, request_message(request), asked_ns + self._offset_ns)
+        for place, (token, seen_ns) in enumerate(tokens, 1):
+            last = place == len(tokens)
+            message = token_message(request.id, token, last=last, error=error if last else "")
+            self._recorder.write(topic + "/token", ros.TOKEN, message, seen_ns + self._offset_ns)
+
+    def flush(self) -> None:
+        """Write what waits; called between samples."""
+        self._recorder.flush()
+
+    def __enter__(self) -> RunRecorder:  # noqa: PYI034 - Self is typing's since 3.11
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._recorder.close()

@@ -1,0 +1,219 @@
+"""The main job of a measuring command: every cell in randomised, interleaved blocks, each sample kept at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from random import Random
+from typing import Any, TypeAlias
+
+from s2a_bench.clock import SystemClock
+from s2a_bench.errors import TransportError
+from s2a_bench.frames import FrameSource, open_source
+from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
+from s2a_bench.harness.patience import Patience
+from s2a_bench.harness.plan import LatencyConfig, plan_cells
+from s2a_bench.harness.progress import Progress
+from s2a_bench.harness.recording import RunRecorder
+from s2a_bench.harness.servers import ServerSet
+from s2a_bench.harness.session import Place, Session
+from s2a_bench.harness.warnings import Counters, SampleGuard, before_run
+from s2a_bench.inference.models import resolve
+from s2a_bench.machine import environment
+from s2a_bench.machine.doctor import Machine
+from s2a_bench.machine.resources.sampler import Sampler, open_sampler
+from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
+from s2a_bench.store.run import RunWriter
+from s2a_bench.store.schema import FrameRow
+from s2a_bench.trace import mark_cost_ns
+from s2a_bench.transport import open_client
+
+GIVE_UP_AFTER = 5
+"""Failures of one cell in a row, after which the run ends."""
+
+
+Turn: TypeAlias = Callable[[Place], None]
+"""Something that has its turn once a block: it measures and keeps what it measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What a measuring command asks for besides the requests themselves."""
+
+    command: str
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    """Goes into the manifest's ``configuration``."""
+    names: Mapping[str, str] = field(default_factory=dict)
+    """What the command calls a cell."""
+    others: Callable[[LatencyConfig, RunWriter, Sequence[Session]], Sequence[Turn]] = lambda *_: ()
+    """Makes what else has a turn in every block; the config has the model files that were found."""
+
+
+def run_requests(task: Task, config: LatencyConfig, output: Path, progress: Progress) -> Path:
+    """Measure and return the run folder; whatever happens, the samples so far are in it.
+
+    Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
+    """
+    limit_threads()
+    malloc_tuned = config.dds_tuning == "tuned" and keep_large_blocks()
+    with ExitStack() as stack:
+        sources = _Sources(config, stack)
+        manifest = _manifest(task, config, malloc_tuned=malloc_tuned)
+        writer = stack.enter_context(RunWriter.create(output, task.command, manifest))
+        progress.opened(writer.path)
+        if config.engine.name == "llama":
+            config = _with_model(config, progress)
+        _measure(task, config, sources, writer, progress)
+        return writer.path
+
+
+def _with_model(config: LatencyConfig, progress: Progress) -> LatencyConfig:
+    """Find or make the model files, so that every server gets the same."""
+    progress.stage("reading the model's headers" if config.engine.model else "the tiny dummy model, made on first use")
+    model, mmproj = resolve(config.engine)
+    return replace(config, engine=replace(config.engine, model=model, mmproj=mmproj))
+
+
+def _manifest(task: Task, config: LatencyConfig, *, malloc_tuned: bool) -> dict[str, Any]:
+    return {
+        "configuration": {**config.to_manifest(), **task.facts},
+        "environment": environment.collect(),
+        "seeds": dict.fromkeys(("order", "sampling", "source", "bootstrap"), config.seed),
+        "tuning": {"dds": config.dds_tuning, "malloc_keeps_large_blocks": malloc_tuned},
+        "cadence": "closed loop, the next request when the last is done"
+        if config.mode == "request"
+        else f"closed loop over an open-loop camera at {config.fps:g} Hz, prompts at random moments",
+        "mark_cost_ns": round(mark_cost_ns(), 1),
+    }
+
+
+class _Sources:
+    """Frame sources: one a cell, with the same frames; a device can be opened only once and is shared."""
+
+    def __init__(self, config: LatencyConfig, stack: ExitStack) -> None:
+        self._config = config
+        self._stack = stack
+        self._shared = config.source.startswith("v4l2")
+        self._ready: FrameSource | None = self._new()  # what is wrong with a source shows before anything starts
+
+    def open(self) -> FrameSource:
+        """Return a source that nobody has yet, or the shared one."""
+        source = self._ready or self._new()
+        self._ready = source if self._shared else None
+        return source
+
+    def _new(self) -> FrameSource:
+        config = self._config
+        source = open_source(config.source, config.width, config.height, fps=config.fps, seed=config.seed)
+        self._stack.callback(source.close)
+        return source
+
+
+def _measure(task: Task, config: LatencyConfig, sources: _Sources, writer: RunWriter, progress: Progress) -> None:
+    """Start the servers, measure all blocks, and write down what there is to doubt."""
+    machine = Machine(output=writer.path)
+    uses_dds = "ros" in config.transports
+    doubts = before_run(config.width, config.height, uses_dds=uses_dds, machine=machine)
+    before = Counters.read(uses_dds=uses_dds)
+    guard = SampleGuard()
+    with ExitStack() as stack:
+        progress.stage(f"starting {len(config.transports)} servers")
+        servers = ServerSet(config, stack, writer.path)
+        facts = servers.start()
+        writer.update(servers=facts, model=servers.model(facts), warnings=[doubt.to_manifest() for doubt in doubts])
+        pids = [server["pid"] for server in facts.values()]
+        sampler = stack.enter_context(open_sampler(config.sample_resources_hz, pids))
+        sessions = list(_sessions(task, config, servers, sources, sampler, stack))
+        asked = {session.cell.name: session.client.describe() for session in sessions}
+        writer.update(asked={name: how for name, how in asked.items() if how})
+        patience = Patience(SystemClock(), progress.stage)
+        turns = [_turn(session, servers, writer, guard, patience, sampler) for session in sessions]
+        try:
+            run_blocks(turns, task.others(config, writer, sessions), config, progress)
+            for session in sessions:
+                _write_frames(writer, session.frames(keep=0))
+                if not guard.successes(session.cell.name):
+                    last = guard.last_error(session.cell.name)
+                    raise TransportError(f"no request of {session.cell.name} succeeded, at last with {last}")
+        finally:
+            doubts += [*guard.doubts(), *Counters.read(uses_dds=uses_dds).doubts_since(before)]
+            sampler.flush(writer)
+            writer.update(warnings=[doubt.to_manifest() for doubt in doubts], resources=sampler.describe())
+
+
+def _sessions(
+    task: Task, config: LatencyConfig, servers: ServerSet, sources: _Sources, sampler: Sampler, stack: ExitStack
+) -> Iterator[Session]:
+    """Open a client and a feed for each cell, and the recording if one is wanted."""
+    recorder: RunRecorder | None = None
+    if config.record is not None:
+        recorder = stack.enter_context(RunRecorder(config.record, config.namespace, live=config.mode == "stream"))
+    clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
+    camera: Camera | None = None
+    if config.mode == "stream":
+        camera = Camera(sources.open(), config.fps, on_frame=recorder.frame if recorder else None)
+        camera.start()
+        stack.callback(camera.stop)
+    for cell in plan_cells(config, servers.addresses):
+        with servers.death_explained(cell.route.transport):
+            client = open_client(cell.route, servers.alive(cell.route.transport))
+        clients.callback(client.close)
+        feed: Feed
+        if camera is not None:
+            random = Random(config.seed)  # noqa: S311 - phases, not secrets
+            feed = StreamFeed(camera, client.camera, int(1e9 / config.fps), random)
+        else:
+            feed = RequestFeed(sources.open(), preencoded=cell.payload == "jpeg-preencoded")
+        named = replace(cell, name=task.names.get(cell.name, cell.name))
+        yield Session(named, client, feed, config, recorder, sampler)
+
+
+def run_blocks(turns: Sequence[Turn], others: Sequence[Turn], config: LatencyConfig, progress: Progress) -> None:
+    """Give everyone a turn a block, in a new random order each time; in the first block the others come last.
+
+    So that what is compared with the requests can learn from the first of them how long their prompts are.
+    """
+    everyone = [*turns, *others]
+    progress.expect(len(everyone) * (config.warmup + config.runs))
+    random = Random(config.seed)  # noqa: S311 - an order, not a secret
+    for block in range(config.warmup + config.runs):
+        progress.stage("warming up" if block < config.warmup else "measuring")
+        order = random.sample(everyone, len(everyone))
+        for position, turn in enumerate(order if block else sorted(order, key=lambda turn: turn in others)):
+            turn(Place(block, position, block < config.warmup))
+            progress.advance()
+
+
+def _turn(
+    session: Session,
+    servers: ServerSet,
+    writer: RunWriter,
+    guard: SampleGuard,
+    patience: Patience,
+    sampler: Sampler,
+) -> Turn:
+    """Return a session's turn: one request, kept at once, and a look at whether the run can go on."""
+
+    def measure(place: Place) -> None:
+        measured = session.measure(place)
+        writer.sample(measured.sample)
+        writer.tokens(measured.tokens)
+        sampler.flush(writer)
+        _write_frames(writer, session.frames())
+        guard.see(measured.sample, measured.fingerprint)
+        servers.raise_if_dead(session.cell.route.transport, suspect=bool(measured.sample.error))
+        if measured.fatal is not None:
+            raise measured.fatal
+        if guard.failures_in_a_row(session.cell.name) >= GIVE_UP_AFTER:
+            name, error = session.cell.name, measured.sample.error
+            raise TransportError(f"{name} failed {GIVE_UP_AFTER} times in a row, at last with {error}")
+        patience.wait(session.cell.name, measured.retry_after_s)
+
+    return measure
+
+
+def _write_frames(writer: RunWriter, rows: list[FrameRow]) -> None:
+    for row in rows:
+        writer.frame(row)

@@ -1,0 +1,107 @@
+"""The server process: one transport around one engine, started, awaited and stopped by the harness.
+
+``python -m s2a_bench.harness.serving`` reads one JSON line (`ServerJob`) from standard input and answers with one JSON
+line on standard output: ``{"address": ..., "engine": {...}, "transport": {...}}`` when it is ready, or ``{"error": ...,
+"exit_code": ...}``. It stops when standard input ends, so it never outlives the harness, and on SIGTERM.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Generator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import S2AError
+from s2a_bench.inference import Engine, EngineConfig, open_engine
+from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
+from s2a_bench.trace import RESIDUAL, Trace
+from s2a_bench.transport import Handler, Route, open_server
+from s2a_bench.types import Request, Token
+
+
+def engine_handler(engine: Engine) -> Handler:
+    """Make the handler that lets one request at a time into the engine and marks `queue` and `inference`."""
+    free = Lock()
+
+    def handle(request: Request, trace: Trace) -> Generator[Token, None, None]:
+        trace.mark(RESIDUAL)
+        if not free.acquire(blocking=False):
+            free.acquire()
+            trace.mark("queue")
+        try:
+            for token in engine.generate(request):
+                now = now_ns()
+                if not trace.token_ns:
+                    trace.marks.append(("inference", now))
+                trace.token_ns.append(now)
+                yield token
+            trace.facts.update(engine.facts)
+        finally:
+            free.release()
+
+    return handle
+
+
+@dataclass(frozen=True, slots=True)
+class ServerJob:
+    """What a server process is told: which route, which engine, and whether memory is tuned."""
+
+    route: Route
+    engine: EngineConfig
+    tuned: bool = True
+
+    def to_json(self) -> str:
+        """Write as one line."""
+        return json.dumps(asdict(self), default=str)
+
+    @staticmethod
+    def from_json(line: str) -> ServerJob:
+        """Read what `to_json` wrote."""
+        fields: dict[str, Any] = json.loads(line)
+        engine = fields["engine"]
+        paths = {key: Path(engine[key]) if engine[key] else None for key in ("model", "mmproj")}
+        return ServerJob(Route(**fields["route"]), EngineConfig(**{**engine, **paths}), fields["tuned"])
+
+
+def main() -> int:
+    """Run a server until standard input ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the harness decides
+    limit_threads()
+    job = ServerJob.from_json(sys.stdin.readline())
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints belongs in the log
+    try:
+        keeps = job.tuned and keep_large_blocks()
+        engine = open_engine(job.engine)
+        server = open_server(job.route, engine_handler(engine))
+    except S2AError as error:
+        print(json.dumps({"error": str(error), "kind": type(error).__name__}), file=answers, flush=True)
+        return error.exit_code
+    ready = {
+        "address": server.address,
+        "engine": engine.describe(),
+        "transport": server.describe(),
+        "malloc_keeps_large_blocks": keeps,
+    }
+
+    def stop_at_end_of_input() -> None:
+        sys.stdin.read()
+        server.stop()
+
+    Thread(target=stop_at_end_of_input, daemon=True).start()
+    signal.signal(signal.SIGTERM, lambda *_: server.stop())
+    print(json.dumps(ready), file=answers, flush=True)
+    server.serve()
+    engine.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,203 @@
+"""One request, measured: capture, ask, collect tokens, and turn the trace into rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import EngineError, RequestFailed, S2AError, ServerDied, SourceError, UsageError
+from s2a_bench.harness.feed import Feed, StreamedFrame, StreamFeed, fingerprint
+from s2a_bench.harness.plan import Cell, LatencyConfig
+from s2a_bench.harness.recording import RunRecorder
+from s2a_bench.machine.resources.sampler import Sampler
+from s2a_bench.store.schema import FrameRow, SampleRow, TokenRow
+from s2a_bench.trace import Mark, Trace
+from s2a_bench.transport import Client
+from s2a_bench.types import Frame, Request, Token
+
+FATAL = (ServerDied, SourceError, UsageError, EngineError)
+"""Errors after which the next request cannot succeed either."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where in the run a request stands."""
+
+    block: int
+    position: int
+    warmup: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """The rows of one request; ``fingerprint`` tells its picture from others, ``fatal`` ends the run.
+
+    ``retry_after_s`` is how long a server that refused asks to be left alone.
+    """
+
+    sample: SampleRow
+    tokens: list[TokenRow]
+    fingerprint: int
+    fatal: S2AError | None = None
+    retry_after_s: float = 0.0
+
+
+KEPT_FRAMES = 90
+"""Frames kept until an answer may name them: three seconds at 30 Hz."""
+
+
+class Session:
+    """The client side of one cell."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        client: Client,
+        feed: Feed,
+        config: LatencyConfig,
+        recorder: RunRecorder | None = None,
+        sampler: Sampler | None = None,
+    ) -> None:
+        """Measure ``cell`` with an open client, recording what travels if there is a recorder."""
+        self.cell = cell
+        self.client = client
+        self.feed = feed
+        self._config = config
+        self._recorder = recorder
+        self._sampler = sampler or Sampler({}, 1)
+        self._frames: dict[int, StreamedFrame] = {}
+        self.prompt_n = 0
+        """Tokens of the last prompt, pictures included; 0 where nobody says."""
+
+    def measure(self, place: Place) -> Measured:
+        """Make one request; a failure becomes a row with its error, and says whether it is the run's end."""
+        self.feed.get_ready()
+        request_id = f"{self.cell.name}-{place.block}"
+        seen: list[tuple[Token, int]] = []
+        trace = Trace()
+        error, fatal, retry_after_s = "", None, 0.0
+        started_ns = now_ns()
+        self._sampler.edge()
+        frame = self.feed.capture(trace)
+        images = () if frame is None else (frame,)
+        config = self._config
+        request = Request(request_id, config.prompt, images, config.max_tokens, config.grammar, config.seed)
+        try:
+            seen.extend((token, now_ns()) for token in self.client.request(request, trace))
+        except S2AError as failure:
+            error = f"{type(failure).__name__}: {failure}"
+            fatal = failure if isinstance(failure, FATAL) else None
+            if isinstance(failure, RequestFailed):
+                retry_after_s = failure.retry_after_s or 0.0
+        self._sampler.edge()
+        trace.facts.update(self._sampler.window(started_ns, now_ns()))
+        if not error and not seen:
+            error = "RequestFailed: the answer was empty"
+        if self._recorder is not None:
+            if frame is not None and config.mode == "request":  # in stream mode the camera records its frames
+                self._recorder.frame(frame)
+            self._recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
+            self._recorder.flush()
+        rows = self._rows(place, request_id, frame, trace, seen, error)
+        return replace(rows, fatal=fatal, retry_after_s=retry_after_s)
+
+    def _rows(
+        self,
+        place: Place,
+        request_id: str,
+        frame: Frame | None,
+        trace: Trace,
+        seen: list[tuple[Token, int]],
+        error: str,
+    ) -> Measured:
+        """Turn what was seen into rows."""
+        config, facts = self._config, trace.facts
+        streamed = self._streamed(trace, request_id)
+        if streamed:
+            index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index
+        elif frame:
+            index, captured_ns, picture = frame.index, frame.stamp_ns, fingerprint(frame)
+        else:
+            index, captured_ns, picture = -1, -1, place.block
+        if isinstance(self.feed, StreamFeed) and streamed is None:
+            error = error or "RequestFailed: the server knew no frame of this camera"
+        started_ns = inference_start_ns(trace)
+        self.prompt_n = _whole(facts.get("prompt_n")) or self.prompt_n
+        sample = SampleRow(
+            cell=self.cell.name,
+            pipeline=self.cell.route.transport,
+            variant=self.cell.route.variant,
+            payload=self.cell.payload,
+            connection=self.cell.route.connection if self.cell.route.transport == "http" else "",
+            engine=config.engine.name,
+            mode=config.mode,
+            size=f"{config.width}x{config.height}",
+            block=place.block,
+            position=place.position,
+            warmup=place.warmup,
+            request_id=request_id,
+            frame_index=index,
+            error=error,
+            marks=trace.chain(),
+            n_tokens=len(seen),
+            last_token_ns=seen[-1][1] if seen else None,
+            frame_age_ns=started_ns - captured_ns if started_ns is not None and captured_ns >= 0 else None,
+            cache_n=_whole(facts.get("cache_n")),
+            prompt_n=_whole(facts.get("prompt_n")),
+            server_prompt_ms=facts.get("prompt_ms"),
+            payload_bytes=_whole(facts.get("payload_bytes")),
+            facts=facts,
+        )
+        engine_ns = trace.remote.token_ns if trace.remote else []
+        tokens = [
+            TokenRow(
+                request_id=request_id,
+                cell=self.cell.name,
+                index=token.index,
+                token_id=token.id,
+                text=token.text,
+                engine_ns=engine_ns[position] if position < len(engine_ns) else None,
+                client_ns=client_ns,
+            )
+            for position, (token, client_ns) in enumerate(seen)
+        ]
+        return Measured(sample, tokens, picture)
+
+    def _streamed(self, trace: Trace, request_id: str) -> StreamedFrame | None:
+        """Find the camera frame that the answer is about, and complete its marks with the server's."""
+        if not isinstance(self.feed, StreamFeed):
+            return None
+        self._frames.update((frame.key, frame) for frame in self.feed.drain())
+        used = self.feed.last
+        if self.feed.sink is not None:
+            used = self._frames.get(trace.remote.frame_stamp_ns) if trace.remote else None
+            if used is not None and trace.remote is not None:
+                used.marks = used.marks if used.used_by else [*used.marks, *trace.remote.frame_marks]
+                if "camera_frames" in trace.facts:
+                    trace.facts["frames_published"] = used.sequence
+                    trace.facts["frames_lost"] = used.sequence - trace.facts["camera_frames"]
+        if used is not None:
+            used.used_by = request_id
+        return used
+
+    def frames(self, keep: int = KEPT_FRAMES) -> list[FrameRow]:
+        """Return the rows of the camera's frames so far, the newest ``keep`` held back as an answer may name them."""
+        rows = []
+        while len(self._frames) > keep:
+            frame = self._frames.pop(next(iter(self._frames)))
+            rows.append(FrameRow(self.cell.name, frame.index, frame.intended_ns, frame.marks, frame.used_by))
+        return rows
+
+
+def inference_start_ns(trace: Trace) -> int | None:
+    """Return when the request was handed to the engine: the mark before `inference`, where there is one."""
+    chain: list[Mark] = trace.chain()
+    for (_, before_ns), (stage, _) in pairwise(chain):
+        if stage == "inference":
+            return before_ns
+    return None
+
+
+def _whole(value: float | None) -> int | None:
+    return None if value is None else int(value)

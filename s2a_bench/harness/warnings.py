@@ -1,0 +1,218 @@
+"""Doubts about a run's validity, as typed warnings that say what to do next."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from s2a_bench.clock import realtime_offset_ns
+from s2a_bench.machine.doctor import BEFORE_RUN, Finding, Machine, examine
+from s2a_bench.machine.doctor.robot import RMEM_WANTED
+from s2a_bench.store.schema import SampleRow
+from s2a_bench.trace import RESIDUAL_LIMIT, budget
+
+LARGE_PICTURE = 640 * 480
+"""Pixels above which DDS needs more receive buffer than Linux gives by default."""
+CLOCK_STEP_NS = 50_000_000
+HEADERS_OFF_MS, HEADERS_OFF_SHARE = 20.0, 0.25
+"""Beyond both, a llama-server's headers did not leave when its slot started."""
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """One warning: what was seen, and the way out."""
+
+    code: str
+    message: str
+    advice: str
+
+    def to_manifest(self) -> dict[str, str]:
+        """Return it as plain data."""
+        return {"code": self.code, "message": self.message, "advice": self.advice}
+
+
+def before_run(width: int, height: int, *, uses_dds: bool, machine: Machine | None = None) -> list[Doubt]:
+    """Return the doctor's warnings that concern a run, for pictures of this size in pixels."""
+    codes = [*BEFORE_RUN, *(["rmem-max"] if uses_dds and width * height > LARGE_PICTURE else [])]
+    return doubts_of(examine(machine or Machine(), codes))
+
+
+def doubts_of(findings: Iterable[Finding]) -> list[Doubt]:
+    """Return the doctor's warnings and errors as runs store them."""
+    return [Doubt(seen.code, seen.message, seen.fix) for seen in findings if seen.level in {"warning", "error"}]
+
+
+@dataclass(slots=True)
+class Counters:
+    """Machine counters whose rise during a run is a reason for doubt; an unreadable one is None."""
+
+    receive_buffer_errors: int | None = None
+    throttles: int | None = None
+    suspended_ns: int = 0
+    realtime_offset_ns: int = 0
+
+    @staticmethod
+    def read(*, uses_dds: bool = True) -> Counters:
+        """Read them all; without DDS the packets that the machine dropped were somebody else's."""
+        throttles = [_number(path) or 0 for path in _cpu_files("thermal_throttle/core_throttle_count")]
+        suspended = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+        return Counters(
+            _receive_buffer_errors() if uses_dds else None,
+            sum(throttles) if throttles else None,
+            suspended,
+            realtime_offset_ns(),
+        )
+
+    def doubts_since(self, before: Counters) -> list[Doubt]:
+        """Compare with an earlier reading."""
+        doubts = []
+        if _rise(before.receive_buffer_errors, self.receive_buffer_errors):
+            doubts.append(
+                Doubt(
+                    "udp-receive-buffer",
+                    f"the kernel dropped {_rise(before.receive_buffer_errors, self.receive_buffer_errors)} UDP packets "
+                    "for want of receive buffer: DDS had to send them again, 200 ms later",
+                    f"--dds-tuning tuned, and sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
+                )
+            )
+        if _rise(before.throttles, self.throttles):
+            doubts.append(Doubt("cpu-throttling", "the CPU was throttled during the run", "cool it, and run again"))
+        if abs(self.suspended_ns - before.suspended_ns) > CLOCK_STEP_NS:
+            doubts.append(Doubt("suspended", "the machine was suspended during the run", "run again"))
+        if abs(self.realtime_offset_ns - before.realtime_offset_ns) > CLOCK_STEP_NS:
+            doubts.append(
+                Doubt(
+                    "clock-jump",
+                    "the wall clock was set during the run; latencies are unaffected, ROS time stamps are not",
+                    "let NTP settle, and run again",
+                )
+            )
+        return doubts
+
+
+@dataclass(slots=True)
+class SampleGuard:
+    """Watches the samples of a run as they come."""
+
+    _frames: dict[tuple[str, int], str] = field(default_factory=dict)
+    _repeated: dict[str, int] = field(default_factory=dict)
+    _cached: dict[str, int] = field(default_factory=dict)
+    _residual: dict[str, int] = field(default_factory=dict)
+    _failed: dict[str, int] = field(default_factory=dict)
+    _frames_lost: dict[str, int] = field(default_factory=dict)
+    _in_a_row: dict[str, int] = field(default_factory=dict)
+    _succeeded: dict[str, int] = field(default_factory=dict)
+    _lost: dict[str, int] = field(default_factory=dict)
+    _headers: dict[str, int] = field(default_factory=dict)
+    _last: dict[str, str] = field(default_factory=dict)
+
+    def see(self, row: SampleRow, fingerprint: int) -> None:
+        """Look at one sample and the fingerprint of its picture."""
+        if self._frames.setdefault((row.cell, fingerprint), row.request_id) != row.request_id:
+            _count(self._repeated, row.cell)
+        if lost := row.facts.get("frames_lost"):
+            self._frames_lost[row.cell] = int(lost)
+        self._in_a_row[row.cell] = self._in_a_row.get(row.cell, 0) + 1 if row.error else 0
+        if row.error:
+            self._last[row.cell] = row.error
+            _count(self._lost if row.error.startswith("MessagesLost") else self._failed, row.cell)
+            return
+        if row.cache_n:
+            _count(self._cached, row.cell)
+        if not row.warmup:
+            _count(self._succeeded, row.cell)
+        off_ms = abs(row.facts.get("headers_off_ms", 0.0))
+        if not row.warmup and off_ms > max(HEADERS_OFF_MS, HEADERS_OFF_SHARE * (row.server_prompt_ms or 0.0)):
+            _count(self._headers, row.cell)
+        share = budget(row.marks).residual_share
+        if not row.warmup and share is not None and share > RESIDUAL_LIMIT:
+            _count(self._residual, row.cell)
+
+    def failures_in_a_row(self, cell: str) -> int:
+        """Count a cell's failures since its last success."""
+        return self._in_a_row.get(cell, 0)
+
+    def last_error(self, cell: str) -> str:
+        """Return what went wrong last in a cell, or nothing."""
+        return self._last.get(cell, "")
+
+    def successes(self, cell: str) -> int:
+        """Count a cell's samples that took part in its numbers."""
+        return self._succeeded.get(cell, 0)
+
+    def doubts(self) -> list[Doubt]:
+        """Say what was seen."""
+        return [
+            *_told(
+                self._repeated,
+                "duplicate-frames",
+                "requests carried a picture that was sent before: a server's cache may have answered",
+                "use a longer video, more images or the synthetic source",
+            ),
+            *_told(
+                self._cached,
+                "prompt-cache",
+                "answers came partly from the server's prompt cache: time to first token is too good",
+                "start llama-server with --no-cache-prompt --cache-ram 0, vLLM with --no-enable-prefix-caching; "
+                "where --dialect was given, leave it out: a server that is known is asked without its cache",
+            ),
+            *_told(
+                self._residual,
+                "residual",
+                f"samples have more than {RESIDUAL_LIMIT:.0%} of their time outside every stage",
+                "look at the machine's load; single samples do no harm to a median",
+            ),
+            *_told(
+                self._headers,
+                "ingest-unsure",
+                "samples whose headers did not leave when the slot started, by the server's own prompt_ms",
+                "where it is most of them, this build sends headers at another moment: compare e2e, not ingest",
+            ),
+            *_told(
+                self._frames_lost,
+                "lost-frames",
+                "camera frames did not reach the server, or were overtaken there by the next (over the whole run)",
+                f"--qos reliable, --dds-tuning tuned, and sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
+            ),
+            *_told(self._lost, "lost-messages", "requests lost messages on the way", "--dds-tuning tuned"),
+            *_told(self._failed, "failed-samples", "requests failed", "see the column error of samples.csv"),
+        ]
+
+
+def _count(counts: dict[str, int], cell: str) -> None:
+    counts[cell] = counts.get(cell, 0) + 1
+
+
+def _told(counts: dict[str, int], code: str, what: str, advice: str) -> list[Doubt]:
+    if not counts:
+        return []
+    where = ", ".join(f"{cell}: {count}" for cell, count in counts.items())
+    return [Doubt(code, f"{what} ({where})", advice)]
+
+
+def _rise(before: int | None, after: int | None) -> int:
+    return 0 if before is None or after is None else max(0, after - before)
+
+
+def _number(path: Path) -> int | None:
+    try:
+        return int(path.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def _cpu_files(name: str) -> Iterable[Path]:
+    return sorted(Path("/sys/devices/system/cpu").glob(f"cpu[0-9]*/{name}"))
+
+
+def _receive_buffer_errors() -> int | None:
+    """Return RcvbufErrors of /proc/net/snmp."""
+    try:
+        names, values = (
+            line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")
+        )
+        return int(values[names.index("RcvbufErrors")])
+    except (OSError, ValueError):
+        return None

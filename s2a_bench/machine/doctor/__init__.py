@@ -1,0 +1,144 @@
+"""Checks of this machine before measuring: what is, what could be better, what distorts results, what cannot work.
+
+A check is a function of a `Machine` that returns one Finding, or None where it has nothing to look at. It reads files
+below the machine's root, its environment and its programs, so that tests run it on recorded trees; NVML and the
+packages of this Python are asked as they are.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+if TYPE_CHECKING:
+    from s2a_bench.frames.v4l2_formats import CameraInfo
+
+Level: TypeAlias = Literal["state", "advice", "warning", "error"]
+LEVELS: tuple[Level, ...] = ("state", "advice", "warning", "error")
+"""State: as it should be, or simply so. Advice: would make results better or steadier. Warning: distorts results.
+Error: what the check is about does not work."""
+
+COMMAND_TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What one check saw; ``fix`` is the command that changes it, and every warning and error has one."""
+
+    code: str
+    level: Level
+    message: str
+    fix: str = ""
+
+
+def _run(command: Sequence[str]) -> str | None:
+    """Return what a program prints on standard output, None where it is missing, fails or hangs."""
+    try:
+        done = subprocess.run(  # noqa: S603 - the checks' own commands
+            command, capture_output=True, text=True, errors="replace", check=False, timeout=COMMAND_TIMEOUT_S
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout if done.returncode == 0 else None
+
+
+def _finds(package: str) -> bool:
+    """Tell whether a package could be imported, without importing it."""
+    return find_spec(package) is not None
+
+
+def _cameras() -> list[CameraInfo]:
+    """List this machine's cameras; their module brings OpenCV, which a run's checks do not need."""
+    from s2a_bench.frames.v4l2_formats import list_cameras
+
+    return list_cameras()
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Everything that checks may look at; the defaults are this machine and this process."""
+
+    root: Path = Path("/")
+    environ: Mapping[str, str] = field(default_factory=lambda: os.environ)
+    cpus: frozenset[int] = field(default_factory=lambda: frozenset(os.sched_getaffinity(0)))
+    output: Path = Path("results")
+    """Where run folders go."""
+    run: Callable[[Sequence[str]], str | None] = _run
+    which: Callable[[str], str | None] = shutil.which
+    finds: Callable[[str], bool] = _finds
+    """Whether this Python has a package."""
+    cameras: Callable[[], list[CameraInfo]] = _cameras
+
+    def read(self, path: str) -> str | None:
+        """Return a file's text without blanks and NULs around it; None where it cannot be read."""
+        try:
+            return (self.root / path).read_text(errors="replace").strip("\0\n ")
+        except OSError:
+            return None
+
+    def number(self, path: str) -> int | None:
+        """Return the number in a file; None where there is none."""
+        text = self.read(path)
+        try:
+            return None if text is None else int(text)
+        except ValueError:
+            return None
+
+    def read_all(self, pattern: str) -> dict[str, str]:
+        """Return the texts of the files that match, by path below the root."""
+        found = {str(path.relative_to(self.root)): path for path in sorted(self.root.glob(pattern))}
+        texts = {name: self.read(name) for name in found}
+        return {name: text for name, text in texts.items() if text is not None}
+
+
+Check: TypeAlias = Callable[[Machine], Finding | None]
+
+CHECKS: dict[str, str] = {
+    "python": "s2a_bench.machine.doctor.software:python",
+    "packages": "s2a_bench.machine.doctor.software:packages",
+    "compiler": "s2a_bench.machine.doctor.software:compiler",
+    "llama-build": "s2a_bench.machine.doctor.software:llama_build",
+    "board": "s2a_bench.machine.doctor.gpu:board",
+    "gpu": "s2a_bench.machine.doctor.gpu:gpu",
+    "gpu-throttling": "s2a_bench.machine.doctor.gpu:gpu_throttling",
+    "power-mode": "s2a_bench.machine.doctor.gpu:power_mode",
+    "jetson-clocks": "s2a_bench.machine.doctor.gpu:jetson_clocks",
+    "cpus": "s2a_bench.machine.doctor.cpu:cpus",
+    "cpu-governor": "s2a_bench.machine.doctor.cpu:governor",
+    "cpu-turbo": "s2a_bench.machine.doctor.cpu:turbo",
+    "load": "s2a_bench.machine.doctor.cpu:load",
+    "cpu-throttling": "s2a_bench.machine.doctor.cpu:throttling",
+    "temperature": "s2a_bench.machine.doctor.cpu:temperature",
+    "clock-source": "s2a_bench.machine.doctor.cpu:clock_source",
+    "memory": "s2a_bench.machine.doctor.room:memory",
+    "disk": "s2a_bench.machine.doctor.room:disk",
+    "rmem-max": "s2a_bench.machine.doctor.robot:rmem_max",
+    "dds": "s2a_bench.machine.doctor.robot:dds",
+    "ros": "s2a_bench.machine.doctor.robot:ros",
+    "middleware": "s2a_bench.machine.doctor.robot:middleware",
+    "cameras": "s2a_bench.machine.doctor.robot:cameras",
+}
+"""Code of the findings -> check, in the order in which they are shown."""
+
+BEFORE_RUN = (
+    *("cpus", "cpu-governor", "jetson-clocks", "load", "temperature", "gpu-throttling", "clock-source", "disk"),
+)
+"""The checks that concern every measurement: those whose trouble distorts its numbers or ends it half-way."""
+
+
+def examine(machine: Machine, codes: Iterable[str] = CHECKS) -> list[Finding]:
+    """Make the named checks, all of them unless told; those with nothing to look at are left out."""
+    found = (resolve_name(CHECKS[code])(machine) for code in codes)
+    return [finding for finding in found if finding is not None]
+
+
+def worst(findings: Iterable[Finding]) -> Level:
+    """Return the most severe level."""
+    return max((finding.level for finding in findings), key=LEVELS.index, default="state")

@@ -1,0 +1,173 @@
+"""GPUs: an NVIDIA card through its driver, or a Jetson's board with its power mode and clocks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from s2a_bench.machine.doctor import Finding, Machine
+
+GIB = 1 << 30
+NVIDIA_VENDOR, DISPLAY_CLASS = "0x10de", "0x03"
+TOO_HOT = {0x08: "hardware slowdown", 0x20: "too warm (driver)", 0x40: "too warm (hardware)", 0x80: "power brake"}
+"""Bits of nvmlDeviceGetCurrentClocksThrottleReasons that mean trouble; idle and the power limit are everyday."""
+FULL_POWER = "MAXN"
+
+
+@contextmanager
+def nvml() -> Iterator[tuple[Any, list[Any]]]:
+    """Open NVML and hand out the module and the GPUs; no GPUs where there is no driver."""
+    import pynvml
+
+    try:
+        pynvml.nvmlInit()
+    except pynvml.NVMLError:
+        yield pynvml, []
+        return
+    try:
+        gpus = []
+        with suppress(pynvml.NVMLError):
+            gpus = [pynvml.nvmlDeviceGetHandleByIndex(place) for place in range(pynvml.nvmlDeviceGetCount())]
+        yield pynvml, gpus
+    finally:
+        pynvml.nvmlShutdown()
+
+
+def identity(lib: Any, card: Any) -> dict[str, str]:
+    """Name a GPU and its driver, as far as NVML tells: a Jetson's knows next to nothing."""
+    facts = {}
+    for key, ask in (
+        ("name", lambda: lib.nvmlDeviceGetName(card)),
+        ("driver", lib.nvmlSystemGetDriverVersion),
+    ):
+        with suppress(lib.NVMLError):
+            facts[key] = str(ask())
+    return facts
+
+
+def is_jetson(machine: Machine) -> bool:
+    """Tell a Jetson by its release file or its device tree (which a container sees too)."""
+    model = machine.read("proc/device-tree/model") or ""
+    return machine.read("etc/nv_tegra_release") is not None or "jetson" in model.lower()
+
+
+def has_nvidia(machine: Machine) -> bool:
+    """Tell whether there is a working NVIDIA GPU."""
+    return machine.read("proc/driver/nvidia/version") is not None or is_jetson(machine)
+
+
+def board(machine: Machine) -> Finding | None:
+    """Name a single-board computer and its system software."""
+    model = machine.read("proc/device-tree/model")
+    if not model:
+        return None
+    release = re.search(r"R(\d+) \(release\), REVISION: ([\d.]+)", machine.read("etc/nv_tegra_release") or "")
+    return Finding("board", "state", model + (f", Jetson Linux {release[1]}.{release[2]}" if release else ""))
+
+
+def gpu(machine: Machine) -> Finding:
+    """Name the GPUs and their driver; an NVIDIA card without one is found on the PCI bus."""
+    with nvml() as (lib, gpus):
+        if gpus:
+            return _cards(lib, gpus)
+    if is_jetson(machine):
+        return Finding("gpu", "state", "the board's own, which shares its memory")
+    for path in machine.read_all("sys/bus/pci/devices/*/vendor").items():
+        folder = path[0].rpartition("/")[0]
+        if path[1] == NVIDIA_VENDOR and (machine.read(f"{folder}/class") or "").startswith(DISPLAY_CLASS):
+            return Finding(
+                "gpu",
+                "warning",
+                f"an NVIDIA card ({folder.rpartition('/')[2]}) whose driver does not answer",
+                "sudo ubuntu-drivers install, and restart; in a container: --gpus all",
+            )
+    return Finding("gpu", "state", "no NVIDIA GPU: models run on the CPU")
+
+
+def _cards(lib: Any, gpus: list[Any]) -> Finding:
+    """Describe the cards that NVML knows."""
+    told, sleepy, driver = [], False, ""
+    for card in gpus:
+        known = identity(lib, card)
+        text, driver = known.get("name", "a GPU without a name"), known.get("driver", "unknown")
+        with suppress(lib.NVMLError):
+            memory = lib.nvmlDeviceGetMemoryInfo(card)
+            text += f", {memory.free / GIB:.1f} of {memory.total / GIB:.1f} GiB free"
+        with suppress(lib.NVMLError):
+            sleepy = sleepy or not lib.nvmlDeviceGetPersistenceMode(card)
+        told.append(text)
+    message = f"{'; '.join(told)}; driver {driver}"
+    if sleepy:
+        return Finding("gpu", "advice", f"{message}; the driver unloads between runs", "sudo nvidia-smi -pm 1")
+    return Finding("gpu", "state", message)
+
+
+def gpu_throttling(machine: Machine) -> Finding | None:  # noqa: ARG001 - NVML knows one machine
+    """See whether a GPU is being slowed down at this moment."""
+    with nvml() as (lib, gpus):
+        reasons: set[str] = set()
+        asked = False
+        for card in gpus:
+            with suppress(lib.NVMLError):
+                bits = lib.nvmlDeviceGetCurrentClocksThrottleReasons(card)
+                asked = True
+                reasons |= {reason for bit, reason in TOO_HOT.items() if bits & bit}
+    if not asked:
+        return None
+    if reasons:
+        fix = "cool it, see nvidia-smi -q -d PERFORMANCE, or lower its limit: sudo nvidia-smi -pl WATTS"
+        return Finding("gpu-throttling", "warning", f"the GPU is slowed down: {', '.join(sorted(reasons))}", fix)
+    return Finding("gpu-throttling", "state", "the GPU is not slowed down")
+
+
+def current_power_mode(machine: Machine) -> tuple[str, dict[str, str]] | None:
+    """Return the name of a Jetson's nvpmodel mode and all modes as id -> name; None where it cannot be read."""
+    modes = dict(re.findall(r"POWER_MODEL\s+ID=(\d+)\s+NAME=(\S+)", machine.read("etc/nvpmodel.conf") or ""))
+    status = re.search(r"pmode:(\d+)", machine.read("var/lib/nvpmodel/status") or "")
+    if status:
+        number = str(int(status[1]))
+        return modes.get(number, number), modes
+    told = re.search(r"NV Power Mode:\s*(\S+)", (machine.run(["nvpmodel", "-q"]) if is_jetson(machine) else "") or "")
+    return (told[1], modes) if told else None
+
+
+def power_mode(machine: Machine) -> Finding | None:
+    """Name a Jetson's power mode; a smaller one than MAXN may well be wanted, and is part of the result."""
+    known = current_power_mode(machine)
+    if known is None:
+        return None
+    name, modes = known
+    if name.startswith(FULL_POWER):
+        return Finding("power-mode", "state", name)
+    full = next((number for number, mode in modes.items() if mode.startswith(FULL_POWER)), "0")
+    return Finding("power-mode", "advice", f"{name}, not {FULL_POWER}: slower, on purpose?", f"sudo nvpmodel -m {full}")
+
+
+def jetson_clocks(machine: Machine) -> Finding | None:
+    """See whether a Jetson's CPU and GPU clocks are locked, without asking jetson_clocks, which wants root."""
+    if not is_jetson(machine):
+        return None
+    loose = [
+        name
+        for name, folder, low, high in (
+            ("CPU", "sys/devices/system/cpu/cpu[0-9]*/cpufreq", "scaling_min_freq", "scaling_max_freq"),
+            ("GPU", "sys/class/devfreq/*", "min_freq", "max_freq"),
+        )
+        if _moves(machine, folder, low, high, gpu_only=name == "GPU")
+    ]
+    if loose:
+        told = f"the clock of {' and '.join(loose)} follows the load: the first tokens of every answer are slow"
+        return Finding("jetson-clocks", "warning", told, "sudo jetson_clocks")
+    return Finding("jetson-clocks", "state", "clocks locked")
+
+
+def _moves(machine: Machine, folder: str, low: str, high: str, *, gpu_only: bool) -> bool:
+    """Tell whether one of the devices has a range of clocks."""
+    lowest = machine.read_all(f"{folder}/{low}")
+    return any(
+        value != machine.read(f"{path.rpartition('/')[0]}/{high}")
+        for path, value in lowest.items()
+        if not gpu_only or re.search(r"gpu|gv11b|ga10b|gp10b|gm20b", path)
+    )

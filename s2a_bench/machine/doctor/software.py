@@ -1,0 +1,86 @@
+"""Python, packages, compiler, and how llama.cpp was built."""
+
+from __future__ import annotations
+
+import platform
+import re
+from importlib.metadata import PackageNotFoundError, requires, version
+
+from packaging.requirements import Requirement
+
+from s2a_bench import __version__
+from s2a_bench.machine.doctor import Finding, Machine
+
+CUDA_BUILD = (
+    "make setup CUDA=1, or CMAKE_ARGS=-DGGML_CUDA=on pip install --no-binary llama-cpp-python --force-reinstall"
+)
+CUDA_BUILD += " --no-cache-dir llama-cpp-python"
+
+
+def python(machine: Machine) -> Finding:
+    """Name the interpreter and the platform."""
+    release = re.search(r'^PRETTY_NAME="?([^"\n]+)', machine.read("etc/os-release") or "", re.MULTILINE)
+    system = f"{release[1]}, " if release else ""
+    told = f"s2a-bench {__version__}, Python {platform.python_version()} on {platform.machine()}"
+    return Finding("python", "state", f"{told}; {system}Linux {platform.release()}")
+
+
+def packages(machine: Machine) -> Finding:  # noqa: ARG001 - the packages of this interpreter
+    """Compare the packages that are installed with those that are needed here."""
+    wrong = []
+    try:
+        stated = [Requirement(text) for text in requires("s2a-bench") or ()]
+    except PackageNotFoundError:
+        stated = []
+    needed = [each for each in stated if not each.marker or each.marker.evaluate({"extra": ""})]
+    for requirement in needed:
+        try:
+            found = version(requirement.name)
+        except PackageNotFoundError:
+            wrong.append(f"{requirement.name} is missing")
+            continue
+        if not requirement.specifier.contains(found, prereleases=True):
+            wrong.append(f"{requirement.name} is {found}, not {requirement.specifier}")
+    if wrong:
+        return Finding("packages", "error", "; ".join(wrong), "make setup")
+    return Finding("packages", "state", f"{len(needed)} requirements, all met")
+
+
+def compiler(machine: Machine) -> Finding:
+    """Find what llama-cpp-python is compiled with."""
+    name = next((name for name in ("c++", "g++", "clang++") if machine.which(name)), None)
+    if name is None:
+        return Finding(
+            "compiler",
+            "advice",
+            "no C++ compiler: fine while llama-cpp-python stays as it is installed",
+            "sudo apt install build-essential",
+        )
+    first = (machine.run([name, "--version"]) or name).splitlines()[0]
+    cuda = re.search(r"release ([\d.]+)", machine.run(["nvcc", "--version"]) or "") if machine.which("nvcc") else None
+    return Finding("compiler", "state", first + (f"; CUDA {cuda[1]}" if cuda else "; no nvcc"))
+
+
+def llama_build(machine: Machine) -> Finding:
+    """Say what llama-cpp-python was built for, and whether a GPU lies idle because of it."""
+    from s2a_bench.machine.doctor.gpu import has_nvidia
+
+    try:
+        import llama_cpp
+
+        from s2a_bench.inference.llama_log import silence
+    except (ImportError, OSError, RuntimeError) as error:
+        return Finding("llama-build", "error", f"llama-cpp-python does not load: {error}", "make setup")
+    silence()
+    llama_cpp.llama_backend_init()
+    text = llama_cpp.llama_print_system_info().decode(errors="replace")
+    flags = re.findall(r"(\w+) = 1\b", text)
+    offload = bool(llama_cpp.llama_supports_gpu_offload())
+    told = f"llama-cpp-python {llama_cpp.__version__}, {'with' if offload else 'without'} GPU; {' '.join(flags)}"
+    if has_nvidia(machine) and not offload:
+        return Finding("llama-build", "warning", f"{told}: the NVIDIA GPU of this machine is not used", CUDA_BUILD)
+    if platform.machine() == "x86_64" and " avx2" in (machine.read("proc/cpuinfo") or "") and "AVX2" not in flags:
+        return Finding(
+            "llama-build", "warning", f"{told}: built without this CPU's AVX2, far slower", "make clean setup"
+        )
+    return Finding("llama-build", "state", told)

@@ -1,0 +1,220 @@
+"""The thread that polls the readers, and the answer to what happened between two moments.
+
+A counter's rise is exact between two readings of it, so the cheap readers are read before and after every request
+(`Sampler.edge`), by the thread that makes the request and outside of its time; the others at the poll rate only. A
+window too short for a reader's rate gets no rise from it: absent, rather than a share of somebody else's work.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import fmean, median
+from threading import Event, Lock, Thread
+from typing import Any
+
+from s2a_bench.clock import now_ns
+from s2a_bench.machine.resources import Reader, open_readers
+from s2a_bench.store.run import RunWriter
+from s2a_bench.store.schema import RESOURCES, ResourceRow
+
+COUNTERS = ("client_cpu_ns", "server_cpu_ns", "package_energy_j", "gpu_energy_j")
+"""Columns that count up; a window's value is the rise."""
+PEAKS = ("client_rss_bytes", "server_rss_bytes", "gpu_memory_bytes", "gpu_temperature_c")
+"""Columns of which a window keeps the largest; of all others it keeps the mean."""
+ENERGY_OF_POWER = {"gpu_power_w": "gpu_energy_j", "board_power_w": "board_energy_j"}
+"""Power that is summed over time where the source has no counter of energy."""
+PARTS = ("gpu_energy_j", "package_energy_j")
+"""What ``energy_j`` adds up where the board's own input is not measured."""
+
+KEPT = 20_000
+"""Readings kept for windows: half an hour at 10 Hz, and requests are shorter; all go to the run folder."""
+COVERED = 0.5
+"""The least part of a window that the readings inside it must span for a rise to be stretched to the whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What one reader said at one moment."""
+
+    at_ns: int
+    values: Mapping[str, float]
+
+
+@dataclass(slots=True)
+class _Source:
+    """One reader, its readings, and what reading cost."""
+
+    name: str
+    reader: Reader
+    readings: deque[Reading] = field(default_factory=lambda: deque(maxlen=KEPT))
+    costs_ns: deque[int] = field(default_factory=lambda: deque(maxlen=KEPT))
+    lock: Lock = field(default_factory=Lock)
+    broken: bool = False
+
+
+def open_sampler(hz: float, pids: Sequence[int]) -> Sampler:
+    """Make the sampler of a run whose servers have ``pids``; one that reads nothing for ``hz`` 0."""
+    readers, left_out = open_readers(pids) if hz else ({}, {})
+    return Sampler(readers, hz or 1, left_out)
+
+
+class Sampler:
+    """Polls readers ``hz`` times a second on a thread of its own. Use as a context manager."""
+
+    def __init__(
+        self,
+        readers: Mapping[str, Reader],
+        hz: float,
+        left_out: Mapping[str, str] | None = None,
+        clock: Callable[[], int] = now_ns,
+    ) -> None:
+        """Take readers, which it closes; ``left_out`` names the others with their reasons, for the manifest.
+
+        Without readers it does nothing at all.
+        """
+        self._sources = [_Source(name, reader) for name, reader in readers.items()]
+        self._cheap = [source for source in self._sources if source.reader.cheap]
+        self._left_out = dict(left_out or {})
+        self._hz = hz
+        self._clock = clock
+        self._rows: deque[ResourceRow] = deque()
+        self._stop = Event()
+        self._thread = Thread(target=self._run, name="resources", daemon=True)
+        self._polls = self._late = 0
+        self._started_ns = self._seen_ns = 0
+        self._thread_cpu_ns = 0
+
+    def __enter__(self) -> Sampler:  # noqa: PYI034 - Self is typing's since 3.11
+        if self._sources:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        if self._sources:
+            self._thread.join()
+        for source in self._sources:
+            source.reader.close()
+
+    def poll(self) -> None:
+        """Read every reader once."""
+        for source in self._sources:
+            self._read(source)
+        self._polls += 1
+
+    def edge(self) -> None:
+        """Read the cheap readers: the border of a window, exactly here. Callable from any thread."""
+        for source in self._cheap:
+            self._read(source)
+
+    def flush(self, run: RunWriter) -> None:
+        """Append the rows since the last call to a run; the file is made with the first of them."""
+        if rows := [self._rows.popleft() for _ in range(len(self._rows))]:
+            run.append(RESOURCES, rows)
+
+    def window(self, start_ns: int, end_ns: int) -> dict[str, float]:
+        """Return what was spent from ``start_ns`` to ``end_ns``: facts of a sample, under the columns' names.
+
+        Counters give their rise, power and shares their mean, memory and temperature their largest value. ``power_w``
+        and ``energy_j`` are the board's where it is measured, else the sum of the readable parts.
+        """
+        facts: dict[str, float] = {}
+        for source in self._sources:
+            with source.lock:
+                facts |= _facts(source.readings, start_ns, end_ns, int(1e9 / self._hz))
+        parts = [facts[name] for name in PARTS if name in facts]
+        if "board_energy_j" in facts:
+            facts["energy_j"] = facts["board_energy_j"]
+        elif parts:
+            facts["energy_j"] = sum(parts)
+        if "energy_j" in facts and end_ns > start_ns:
+            facts["power_w"] = facts["energy_j"] / (end_ns - start_ns) * 1e9
+        return facts
+
+    def describe(self) -> dict[str, Any]:
+        """Return the manifest's word on it: readers, polls, and what they cost; nothing where nothing is read."""
+        if not self._sources:
+            return {}
+        elapsed_ns = self._seen_ns - self._started_ns
+        return {
+            "hz": self._hz,
+            "readers": {source.name: source.reader.about for source in self._sources},
+            "left_out": self._left_out,
+            "polls": self._polls,
+            "late": self._late,
+            "cost_us": {
+                source.name: round(median(source.costs_ns) / 1e3, 1) for source in self._sources if source.costs_ns
+            },
+            "edge_us": round(sum(median(source.costs_ns) for source in self._cheap if source.costs_ns) / 1e3, 1),
+            "core_share": round(self._thread_cpu_ns / elapsed_ns, 6) if elapsed_ns else None,
+        }
+
+    def _read(self, source: _Source) -> None:
+        """Take a reading; a reader that fails is read no more, and ends no run."""
+        with source.lock:  # so that a source's readings are in the order of their times
+            if source.broken:
+                return
+            before = self._clock()
+            try:
+                values = source.reader.read()
+            except Exception as error:  # noqa: BLE001 - drivers and other people's clients fail in their own ways
+                source.broken = True
+                self._left_out[source.name] = f"stopped after {len(source.costs_ns)} readings: {error!r}"
+                return
+            cost_ns = self._clock() - before
+            at_ns = before + cost_ns // 2
+            source.readings.append(Reading(at_ns, values))
+            source.costs_ns.append(cost_ns)
+            self._rows.append(ResourceRow(at_ns, source.name, cost_ns, **values))  # type: ignore[arg-type]
+
+    def _run(self) -> None:
+        """Poll at absolute times, so that what a poll takes does not add up; a missed time is left out."""
+        period_ns = int(1e9 / self._hz)
+        self._started_ns = due_ns = self._clock()
+        while True:
+            self.poll()
+            self._thread_cpu_ns = time.thread_time_ns()
+            self._seen_ns = self._clock()
+            due_ns += period_ns
+            missed = max(0, self._seen_ns - due_ns) // period_ns
+            self._late += missed
+            due_ns += missed * period_ns
+            if self._stop.wait(max(0, due_ns - self._seen_ns) / 1e9):
+                return
+
+
+def _facts(readings: deque[Reading], start_ns: int, end_ns: int, period_ns: int) -> dict[str, float]:
+    """Summarise one source's readings of a window; the last one before it stands in where there is none inside."""
+    inside: list[Reading] = []
+    before: Reading | None = None
+    for reading in reversed(readings):
+        if reading.at_ns < start_ns:
+            before = reading
+            break
+        if reading.at_ns <= end_ns:
+            inside.append(reading)
+    inside.reverse()
+    held = inside or ([before] if before and end_ns - before.at_ns <= 2 * period_ns else [])
+    facts: dict[str, float] = {}
+    for name in dict.fromkeys(name for reading in held for name in reading.values):
+        values = [(reading.at_ns, reading.values[name]) for reading in held if name in reading.values]
+        if name not in COUNTERS:
+            facts[name] = max(value for _, value in values) if name in PEAKS else fmean(value for _, value in values)
+        elif (rise := _rise(values, start_ns, end_ns)) is not None:
+            facts[name] = rise
+    for power, energy in ENERGY_OF_POWER.items():
+        seen = [reading.at_ns for reading in inside if power in reading.values]
+        if energy not in facts and len(seen) > 1 and seen[-1] - seen[0] >= COVERED * (end_ns - start_ns):
+            facts[energy] = facts[power] * (end_ns - start_ns) / 1e9
+    return facts
+
+
+def _rise(values: list[tuple[int, float]], start_ns: int, end_ns: int) -> float | None:
+    """Return how much a counter rose in a window; None where its readings do not span enough of it."""
+    (first_ns, first), (last_ns, last) = values[0], values[-1]
+    if last_ns <= first_ns or last_ns - first_ns < COVERED * (end_ns - start_ns):
+        return None
+    return (last - first) * (end_ns - start_ns) / (last_ns - first_ns)

@@ -1,0 +1,222 @@
+"""Whether a statistic changed between two sides of a comparison: effect sizes, their intervals, and one test."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+from s2a_bench.report.compare.batches import FEWEST_ROWS, Launch, Rows
+from s2a_bench.stats import Ratio
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A statistic of ``other`` against ``baseline``: as a ratio, as a difference, and as a probability.
+
+    ``superiority`` is the probability that a value of ``other`` is the larger of two, ties counted half (Vargha and
+    Delaney 2000); 0.5 means no difference. ``p`` is None where there are too few values for an interval.
+    ``dependent`` is true where neighbours are so alike that batches are not independent: the interval is too narrow.
+    """
+
+    baseline: float
+    other: float
+    ratio: Ratio
+    difference: Ratio
+    superiority: Ratio
+    p: float | None
+    dependent: bool
+
+    @property
+    def relative(self) -> float | None:
+        """Return the change as a share of the baseline's size; None where something came of nothing."""
+        if self.other == self.baseline:
+            return 0.0
+        if self.ratio.value is not None:
+            return self.ratio.value - 1
+        return None if self.baseline == 0 else (self.other - self.baseline) / abs(self.baseline)
+
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """Return the interval of `relative`; None where there is none."""
+        if self.ratio.low is not None and self.ratio.high is not None:
+            return self.ratio.low - 1, self.ratio.high - 1
+        low, high = self.difference.low, self.difference.high
+        if low is None or high is None or (self.baseline == 0 and (low, high) != (0, 0)):
+            return None
+        return low / (abs(self.baseline) or 1), high / (abs(self.baseline) or 1)
+
+
+def change_between(
+    baseline: Sequence[Rows],
+    other: Sequence[Rows],
+    statistic: str,
+    *,
+    seed: int,
+    confidence: float = 0.95,
+    exact: bool = False,
+) -> Change:
+    """Compare a statistic of two sides, each of one launch or more; every launch has at least one value.
+
+    ``exact`` values are computed, not sampled: any difference is one.
+
+    The test is Welch's t on the logarithm of the statistic (on the statistic itself where it may be zero or less);
+    the interval is that of the same t, so both agree. What the t is told about the spread of a side:
+
+    - several launches: that of the launches' own values (Kalibera and Jones 2013);
+    - one launch: its requests, in order of time, are cut into `BATCHES` batches, which are drawn with replacement
+      (a bootstrap of batches, n - 1 degrees of freedom). So neighbours that are alike, or a slow trend, widen the
+      interval. What differs only from launch to launch is not in it.
+    """
+    import numpy as np
+
+    rng = np.random.default_rng(seed)
+    launches = [[Launch(rows) for rows in side] for side in (baseline, other)]
+    draws = [side[0].draw(rng) if len(side) == 1 else None for side in launches]
+    below, above = (_Side.of(side, statistic, drawn, exact) for side, drawn in zip(launches, draws, strict=True))
+    plain = _Test.of(below, above, confidence)
+    if below.positive and above.positive:
+        test = _Test.of(below.log(), above.log(), confidence)
+        ratio = Ratio(*(None if value is None else math.exp(value) for value in (test.shift, test.low, test.high)))
+    else:
+        test = plain
+        ratio = Ratio(above.mean / below.mean if below.mean > 0 else None, None, None)
+    return Change(
+        below.level,
+        above.level,
+        ratio,
+        Ratio(plain.shift, plain.low, plain.high),
+        _superiority(launches, draws, confidence),
+        test.p,
+        any(side[0].dependent for side in launches if len(side) == 1),
+    )
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """Correct p-values for their number (Holm 1979); None, where there was no test, stays None and does not count."""
+    there = sorted((p, place) for place, p in enumerate(p_values) if p is not None)
+    corrected: list[float | None] = [None] * len(p_values)
+    highest = 0.0
+    for rank, (p, place) in enumerate(there):
+        highest = max(highest, min(1.0, p * (len(there) - rank)))
+        corrected[place] = highest
+    return corrected
+
+
+@dataclass(frozen=True, slots=True)
+class _Side:
+    """A statistic of one side: of each launch, and of every resample where there is only one launch."""
+
+    points: Floats
+    copies: Floats | None
+    launch: Launch
+    exact: bool
+
+    @classmethod
+    def of(cls, launches: Sequence[Launch], statistic: str, drawn: NDArray[np.int64] | None, exact: bool) -> _Side:
+        """Compute them; no resamples where there are too few values for an interval."""
+        import numpy as np
+
+        points = np.array([launch.statistic(statistic) for launch in launches])
+        copies = (
+            launches[0].replicate(statistic, drawn) if drawn is not None and launches[0].allows(statistic) else None
+        )
+        return cls(points, copies, launches[0], exact)
+
+    @property
+    def positive(self) -> bool:
+        """Tell whether it has a logarithm throughout."""
+        return all((values > 0).all() for values in (self.points, self.copies) if values is not None)
+
+    def log(self) -> _Side:
+        """Return the same on the logarithmic scale."""
+        import numpy as np
+
+        return _Side(np.log(self.points), None if self.copies is None else np.log(self.copies), self.launch, self.exact)
+
+    @property
+    def mean(self) -> float:
+        """Return the mean over the launches."""
+        return float(self.points.mean())
+
+    @property
+    def level(self) -> float:
+        """Return what is shown: the only value, else the geometric mean of the launches where there is one."""
+        if len(self.points) == 1 or not self.positive:
+            return self.mean
+        return math.exp(self.log().mean)
+
+    @property
+    def variance(self) -> tuple[float, int] | None:
+        """Return the variance of that mean with its degrees of freedom; None where nothing tells them."""
+        if self.exact:
+            return 0.0, 1
+        if (n := len(self.points)) > 1:
+            return float(self.points.var(ddof=1)) / n, n - 1
+        if self.copies is None:
+            return None
+        # Drawing k batches with replacement shows (k - 1) / k of the variance.
+        k = len(self.launch.batches)
+        # Equal values have no variance, whatever rounding says.
+        varies = self.copies.max() > self.copies.min()
+        return (float(self.copies.var()) * k / (k - 1) * self.launch.hidden if varies else 0.0), k - 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Test:
+    """Welch's t of two means; no interval and no p where a side has no variance to go by."""
+
+    shift: float
+    low: float | None
+    high: float | None
+    p: float | None
+
+    @classmethod
+    def of(cls, below: _Side, above: _Side, confidence: float) -> _Test:
+        """Test the second side against the first."""
+        from scipy import stats
+
+        shift = above.mean - below.mean
+        if below.variance is None or above.variance is None:
+            return cls(shift, None, None, None)
+        (first, df_first), (second, df_second) = below.variance, above.variance
+        total = first + second
+        if total == 0:  # nothing varies: every difference is certain
+            return cls(shift, shift, shift, 0.0 if shift else 1.0)
+        df = total**2 / (first**2 / df_first + second**2 / df_second)
+        error = math.sqrt(total)
+        reach = float(stats.t.ppf((1 + confidence) / 2, df)) * error
+        return cls(shift, shift - reach, shift + reach, float(2 * stats.t.sf(abs(shift) / error, df)))
+
+
+def _superiority(
+    sides: Sequence[Sequence[Launch]], draws: Sequence[NDArray[np.int64] | None], confidence: float
+) -> Ratio:
+    """Return P(other > baseline) + P(equal) / 2, with a percentile interval over the batches of two single launches."""
+    import numpy as np
+
+    below, above = ([batch for launch in side for batch in launch.batches] for side in sides)
+    wins = np.array([[_wins(one, np.sort(two)) for two in below] for one in above])
+    pairs = np.outer([len(one) for one in above], [len(two) for two in below])
+    value = float(wins.sum() / pairs.sum())
+    first, second = draws
+    if first is None or second is None or any(side[0].n_rows < FEWEST_ROWS for side in sides):
+        return Ratio(value, None, None)
+    found = ((second @ wins) * first).sum(axis=1) / ((second @ pairs) * first).sum(axis=1)
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(found, (tail, 1 - tail))
+    return Ratio(value, float(low), float(high))
+
+
+def _wins(values: Floats, ordered: Floats) -> float:
+    """Count the pairs in which the value is the larger one, ties half."""
+    import numpy as np
+
+    return float(sum(np.searchsorted(ordered, values, side).sum() for side in ("left", "right"))) / 2

@@ -1,0 +1,219 @@
+"""The comparison of two runs, or of two sets of launches: which cells belong together, what changed, by which test."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from s2a_bench.errors import UnlikeRuns, UsageError
+from s2a_bench.experiments.latency.view.cells import seed_of
+from s2a_bench.report.compare.alike import Difference, differences, in_words
+from s2a_bench.report.compare.batches import STATISTICS
+from s2a_bench.report.compare.change import Change, change_between, holm
+from s2a_bench.report.compare.metrics import HIGHER, KINDS, NEITHER, Kind, Metric, Subject
+
+if TYPE_CHECKING:
+    from s2a_bench.report.compare.batches import Floats
+    from s2a_bench.store.run import Run
+
+LEVEL: Final = 0.05
+"""The chance to call any difference one where there is none, over all comparisons together."""
+
+SAME, UNCLEAR, TOO_FEW = "same", "unclear", "too few"
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """One cell as the launches of both sides have it; never empty."""
+
+    baseline: tuple[Subject, ...]
+    other: tuple[Subject, ...]
+
+    @property
+    def name(self) -> str:
+        """Name the cell."""
+        return self.baseline[0].name
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One statistic of one cell: what changed, the p-value corrected for all comparisons, and the verdict."""
+
+    pair: Pair
+    metric: Metric
+    statistic: str
+    n: tuple[int, int]
+    change: Change
+    p_holm: float | None = None
+    verdict: str = TOO_FEW
+
+    @property
+    def name(self) -> str:
+        """Name the metric with its statistic."""
+        return f"{self.metric.name}.{self.statistic}"
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """Everything that is known of two sides. ``only`` lists the cells that have no partner, a side each."""
+
+    baseline: tuple[Run, ...]
+    other: tuple[Run, ...]
+    kind: Kind
+    differences: tuple[Difference, ...]
+    pairs: tuple[Pair, ...]
+    only: tuple[tuple[str, ...], tuple[str, ...]]
+    least: float
+    comparisons: tuple[Comparison, ...] = ()
+
+    @property
+    def launches(self) -> bool:
+        """Tell whether launches were repeated on both sides, so that they are what the test goes by."""
+        return len(self.baseline) > 1 and len(self.other) > 1
+
+    @property
+    def command(self) -> str:
+        """Name the command whose runs these are."""
+        return str(self.baseline[0].manifest["command"])
+
+
+def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bool, least: float) -> Compared:
+    """Find what belongs together. ``least`` is the smallest share that is called a change.
+
+    Raises UnlikeRuns where machine, model or setting differ and ``unlike`` does not allow it, UsageError where the
+    runs are of different commands.
+    """
+    runs = (*baseline, *other)
+    commands = list(dict.fromkeys(str(run.manifest["command"]) for run in runs))
+    if len(commands) > 1:
+        raise UsageError(f"these are runs of {' and '.join(commands)}: name runs of one command")
+    if commands[0] not in KINDS:
+        raise UsageError(f"runs of {commands[0]} cannot be compared, only those of {', '.join(KINDS)}")
+    if (len(baseline) > 1) != (len(other) > 1):
+        raise UsageError(
+            "name several launches on both sides, or one on each: the test goes by launches or by requests"
+        )
+    found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
+    fatal = [difference for difference in found if difference.fatal]
+    if fatal and not unlike:
+        raise UnlikeRuns(f"the runs are unlike: {in_words(fatal)}; --unlike compares them all the same")
+    kind = KINDS[commands[0]]
+    sides = [[{cell.name: cell for cell in kind.subjects(run)} for run in side] for side in (baseline, other)]
+    pairs, only, settings = _match(*sides)
+    if settings and not unlike:
+        raise UnlikeRuns(f"cells of one name differ: {in_words(settings)}; --unlike compares them all the same")
+    if not pairs:
+        raise UnlikeRuns(f"no cell is in every run: {', '.join(only[0])} against {', '.join(only[1])}")
+    return Compared(tuple(baseline), tuple(other), kind, (*settings, *found), tuple(pairs), only, least)
+
+
+def _match(
+    baseline: list[dict[str, Subject]], other: list[dict[str, Subject]]
+) -> tuple[list[Pair], tuple[tuple[str, ...], tuple[str, ...]], list[Difference]]:
+    """Pair the cells that every launch has; also return the others, and how settings differ under one name."""
+    everywhere = [name for name in baseline[0] if all(name in run for run in (*baseline, *other))]
+    pairs = [Pair(tuple(run[name] for run in baseline), tuple(run[name] for run in other)) for name in everywhere]
+    left = [
+        tuple(dict.fromkeys(name for run in side for name in run if name not in everywhere))
+        for side in (baseline, other)
+    ]
+    settings: dict[Difference, None] = {}
+    for pair in pairs:
+        first = pair.baseline[0]
+        for subject in (*pair.baseline[1:], *pair.other):
+            for key, value in first.setting.items():
+                if (found := subject.setting.get(key)) != value:
+                    settings[Difference(f"{pair.name} {key}", value, str(found), fatal=True)] = None
+    return pairs, (left[0], left[1]), list(settings)
+
+
+def metrics_of(compared: Compared, names: Sequence[str]) -> list[tuple[Metric, str]]:
+    """Return metric and statistic of each NAME or NAME.STATISTIC; ``all`` is every metric. Raises UsageError."""
+    metrics = compared.kind.metrics
+    wanted: dict[tuple[Metric, str], None] = {}
+    for name in names:
+        if name == "all":
+            wanted |= {(metric, metric.statistic): None for metric in metrics.values()}
+        else:
+            wanted[metric_of(compared, name, "--metric")] = None
+    return list(wanted)
+
+
+def shown_metrics(compared: Compared) -> list[tuple[Metric, str]]:
+    """Return the metrics that are compared unless others are named."""
+    return [(compared.kind.metrics[name], compared.kind.metrics[name].statistic) for name in compared.kind.shown]
+
+
+def metric_of(compared: Compared, name: str, flag: str) -> tuple[Metric, str]:
+    """Read NAME or NAME.STATISTIC; raises UsageError listing what there is, also where no cell has it."""
+    metrics = compared.kind.metrics
+    metric, dot, statistic = name.rpartition(".")
+    if name in metrics:
+        found, statistic = metrics[name], metrics[name].statistic
+    elif dot and metric in metrics and statistic in STATISTICS:
+        found = metrics[metric]
+    else:
+        has = [one for one in metrics if any(_rows(pair, one) for pair in compared.pairs)]
+        said = f"the statistics are {', '.join(STATISTICS)}" if metric in metrics else f"there are {', '.join(has)}"
+        raise UsageError(f"{flag}: '{name}' is no metric of these {compared.command} runs; {said}")
+    if not any(_rows(pair, found.name) for pair in compared.pairs):
+        raise UsageError(f"{flag}: no cell has {found.name} on both sides")
+    return found, statistic
+
+
+def compare(compared: Compared, wanted: Sequence[tuple[Metric, str]]) -> Compared:
+    """Compare every cell by every metric that it has on both sides, and judge what changed."""
+    found = [found for metric, statistic in wanted for found in changes(compared, metric, statistic)]
+    corrected = holm([comparison.change.p for comparison in found])
+    judged = [
+        replace(one, p_holm=p, verdict=verdict(one.change, p, one.metric, compared.least))
+        for one, p in zip(found, corrected, strict=True)
+    ]
+    return replace(compared, comparisons=tuple(judged))
+
+
+def changes(compared: Compared, metric: Metric, statistic: str) -> Iterator[Comparison]:
+    """Yield what changed in each cell that has the metric on both sides; not corrected, not judged."""
+    for pair in compared.pairs:
+        if rows := _rows(pair, metric.name):
+            exact = all(subject.exact for subject in (*pair.baseline, *pair.other))
+            change = change_between(*rows, statistic, seed=seed_of(compared.baseline[0]), exact=exact)
+            n = [sum(len(launch) for launch in side) for side in rows]
+            yield Comparison(pair, metric, statistic, (n[0], n[1]), change)
+
+
+def _rows(pair: Pair, metric: str) -> tuple[list[list[Floats]], list[list[Floats]]] | None:
+    """Return the rows of every launch; None where one has none."""
+    sides = [[list(subject.rows(metric)) for subject in side] for side in (pair.baseline, pair.other)]
+    return (sides[0], sides[1]) if all(all(side) for side in sides) else None
+
+
+def verdict(change: Change, p_holm: float | None, metric: Metric, least: float) -> str:
+    """Say in a word what a change means.
+
+    A change is one where the corrected p is below `LEVEL` and its size reaches ``least``: better, worse, or for a
+    metric without a good side lower, higher. "same" where the whole interval lies within ``least``; else "unclear".
+    """
+    if p_holm is None:
+        return TOO_FEW
+    relative, bounds = change.relative, change.bounds
+    if p_holm < LEVEL and (relative is None or abs(relative) >= least):
+        rises = change.other > change.baseline
+        if metric.better == NEITHER:
+            return "higher" if rises else "lower"
+        return "better" if rises == (metric.better == HIGHER) else "worse"
+    return SAME if bounds and max(map(abs, bounds)) <= least else UNCLEAR
+
+
+def read_side(text: str, flag: str) -> list[Run]:
+    """Read a run folder, or several with commas between them; raises UsageError, StoreError."""
+    from s2a_bench.store.run import read_run
+
+    folders = [part.strip() for part in text.split(",") if part.strip()]
+    if not folders:
+        raise UsageError(f"{flag}: name a run folder")
+    if len(set(folders)) < len(folders):
+        raise UsageError(f"{flag}: a folder is named twice; every launch counts once")
+    return [read_run(Path(folder)) for folder in folders]

@@ -1,0 +1,95 @@
+r"""Gates: conditions on a change under which a comparison fails, ``[CELL:]METRIC[.STATISTIC]>N%`` or ``<-N%``.
+
+``e2e.median>5%`` trips where the median of B is more than 5 % above that of A, ``tokens_per_s<-5%`` where it is more
+than 5 % below; ``ros/topic:`` or a pattern as ``http/*:`` in front narrows it to cells.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Final
+
+from s2a_bench.errors import UsageError
+from s2a_bench.report.compare.change import holm
+from s2a_bench.report.compare.comparison import LEVEL, Compared, Comparison, changes, metric_of
+
+_FLAG: Final = "--fail-if"
+_FORM: Final = re.compile(r"(?:(?P<cells>.+):)?(?P<metric>[\w.]+)\s*(?P<sign>>|<\s*-)\s*(?P<limit>\d+(?:\.\d+)?)\s*%")
+
+PASSED, TRIPPED, UNDECIDED = "passed", "tripped", "undecided"
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """One condition; ``limit`` is a share with its sign, ``cells`` a pattern, empty for all."""
+
+    text: str
+    cells: str
+    metric: str
+    rises: bool
+    limit: float
+
+    def beyond(self, relative: float | None, rises: bool) -> bool:
+        """Tell whether a change is past the limit; one that started from nothing has no size and is past every one."""
+        if relative is None:
+            return rises == self.rises
+        return relative > self.limit if self.rises else relative < self.limit
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What a gate said of one cell."""
+
+    gate: Gate
+    comparison: Comparison
+    p_holm: float | None
+    outcome: str
+
+
+def read_gate(text: str) -> Gate:
+    """Read a gate; raises UsageError."""
+    found = _FORM.fullmatch(text.strip())
+    if not found:
+        raise UsageError(f"{_FLAG}: '{text}' should look like e2e.median>5%, tokens_per_s<-5% or ros/topic:e2e.p99>10%")
+    rises = found["sign"] == ">"
+    limit = float(found["limit"]) / 100
+    return Gate(text, found["cells"] or "", found["metric"], rises, limit if rises else -limit)
+
+
+def judge(compared: Compared, gates: Sequence[Gate], *, strict: bool) -> list[Judgement]:
+    """Judge every gate in every cell it is about.
+
+    A gate trips where the change is past the limit *and* is one: its p-value, corrected by Holm for all cells of all
+    gates, is below `LEVEL`. With ``strict`` the change itself is enough. Without it a gate is undecided where there are
+    too few values for a test. Raises UsageError for a metric or a cell that there is not.
+    """
+    asked = [(gate, one) for gate in gates for one in _concerned(compared, gate)]
+    corrected = holm([one.change.p for _, one in asked])
+    return [
+        Judgement(gate, one, p, _outcome(gate, one, p, strict=strict))
+        for (gate, one), p in zip(asked, corrected, strict=True)
+    ]
+
+
+def _concerned(compared: Compared, gate: Gate) -> list[Comparison]:
+    """Return the comparisons that a gate is about."""
+    metric, statistic = metric_of(compared, gate.metric, _FLAG)
+    every = list(changes(compared, metric, statistic))
+    found = [one for one in every if not gate.cells or fnmatchcase(one.pair.name, gate.cells)]
+    if not found:
+        names = ", ".join(one.pair.name for one in every)
+        raise UsageError(f"{_FLAG}: no cell with {metric.name} is called '{gate.cells}'; there are {names}")
+    return found
+
+
+def _outcome(gate: Gate, comparison: Comparison, p_holm: float | None, *, strict: bool) -> str:
+    """Say in a word what a gate finds."""
+    change = comparison.change
+    past = gate.beyond(change.relative, change.other > change.baseline)
+    if p_holm is None and not strict:
+        return UNDECIDED
+    significant = p_holm is not None and p_holm < LEVEL
+    return TRIPPED if past and (strict or significant) else PASSED

@@ -1,0 +1,133 @@
+"""From folders to chapters: a run is one, a sweep an overview and what its cells' runs come to."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from s2a_bench.errors import StoreError
+from s2a_bench.report.compare.alike import differences
+from s2a_bench.report.page import Chapter, Content
+from s2a_bench.report.page.contents import content_of
+from s2a_bench.report.page.sweeps import overview, pooled, words_of
+from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep
+
+if TYPE_CHECKING:
+    from s2a_bench.report.compare.alike import Difference
+
+MOST_CHAPTERS = 12
+"""Runs of a sweep that get a chapter each; the others stand in the overview only."""
+
+
+def read_chapters(paths: Sequence[Path], *, against_paper: bool) -> list[Chapter]:
+    """Read run folders and sweeps, each once, in their order; raises StoreError where one is none, or damaged."""
+    found: list[Chapter] = []
+    for path in dict.fromkeys(path.resolve() for path in paths):
+        run = read_run(path)
+        if is_sweep(run.manifest):
+            found += _sweep(read_sweep(path), against_paper)
+        else:
+            found.append(_chapter(run, title_of(run.manifest), against_paper))
+    return [_named(chapter, place, found) for place, chapter in enumerate(found)]
+
+
+def title_of(manifest: Mapping[str, Any]) -> str:
+    """Name a run by its command, host and time."""
+    return f"{manifest.get('command', 'a run')} on {manifest.get('host', 'an unknown host')}, {when(manifest)}"
+
+
+def when(manifest: Mapping[str, Any]) -> str:
+    """Say when a run began, for people."""
+    return str(manifest.get("started", "at an unknown time")).replace("T", " ").replace("+00:00", " UTC")
+
+
+def repeat_command(manifest: Mapping[str, Any]) -> str:
+    """Write the command line that makes such a run, quoted for a shell."""
+    return shlex.join(["s2a-bench", *map(str, manifest.get("argv", [])[1:])])
+
+
+def mixed_machines(chapters: Sequence[Chapter]) -> list[str]:
+    """Say which runs come from machines unlike the first one's; their numbers are nowhere pooled."""
+    if not chapters:
+        return []
+    first = chapters[0]
+    said = []
+    for chapter in chapters[1:]:
+        unlike = [found for found in differences(first.run, chapter.run) if _of_machine(found)]
+        if unlike:
+            what = "; ".join(map(str, unlike))
+            said.append(
+                f"{chapter.title} ran on another machine than {first.title} ({what}): "
+                "their numbers stand side by side, and none is made of both."
+            )
+    return said
+
+
+def _of_machine(found: Difference) -> bool:
+    """Tell whether a difference makes it another machine."""
+    return found.fatal and not found.what.startswith("model ")
+
+
+def _chapter(run: Run, title: str, against_paper: bool, **more: Any) -> Chapter:
+    """Make a run's chapter; one that did not end may lack what its command's tables need."""
+    manifest = run.manifest
+    doubts = list(_unfinished(manifest))
+    try:
+        content = content_of(run, against_paper=against_paper)
+    except (KeyError, IndexError, TypeError, ValueError, StoreError) as error:
+        if not doubts:
+            raise StoreError(f"{run.path}: its rows and its manifest do not fit: {error!r}") from error
+        content = Content(summary=("What there is of this run is not enough for its tables; its CSV files hold it.",))
+    command = more.pop("command", repeat_command(manifest))
+    return Chapter(_slug(run.path.name), title, run, content, command, doubts, **more)
+
+
+def _slug(name: str) -> str:
+    """Make a folder's name fit for a path that LaTeX reads, and for an id."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "-", name) or "run"
+
+
+def _unfinished(manifest: Mapping[str, Any]) -> Iterator[str]:
+    """Say that a run did not come to its end."""
+    state = manifest.get("state")
+    if state == "running":
+        yield "This run has not finished: it is still running, or was killed. What follows are its rows so far."
+    elif state != "finished":
+        why = f": {manifest['error']}" if manifest.get("error") else ""
+        yield f"This run did not come to its end ({state}{why}). What follows are its rows until then."
+
+
+def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
+    """Yield the overview, runs that are computed as one, and the others one by one."""
+    manifest, head = sweep.manifest, Run(sweep.path, sweep.manifest, read_run(sweep.path).tables)
+    runs = list(sweep.runs())
+    copy = sweep.path / "sweep.toml"
+    attached = {copy.name: copy.read_text(encoding="utf-8")} if copy.is_file() else {}
+    doubts = list(_unfinished(manifest))
+    pools, single = pooled(sweep, runs)
+    if len(single) > MOST_CHAPTERS:
+        doubts.append(
+            f"{len(single)} cells were run: the first {MOST_CHAPTERS} have a chapter each, all are in the overview; "
+            "give the folders of others to s2a-bench report to see them."
+        )
+    command = repeat_command(manifest)
+    content = overview(sweep, runs)
+    yield Chapter(_slug(sweep.path.name), title_of(manifest), head, content, command, doubts, attached)
+    for place, run in enumerate(pools, 1):
+        what = f"{run.manifest['command']}s of the sweep" + (f", part {place}" if len(pools) > 1 else "")
+        yield _chapter(run, what, against_paper, command=command)
+    for settings, run in single[:MOST_CHAPTERS]:
+        yield _chapter(run, f"{run.manifest['command']}: {words_of(settings)}", against_paper)
+
+
+def _named(chapter: Chapter, place: int, chapters: Sequence[Chapter]) -> Chapter:
+    """Give a chapter a name that no other has: two of one folder, or of folders of one name, are numbered."""
+    from dataclasses import replace
+
+    same = [other for other in chapters if other.name == chapter.name]
+    number = sum(other.name == chapter.name for other in chapters[: place + 1])
+    return chapter if len(same) == 1 or number == 1 else replace(chapter, name=f"{chapter.name}-{number}")

@@ -1,0 +1,141 @@
+"""What the page shows of each command's runs: the tables and figures that the command itself makes, and sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Final
+
+from s2a_bench.report.page import Content
+from s2a_bench.report.page.sentences import (
+    boundary_sentences,
+    ccrb_sentences,
+    latency_sentences,
+    study_sentences,
+    throughput_sentences,
+    timeline_sentences,
+)
+
+if TYPE_CHECKING:
+    from s2a_bench.store.run import Run
+    from s2a_bench.writers.tables import TextTable
+
+
+def content_of(run: Run, *, against_paper: bool) -> Content:
+    """Return what a run shows; of a run without rows nothing, of an unknown command the names of its tables."""
+    if not any(len(table) for table in run.tables.values()):
+        return Content(summary=("The run has no rows: it ended before anything was measured.",))
+    command = str(run.manifest["command"])
+    build = CONTENTS.get(command) or CONTENTS.get(command.partition("-")[0], _other)
+    return build(run, against_paper)
+
+
+def _latency(run: Run, against_paper: bool) -> Content:
+    from s2a_bench.experiments.latency.view.as_csv import csv_texts
+    from s2a_bench.experiments.latency.view.figures import latency_figures
+    from s2a_bench.experiments.latency.view.files import latency_tables
+
+    tables = latency_tables(run)
+    main = [name for name in ("summary", "stages") if name in tables]
+    figures = latency_figures(run, against_paper)
+    return Content(latency_sentences(run), tables, main, csv_texts(run), figures)
+
+
+def _throughput(run: Run, against_paper: bool) -> Content:
+    from s2a_bench.experiments.throughput.view.figures import throughput_figures
+    from s2a_bench.experiments.throughput.view.tables import throughput_csv, throughput_tables
+
+    figures = throughput_figures(run, against_paper=against_paper)
+    return Content(throughput_sentences(run), throughput_tables(run), ["throughput"], throughput_csv(run), figures)
+
+
+def _timeline(run: Run, _against_paper: bool) -> Content:
+    from s2a_bench.experiments.timeline.view.cells import timelines_of
+    from s2a_bench.experiments.timeline.view.figures import timeline_figures
+    from s2a_bench.experiments.timeline.view.tables import timeline_csv, timeline_tables
+
+    shown = [cell for cell in timelines_of(run) if len(cell.skills)]
+    tables, csvs = timeline_tables(run), timeline_csv(run)
+    return Content(timeline_sentences(run), tables, ["timelines"], csvs, timeline_figures(run), shown)
+
+
+def _boundary(run: Run, _against_paper: bool) -> Content:
+    from s2a_bench.experiments.boundary.view.figure import boundary_figures
+    from s2a_bench.experiments.boundary.view.tables import boundary_csv, boundary_tables
+
+    tables = boundary_tables(run)
+    return Content(boundary_sentences(run), tables, ["boards"], boundary_csv(run), boundary_figures(run))
+
+
+def _study(run: Run, _against_paper: bool) -> Content:
+    from functools import partial
+
+    from s2a_bench.experiments.study.view.figures import FIGURES
+    from s2a_bench.experiments.study.view.tables import study_tables, table_files
+    from s2a_bench.writers.csv_text import csv_text
+
+    rows = run.tables["studies"]
+    name = str(rows["study"].iloc[0])
+    tables = table_files(study_tables(run))
+    csvs = {f"{name}.csv": csv_text(tuple(map(str, rows.columns)), _plain(rows))}
+    figures = {name: partial(FIGURES[name], run)} if name in FIGURES else {}
+    return Content(study_sentences(run), tables, list(tables), csvs, figures)
+
+
+def _ccrb(run: Run, _against_paper: bool) -> Content:
+    from s2a_bench.experiments.ccrb.view.figures import ccrb_figures
+    from s2a_bench.experiments.ccrb.view.tables import ccrb_csv, ccrb_tables
+
+    tables = ccrb_tables(run)
+    main = [name for name in ("outcomes", "phase", "random") if name in tables]
+    return Content(ccrb_sentences(run), tables, main, ccrb_csv(run), ccrb_figures(run))
+
+
+def _validity(run: Run, _against_paper: bool) -> Content:
+    from s2a_bench.experiments.model_validity.view import validity_tables
+
+    tables = validity_tables(run)
+    answers = len(run.tables["validity"])
+    return Content((f"{answers} answers to the prompts were parsed, skill by skill.",), tables, list(tables)[:1])
+
+
+def _other(run: Run, _against_paper: bool) -> Content:
+    """Tell what lies in a run that has no view of its own."""
+    rows = [f"{name} ({len(table)} rows)" for name, table in run.tables.items() if len(table)]
+    return Content(summary=(f"There is no view of {run.manifest['command']} runs; this one holds {', '.join(rows)}.",))
+
+
+CONTENTS: Final[dict[str, Callable[[Run, bool], Content]]] = {
+    "latency": _latency,
+    "throughput": _throughput,
+    "timeline": _timeline,
+    "boundary": _boundary,
+    "study": _study,
+    "ccrb": _ccrb,
+    "model validity": _validity,
+}
+"""Command, or its first word (study of study-drift), -> what its run shows."""
+
+
+LABELS: Final = {
+    "EMULATED": "emulated",
+    "dummy weights": "dummy weights",
+    "the paper's": "paper's claim",
+    "assumption": "assumption",
+    "are drawn": "drawn, not measured",
+    "echo engine": "echo engine",
+}
+"""Words of the tables' notes -> the label that the run carries on the page."""
+
+
+def labels_of(tables: Sequence[TextTable]) -> Iterator[str]:
+    """Yield the labels that a run carries, since its tables do."""
+    text = " ".join(note for table in tables for note in table.notes).lower()
+    yield from (label for word, label in LABELS.items() if word.lower() in text)
+
+
+def _plain(rows: object) -> Iterator[tuple[object, ...]]:
+    """Yield rows for a CSV file; what is missing is an empty field."""
+    import pandas as pd
+
+    for row in rows.itertuples(index=False, name=None):  # type: ignore[attr-defined]
+        yield tuple(None if pd.isna(value) else value for value in row)

@@ -1,0 +1,147 @@
+"""What a report writes: the page, and tables and figures for papers and programs, in a folder a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from s2a_bench.errors import StoreError, UsageError
+from s2a_bench.report.claims.verdicts import Judged, claim_table, judge_claims
+from s2a_bench.report.page.chapters import mixed_machines
+from s2a_bench.report.page.page import GENERATOR, render, tally
+from s2a_bench.report.page.plots import draw
+from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.writers.latex import document, escape, to_siunitx
+from s2a_bench.writers.tables import to_markdown
+
+if TYPE_CHECKING:
+    from s2a_bench.report.page import Chapter
+    from s2a_bench.report.page.plots import Drawn
+
+_MARK = f"<!-- {GENERATOR} -->"
+_HEAD_CHARS = 4096
+"""Where a file says who made it."""
+_LONG_ROWS = 30
+"""A page of a paper holds no more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """Where everything goes; None: it is not wanted."""
+
+    page: Path | None = None
+    latex: Path | None = None
+    csv: Path | None = None
+    markdown: Path | None = None
+
+    def check(self) -> None:
+        """Refuse, before any work, to write over what no report wrote; raises UsageError naming the flag."""
+        for flag, path in (("--output", self.page), ("--markdown", self.markdown)):
+            if path is not None:
+                _check_file(flag, path)
+        for flag, path in (("--latex", self.latex), ("--csv", self.csv)):
+            if path is not None and path.exists() and not path.is_dir():
+                raise UsageError(f"{flag}: {path} is a file; name a folder")
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A report before it is written: its chapters, the claims judged by their runs, and what must be known first."""
+
+    chapters: Sequence[Chapter]
+    judged: Sequence[Judged]
+    doubts: Sequence[str]
+
+
+def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
+    """Judge the claims where that is wanted, and look for runs of unlike machines."""
+    judged = judge_claims([chapter.run for chapter in chapters]) if against_paper else []
+    return Report(chapters, judged, mixed_machines(chapters))
+
+
+def write_report(report: Report, outputs: Outputs) -> list[Path]:
+    """Write what is wanted and return the files; figures are drawn once. Raises StoreError."""
+    drawn = {}
+    if outputs.page or outputs.latex:
+        for chapter in report.chapters:
+            drawn[chapter.name] = draw(chapter.name, chapter.content.figures, pdf=outputs.latex is not None)
+    texts: dict[Path, str | bytes] = {}
+    if outputs.page:
+        texts[outputs.page] = render(report.chapters, drawn, report.judged, report.doubts)
+    if outputs.latex:
+        texts |= {outputs.latex / name: text for name, text in _latex(report, drawn)}
+    if outputs.csv:
+        texts |= {outputs.csv / name: text for name, text in _csv(report)}
+    if outputs.markdown:
+        texts[outputs.markdown] = _markdown(report)
+    for path, text in texts.items():
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8", "backslashreplace"))
+        except OSError as error:
+            raise StoreError(f"cannot write {path}: {error.strerror}; name another place") from error
+    return list(texts)
+
+
+def _check_file(flag: str, path: Path) -> None:
+    if path.is_dir():
+        raise UsageError(f"{flag}: {path} is a folder; name a file")
+    if not path.exists():
+        return
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            ours = GENERATOR in file.read(_HEAD_CHARS)
+    except OSError as error:
+        raise UsageError(f"{flag}: cannot read {path}: {error.strerror}; name another file") from error
+    if not ours:
+        raise UsageError(f"{flag}: {path} is there, and s2a-bench report did not write it; name another file")
+
+
+def _latex(report: Report, drawn: dict[str, dict[str, Drawn]]) -> Iterator[tuple[str, str | bytes]]:
+    r"""Yield every table as .tex and figure as .pdf by its path, and a report.tex that shows all of them."""
+    parts = []
+    if report.judged:
+        table = claim_table(report.judged)
+        yield "claims.tex", to_siunitx(table, ("22mm", "62mm", "22mm", "130mm"), long=True)
+        parts.append(r"\input{claims}")
+    for chapter in report.chapters:
+        lines = [f"\\section*{{{escape(chapter.title)}}}"]
+        for name, table in chapter.content.tables.items():
+            yield f"{chapter.name}/{name}.tex", to_siunitx(table, long=len(table.rows) > _LONG_ROWS)
+            lines.append(f"\\input{{{chapter.name}/{name}}}")
+        for name, figure in drawn.get(chapter.name, {}).items():
+            if figure.pdf:
+                yield f"{chapter.name}/{name}.pdf", figure.pdf
+                path = f"{chapter.name}/{name}.pdf"
+                lines.append(f"\\begin{{figure}}[htbp]\\centering\\includegraphics{{{path}}}\\end{{figure}}")
+        parts.append("\n".join(lines))
+    yield "report.tex", document("s2a-bench report", parts)
+
+
+def _csv(report: Report) -> Iterator[tuple[str, str]]:
+    """Yield CSV texts by their paths."""
+    if report.judged:
+        rows = [
+            (each.verdict, each.claim.where, each.claim.text, each.claim.run, " ".join(each.evidence))
+            for each in report.judged
+        ]
+        yield "claims.csv", csv_text(("verdict", "where", "claim", "run", "evidence"), rows)
+    for chapter in report.chapters:
+        for name, text in chapter.content.csvs.items():
+            yield f"{chapter.name}/{name}", text
+
+
+def _markdown(report: Report) -> str:
+    """Return everything but the figures as one Markdown text."""
+    parts = [_MARK, *(f"> {doubt}" for doubt in report.doubts)]
+    if report.judged:
+        parts += [f"## The paper's claims\n\n{tally(report.judged)}.", to_markdown(claim_table(report.judged))]
+    for chapter in report.chapters:
+        parts.append(f"## {chapter.title}")
+        parts += [f"> {doubt}" for doubt in chapter.doubts]
+        parts.append("\n".join(f"- {text}" for text in chapter.content.summary))
+        parts.append(f"```sh\n{chapter.command}\n```")
+        parts += [to_markdown(table) for table in chapter.content.tables.values()]
+    return "\n\n".join(part for part in parts if part) + "\n"

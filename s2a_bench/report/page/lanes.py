@@ -1,0 +1,118 @@
+"""Timelines as what the page draws: panels of lanes of bars, in seconds from the request."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from s2a_bench.experiments.timeline.view.cells import Timelines, panels
+from s2a_bench.experiments.timeline.view.figures import policy_colours
+from s2a_bench.experiments.timeline.view.tables import seconds
+
+MOST_PANELS = 60
+"""More would make the page heavy; the tables and CSV files have all."""
+TICKS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """One skill or stall; ``text`` says all about it."""
+
+    kind: str
+    start_s: float
+    width_s: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """One policy's plan: where it waits, acts and stalls; S0 and the tokens when they arrived, if they are its own."""
+
+    name: str
+    colour: str
+    bars: tuple[Bar, ...]
+    start_s: float
+    safe_start_s: float
+    tokens_s: tuple[float, ...]
+    complete_s: tuple[float, ...]
+    words: str
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One board and granularity; ``tokens`` and ``complete`` are those that all lanes share, empty where none do."""
+
+    title: str
+    end_s: float
+    ticks: tuple[float, ...]
+    lanes: tuple[Lane, ...]
+    tokens_s: tuple[float, ...]
+    complete_s: tuple[float, ...]
+
+
+def panels_of(cells: Sequence[Timelines]) -> list[Panel]:
+    """Lay out the shown plan of every cell, a panel a setting."""
+    colours = policy_colours(list(dict.fromkeys(cell.policy for cell in cells)))
+    return [_panel(setting, group, colours) for setting, group in list(panels(cells))[:MOST_PANELS]]
+
+
+def _panel(setting: tuple[str, int, int, float], cells: Sequence[Timelines], colours: dict[str, str]) -> Panel:
+    title, tokens, n_skills, t_nom_s = setting
+    shared = len({cell.about("request_id") for cell in cells}) == 1
+    end_s = max(cell.moment_s("end") for cell in cells) * 1.02
+    rate = f"{cells[0].about('tokens_per_s'):g} tokens/s"
+    board = title if rate in title else f"{title}, {rate}"
+    plans = f"; plan 1 of {cells[0].n}" if cells[0].n > 1 else ""
+    return Panel(
+        f"{board}: L = {tokens}, N = {n_skills}, T_nom = {t_nom_s:g} s{plans}",
+        end_s,
+        ticks_of(end_s),
+        tuple(_lane(cell, colours[cell.policy], own_tokens=not shared) for cell in cells),
+        tuple(cells[0].token_s) if shared else (),
+        _complete_s(cells[0]) if shared else (),
+    )
+
+
+def ticks_of(end_s: float) -> tuple[float, ...]:
+    """Return round times from 0 to the end, at most eight."""
+    step = next(
+        each
+        for power in range(-6, 12)
+        for each in (1 * 10.0**power, 2 * 10.0**power, 5 * 10.0**power)
+        if end_s <= TICKS * each
+    )
+    return tuple(place * step for place in range(int(end_s / step) + 1))
+
+
+def _lane(cell: Timelines, colour: str, *, own_tokens: bool) -> Lane:
+    bars = []
+    for skill in cell.skills.to_dict("records"):
+        start, end, stall, arrival = (skill[f"{name}_ns"] / 1e9 for name in ("start", "end", "stall", "arrival"))
+        name = f"skill {skill['index'] + 1}" + (f" {skill['text']}" if skill["text"] else "")
+        if stall > 0:
+            span = f"{seconds(start - stall)} to {seconds(start)} s"
+            text = f"{cell.policy}: stall of {seconds(stall)} s before {name}, {span}"
+            bars.append(Bar("stall", start - stall, stall, text))
+        stalled = f", after a stall of {seconds(stall)} s" if stall > 0 else ", no stall before it"
+        text = (
+            f"{cell.policy}: {name} arrives at {seconds(arrival)} s, runs {seconds(start)} to {seconds(end)} s{stalled}"
+        )
+        bars.append(Bar("skill", start, end - start, text))
+    stalls, stall_s = int(cell.rows["stalls"].iloc[0]), cell.moment_s("stall")
+    words = f"starts {seconds(cell.moment_s('start'))} s, ends {seconds(cell.moment_s('end'))} s, "
+    words += f"{stalls} stalls, {seconds(stall_s)} s" if stall_s else "no stalls"
+    return Lane(
+        cell.policy,
+        colour,
+        tuple(bars),
+        cell.moment_s("start"),
+        cell.moment_s("safe_start"),
+        tuple(cell.token_s) if own_tokens else (),
+        _complete_s(cell) if own_tokens else (),
+        words,
+    )
+
+
+def _complete_s(cell: Timelines) -> tuple[float, ...]:
+    """Return when each skill's fragment was complete."""
+    return tuple(cell.skills["arrival_ns"].to_numpy(dtype="float64") / 1e9)

@@ -1,0 +1,118 @@
+"""The page: one HTML file with its styles, its script and its figures inside, and nothing fetched."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from s2a_bench import __version__
+from s2a_bench.report.claims.claim import NO_RUN
+from s2a_bench.report.claims.verdicts import Judged
+from s2a_bench.report.page.chapters import when
+from s2a_bench.report.page.contents import labels_of
+from s2a_bench.report.page.lanes import MOST_PANELS, panels_of
+from s2a_bench.store.manifest import utc_now
+from s2a_bench.store.sweep import is_sweep
+
+if TYPE_CHECKING:
+    from s2a_bench.report.page import Chapter
+    from s2a_bench.report.page.plots import Drawn
+
+GENERATOR = "s2a-bench report"
+"""What the page says it was made by: such a file may be written over."""
+
+
+def render(
+    chapters: Sequence[Chapter],
+    figures: dict[str, dict[str, Drawn]],
+    judged: Sequence[Judged],
+    doubts: Sequence[str],
+) -> str:
+    """Return the page; ``figures`` are those of each chapter by its name. Every text of a run is escaped."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    world = Environment(
+        loader=PackageLoader("s2a_bench.report.page", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    world.filters["short"] = lambda value: f"{value:.6g}"
+    world.globals.update(most_panels=MOST_PANELS, no_run=NO_RUN)
+    source = world.loader
+    assert source is not None  # noqa: S101 - it was just given
+    shown = [_view(chapter, figures.get(chapter.name, {})) for chapter in chapters]
+    return world.get_template("page.html").render(
+        generator=GENERATOR,
+        version=__version__,
+        made=utc_now().replace("T", " ").replace("+00:00", " UTC"),
+        style=source.get_source(world, "page.css")[0],
+        script=source.get_source(world, "page.js")[0],
+        title=title_of_page(chapters),
+        chapters=shown,
+        judged=judged,
+        tally=tally(judged),
+        doubts=doubts,
+    )
+
+
+def title_of_page(chapters: Sequence[Chapter]) -> str:
+    """Name the page after its only folder, or count them: a sweep's chapters are of one."""
+    folders = [chapter for chapter in chapters if not any(top in chapter.run.path.parents for top in _sweeps(chapters))]
+    names = {chapter.run.path: chapter.title for chapter in reversed(folders)}
+    return next(iter(names.values())) if len(names) == 1 else f"{len(names)} runs, side by side"
+
+
+def _sweeps(chapters: Sequence[Chapter]) -> list[Path]:
+    return [chapter.run.path for chapter in chapters if is_sweep(chapter.manifest)]
+
+
+def tally(judged: Sequence[Judged]) -> str:
+    """Count the verdicts in words."""
+    verdicts = [each.verdict for each in judged]
+    return ", ".join(f"{verdicts.count(each)} {each}" for each in dict.fromkeys(verdicts))
+
+
+def _view(chapter: Chapter, figures: dict[str, Drawn]) -> dict[str, Any]:
+    """Return what the template shows of a chapter."""
+    content, manifest = chapter.content, chapter.manifest
+    main = [content.tables[name] for name in content.main]
+    return {
+        "id": "run-" + re.sub(r"[^A-Za-z0-9_-]", "-", chapter.name),
+        "title": chapter.title,
+        "folder": str(chapter.run.path),
+        "state": manifest.get("state", "unknown"),
+        "started": when(manifest),
+        "labels": list(labels_of([*content.tables.values()])),
+        "summary": content.summary,
+        "doubts": chapter.doubts,
+        "warnings": manifest.get("warnings", []),
+        "tables": main,
+        "more": [table for name, table in content.tables.items() if name not in content.main],
+        "panels": panels_of(content.timelines),
+        "left_out": max(0, len({cell.setting for cell in content.timelines}) - MOST_PANELS),
+        "figures": figures,
+        "command": chapter.command,
+        "attached": chapter.attached,
+        "environment": list(_facts(manifest.get("environment", {}))),
+        "model": list(_facts(manifest.get("model") or {})),
+        "configuration": list(_facts(manifest.get("configuration", {}))),
+        "seeds": list(_facts(manifest.get("seeds", {}))),
+    }
+
+
+def _facts(facts: Any, prefix: str = "") -> list[tuple[str, str]]:
+    """Return nested facts as lines: a dotted name and its value."""
+    if isinstance(facts, dict):
+        return [
+            line for name, value in facts.items() for line in _facts(value, f"{prefix}.{name}" if prefix else str(name))
+        ]
+    if isinstance(facts, list) and any(isinstance(each, dict) for each in facts):
+        return [line for place, value in enumerate(facts) for line in _facts(value, f"{prefix}.{place}")]
+    if facts is None or facts in ("", []):
+        return []
+    text = ", ".join(map(str, facts)) if isinstance(facts, list) else str(facts)
+    return [(prefix, text)]

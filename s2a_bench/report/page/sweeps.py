@@ -1,0 +1,152 @@
+"""What a sweep shows: its cells at a glance, and timelines that were computed cell by cell put together again.
+
+Only what is computed is put together: measured cells stay runs of their own, since machines and moments differ.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from s2a_bench.experiments.latency.view.cells import cells_of, engine_note
+from s2a_bench.experiments.latency.view.tables import TITLES
+from s2a_bench.report.page import Content
+from s2a_bench.stats import summary_of
+from s2a_bench.store.run import Run
+from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.writers.tables import ABSENT, TextTable, mean_sd, number
+
+if TYPE_CHECKING:
+    from s2a_bench.experiments.latency.view.cells import Cell, Floats
+    from s2a_bench.store.sweep import Sweep
+
+Runs = Sequence[tuple[dict[str, Any], Run]]
+
+_AXES: Final = ("policies", "profiles", "rates", "tokens_per_skill", "n_skills", "t_nom_s")
+"""What may differ between timelines that belong together: the name of a timeline's cell tells these apart."""
+
+
+def overview(sweep: Sweep, runs: Runs) -> Content:
+    """Return the cells of a sweep with what became of them, and the numbers of measured ones side by side."""
+    states = sweep.cells["state"].value_counts().to_dict()
+    asked = int(sweep.manifest["configuration"].get("cells", len(sweep.cells)))
+    done = int(states.get("finished", 0))
+    said = [f"{done} of {asked} cells of s2a-bench {sweep.manifest['configuration']['command']} are finished."]
+    if failed := int(states.get("failed", 0)):
+        said.append(f"{failed} failed; the table of cells says why, and --resume --retry-failed runs them again.")
+    tables = {"cells": cell_table(sweep)}
+    if measured := measured_table(runs):
+        tables = {"overview": measured, **tables}
+    csvs = {"cells.csv": csv_text(tuple(map(str, sweep.cells.columns)), _plain(sweep.cells))}
+    return Content(said, tables, ["overview"] if measured else [], csvs)
+
+
+def cell_table(sweep: Sweep) -> TextTable:
+    """Lay out every cell: what was set, where it ran, how it ended, how long it took."""
+    rows: list[tuple[str, ...]] = [
+        (
+            str(row["cell"]),
+            words_of(json.loads(row["settings"])),
+            str(row["host"]),
+            str(row["state"]) + (f": {row['error']}" if row["error"] else ""),
+            str(row["repeat"]),
+            str(row["attempt"]),
+            f"{row['wall_s']:.1f}",
+        )
+        for row in sweep.cells.to_dict("records")
+    ]
+    return TextTable("Cells", ("cell", "settings", "host", "state", "repeat", "attempt", "took s"), rows, 4)
+
+
+def measured_table(runs: Runs) -> TextTable | None:
+    """Lay out the numbers of latency and throughput cells side by side; None where there are none."""
+    rows = [row for settings, run in runs for row in _measured(words_of(settings), run)]
+    if not rows:
+        return None
+    header = ("settings", "cell", "what", "host", "n", "errors", "mean ± sd", "median", "p99")
+    notes = sorted({f"{note[0].upper()}{note[1:]}." for _, run in runs if (note := engine_note(run, cells_of(run)))})
+    return TextTable("Measured cells side by side", header, rows, 4, notes=tuple(notes))
+
+
+def words_of(settings: Mapping[str, Any]) -> str:
+    """Write settings as a person would: payload jpeg, size 640x480."""
+    return ", ".join(f"{name} {value}" for name, value in settings.items()) or "as the command has it"
+
+
+def pooled(sweep: Sweep, runs: Runs) -> tuple[list[Run], Runs]:
+    """Put computed timelines of like configuration together; return them and the runs that stay alone."""
+    groups: dict[str, list[list[Run]]] = {}
+    single = []
+    for settings, run in runs:
+        if not _is_virtual(run):
+            single.append((settings, run))
+            continue
+        asked = {name: value for name, value in run.manifest["configuration"].items() if name not in _AXES}
+        parts = groups.setdefault(json.dumps(asked, sort_keys=True), [])
+        free = next((part for part in parts if not any(_overlap(run, other) for other in part)), None)
+        if free is None:
+            parts.append([run])
+        else:
+            free.append(run)
+    return [_joined(sweep, part) for parts in groups.values() for part in parts], single
+
+
+def _is_virtual(run: Run) -> bool:
+    rows = run.tables["timelines"]
+    return run.manifest["command"] == "timeline" and len(rows) > 0 and bool((rows["mode"] == "virtual").all())
+
+
+def _overlap(one: Run, other: Run) -> bool:
+    """Tell whether two runs have a cell of one name, as repeats without anything random have."""
+    return bool(set(one.tables["timelines"]["cell"]) & set(other.tables["timelines"]["cell"]))
+
+
+def _joined(sweep: Sweep, runs: Sequence[Run]) -> Run:
+    """Make one run of several: rows one below the other in the order of board, L, N, T; shared tokens once."""
+    import pandas as pd
+
+    tables = {
+        name: pd.concat([run.tables[name] for run in runs], ignore_index=True) if any_rows else first
+        for name, first in runs[0].tables.items()
+        for any_rows in [any(len(run.tables[name]) for run in runs)]
+    }
+    tables["tokens"] = tables["tokens"].drop_duplicates(["request_id", "index"], ignore_index=True)
+    manifest = dict(runs[0].manifest)
+    for name in ("boards", "warnings"):
+        every = [each for run in runs for each in run.manifest.get(name, [])]
+        manifest[name] = list({json.dumps(each, sort_keys=True): each for each in every}.values())
+    manifest["calibrations"] = {
+        name: found for run in runs for name, found in (run.manifest.get("calibrations") or {}).items()
+    }
+    return Run(sweep.path, manifest, tables)
+
+
+def _measured(words: str, run: Run) -> Iterator[tuple[str, ...]]:
+    """Yield a row a cell of a measured run."""
+    if run.samples.empty:
+        return
+    for cell in cells_of(run):
+        what, values = _quantity(cell, run)
+        found = summary_of(values)
+        numbers = [mean_sd(found), number(found.median), number(found.p99)] if found else [ABSENT] * 3
+        host = str(run.manifest.get("host", ""))
+        yield words, cell.name, what, host, str(cell.n), str(cell.errors), *numbers
+
+
+def _quantity(cell: Cell, run: Run) -> tuple[str, Floats]:
+    """Return what a cell is judged by: tokens/s of a throughput run, else e2e without inference where it is known."""
+    if run.manifest["command"] == "throughput":
+        from s2a_bench.experiments.throughput.view.cells import Speed
+
+        return "tokens/s", Speed(cell).values("tokens_per_s")
+    metric = next((name for name in ("e2e_without_inference", "e2e") if cell.values_ms(name).size), "e2e")
+    return f"{TITLES[metric]}, ms", cell.values_ms(metric)
+
+
+def _plain(rows: Any) -> Iterator[tuple[object, ...]]:
+    """Yield rows for a CSV file; what is missing is an empty field."""
+    import pandas as pd
+
+    for row in rows.itertuples(index=False, name=None):
+        yield tuple(None if value is None or value is pd.NA or value != value else value for value in row)  # noqa: PLR0124 - NaN

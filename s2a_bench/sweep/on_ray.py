@@ -1,0 +1,139 @@
+"""Cells on a Ray cluster: those that need a board go where it is, virtual ones to every core of every node.
+
+A node offers its board as a custom resource, ``ray start --address=HEAD:6379 --resources='{"board:NAME": 1}'``.
+A cell's run folder comes back through Ray, so that nodes need no common disk. Ray runs the cells of a lost node again
+elsewhere, or waits until a node has the board.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import socket
+import tarfile
+from collections.abc import Mapping
+from concurrent.futures import Future
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final, TypeAlias
+
+from s2a_bench.errors import UsageError
+from s2a_bench.machine.environment import collect
+from s2a_bench.store.manifest import utc_now
+from s2a_bench.sweep import Cell, Outcome
+from s2a_bench.sweep.perform import perform
+from s2a_bench.sweep.plan import Plan
+
+INSTALL: Final = "--ray needs Ray, which is not installed here: .venv/bin/pip install -e '.[ray]' -c constraints.txt"
+LOCAL: Final = "local"
+TRIES: Final = 5
+"""How often a cell is run again because its node or process was lost."""
+AHEAD: Final = 2
+"""Virtual cells given to Ray for each core: one runs, one waits."""
+PROBE_S: Final = 5.0
+OBJECT_STORE_BYTES: Final = 256 << 20
+"""Of a local cluster: run folders are small."""
+
+Packed: TypeAlias = tuple[Outcome, bytes]
+
+
+class OnRay:
+    """A cluster that runs there, or one of this machine's cores made for the sweep."""
+
+    def __init__(self, entry: str, address: str, plan: Plan, jobs: int) -> None:
+        """Connect; raises UsageError where Ray is not installed, does not answer, or no node has a board."""
+        connect(address, jobs)
+        import ray
+
+        self._entry = entry
+        self._refs: set[Any] = set()
+        resources = ray.cluster_resources()
+        try:
+            _check(plan, resources)
+        except UsageError:
+            ray.shutdown()
+            raise
+        self.width = max(AHEAD * int(resources.get("CPU", 1)), 1)
+        self._remote = ray.remote(max_retries=TRIES)(packed)
+
+    def submit(self, cell: Cell, folder: Path) -> Future[Packed]:  # noqa: ARG002 - it is unpacked later
+        """Give a cell to the cluster."""
+        wants = {} if cell.virtual else {"resources": {resource(cell.board): 1}}
+        ref = self._remote.options(name=f"{cell.name}-r{cell.repeat}", **wants).remote(cell, self._entry)
+        self._refs.add(ref)
+        future: Future[Packed] = ref.future()
+        future.add_done_callback(lambda _: self._refs.discard(ref))
+        return future
+
+    def collect(self, future: Future[Packed], folder: Path) -> Outcome:
+        """Unpack a cell's run folder and return how it went."""
+        from ray.exceptions import RayError
+
+        try:
+            outcome, data = future.result()
+        except RayError as error:
+            return Outcome(f"Ray gave it up: {str(error).splitlines()[0]}", 0.0, utc_now(), collect())
+        with tarfile.open(fileobj=io.BytesIO(data)) as archive:
+            archive.extractall(folder, filter="data")
+        return outcome
+
+    def __enter__(self) -> OnRay:  # noqa: PYI034 - Self is typing's since 3.11
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Cancel what is under way and leave the cluster."""
+        import ray
+
+        for ref in list(self._refs):
+            ray.cancel(ref, force=True)
+        ray.shutdown()
+
+
+def connect(address: str, jobs: int) -> None:
+    """Join the cluster at an address, or make one of ``jobs`` cores for "local"; raises UsageError."""
+    if find_spec("ray") is None:
+        raise UsageError(INSTALL)
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is told to anybody
+    import ray
+
+    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address == LOCAL:
+        ray.init(num_cpus=jobs, include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, address=LOCAL, **quiet)
+        return
+    try:
+        host, colon, port = address.rpartition(":")
+        if colon and port.isdecimal():  # Ray itself would try for minutes
+            socket.create_connection((host.rpartition("/")[2], int(port)), PROBE_S).close()
+        ray.init(address=address, **quiet)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise UsageError(f"--ray: no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
+
+
+def _check(plan: Plan, resources: Mapping[str, float]) -> None:
+    """Refuse cells that no node could take."""
+    missing = [board for board in plan.boards if not resources.get(resource(board))]
+    if missing:
+        offered = ", ".join(name.partition(":")[2] for name in resources if name.startswith("board:"))
+        raise UsageError(
+            f"--ray: no node offers {', '.join(missing)} (offered: {offered or 'none'}); start Ray there with "
+            f"--resources='{{\"{resource(missing[0])}\": 1}}'"
+        )
+    if any(not cell.virtual and not cell.board for cell in plan.cells):
+        raise UsageError('--ray: cells that measure need a machine: add board = "NAME" to the sweep file\'s settings')
+
+
+def resource(board: str) -> str:
+    """Name the custom resource of a board."""
+    return f"board:{board}"
+
+
+def packed(cell: Cell, entry: str) -> Packed:
+    """Carry out a cell on a node and pack its folder."""
+    with TemporaryDirectory(prefix="s2a-bench-cell-") as place:
+        folder = Path(place) / "cell"
+        outcome = perform(cell, folder, entry)
+        data = io.BytesIO()
+        with tarfile.open(fileobj=data, mode="w:gz", compresslevel=1) as archive:
+            archive.add(folder, arcname=".")
+        return outcome, data.getvalue()

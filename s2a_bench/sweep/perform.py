@@ -1,0 +1,95 @@
+"""One cell carried out, on whatever machine this is: in this process where it is virtual, else in one of its own."""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import signal
+import subprocess
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any, Final
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import S2AError, StoreError
+from s2a_bench.machine.environment import collect
+from s2a_bench.store import manifest as manifests
+from s2a_bench.sweep import Cell, Outcome
+
+LOG: Final = "stderr.txt"
+PR_SET_PDEATHSIG: Final = 1
+_prctl = ctypes.CDLL(None).prctl
+
+
+def perform(cell: Cell, folder: Path, entry: str) -> Outcome:
+    """Run a cell's command with ``--output`` at a new folder; ``entry`` is "module:function" of the command line.
+
+    Whatever goes wrong in the cell is the outcome's error.
+    """
+    folder.mkdir(parents=True)
+    argv = [*cell.argv, f"--output={folder}"]
+    started, before_ns = manifests.utc_now(), now_ns()
+    error = _inside(argv, entry) if cell.virtual else _outside(argv, folder / LOG)
+    wall_s = (now_ns() - before_ns) / 1e9
+    path = run_folder(folder)
+    if path is None and not error:
+        error = "it left no run folder"
+    try:
+        environment = manifests.read(path)["environment"] if path else collect()
+    except StoreError as wrong:
+        environment, error = collect(), error or str(wrong)
+    return Outcome(error, wall_s, started, environment)
+
+
+def run_folder(folder: Path) -> Path | None:
+    """Find the one run folder in a cell's folder."""
+    return next((path.parent for path in folder.glob(f"*/{manifests.NAME}")), None)
+
+
+def end_with_parent(number: signal.Signals = signal.SIGKILL) -> None:
+    """Have the kernel end this process when the one that started it is gone, however it went."""
+    _prctl(PR_SET_PDEATHSIG, number)
+
+
+def _inside(argv: list[str], entry: str) -> str:
+    """Run the command here, quietly; return what went wrong."""
+    run: Any = resolve_name(entry)
+    given = sys.argv
+    sys.argv = ["s2a-bench", *argv]  # what the run's manifest says
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            run(argv)
+    except S2AError as error:
+        return str(error)
+    except Exception as error:  # noqa: BLE001 - a cell that breaks is told, and the others go on
+        return f"{type(error).__name__}: {error}"
+    finally:
+        sys.argv = given
+    return ""
+
+
+def _outside(argv: list[str], log: Path) -> str:
+    """Run the command as a user would, in a process that may crash; return what went wrong."""
+    with log.open("wb") as errors:
+        done = subprocess.run(  # noqa: S603 - our own command line
+            [sys.executable, "-m", "s2a_bench", *argv],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+            check=False,
+            start_new_session=True,  # Ctrl-C is the sweep's to handle
+            preexec_fn=_stop_with_parent,
+        )
+    if not done.returncode:
+        return ""
+    lines = log.read_text(errors="replace").strip().splitlines()
+    told = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
+    how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+    return told[-1] if told else f"{how}: {lines[-1][:200]}" if lines else how
+
+
+def _stop_with_parent() -> None:
+    """Let it close its run folder and stop its servers."""
+    end_with_parent(signal.SIGTERM)

@@ -1,0 +1,142 @@
+"""From a sweep file to cells: each setting as the command line that its command reads, in the order they run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from s2a_bench.boards.search import find_profile
+from s2a_bench.errors import UsageError
+from s2a_bench.sweep import Cell, Command
+from s2a_bench.sweep.file import BOARD, OWN, SweepFile, like
+from s2a_bench.sweep.grid import Setting, rounds
+
+HASHED_WHOLE = 1 << 20
+"""Bytes up to which a file that a setting names is known by its content; a larger one, by size and time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The cells of a sweep in the order in which they run."""
+
+    command: str
+    cells: tuple[Cell, ...]
+    rest_s: float
+    seed: int
+    repeats: int
+
+    @property
+    def config_hash(self) -> str:
+        """Tell this sweep from any other: a changed value, axis, order or profile changes it."""
+        return _hash([self.command, self.rest_s, self.seed, [[*cell.key, cell.config_hash] for cell in self.cells]])
+
+    @property
+    def boards(self) -> tuple[str, ...]:
+        """Name the machines that cells need."""
+        return tuple(dict.fromkeys(cell.board for cell in self.cells if cell.board))
+
+
+def plan_sweep(file: SweepFile, command: Command, boards: Collection[str] | None = None) -> Plan:
+    """Make the cells, those for ``boards`` and those that need none; None: all.
+
+    Raises UsageError, naming the file and the key, for a flag that the command does not have or a value that its
+    parser refuses.
+    """
+    settings = list(enumerate(file.settings, 1))
+    for _, setting in settings:
+        _check_keys(file, command, setting)
+    here = [(number, each) for number, each in settings if boards is None or each.get(BOARD, "") in {"", *boards}]
+    if not here:
+        wanted = ", ".join(dict.fromkeys(str(setting[BOARD]) for _, setting in settings))
+        raise UsageError(f"--board: {file.path} has cells for {wanted} only; name one of them, or use --ray")
+    cells = []
+    for repeat, (number, setting) in rounds(here, file.repeats, file.seed):
+        argv = _argv(file, command, setting, file.seed + repeat - 1)
+        try:
+            command.check(argv[1:])
+        except UsageError as error:
+            raise UsageError(f"{file.path}: {_words(setting)}: {error}") from error
+        real = command.real is None or any(setting.get(key) == value for key, value in command.real.items())
+        found = _hash([argv, setting.get(BOARD), [_content(path) for path in _files(setting)]])
+        plain = {key: _text(value) if isinstance(value, list) else value for key, value in setting.items()}
+        cells.append(Cell(number, repeat, plain, tuple(argv), not real, setting.get(BOARD, ""), found))
+    return Plan(command.name, tuple(cells), file.rest_s, file.seed, file.repeats)
+
+
+def _check_keys(file: SweepFile, command: Command, setting: Setting) -> None:
+    """Refuse what is no flag, and values of the wrong kind."""
+    for key, value in setting.items():
+        if key == BOARD:
+            if not isinstance(value, str) or not value:
+                raise UsageError(f"{file.path}: board: {value!r} should be the name of a machine")
+            continue
+        if key not in command.flags:
+            known = sorted({*command.flags, BOARD}.difference(OWN))
+            hint = like(key, known) or f"; it has {', '.join(known)}"
+            raise UsageError(f"{file.path}: '{key}' is no flag of s2a-bench {command.name}{hint}")
+        if command.flags[key] in {"switch", "toggle"}:
+            if not isinstance(value, bool):
+                raise UsageError(f"{file.path}: {key}: {value!r} should be true or false")
+        else:
+            for each in value if isinstance(value, list) else [value]:
+                if isinstance(each, bool) or not isinstance(each, (str, int, float)):
+                    raise UsageError(f"{file.path}: {key}: {each!r} should be text or a number")
+
+
+def _argv(file: SweepFile, command: Command, setting: Setting, seed: int) -> list[str]:
+    """Write a setting as a command line; a list becomes values with commas, as flags take several."""
+    flags, arguments = [], []
+    for key, value in setting.items():
+        if key == BOARD:
+            continue
+        text = _text(value)
+        if command.flags[key] == "argument":
+            arguments.append(text)
+        elif command.flags[key] == "value":
+            flags.append(f"--{key}={text}")
+        elif value:
+            flags.append(f"--{key}")
+        elif command.flags[key] == "toggle":
+            flags.append(f"--no-{key}")
+    if "seed" in command.flags:
+        flags.append(f"--seed={seed}")
+    if "data-only" in command.flags:
+        flags.append("--data-only")
+    return [file.command, *arguments, *flags]
+
+
+def _text(value: Any) -> str:
+    """Write a value as a flag takes it."""
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _files(setting: Setting) -> Iterator[Path]:
+    """Find the files that settings name, profiles by their names too: their content is part of the configuration."""
+    for key, value in setting.items():
+        for text in _text(value).split(","):
+            if key == "profile" and text:
+                yield find_profile(text.strip())
+                continue
+            path = Path(text.strip().removeprefix("@").rpartition(":")[2])
+            if path.is_file():
+                yield path
+
+
+def _content(path: Path) -> list[Any]:
+    """Describe a file so that a change shows."""
+    facts = path.stat()
+    if facts.st_size <= HASHED_WHOLE:
+        return [path.name, sha256(path.read_bytes()).hexdigest()]
+    return [path.name, facts.st_size, facts.st_mtime_ns]
+
+
+def _hash(value: Any) -> str:
+    return sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _words(setting: Setting) -> str:
+    return " ".join(f"{key}={value}" for key, value in setting.items())

@@ -1,0 +1,204 @@
+"""The sweep itself: cells run once, each is on disk with its row before the next is counted, and it can go on later."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import shutil
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from s2a_bench.clock import Clock, SystemClock
+from s2a_bench.errors import StoreError, UsageError
+from s2a_bench.machine import environment
+from s2a_bench.store.run import RunWriter, read_run
+from s2a_bench.store.schema import CELLS, CellRow
+from s2a_bench.store.sweep import COMMAND, is_sweep
+from s2a_bench.sweep import Cell, Outcome, Workers
+from s2a_bench.sweep.machine import KIND, difference, facts_of
+from s2a_bench.sweep.perform import run_folder
+from s2a_bench.sweep.plan import Plan
+
+if TYPE_CHECKING:
+    from s2a_bench.harness.progress import Progress
+
+COPY = "sweep.toml"
+"""The sweep file as it was, in the sweep's folder."""
+UNDER_WAY = ".under-way"
+"""Cells that are running; what a killed sweep leaves there is the work that is lost."""
+
+
+def start_sweep(plan: Plan, source: Path, output: Path, boards: Sequence[str] | None) -> RunWriter:
+    """Make the sweep's folder; ``boards`` are what this machine is called, None where Ray knows. Raises StoreError."""
+    facts = {
+        "configuration": {
+            "command": plan.command,
+            "hash": plan.config_hash,
+            "file": str(source),
+            "cells": len(plan.cells),
+            "repeats": plan.repeats,
+            "rest_s": plan.rest_s,
+            "boards": boards and list(boards),
+        },
+        "environment": environment.collect(),
+        "seeds": {"sweep": plan.seed},
+        "machines": {},
+        "boards": {},
+    }
+    writer = RunWriter.create(output, COMMAND, facts, (CELLS,))
+    (writer.path / COPY).write_bytes(source.read_bytes())
+    return writer
+
+
+def check_resume(folder: Path, plan: Plan) -> None:
+    """Refuse to go on with another configuration or on another machine; raises UsageError."""
+    run = read_run(folder)
+    if not is_sweep(run.manifest):
+        raise UsageError(f"--resume: {folder} is the folder of a {run.manifest['command']} run, not of a sweep")
+    if run.manifest["configuration"]["hash"] != plan.config_hash:
+        raise UsageError(
+            f"--resume: the sweep in {folder} was another one: its file is {folder / COPY}, and the profiles and files "
+            "that it names count too; start a new sweep, or put back what was changed"
+        )
+    here = facts_of(environment.collect())
+    if other := difference(here, facts_of(run.manifest["environment"])):
+        raise UsageError(f"--resume: {folder} was measured elsewhere: {other}; go on there, or start a new sweep here")
+
+
+@contextmanager
+def only_one(folder: Path) -> Iterator[None]:
+    """Hold a sweep's folder for this process alone; raises StoreError where another one has it."""
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise StoreError(f"{folder}: another s2a-bench sweep is writing it; wait for it, or stop it") from error
+        yield
+
+
+def latest(rows: Iterable[Mapping[Any, Any]]) -> dict[tuple[str, int], tuple[int, str]]:
+    """Return the last attempt at each cell, and how it ended."""
+    return {(row["cell"], row["repeat"]): (row["attempt"], row["state"]) for row in rows}
+
+
+def pending(plan: Plan, rows: Iterable[Mapping[Any, Any]], *, retry_failed: bool) -> list[Cell]:
+    """List the cells of a plan that have still to run, in their order."""
+    over = {"finished"} if retry_failed else {"finished", "failed"}
+    ended = latest(rows)
+    return [cell for cell in plan.cells if ended.get(cell.key, (0, ""))[1] not in over]
+
+
+class SweepRun:
+    """One sitting at a sweep."""
+
+    def __init__(self, writer: RunWriter, plan: Plan, progress: Progress, clock: Clock | None = None) -> None:
+        """Look at what earlier sittings left; the folder must be held by `only_one`."""
+        self._writer = writer
+        self._plan = plan
+        self._progress = progress
+        self._clock = clock or SystemClock()
+        shutil.rmtree(writer.path / UNDER_WAY, ignore_errors=True)
+        self._rows = read_run(writer.path).tables["cells"].to_dict("records")
+        self._latest = latest(self._rows)
+
+    @property
+    def failed(self) -> int:
+        """Count the cells whose latest attempt failed."""
+        return sum(state == "failed" for _, state in self._latest.values())
+
+    def pending(self, *, retry_failed: bool) -> list[Cell]:
+        """List the cells that have still to run, in their order."""
+        return pending(self._plan, self._rows, retry_failed=retry_failed)
+
+    def work(self, cells: Sequence[Cell], workers: Workers) -> None:
+        """Run cells: measured ones first, one at a time on each board; then the virtual ones, many at once."""
+        self._progress.expect(len(cells))
+        lanes: dict[str, deque[Cell]] = {}
+        for cell in cells:
+            if not cell.virtual:
+                lanes.setdefault(cell.board, deque()).append(cell)
+        self._drain(lanes, dict.fromkeys(lanes, 1), workers, round(self._plan.rest_s * 1e9))
+        virtual = deque(cell for cell in cells if cell.virtual)
+        self._drain({"": virtual}, {"": workers.width}, workers, 0)
+
+    def finish(self) -> None:
+        """Write how the sweep ended."""
+        shutil.rmtree(self._writer.path / UNDER_WAY, ignore_errors=True)
+        failed = self.failed
+        text = f"{failed} of {len(self._plan.cells)} cells failed" if failed else None
+        self._writer.finish("failed" if failed else "finished", text)
+
+    def _drain(self, lanes: dict[str, deque[Cell]], width: dict[str, int], workers: Workers, rest_ns: int) -> None:
+        """Keep every lane busy until its cells are done, with a rest after each."""
+        running: dict[Future[Any], tuple[str, Cell, Path]] = {}
+        ready_ns = dict.fromkeys(lanes, 0)
+        while running or any(lanes.values()):
+            now = self._clock.now_ns()
+            for lane, waiting in lanes.items():
+                free = width[lane] - sum(name == lane for name, _, _ in running.values())
+                while waiting and free > 0 and ready_ns[lane] <= now:
+                    cell, free = waiting.popleft(), free - 1
+                    folder = self._writer.path / UNDER_WAY / f"{cell.name}-r{cell.repeat}"
+                    which = "cells" if cell.virtual else f"{cell.name}-r{cell.repeat}"
+                    self._progress.stage(f"{self._plan.command} {which}")
+                    running[workers.submit(cell, folder)] = lane, cell, folder
+            rests = [ready_ns[lane] for lane, waiting in lanes.items() if waiting and ready_ns[lane] > now]
+            if not running:
+                self._clock.sleep_until_ns(min(rests))
+                continue
+            done, _ = wait(running, (min(rests) - now) / 1e9 if rests else None, FIRST_COMPLETED)
+            for future in done:
+                lane, cell, folder = running.pop(future)
+                self._keep(cell, workers.collect(future, folder), folder)
+                ready_ns[lane] = self._clock.now_ns() + rest_ns
+
+    def _keep(self, cell: Cell, outcome: Outcome, folder: Path) -> None:
+        """Move a cell's run folder to its place and write its row: from then on it is done."""
+        attempt = self._latest.get(cell.key, (0, ""))[0] + 1
+        host = str(outcome.machine.get("host", ""))
+        error = outcome.error or self._stranger(cell, outcome)
+        found = run_folder(folder) if folder.exists() else None
+        kept = self._writer.path / "cells" / (f"{cell.name}-r{cell.repeat}" + (f"-{attempt}" if attempt > 1 else ""))
+        if found is not None:
+            kept.parent.mkdir(exist_ok=True)
+            shutil.rmtree(kept, ignore_errors=True)  # moved, but killed before its row: it counts as not done
+            found.rename(kept)
+        shutil.rmtree(folder, ignore_errors=True)
+        if host not in self._writer.manifest["machines"]:
+            self._writer.update(machines={host: outcome.machine})
+        row = CellRow(
+            cell=cell.name,
+            repeat=cell.repeat,
+            attempt=attempt,
+            state="failed" if error else "finished",
+            error=error,
+            virtual=cell.virtual,
+            board=cell.board,
+            host=host,
+            settings=cell.settings,
+            argv=list(cell.argv),
+            config_hash=cell.config_hash,
+            folder=str(kept.relative_to(self._writer.path)) if found is not None else "",
+            started=outcome.started,
+            wall_s=outcome.wall_s,
+        )
+        self._writer.append(CELLS, [row])
+        self._latest[cell.key] = attempt, row.state
+        if error:
+            self._progress.stage(f"cell {cell.name} failed: {error}")
+        self._progress.advance()
+
+    def _stranger(self, cell: Cell, outcome: Outcome) -> str:
+        """Remember what machine a board is, and refuse an unlike one of that name."""
+        if not cell.board or cell.virtual:
+            return ""
+        kind = facts_of(outcome.machine, KIND)
+        boards = self._writer.manifest["boards"]
+        if cell.board not in boards:
+            self._writer.update(boards={cell.board: json.loads(json.dumps(kind))})
+        other = difference(kind, boards[cell.board])
+        return f"{cell.board} is another machine than before: {other}" if other else ""

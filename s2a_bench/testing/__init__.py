@@ -1,0 +1,1 @@
+"""What the author of a plug-in needs: one suite a seam, run by every implementation of ours too."""

@@ -1,0 +1,159 @@
+"""What every transport promises, as one suite: subclass `TransportContract` and say how to connect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from s2a_bench.clock import clock_id, now_ns
+from s2a_bench.errors import EngineError, RequestFailed
+from s2a_bench.trace import RESIDUAL, STAGES, Trace, budget
+from s2a_bench.transport import Client, Handler
+from s2a_bench.types import Frame, Request, Token
+
+Connect = Callable[[Handler], Client]
+
+
+class Recorder:
+    """A handler that remembers what it got and answers what it is told."""
+
+    def __init__(self, answer: list[str]) -> None:
+        self.answer = answer
+        self.requests: list[Request] = []
+        self.fail_at: int | None = None
+
+    def __call__(self, request: Request, trace: Trace) -> Generator[Token, None, None]:
+        self.requests.append(request)
+        for index, text in enumerate(self.answer):
+            if index == self.fail_at:
+                raise EngineError("the engine has had enough")
+            now = now_ns()
+            if not index:
+                trace.marks.append(("inference", now))
+            trace.token_ns.append(now)
+            yield Token(index, text, 7 + index)
+        if self.fail_at == len(self.answer):
+            raise EngineError("the engine has had enough")
+        trace.facts["prompt_n"] = 12.0
+
+
+def yuyv_frame(width: int = 64, height: int = 48, seed: int = 0) -> Frame:
+    """A camera frame of noise."""
+    data = np.random.default_rng(seed).integers(0, 256, (height, width, 2), np.uint8)
+    return Frame(seed, now_ns(), width, height, "yuv422_yuy2", data)
+
+
+def ask(client: Client, request: Request) -> tuple[list[Token], Trace]:
+    """Make one request the way a session does."""
+    trace = Trace()
+    trace.mark(RESIDUAL)
+    return list(client.request(request, trace)), trace
+
+
+class TransportContract:
+    """Run by every transport and variant. Override `connect`; say what its wire does not carry."""
+
+    lossless = True
+    carries_id_and_limit = True
+
+    @pytest.fixture
+    def connect(self) -> Connect:
+        raise NotImplementedError
+
+    def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect) -> None:
+        client = connect(Recorder(["go", "_to(", "キッチン", ")\n", ""]))
+        tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),)))
+        assert [(token.index, token.text, token.id) for token in tokens] == [
+            (0, "go", 7),
+            (1, "_to(", 8),
+            (2, "キッチン", 9),
+            (3, ")\n", 10),
+            (4, "", 11),
+        ]
+
+    def test_every_field_of_a_request_reaches_the_handler(self, connect: Connect) -> None:
+        handler = Recorder(["x"])
+        sent = Request("id-7", 'Grüße,\n"robot"\t机器人', (), max_tokens=9, grammar='root ::= "x"\n', seed=42)
+        ask(connect(handler), sent)
+        (got,) = handler.requests
+        assert got == (sent if self.carries_id_and_limit else replace(sent, id=got.id, max_tokens=got.max_tokens))
+
+    def test_the_picture_arrives_as_rgb(self, connect: Connect) -> None:
+        import cv2
+
+        handler = Recorder(["x"])
+        frame = yuyv_frame(seed=3)
+        ask(connect(handler), Request("a", "", (frame,)))
+        (image,) = handler.requests[0].images
+        expected = cv2.cvtColor(frame.data, cv2.COLOR_YUV2RGB_YUY2)
+        assert (image.encoding, image.width, image.height) == ("rgb8", 64, 48)
+        assert image.data.shape == expected.shape
+        if self.lossless:
+            np.testing.assert_array_equal(image.data, expected)
+
+    def test_stages_and_residual_sum_to_the_whole(self, connect: Connect) -> None:
+        client = connect(Recorder(["x", "y"]))
+        begin = now_ns()
+        _, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
+        end = now_ns()
+        chain = trace.chain()
+        spent = budget(chain)
+        assert sum(spent.stages_ns.values()) + spent.residual_ns == spent.e2e_ns == chain[-1][1] - chain[0][1]
+        assert begin <= chain[0][1] <= chain[-1][1] <= end
+        assert chain[-1][0] == "return"
+        assert set(spent.stages_ns) <= set(STAGES)
+        assert all(duration >= 0 for duration in spent.stages_ns.values())
+        assert {"convert", "inference", "return"} <= set(spent.stages_ns)
+
+    def test_the_servers_marks_come_back(self, connect: Connect) -> None:
+        _, trace = ask(connect(Recorder(["x", "y", "z"])), Request("a", "plan"))
+        assert trace.remote is not None
+        assert trace.remote.clock == clock_id()
+        assert len(trace.remote.token_ns) == 3
+        assert trace.remote.token_ns == sorted(trace.remote.token_ns)
+        assert trace.facts["prompt_n"] == 12.0
+
+    def test_an_engine_that_refuses_fails_this_request_only(self, connect: Connect) -> None:
+        handler = Recorder(["x"])
+        client = connect(handler)
+        handler.fail_at = 0
+        with pytest.raises(RequestFailed, match="the engine has had enough"):
+            ask(client, Request("a", "plan"))
+        handler.fail_at = None
+        tokens, _ = ask(client, Request("b", "plan"))
+        assert [token.text for token in tokens] == ["x"]
+
+    @pytest.mark.parametrize("fail_at", [1, 2, 3])
+    def test_tokens_before_a_break_are_seen(self, connect: Connect, fail_at: int) -> None:
+        handler = Recorder(["a", "b", "c"])
+        handler.fail_at = fail_at
+        seen: list[str] = []
+        with pytest.raises(RequestFailed, match="the engine has had enough"):
+            seen.extend(token.text for token in connect(handler).request(Request("a", "plan"), Trace()))
+        # what a generator hands to extend before it raises is kept
+        assert seen == ["a", "b", "c"][:fail_at]
+
+    def test_an_empty_answer_is_no_error(self, connect: Connect) -> None:
+        tokens, _ = ask(connect(Recorder([])), Request("a", "plan"))
+        assert tokens == []
+
+    def test_a_burst_of_a_thousand_tokens_is_complete(self, connect: Connect) -> None:
+        words = [f"t{number} " for number in range(1000)]
+        tokens, _ = ask(connect(Recorder(words)), Request("a", "plan", max_tokens=1000))
+        assert [token.text for token in tokens] == words
+
+    def test_a_request_can_be_left_early(self, connect: Connect) -> None:
+        client = connect(Recorder([f"t{number}" for number in range(50)]))
+        tokens = client.request(Request("a", "plan"), Trace())
+        assert next(tokens).text == "t0"
+        tokens.close()  # type: ignore[attr-defined]  # both are generators
+        again, _ = ask(client, Request("b", "plan", max_tokens=50))
+        assert len(again) == 50
+
+    def test_closing_twice_does_no_harm(self, connect: Connect) -> None:
+        client = connect(Recorder(["x"]))
+        client.close()
+        client.close()

@@ -1,0 +1,78 @@
+"""What travels beside pictures: requests, tokens and marks as messages of s2a_msgs, and their quality of service."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from s2a_bench.ros import QoS
+from s2a_bench.ros import messages as ros
+from s2a_bench.trace import Remote
+from s2a_bench.types import Request, Token
+
+REQUEST_QOS = QoS(depth=10)
+
+
+READER_QOS = QoS(depth=0)
+"""Our readers keep all: history is local, and a burst of tokens overruns ROS's default of 10."""
+
+
+TOKEN_QOS = QoS(depth=1000)
+"""Our writers keep the last: one that keeps all blocks for as long as a reader does not read."""
+
+
+def request_message(request: Request, images: Sequence[Any] = (), compressed_images: Sequence[Any] = ()) -> Any:
+    """Turn a request into s2a_msgs/Request, with pictures as messages."""
+    return ros.message(
+        ros.REQUEST,
+        id=request.id,
+        prompt=request.prompt,
+        grammar=request.grammar,
+        max_tokens=request.max_tokens,
+        seed=request.seed,
+        images=images,
+        compressed_images=compressed_images,
+    )
+
+
+def token_message(request_id: str, token: Token, *, last: bool, error: str = "", marks: Sequence[Any] = ()) -> Any:
+    """Turn a token into s2a_msgs/Token; ``last`` ends the answer, with marks or an error."""
+    return ros.message(
+        ros.TOKEN,
+        id=request_id,
+        index=token.index,
+        text=token.text,
+        token=token.id,
+        last=last,
+        error=error,
+        marks=marks,
+    )
+
+
+def marks_message(request_id: str, remote: Remote) -> Any:
+    """Turn a server's marks into s2a_msgs/Marks."""
+    return ros.message(
+        ros.MARKS,
+        id=request_id,
+        clock=remote.clock,
+        stages=[stage for stage, _ in remote.marks],
+        stamps=ros.int64_array(stamp for _, stamp in remote.marks),
+        token_stamps=ros.int64_array(remote.token_ns),
+        frame_stamp=remote.frame_stamp_ns,
+        frame_stages=[stage for stage, _ in remote.frame_marks],
+        frame_stamps=ros.int64_array(stamp for _, stamp in remote.frame_marks),
+        fact_names=list(remote.facts),
+        fact_values=ros.float64_array(remote.facts.values()),
+    )
+
+
+def remote_of(marks: Any) -> Remote:
+    """Read a server's marks from s2a_msgs/Marks."""
+    return Remote(
+        clock=marks.clock,
+        marks=list(zip(marks.stages, marks.stamps.tolist(), strict=True)),
+        token_ns=marks.token_stamps.tolist(),
+        frame_stamp_ns=int(marks.frame_stamp),
+        frame_marks=list(zip(marks.frame_stages, marks.frame_stamps.tolist(), strict=True)),
+        facts=dict(zip(marks.fact_names, marks.fact_values.tolist(), strict=True)),
+    )

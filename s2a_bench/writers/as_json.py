@@ -1,0 +1,53 @@
+"""What the ``--json`` objects of all commands share; times in ms, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from s2a_bench.stats import Ratio, summary_of
+from s2a_bench.store.schema import SCHEMA
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from s2a_bench.store.run import Run
+
+
+def frame(run: Run, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    """Return what the objects of all commands share, around a command's own cells."""
+    return {
+        "schema": SCHEMA,
+        "command": run.manifest["command"],
+        "run": str(run.path),
+        "state": run.manifest["state"],
+        "environment": run.manifest.get("environment", {}),
+        "cells": cells,
+        "ratios": ratios,
+        **more,
+        "warnings": run.manifest.get("warnings", []),
+    }
+
+
+def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
+    """Return one ratio of the object."""
+    interval = None if ratio.low is None or ratio.high is None else [ratio.low, ratio.high]
+    return {"metric": metric, "of": of, "to": to, "value": ratio.value, "ci95": interval}
+
+
+def summaries(metrics: Iterable[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:
+    """Summarise the metrics that have values; ``n`` tells where only some samples have a stage."""
+    found = ((name, summary_of(values)) for name, values in metrics)
+    return {
+        name: {
+            "n": summary.n,
+            "median": summary.median,
+            "mean": summary.mean,
+            "sd": summary.sd,
+            "p90": summary.p90,
+            "p99": summary.p99,
+        }
+        for name, summary in found
+        if summary
+    }

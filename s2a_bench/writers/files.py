@@ -1,0 +1,28 @@
+"""The tables of a run as files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from s2a_bench.errors import StoreError
+from s2a_bench.writers.tables import TextTable, to_latex, to_markdown
+
+if TYPE_CHECKING:
+    from s2a_bench.store.run import Run
+
+
+def write_texts(run: Run, tables: Mapping[str, TextTable], csvs: Mapping[str, str]) -> list[Path]:
+    """Write ``tables/``: each table as .md and .tex, and CSV texts under their names; raises StoreError."""
+    texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
+    texts |= {f"{name}.tex": to_latex(table) for name, table in tables.items()}
+    texts |= csvs
+    folder = run.path / "tables"
+    try:
+        folder.mkdir(exist_ok=True)
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"cannot write {folder}: {error.strerror}; the samples are kept") from error
+    return [folder / name for name in texts]

@@ -1,0 +1,157 @@
+r"""Text tables as LaTeX for papers: booktabs rules, and numbers set by siunitx.
+
+A column whose entries are all plain numbers, with or without a deviation, becomes an ``S`` column, aligned at the
+decimal marker; in others every number stands in ``\num``. The packages are those of
+`PREAMBLE`.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Sequence
+from typing import Final
+
+from s2a_bench.writers.tables import ABSENT, TextTable
+
+_PLAIN: Final = re.compile(r"[-+]?\d+(?:\.\d+)?(?: ± \d+(?:\.\d+)?)?")
+_NUMBER: Final = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?: ± \d+(?:\.\d+)?)?(?![\w.]*\w)")
+_SIGNS: Final = {
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "_": r"\_",
+    "%": r"\%",
+    "&": r"\&",
+    "#": r"\#",
+    "$": r"\$",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': "''",
+    "±": r"$\pm$",
+    "²": r"$^2$",
+    "³": r"$^3$",
+    "·": r"$\cdot$",
+    "→": r"$\to$",
+    "≤": r"$\leq$",
+    "≥": r"$\geq$",
+    "\N{MULTIPLICATION SIGN}": r"$\times$",
+    "λ": r"$\lambda$",
+    "\N{GREEK SMALL LETTER RHO}": r"$\rho$",
+    "Δ": r"$\Delta$",
+    "\N{EN DASH}": "--",
+    "\N{EM DASH}": "---",
+    "\N{MINUS SIGN}": "$-$",
+}
+
+PREAMBLE: Final = r"""\documentclass[a4paper,landscape]{article}
+\usepackage[margin=15mm]{geometry}
+\usepackage[utf8]{inputenc}
+\usepackage{array,booktabs,graphicx,longtable,siunitx}
+\sisetup{separate-uncertainty=true,retain-explicit-plus=true}
+"""
+"""What the tables need, and a page wide enough for them."""
+
+
+def to_siunitx(table: TextTable, widths: Sequence[str] = (), *, long: bool = False) -> str:
+    r"""Write a table as a LaTeX ``table``, or a ``longtable`` over several pages; title and notes are the caption.
+
+    ``widths`` are those of columns of running text (``60mm``, empty for an ordinary one).
+    """
+    columns = list(zip(*table.rows, strict=True)) if table.rows else [()] * len(table.header)
+    kinds = [
+        _kind(column, names=place < table.left, width=widths[place] if place < len(widths) else "")
+        for place, column in enumerate(columns)
+    ]
+    names = (escape(name) for name in table.header)
+    head = _row([name if place < table.left else f"{{{name}}}" for place, name in enumerate(names)])
+    caption = f"\\caption{{{' '.join(escape(text) for text in (table.title + '.', *table.notes))}}}"
+    body = []
+    for place, row in enumerate(table.rows):
+        body += [r"\midrule"] if place in table.rules and place else []
+        entries = zip(row, kinds, strict=True)
+        body.append(_row([_entry(text, kind, names=n < table.left) for n, (text, kind) in enumerate(entries)]))
+    if long:
+        lines = [
+            r"{\footnotesize\setlength{\tabcolsep}{3pt}",
+            f"\\begin{{longtable}}{{{''.join(kinds)}}}",
+            caption + r"\\",
+        ]
+        lines += [r"\toprule", head, r"\midrule", r"\endfirsthead", r"\toprule", head, r"\midrule", r"\endhead"]
+        lines += [r"\bottomrule", r"\endlastfoot", *body, r"\end{longtable}}"]
+    else:
+        lines = [r"\begin{table}[htbp]", r"\centering\footnotesize\setlength{\tabcolsep}{3pt}", caption]
+        lines += [f"\\begin{{tabular}}{{{''.join(kinds)}}}", r"\toprule", head, r"\midrule", *body]
+        lines += [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
+    return "\n".join(lines) + "\n"
+
+
+def document(title: str, parts: Sequence[str]) -> str:
+    """Write a document that compiles and shows parts of LaTeX one after the other."""
+    body = "\n\\clearpage\n".join(parts)
+    head = f"{PREAMBLE}\\title{{{escape(title)}}}\n\\date{{}}\n"
+    return f"{head}\\begin{{document}}\n\\maketitle\n{body}\n\\end{{document}}\n"
+
+
+def escape(text: str) -> str:
+    """Write any text so that LaTeX sets it; a sign that it does not have becomes its letter, or its code."""
+    return "".join(_SIGNS.get(char) or _sign(char) for char in text)
+
+
+def _sign(char: str) -> str:
+    """Keep what Latin fonts have."""
+    if char in "\n\r\t":
+        return " "
+    if (
+        " " <= char <= "~"
+        or "\N{LATIN CAPITAL LETTER A WITH GRAVE}" <= char <= "\N{LATIN SMALL LETTER Y WITH DIAERESIS}"
+    ):
+        return char
+    plain = unicodedata.normalize("NFKD", char).encode("ascii", "ignore").decode()
+    return plain if plain.isalnum() else f"[U+{ord(char):04X}]"
+
+
+def _kind(column: Sequence[str], *, names: bool, width: str) -> str:
+    """Choose a column's type."""
+    if width:
+        return f">{{\\raggedright\\arraybackslash}}p{{{width}}}"
+    if names:
+        return "l"
+    found = [text for text in column if text not in {"", ABSENT}]
+    if not found or not all(_PLAIN.fullmatch(text) for text in found):
+        return "r"
+    before, after, spread = 1, 0, 0
+    for text in found:
+        value, _, sd = text.lstrip("+-").partition(" ± ")
+        whole, _, decimals = value.partition(".")
+        before, after = max(before, len(whole)), max(after, len(decimals))
+        spread = max(spread, len(sd.replace(".", "").lstrip("0") or "0") if sd else 0)
+    sign = "-" if any(text.startswith("-") for text in found) else ""
+    return f"S[table-format={sign}{before}.{after}{f'({spread})' if spread else ''}]"
+
+
+def _entry(text: str, kind: str, *, names: bool) -> str:
+    """Write one entry for a column of its type."""
+    if kind.startswith("S"):
+        return "{--}" if text == ABSENT else _plain(text)
+    if names or kind != "r":
+        return escape(text)
+    # Texts between numbers are escaped, numbers are left to siunitx.
+    done, place = "", 0
+    for found in _NUMBER.finditer(text):
+        done += escape(text[place : found.start()]) + f"\\num{{{_plain(found[0])}}}"
+        place = found.end()
+    return done + escape(text[place:])
+
+
+def _plain(number: str) -> str:
+    """Write a number, perhaps with its deviation, for siunitx."""
+    return number.replace("±", r"\pm")
+
+
+def _row(entries: Sequence[str]) -> str:
+    """Write one row; what opens with a bracket would be read as an option of the row before it."""
+    return " & ".join(f"{{{text}}}" if text.startswith("[") else text for text in entries) + r" \\"

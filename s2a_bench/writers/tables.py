@@ -1,0 +1,79 @@
+"""Text tables: their cells as text, rounded to three digits, and the whole as Markdown or LaTeX."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from s2a_bench.stats import Ratio, Summary
+
+
+ABSENT = "\N{EN DASH}"
+"""Stands where a cell does not have a stage or a ratio."""
+
+
+@dataclass(frozen=True, slots=True)
+class TextTable:
+    """One table: ``left`` columns of names, then columns of numbers; ``rules`` are the rows that a line precedes."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    left: int
+    rules: frozenset[int] = frozenset()
+    notes: tuple[str, ...] = ()
+
+
+def number(value: float) -> str:
+    """Write a time in ms, or a ratio, with three digits; never more than three decimals."""
+    return f"{value:.{_decimals(value)}f}"
+
+
+def mean_sd(summary: Summary) -> str:
+    """Write mean ± standard deviation with the decimals of the mean."""
+    places = _decimals(summary.mean)
+    return f"{summary.mean:.{places}f}" + ("" if summary.sd is None else f" ± {summary.sd:.{places}f}")
+
+
+def interval(ratio: Ratio | None) -> str:
+    """Write a ratio with its interval."""
+    if ratio is None or ratio.value is None:
+        return ABSENT
+    if ratio.low is None or ratio.high is None:
+        return number(ratio.value)
+    places = _decimals(ratio.value)
+    return f"{ratio.value:.{places}f} [{ratio.low:.{places}f}, {ratio.high:.{places}f}]"
+
+
+def to_markdown(table: TextTable) -> str:
+    """Write a table as Markdown, its title and notes around it."""
+    rule = ["---"] * table.left + ["---:"] * (len(table.header) - table.left)
+    lines = ["| " + " | ".join(row) + " |" for row in (table.header, tuple(rule), *table.rows)]
+    return "\n".join([f"**{table.title}**", "", *lines, "", *table.notes]) + "\n"
+
+
+def to_latex(table: TextTable) -> str:
+    """Write a table as a LaTeX ``tabular`` for the package booktabs; title and notes are comments."""
+    lines = [f"% {note}" for note in (table.title, *table.notes)]
+    lines += [f"\\begin{{tabular}}{{{'l' * table.left}{'r' * (len(table.header) - table.left)}}}", "\\toprule"]
+    lines += [_latex_row(table.header), "\\midrule"]
+    for place, row in enumerate(table.rows):
+        lines += [*(["\\midrule"] if place in table.rules else []), _latex_row(row)]
+    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}"]) + "\n"
+
+
+def _decimals(value: float) -> int:
+    """Return how many decimals leave three digits."""
+    for places, limit in ((0, 99.95), (1, 9.995), (2, 0.9995)):
+        if abs(value) >= limit:
+            return places
+    return 3
+
+
+def _latex_row(row: tuple[str, ...]) -> str:
+    """Write one row of a LaTeX table."""
+    escapes = {"_": "\\_", "%": "\\%", "&": "\\&", "#": "\\#", "±": "$\\pm$", ">": "$>$", ABSENT: "--"}
+    texts = ("".join(escapes.get(char, char) for char in text) for text in row)
+    # A booktabs row that opens with a bracket would be read as an option of the row before it.
+    return " & ".join(f"{{{text}}}" if text.startswith("[") else text for text in texts) + " \\\\"

@@ -1,0 +1,164 @@
+"""The studies of the driving scenario on small grids: where the paper's ordering holds, and where it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from s2a_bench.cli.progress import RunProgress
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.run import run_ccrb
+from s2a_bench.experiments.ccrb.view.figures import build_scenario
+from s2a_bench.experiments.ccrb.view.outcomes import Share, rate_span, rate_span_here, scenes_of, share_of, words
+from s2a_bench.experiments.ccrb.view.phase_figure import build_phase, region_of
+from s2a_bench.plan.skillset import GAPS
+from s2a_bench.store.run import Run, read_run
+
+GRID = {"phase": True, "phase_points": (21, 13)}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Run]:
+    @cache
+    def make(**asked: Any) -> Run:
+        with RunProgress() as progress:
+            return read_run(run_ccrb(CcrbConfig(**asked), tmp_path_factory.mktemp("runs"), progress))
+
+    return make
+
+
+def test_at_the_operating_point_the_papers_outcome_comes_about(made: Callable[..., Run]) -> None:
+    rows = made().tables["rollouts"].set_index("policy")
+    assert rows["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "none"}
+    assert rows["stalls"].to_dict() == {"naive": 4, "wait-then-act": 0, "stream-to-act": 0}
+    starts = {"naive": 1_750_000_000, "wait-then-act": 6_750_000_000, "stream-to-act": 3_550_000_000}
+    assert rows["start_ns"].to_dict() == starts
+    assert rows["emulated"].all()
+
+
+def test_with_full_braking_in_gaps_the_ordering_holds_for_a_band_of_rates_only(made: Callable[..., Run]) -> None:
+    run = made(**GRID)
+    low, high = rate_span_here(run, "stop") or (0.0, 0.0)
+    assert 4.0 <= low <= 4.8 <= high <= 6.5
+    assert share_of(scenes_of(run, "phase", "stop"), "paper").value < 0.15
+
+
+@pytest.mark.parametrize("gap", ["coast", "hold", "cruise"])
+def test_with_other_gap_behaviours_it_holds_next_to_nowhere(made: Callable[..., Run], gap: str) -> None:
+    run = made(**GRID)
+    assert rate_span_here(run, gap) is None
+    assert share_of(scenes_of(run, "phase", gap), "paper").value < 0.02
+
+
+def test_waiting_is_worse_all_over_the_diagram_and_never_better(made: Callable[..., Run]) -> None:
+    scenes = scenes_of(made(**GRID), "phase", "stop")
+    assert share_of(scenes, "wait_worse").value > 0.3
+    assert share_of(scenes, "wait_better").k == 0
+
+
+def test_acting_at_once_is_more_often_better_than_worse(made: Callable[..., Run]) -> None:
+    for gap in GAPS:
+        scenes = scenes_of(made(**GRID), "phase", gap)
+        assert share_of(scenes, "naive_better").k > share_of(scenes, "naive_worse").k
+
+
+def test_with_an_idm_follower_the_operating_point_turns_round(made: Callable[..., Run]) -> None:
+    run = made(follower="idm", **GRID)
+    point = run.tables["rollouts"][run.tables["rollouts"]["study"] == "point"].set_index("policy")
+    assert point["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "rear"}
+    assert point["rear_impact_mps"]["stream-to-act"] > point["rear_impact_mps"]["naive"] + 1
+    assert rate_span_here(run, "stop") is None
+    assert share_of(scenes_of(run, "phase", "stop"), "paper").value < 0.02
+
+
+def test_in_random_scenarios_the_ordering_is_rare_and_waiting_is_worse(made: Callable[..., Run]) -> None:
+    scenes = scenes_of(made(random=150), "random", "stop")
+    assert len(scenes) == 150
+    paper, worse, better = (share_of(scenes, name) for name in ("paper", "wait_worse", "wait_better"))
+    assert paper.interval[1] < 0.1
+    assert worse.interval[0] > better.interval[1]
+
+
+def test_random_scenarios_repeat_by_their_seed(tmp_path: Path) -> None:
+    again = []
+    for seed in (3, 3, 4):
+        with RunProgress() as progress:
+            run = read_run(run_ccrb(CcrbConfig(random=10, seed=seed), tmp_path, progress))
+        again.append(run.tables["rollouts"].drop(columns="cell").to_csv())
+    assert again[0] == again[1] != again[2]
+
+
+def test_what_never_stalls_comes_out_alike_with_every_gap_behaviour(made: Callable[..., Run]) -> None:
+    run = made(**GRID)
+    columns = ["wait-then-act", "stream-to-act"]
+    first = scenes_of(run, "phase", "stop")[columns]
+    for gap in GAPS[1:]:
+        assert scenes_of(run, "phase", gap)[columns].equals(first)
+
+
+def test_studies_are_driven_fast_enough_to_be_of_use(made: Callable[..., Run]) -> None:
+    studies = made(**GRID).manifest["studies"]
+    assert studies["rollouts"] == 21 * 13 * 6
+    assert studies["rollouts_per_cpu_s"] > 0
+
+
+def test_the_words_name_every_gap_behaviour(made: Callable[..., Run]) -> None:
+    run = made(**GRID)
+    said = words(run)
+    assert [line.split(":")[0] for line in said] == list(GAPS)
+    assert "holds nowhere" in said[GAPS.index("hold")]
+    assert rate_span(run, "hold") is None
+    assert words(made()) == []
+
+
+def test_the_regions_of_the_diagram_cover_it_and_the_figures_can_be_drawn(made: Callable[..., Run]) -> None:
+    run = made(**GRID)
+    scenes = scenes_of(run, "phase", "stop")
+    named = region_of(scenes)
+    assert named.count("paper") == share_of(scenes, "paper").k > 0
+    assert {"wait", "nobody", "all"} <= set(named)
+    assert len(build_phase(run).axes) == len(GAPS)
+    assert len(build_scenario(run).axes) == 9
+
+
+def test_the_interval_is_clopper_pearsons() -> None:
+    assert Share(0, 100).interval == pytest.approx((0.0, 1 - 0.025 ** (1 / 100)))
+
+
+def test_the_deadline_makes_stream_to_act_start_earlier_where_it_must(made: Callable[..., Run]) -> None:
+    rows = made(ttc=True, front_gap_m=30.0).tables["rollouts"].set_index("policy")
+    stream, timed = rows.loc["stream-to-act"], rows.loc["s2a-ttc"]
+    assert timed["deadline_ns"] < stream["start_ns"]
+    assert timed["start_ns"] == pytest.approx(timed["deadline_ns"], abs=1000)
+    assert not timed["late"]
+    assert timed["stalls"] == 0
+    assert timed["min_front_gap_m"] > stream["min_front_gap_m"] or timed["outcome"] == "none"
+    late = made(ttc=True, front_gap_m=12.0, lead_decel_mps2=6.0).tables["rollouts"].set_index("policy").loc["s2a-ttc"]
+    assert late["late"]
+    assert late["start_ns"] == 1_750_000_000
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"simulator": "gazebo"}, "--simulator: 'gazebo' is none of longitudinal, embedded, carla"),
+        ({"follower": "drunk"}, "--follower: 'drunk' is none of careful, idm"),
+        ({"gap": "panic"}, "--gap-behaviour: 'panic' is none of stop, coast, hold, cruise"),
+        ({"front_gap_m": 0.0}, "--front-gap: 0 should be above 0"),
+        ({"n_skills": 0}, "--skills: 0 should be 1 or more"),
+        ({"t_nom_s": 0.1}, "the plan brakes at"),
+        ({"lane_change": True}, "--lane-change: .* take --simulator embedded"),
+        ({"phase_rates": (5.0, 2.0)}, "--phase-rates: should be two numbers, the lower first"),
+        ({"rate": 0.01}, "which is no driving"),
+        ({"profile": "abacus"}, "--profile: 'abacus' is none of"),
+        ({"policies": ("hope",)}, "--policy: 'hope' is none of"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(asked: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        CcrbConfig(**asked).check()

@@ -1,0 +1,132 @@
+"""`ccrb --live`: one request about the rendered scene, and every policy driven on the arrivals of its tokens."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from s2a_bench.boards.file import to_toml
+from s2a_bench.cli.progress import RunProgress
+from s2a_bench.errors import TransportError
+from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.live import run_ccrb_live
+from s2a_bench.experiments.ccrb.view.as_json import ccrb_to_json
+from s2a_bench.experiments.ccrb.view.figures import build_scenario
+from s2a_bench.experiments.ccrb.view.outcomes import origin_notes, token_times_s
+from s2a_bench.experiments.timeline.live.config import LiveConfig
+from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.inference import EngineConfig
+from s2a_bench.store.run import Run, read_run
+from s2a_bench.trace import Trace
+from s2a_bench.transport.loopback import LoopbackClient
+from s2a_bench.types import Request, Token
+
+SCHEMA = json.loads((Path(__file__).parent.parent.parent / "docs" / "schema" / "s2a-bench-1.json").read_text())
+N, L, T_NS = 3, 6, 800_000_000
+FACTS = {"title": "A board", "origin": "measured", "tokens_per_s": 120.0, "prompt_s": 0.05}
+
+
+def asked(engine: EngineConfig, skills: str) -> LiveConfig:
+    requests = LatencyConfig(
+        transports=("loopback",), http=("as-deployed",), width=64, height=48, engine=engine, runs=1, warmup=1
+    )
+    return LiveConfig(requests=requests, skills=skills, tokens_per_skill=(L,), n_skills=(N,))
+
+
+def drive(live: LiveConfig, folder: Path) -> Run:
+    config = CcrbConfig(n_skills=N, tokens_per_skill=L)
+    with RunProgress() as progress:
+        return read_run(run_ccrb_live(config, live, folder, progress))
+
+
+@pytest.fixture
+def replayed(tmp_path: Path) -> LiveConfig:
+    """A board of 120 tokens a second, replayed."""
+    path = tmp_path / "fast.toml"
+    path.write_text(to_toml({**FACTS, "gaps": {"family": "constant"}}))
+    return asked(EngineConfig("replay", profile=str(path)), "household")
+
+
+@pytest.fixture(scope="module")
+def paced(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The tiny dummy model, held back to 40 tokens a second."""
+    return drive(asked(EngineConfig("llama", threads=1, pace=40.0), "driving"), tmp_path_factory.mktemp("runs"))
+
+
+def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: Run) -> None:
+    token_ns = np.rint(np.array(token_times_s(paced)) * 1e9).astype(np.int64)
+    assert len(token_ns) == N * L
+    arrivals_ns = token_ns[L - 1 :: L]
+    skills = paced.tables["skills"]
+    by_policy = {cell.rsplit("/", 1)[1]: rows for cell, rows in skills.groupby("cell", sort=False)}
+    assert list(by_policy) == ["naive", "wait-then-act", "stream-to-act"]
+    for rows in by_policy.values():
+        assert rows["arrival_ns"].to_numpy() == pytest.approx(arrivals_ns, abs=2)
+    starts_ns = [int(arrivals_ns[0])]
+    for arrival_ns in arrivals_ns[1:]:
+        starts_ns.append(max(int(arrival_ns), starts_ns[-1] + T_NS))
+    assert by_policy["naive"]["start_ns"].to_numpy() == pytest.approx(starts_ns, abs=4)
+    assert by_policy["wait-then-act"]["start_ns"].iloc[0] == pytest.approx(arrivals_ns[-1], abs=2)
+
+
+def test_what_is_driven_is_the_scenarios_plan_and_not_the_models(paced: Run) -> None:
+    assert list(paced.tables["skills"]["text"][:N]) == ["set_speed(33.3)", "set_speed(16.7)", "set_speed(0)"]
+
+
+def test_each_request_has_a_picture_of_its_own_and_the_warm_up_is_marked(paced: Run) -> None:
+    samples = paced.tables["samples"]
+    assert list(samples["frame_index"]) == [0, 1]
+    assert list(samples["warmup"]) == [True, False]
+    assert set(paced.tables["tokens"]["request_id"]) == set(samples["request_id"])
+    assert paced.manifest["configuration"]["live"]["source"] == "scenario"
+
+
+def test_a_paced_dummy_is_live_and_says_what_is_set_and_what_means_nothing(paced: Run) -> None:
+    notes = " ".join(origin_notes(paced))
+    assert "LIVE tokens over loopback, paced to 40 tokens/s (the rate is set); car simulated." in notes
+    assert "Dummy weights: what the plan says means nothing" in notes
+    assert "Open loop: one request at t = 0" in notes
+    assert "EMULATED" not in notes
+    printed = ccrb_to_json(paced)
+    jsonschema.validate(printed, SCHEMA)
+    assert {cell["emulated"] for cell in printed["cells"]} == {False}
+    assert {cell["rate_tokens_per_s"] for cell in printed["cells"]} == {40.0}
+    assert not any("prompt_s" in cell for cell in printed["cells"])
+    assert (printed["live"]["dummy"], printed["live"]["robot"]) == (True, "longitudinal simulator")
+
+
+def test_the_figure_marks_every_token(paced: Run) -> None:
+    axes = build_scenario(paced).axes
+    marks = [line for line in axes[0].lines if line.get_marker() == "|"]
+    assert [len(line.get_xdata()) for line in marks] == [N * L]  # type: ignore[arg-type]
+
+
+def test_a_replayed_profile_stays_emulated(replayed: LiveConfig, tmp_path: Path) -> None:
+    run = drive(replayed, tmp_path / "runs")
+    assert run.tables["rollouts"]["emulated"].all()
+    first = origin_notes(run)[0]
+    assert first.startswith("EMULATED (replayed) tokens over loopback; car simulated. 1")
+    assert first.endswith(" tokens/s came.")
+    assert ccrb_to_json(run)["live"]["emulated"] is True
+
+
+def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
+    replayed: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = LoopbackClient.request
+
+    def cut(self: LoopbackClient, request: Request, trace: Trace) -> Iterator[Token]:
+        for token in whole(self, request, trace):
+            if token.index < L:
+                yield token
+
+    monkeypatch.setattr(LoopbackClient, "request", cut)
+    with pytest.raises(TransportError, match=r"loopback: 1 of 3 skills came; .*tokens\.csv has what the model wrote"):
+        drive(replayed, tmp_path / "runs")
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert len(read_run(folder).tables["tokens"]) == 2 * L

@@ -1,0 +1,376 @@
+"""Live and real-time timelines: what is streamed is executed, and whatever goes wrong is told and kept."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+
+from s2a_bench.boards.file import to_toml
+from s2a_bench.errors import EngineError, ServerDied, SourceError, TransportError, UsageError
+from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.experiments.timeline.execution import Scene
+from s2a_bench.experiments.timeline.live.asks import asks_of, prior_of
+from s2a_bench.experiments.timeline.live.config import LiveConfig
+from s2a_bench.experiments.timeline.live.run import run_live
+from s2a_bench.experiments.timeline.real_time import run_real_time
+from s2a_bench.experiments.timeline.view.as_json import timelines_to_json
+from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_of
+from s2a_bench.experiments.timeline.view.figures import write_timeline_figures
+from s2a_bench.harness.feed import RequestFeed
+from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.replay import ReplayEngine
+from s2a_bench.store.run import Run, read_run
+from s2a_bench.trace import Trace
+from s2a_bench.transport.loopback import LoopbackClient
+from s2a_bench.types import Frame, Request, Token
+
+SCHEMA = json.loads((Path(__file__).parent.parent.parent / "docs" / "schema" / "s2a-bench-1.json").read_text())
+THREE = ("naive", "wait-then-act", "stream-to-act")
+
+
+class Watched:
+    """Looks at every scene and keeps it."""
+
+    def __init__(self) -> None:
+        self.scenes: list[Scene] = []
+        self.said: list[str] = []
+
+    def opened(self, folder: Path) -> None:
+        self.folder = folder
+
+    def stage(self, text: str) -> None:
+        self.said.append(text)
+
+    def expect(self, samples: int) -> None: ...
+
+    def advance(self) -> None: ...
+
+    def show(self, scene: Scene) -> AbstractContextManager[None]:
+        self.scenes.append(scene)
+        return nullcontext()
+
+
+@pytest.fixture
+def fast(tmp_path: Path) -> str:
+    """A board of 120 tokens a second."""
+    tables = {
+        "title": "A board",
+        "origin": "measured",
+        "tokens_per_s": 120.0,
+        "prompt_s": 0.05,
+        "gaps": {"family": "constant"},
+    }
+    path = tmp_path / "fast.toml"
+    path.write_text(to_toml(tables))
+    return str(path)
+
+
+@pytest.fixture
+def config(fast: str) -> LiveConfig:
+    """Eight household skills of 30 ms each, written by a replay: naive has to wait for every one of them."""
+    requests = LatencyConfig(
+        transports=("loopback",),
+        http=("as-deployed",),
+        width=64,
+        height=48,
+        engine=EngineConfig("replay", profile=fast),
+        runs=1,
+        warmup=1,
+        timeout_s=30.0,
+    )
+    return LiveConfig(requests=requests, t_nom_s=(0.03,))
+
+
+def live(config: LiveConfig, output: Path) -> tuple[Run, Watched]:
+    view = Watched()
+    return read_run(run_live(config, output / "runs", view)), view
+
+
+def check(run: Run, transport: str) -> None:
+    """Check what holds of every live run that went well."""
+    assert run.manifest["state"] == "finished"
+    assert [found["outcome"] for found in run.manifest["executions"].values()] == ["completed"] * 3
+    cells = timelines_of(run)
+    assert [cell.policy for cell in cells] == list(THREE)
+    naive, wait, online = cells
+    assert {cell.about("mode") for cell in cells} == {"live"}
+    assert len({cell.about("request_id") for cell in cells}) == 1
+    for cell in cells:
+        assert len(cell.skills) == 8
+        assert (cell.skills["start_ns"] >= cell.skills["arrival_ns"]).all()
+        assert (cell.skills["start_ns"].to_numpy()[1:] >= cell.skills["end_ns"].to_numpy()[:-1]).all()
+        assert (cell.skills["start_jitter_ns"] >= 0).all()
+        assert (cell.skills["end_ns"] > cell.skills["start_ns"]).all()
+        assert len(cell.token_s) == 48
+        np.testing.assert_allclose(cell.skills["arrival_ns"] / 1e9, cell.token_s[5::6], rtol=0, atol=1e-9)
+        assert cell.skills["text"].str.fullmatch(r"\w+\(\w+(, \w+)?\)").all()
+    assert naive.mean("start") <= online.mean("start") <= wait.mean("start")  # type: ignore[operator]
+    assert wait.mean("start") >= wait.mean("last_arrival")  # type: ignore[operator]
+    assert list(naive.skills["text"]) == list(wait.skills["text"]) == list(online.skills["text"])
+    assert run.manifest["live"]["transport"] == transport
+    assert run.manifest["start_jitter"]["starts"] == 24
+    jsonschema.validate(timelines_to_json(run), SCHEMA)
+
+
+def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: LiveConfig, tmp_path: Path) -> None:
+    run, view = live(config, tmp_path)
+    check(run, "loopback")
+    assert run.manifest["live"]["emulated"] is True
+    assert [len(scene.records) for scene in view.scenes] == [3]
+    (note,) = origin_notes(run, timelines_of(run))
+    assert note.startswith("EMULATED tokens over loopback, parsed and executed as they arrive")
+    assert {path.name for path in write_timeline_figures(run)} == {"timeline.png", "timeline.pdf"}
+    assert run.samples["warmup"].tolist() == [True, False]
+    assert run.manifest["prior"]["mean_s"] == pytest.approx(1 / 120, rel=0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ros", ["topic", "action"])
+def test_a_replay_over_dds_is_executed_by_three_policies_at_once(
+    config: LiveConfig, tmp_path: Path, dds_domain: int, ros: str
+) -> None:
+    pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
+    requests = replace(config.requests, transports=("ros",), ros=(ros,), domain_id=dds_domain)
+    run, _ = live(replace(config, requests=requests), tmp_path)
+    check(run, f"ros/{ros}")
+
+
+@pytest.mark.slow
+def test_a_real_model_is_held_to_its_grammar_and_its_pace(
+    config: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
+    engine = EngineConfig(threads=1, pace=60.0)
+    requests = replace(config.requests, engine=engine, transports=("http",), timeout_s=120.0)
+    asked = replace(config, requests=requests, t_nom_s=(0.05,), task="Tidy up.", plans=2)
+    view = Watched()
+    run = read_run(run_live(asked, tmp_path / "runs", view))
+    outcomes = [found["outcome"] for found in run.manifest["executions"].values()]
+    assert outcomes == ["completed"] * 6
+    told = run.manifest["live"]
+    assert (told["engine"], told["emulated"], told["dummy"], told["paced_tokens_per_s"]) == ("llama", False, True, 60.0)
+    cells = timelines_of(run)
+    assert {(cell.about("emulated"), cell.about("tokens_per_s"), cell.n) for cell in cells} == {(False, 60.0, 2)}
+    tokens = run.tokens.groupby("request_id")["client_ns"]
+    assert (tokens.count() == 48).all()
+    span_s = (tokens.max() - tokens.min()) / 1e9
+    assert (span_s >= 47 / 60 - 0.05).all()
+    (note,) = origin_notes(run, cells)
+    assert note.startswith("LIVE: real tokens over http/as-deployed, paced to 60 tokens/s (the rate is set)")
+    assert note.endswith("Dummy weights: what the plan says means nothing.")
+    first, second = (frame["text"].str.cat() for _, frame in run.tokens[48:].groupby("request_id"))
+    assert first != second  # every plan has a seed of its own
+
+
+@pytest.mark.parametrize("tokens", [0, 1, 5, 6, 7, 20, 47])
+def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
+    config: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tokens: int
+) -> None:
+    whole = ReplayEngine.generate
+
+    def dies(self: ReplayEngine, request: Request) -> Iterator[Token]:
+        for token in whole(self, request):
+            if token.index == tokens:
+                raise EngineError("the board fell off the robot")
+            yield token
+
+    monkeypatch.setattr(ReplayEngine, "generate", dies)
+    asked = replace(config, requests=replace(config.requests, warmup=0))
+    view = Watched()
+    with pytest.raises(TransportError, match="no request of loopback succeeded"):
+        run_live(asked, tmp_path / "runs", view)
+    run = read_run(view.folder)
+    assert run.manifest["state"] == "failed"
+    assert run.samples["error"].tolist() == ["RequestFailed: the board fell off the robot"]
+    executions = run.manifest["executions"]
+    codes = [warning["code"] for warning in run.manifest["warnings"]]
+    assert [found["outcome"] for found in executions.values()] == ["stream-error"] * 3
+    assert codes.count("plan-stream-error") == 1
+    assert {found["arrived"] for found in executions.values()} == {tokens // 6}
+    assert next(found["started"] for name, found in executions.items() if "wait-then-act" in name) == 0
+    assert len(run.tables["timelines"]) == len([found for found in executions.values() if found["started"]])
+    assert len(run.tokens) == tokens
+
+
+def test_prose_is_not_executed(config: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def prose(self: ReplayEngine, request: Request) -> Iterator[Token]:
+        del self, request
+        yield from (
+            Token(index, text) for index, text in enumerate(["Sure", "!", " Here is", " the plan:", "\n", "1."])
+        )
+
+    monkeypatch.setattr(ReplayEngine, "generate", prose)
+    run, _ = live(config, tmp_path)
+    executions = run.manifest["executions"].values()
+    assert [(found["outcome"], found["started"]) for found in executions] == [("invalid-line", 0)] * 3
+    assert run.tables["timelines"].empty
+
+
+def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
+    config: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = LoopbackClient.request
+
+    def dies(self: LoopbackClient, request: Request, trace: Trace) -> Iterator[Token]:
+        for token in whole(self, request, trace):
+            if token.index == 20:
+                raise ServerDied("the server (pid 7) died, killed by signal 9")
+            yield token
+
+    monkeypatch.setattr(LoopbackClient, "request", dies)
+    view = Watched()
+    asked = replace(config, requests=replace(config.requests, warmup=0), t_nom_s=(0.3,))
+    with pytest.raises(ServerDied, match="pid 7"):
+        run_live(asked, tmp_path / "runs", view)
+    run = read_run(view.folder)
+    assert run.manifest["state"] == "failed"
+    assert {found["outcome"] for found in run.manifest["executions"].values()} == {"stream-error"}
+    skills = run.tables["skills"]
+    assert len(skills[skills["cell"].str.endswith("/naive")]) == 1
+    assert (skills["end_ns"] - skills["start_ns"] >= 0.24e9 - 1e6).all()
+
+
+def test_a_camera_that_breaks_ends_the_run_and_not_the_executors(
+    config: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = RequestFeed.capture
+    frames = iter(range(9))
+
+    def breaks(self: RequestFeed, trace: Trace) -> Frame:
+        if next(frames):
+            raise SourceError("the camera was pulled out")
+        return whole(self, trace)
+
+    monkeypatch.setattr(RequestFeed, "capture", breaks)
+    view = Watched()
+    with pytest.raises(SourceError, match="pulled out"):
+        run_live(config, tmp_path / "runs", view)
+    outcomes = {found["outcome"] for found in read_run(view.folder).manifest["executions"].values()}
+    assert outcomes == {"stream-error"}
+
+
+def test_an_interruption_aborts_the_robots_and_keeps_what_ran(config: LiveConfig, tmp_path: Path) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    class Impatient(Watched):
+        def show(self, scene: Scene) -> AbstractContextManager[None]:
+            signal.setitimer(signal.ITIMER_REAL, 0.5)
+            return super().show(scene)
+
+    view = Impatient()
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_live(replace(config, t_nom_s=(100.0,)), tmp_path / "runs", view)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    run = read_run(view.folder)
+    assert run.manifest["state"] == "interrupted"
+    assert {found["outcome"] for found in run.manifest["executions"].values()} == {"aborted"}
+    assert all(scene.records[0].outcome == "aborted" for scene in view.scenes)
+
+
+def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
+    played = TimelineConfig(
+        profiles=(fast,), tokens_per_skill=(6, 2), t_nom_s=(0.03,), policies=(*THREE, "s2a-clairvoyant")
+    )
+    view = Watched()
+    run = read_run(run_real_time(played, tmp_path / "runs", view))
+    cells = timelines_of(run)
+    assert [(cell.about("tokens_per_skill"), cell.policy) for cell in cells] == [
+        (length, name) for length in (6, 2) for name in (*THREE, "s2a-clairvoyant")
+    ]
+    assert {(cell.about("mode"), cell.about("emulated")) for cell in cells} == {("real-time", True)}
+    naive, wait, online, clairvoyant = cells[:4]
+    # t_i = .05 + i / 20 s at least: a real clock is never early.
+    assert (naive.skills["arrival_ns"].to_numpy() / 1e9 >= 0.05 + np.arange(1, 9) / 20 - 1e-6).all()
+    assert clairvoyant.mean("start") >= 0.05 + 0.4 - 7 * 0.03 - 1e-6  # type: ignore[operator]
+    assert naive.mean("start") < online.mean("start") < wait.mean("start")  # type: ignore[operator]
+    assert run.manifest["configuration"]["time"] == "real-time"
+    assert run.manifest["start_jitter"]["starts"] == 64
+    assert any("EMULATED, executed in real time" in note for note in origin_notes(run, cells))
+    jsonschema.validate(timelines_to_json(run), SCHEMA)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"policies": ()}, "--policy: name at least one"),
+        ({"policies": ("eager",)}, "--policy: 'eager' is none of"),
+        ({"policies": ("s2a-clairvoyant",)}, "s2a-clairvoyant needs to know when every skill will arrive"),
+        ({"skills": "juggling"}, "--skills: 'juggling' is none of"),
+        ({"n_skills": (0,)}, "--n-skills: 0 should be 1 or more"),
+        ({"plans": 0}, "--plans: 0 should be 1 or more"),
+        ({"t_nom_s": (0.0,)}, "--t-nom: 0 should be 1e-06 or more"),
+        ({"robot": "kuka"}, "--robot: 'kuka' is none of timed, ros"),
+        ({"robot": "ros"}, "--robot ros: one robot follows one policy"),
+        ({"tokens_per_skill": (4,)}, "--engine replay writes plans of the household skills in 6 tokens a skill"),
+        ({"skills": "driving"}, "--engine replay writes plans of the household skills in 6 tokens a skill"),
+        ({"requests": {"transports": ("http", "ros")}}, "--transport: --live follows one stream"),
+        ({"requests": {"transports": ("ros",), "ros": ("topic", "action")}}, "--transport: --live follows one stream"),
+        ({"engine": {"name": "echo", "profile": ""}}, "--engine echo writes no plans"),
+        ({"engine": {"pace": 5.0}}, "--pace: --engine replay has its profile's rate"),
+        ({"engine": {"name": "llama", "profile": "", "pace": 1e6}}, "--pace: 1e+06 should be above 0"),
+        (
+            {
+                "engine": {"name": "llama", "profile": "", "pace": 5.0},
+                "requests": {"transports": ("http",), "url": "http://x"},
+            },
+            "--pace needs our own server",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_named(config: LiveConfig, fields: dict[str, Any], message: str) -> None:
+    engine = replace(config.requests.engine, **fields.pop("engine", {}))
+    requests = replace(config.requests, engine=engine, **fields.pop("requests", {}))
+    with pytest.raises(UsageError) as error:
+        replace(config, requests=requests, **fields).check()
+    assert message in str(error.value)
+
+
+def test_the_prior_is_learned_from_warm_ups_and_else_from_the_pace() -> None:
+    assert prior_of([], None) is None
+    assert prior_of([[5]], None) is None
+    paced = prior_of([], 5.0)
+    assert paced is not None
+    assert paced.mean_s == 0.2
+    learned = prior_of([[0, 10**8, 3 * 10**8], [0, 3 * 10**8]], 5.0)
+    assert learned is not None
+    assert learned.mean_s == pytest.approx(0.2)
+    assert learned.token_cv == pytest.approx(np.std([0.1, 0.2, 0.3], ddof=1) / 0.2)
+
+
+def test_a_prior_knows_bursts_that_single_gaps_hide() -> None:
+    slow_then_fast = np.cumsum([0.0, *[0.3] * 8, *[0.1] * 8]) * 1e9
+    alternating = np.cumsum([0.0, *[0.3, 0.1] * 8]) * 1e9
+    burst, even = (prior_of([times.astype(int).tolist()], None) for times in (slow_then_fast, alternating))
+    assert burst is not None
+    assert even is not None
+    assert even.token_cv == pytest.approx(np.std([0.3, 0.1] * 8, ddof=1) / 0.2)
+    assert burst.token_cv > 1.9 * even.token_cv  # four blocks of four: 1.2, 1.2, .4, .4 s
+
+
+def test_skills_keep_their_own_durations_unless_they_are_given(config: LiveConfig) -> None:
+    (own,) = asks_of(replace(config, t_nom_s=()), None)
+    times = [call.skill.durations.nominal_s for call in own.skills.calls]
+    assert own.t_nom_s == pytest.approx(np.mean(times))
+    assert own.shape.expected_cv == pytest.approx(np.std(times) / np.mean(times))
+    (given,) = asks_of(config, None)
+    assert (given.t_nom_s, given.shape.expected_cv) == (pytest.approx(0.03), 0.0)
+    assert given.shape.expected.most_s == pytest.approx(0.045)
+    assert "Output exactly 8 of them." in given.prompt
+    assert (bool(given.grammar), given.max_tokens) == (True, 48)
+    (free,) = asks_of(replace(config, constrained=False), None)
+    assert free.grammar == ""

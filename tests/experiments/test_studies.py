@@ -1,0 +1,267 @@
+"""The studies: repeatable by seed, right about a few settings, and told as tables."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.study import drift as study_drift
+from s2a_bench.experiments.study import jitter as study_jitter
+from s2a_bench.experiments.study import misfit as study_misfit
+from s2a_bench.experiments.study import targets as study_targets
+from s2a_bench.experiments.study.run import STUDIES, StudyConfig, cells_of, results, run_study
+from s2a_bench.experiments.study.view.as_json import study_to_json
+from s2a_bench.experiments.study.view.figures import write_study_figure
+from s2a_bench.experiments.study.view.tables import regret_at, study_tables, table_files, targets
+from s2a_bench.experiments.study.worlds import World, generator, recorded_plans
+from s2a_bench.policy.conformal import calibrate
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy.metrics import stalls
+from s2a_bench.policy.schedule import safe_start
+from s2a_bench.policy.stream_to_act import StreamToAct
+from s2a_bench.store.run import read_run
+from s2a_bench.store.schema import STUDIES as TABLE
+from s2a_bench.store.schema import StudyRow
+
+SCHEMA = Path(__file__).parents[2] / "docs" / "schema" / "s2a-bench-1.json"
+TARGETS = [
+    "P(any stall), pooled, upper end of 95 %",
+    "P(any stall), worst setting",
+    "start regret, all settings",
+    "start regret, rho > .8",
+    "end regret, all settings",
+    "end regret, rho > .8",
+]
+
+HARDEST = (
+    World(4.8, 0.5, 6, 4, 1.0),
+    World(4.8, 0.5, 4, 16, 1.0),
+    World(0.58, 3.0, 1, 16, 2.0),
+    World(0.58, 3.0, 4, 8, 2.0),
+    World(0.58, 3.0, 6, 8, 1.0),
+)
+"""Settings with rho from .83 to 10.3 where stalls were most frequent."""
+
+
+class Quiet:
+    """Progress that nobody watches."""
+
+    folder: Path | None = None
+    done = 0
+
+    def opened(self, folder: Path) -> None:
+        self.folder = folder
+
+    def stage(self, text: str) -> None:
+        pass
+
+    def expect(self, samples: int) -> None:
+        pass
+
+    def advance(self) -> None:
+        self.done += 1
+
+
+def frame(rows: list[StudyRow]):  # noqa: ANN201 - pandas is imported late, as in the package
+    import pandas as pd
+
+    return pd.DataFrame([dict(zip(TABLE.columns, TABLE.values(row), strict=True)) for row in rows])
+
+
+def test_the_settings_are_those_of_the_specification() -> None:
+    worlds = study_targets.WORLDS
+    assert len(worlds) == len(set(worlds)) == 192
+    assert {(world.tokens_per_s, world.prompt_s) for world in worlds} == {(34.2, 0.05), (4.8, 0.5), (0.58, 3.0)}
+    assert sum(world.rho > 0.8 for world in worlds) == 80
+
+
+def test_a_world_draws_what_the_specification_says() -> None:
+    world = World(4.8, 0.5, 6, 8, 1.0)
+    plans = world.draw(generator(0, "world"), 40_000)
+    assert plans.token_s is not None
+    first, gaps = plans.token_s[0], np.diff(plans.token_s, axis=0)
+    means = gaps.mean(axis=0)
+    assert first.mean() == pytest.approx(0.5 + 1 / 4.8, rel=0.005)
+    assert first.std() / first.mean() == pytest.approx(0.15, rel=0.02)
+    assert means.mean() == pytest.approx(1 / 4.8, rel=0.005)
+    assert (gaps.std(axis=0, ddof=1) / means).mean() == pytest.approx(0.2, rel=0.02)
+    assert means.std() / means.mean() == pytest.approx((0.1**2 + 0.2**2 / 47) ** 0.5, rel=0.02)
+    assert plans.nominal_s.mean() == pytest.approx(1.0, rel=0.005)
+    assert plans.nominal_s.std() == pytest.approx(0.2, rel=0.01)
+    assert plans.nominal_s.min() > 1 - 0.2 * 3**0.5 - 1e-9
+    np.testing.assert_allclose(plans.most_s, 1.5 * plans.nominal_s)
+    np.testing.assert_allclose(plans.least_s, 0.8 * plans.nominal_s)
+    np.testing.assert_array_equal(plans.arrival_s[0], plans.token_s[5])
+
+
+def test_every_cell_repeats_by_its_seed_whatever_runs_beside_it() -> None:
+    config = StudyConfig(seed=5, plans=50, calibration_plans=120)
+    cells = cells_of("targets", config)
+    alone = cells[100]()
+    assert list(results([cells[3], cells[100]]))[1] == alone
+    assert cells_of("targets", replace(config, seed=6))[100]() != alone
+
+
+@pytest.mark.slow
+def test_processes_change_nothing() -> None:
+    cells = cells_of("misfit", StudyConfig(plans=20, calibration_plans=120))
+    assert list(results(cells, 2)) == list(results(cells))
+
+
+def test_stream_to_act_reaches_its_targets_in_the_hardest_settings() -> None:
+    config = StudyConfig(seed=0, plans=2000)
+    rows = [row for world in HARDEST for row in study_targets.setting(config, world)]
+    online = frame([row for row in rows if row.policy == "stream-to-act"])
+    assert [target.what for target in targets(online) if not target.met] == []
+    mean = frame([row for row in rows if row.policy == "s2a-mean"])
+    assert mean["p_any_stall"].min() > 0.2
+    quantile = frame([row for row in rows if row.policy == "s2a-quantile"])
+    assert quantile["start_regret"].mean() > 2 * online["start_regret"].mean()
+
+
+def test_a_row_is_what_the_plans_say() -> None:
+    world = World(4.8, 0.5, 6, 8, 1.0)
+    config = StudyConfig(seed=2, plans=300, calibration_plans=150)
+    waiting = study_targets.setting(config, world)[-1]
+    rng = generator(2, "targets", world)
+    world.draw(rng, 150)
+    plans = world.draw(rng, 300)
+    safe = safe_start(plans.arrival_s, plans.nominal_s)
+    assert waiting.policy == "wait-then-act"
+    assert (waiting.stalled, waiting.caution, waiting.start_regret_of_wait) == (0, None, 1.0)
+    assert waiting.start_regret == pytest.approx(float(((plans.arrival_s[-1] - safe) / safe).mean()))
+    assert waiting.p_any_stall_high == pytest.approx(1 - 0.025 ** (1 / 300))
+
+
+def test_tracking_cuts_the_stalls_that_drift_brings() -> None:
+    world = World(0.58, 3.0, 1, 8, 1.0)
+    rng = generator(0, "drift test")
+    calibration, plans = world.draw(rng, 400), world.draw(rng, 1500, np.linspace(1, 2, 1500))
+    shares = {}
+    for arm in study_drift.ARMS:
+        _, found = study_drift.follow(calibration, plans, 0.01, arm)
+        shares[arm] = float((found.stalls > 0).mean())
+    assert shares["fixed"] > 0.05
+    # The bound of adaptive conformal inference: (.01 + .002) / (.002 * 1500) above epsilon.
+    assert shares["tracked"] <= 0.014
+    assert shares["refitted"] <= 0.014
+
+
+def test_following_with_a_fixed_caution_is_deciding_all_plans_at_once() -> None:
+    from s2a_bench.policy.conformal import calibrate
+    from s2a_bench.policy.estimator import GapPrior
+    from s2a_bench.policy.stream_to_act import StreamToAct
+
+    world = World(0.58, 3.0, 1, 8, 1.0)
+    rng = generator(1, "drift test")
+    calibration, plans = world.draw(rng, 200), world.draw(rng, 300)
+    assert calibration.token_s is not None
+    policy = StreamToAct(GapPrior.fit(calibration.token_s))
+    policy = replace(policy, caution=calibrate(policy, calibration).caution)
+    schedule = policy.schedule(plans)
+    caution, found = study_drift.follow(calibration, plans, 0.01, "fixed")
+    assert set(caution) == {policy.caution}
+    np.testing.assert_allclose(found.first_action_s, schedule.start_s[0])
+    np.testing.assert_array_equal(found.stalls, (stalls(schedule) > 1e-6).sum(axis=0))
+
+
+def test_too_short_a_plan_believed_stalls_and_too_long_a_one_is_late() -> None:
+    config = StudyConfig(plans=500)
+    rows = {row.condition: row for row in study_misfit.cell(config, World(4.8, 0.5, 6, 8, 1.0))}
+    assert rows["N +0"].p_any_stall < 0.02
+    assert rows["N -2"].p_any_stall > 0.1
+    assert rows["N +2"].start_regret > rows["N +0"].start_regret + 0.05
+    assert rows["N +0"].p_any_stall == rows["L x 1"].p_any_stall == rows["gap x 1"].p_any_stall
+
+
+def test_rare_stalls_cost_more_under_pauses_than_under_even_jitter() -> None:
+    config = StudyConfig(plans=500, calibration_plans=200)
+    world = World(4.8, 0.5, 6, 8, 1.0)
+    costs = {}
+    for gaps in study_jitter.families(1 / 4.8, (0.2, 0.1, 0.3)):
+        rows = frame(study_jitter.cell(config, replace(world, gaps=gaps)))
+        elastic = rows[(rows["policy"] == "stream-to-act") & (rows["condition"] == "")]
+        costs[str(elastic["family"].iloc[0])] = [regret_at(elastic, level) for level in (0.0, 0.01, 0.05, 0.2)]
+        assert elastic["p_any_stall"].iloc[-1] == 0  # lambda = infinity waits
+        assert costs[str(elastic["family"].iloc[0])] == sorted(costs[str(elastic["family"].iloc[0])], reverse=True)
+    assert set(costs) == {"lognormal", "markov", "bursty", "recorded"}
+    assert costs["markov"][1] > 1.0
+    assert costs["lognormal"][1] < 0.2
+
+
+def test_a_frontier_marks_where_calibration_would_put_the_robot() -> None:
+    config = StudyConfig(plans=300, calibration_plans=200)
+    world = World(0.58, 3.0, 1, 8, 2.0)
+    rows = study_jitter.cell(config, world)
+    (chosen,) = (row for row in rows if row.condition == study_jitter.CALIBRATED)
+    drawn = world.draw(generator(config.seed, study_jitter.NAME, world), config.calibration_plans)
+    assert drawn.token_s is not None
+    found = calibrate(StreamToAct(GapPrior.fit(drawn.token_s)), drawn, config.epsilon)
+    assert chosen.caution == found.caution > 0
+    assert replace(chosen, condition="") in rows
+
+
+def test_recorded_answers_become_plans_and_short_ones_are_left_out() -> None:
+    shape = World(4.8, 0.5, 2, 3, 1.0).shape
+    plans = recorded_plans([np.arange(1.0, 9), np.arange(5.0), np.arange(2.0, 8)], shape, generator(0))
+    assert plans.token_s is not None
+    np.testing.assert_array_equal(plans.token_s.T, [np.arange(1.0, 7), np.arange(2.0, 8)])
+    np.testing.assert_array_equal(plans.arrival_s.T, [[2, 4, 6], [3, 5, 7]])
+    assert recorded_plans([np.arange(2.0)], shape, generator(0)).arrival_s.shape == (3, 0)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (study_targets, study_jitter, study_drift, study_misfit):
+        monkeypatch.setattr(module, "WORLDS", HARDEST[:1])
+    monkeypatch.setattr(study_drift, "REFIT", 32)
+    progress = Quiet()
+    config = StudyConfig(plans=64, calibration_plans=100)
+    folder = run_study(name, config, tmp_path, progress)
+    assert folder == progress.folder
+    assert progress.done == len(cells_of(name, config))
+    run = read_run(folder)
+    assert run.manifest["configuration"]["study"] == name
+    assert set(run.tables["studies"]["study"]) == {name}
+    assert (run.tables["studies"]["plans"] > 0).all()
+    tables = study_tables(run)
+    assert all(len(row) == len(table.header) for table in tables for row in table.rows)
+    assert all("nan" not in entry.lower() for table in tables for row in table.rows for entry in row)
+    assert len(table_files(tables)) == len(tables)
+    assert [path.name for path in write_study_figure(run)] == [f"{name}.png", f"{name}.pdf"]
+    told = study_to_json(run)
+    jsonschema.validate(told, json.loads(SCHEMA.read_text()))
+    assert len(told["cells"]) == len(run.tables["studies"])
+    assert [each["what"] for each in told.get("targets", [])] == (TARGETS if name == "targets" else [])
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "message"),
+    [
+        ("fly", StudyConfig(), "--study: 'fly' is none of targets"),
+        ("targets", StudyConfig(jobs=0), "--jobs: 0"),
+        ("targets", StudyConfig(plans=0), "--plans: 0"),
+        ("targets", StudyConfig(seed=-1), "--seed: -1"),
+        ("targets", StudyConfig(calibration_plans=20), "20 calibration plans"),
+    ],
+)
+def test_wrong_use_is_told_before_anything_is_written(
+    name: str, config: StudyConfig, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        run_study(name, config, tmp_path, Quiet())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cells_can_be_sent_to_another_process() -> None:
+    import pickle
+
+    for name in STUDIES:
+        assert all(isinstance(pickle.loads(pickle.dumps(cell)), partial) for cell in cells_of(name, StudyConfig()))  # noqa: S301

@@ -1,0 +1,173 @@
+"""What a throughput run is asked to do, its rounds, and the reference beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from s2a_bench.errors import EngineError, UsageError
+from s2a_bench.experiments.throughput.llama_bench import LlamaBench
+from s2a_bench.experiments.throughput.run import ThroughputConfig
+from s2a_bench.harness.llama_flags import llama_flags
+from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.rounds import run_blocks
+from s2a_bench.harness.session import Place
+from s2a_bench.inference import EngineConfig
+from s2a_bench.store.run import RunWriter, read_run
+from tests.llama_bench_stand_in import install
+
+REQUESTS = LatencyConfig(transports=("loopback",), max_tokens=16)
+
+
+class Silent:
+    """Progress that nobody watches."""
+
+    expected = done = 0
+
+    def opened(self, folder: Path) -> None: ...
+
+    def stage(self, text: str) -> None: ...
+
+    def expect(self, samples: int) -> None:
+        self.expected = samples
+
+    def advance(self) -> None:
+        self.done += 1
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"max_tokens": 1}, "--max-tokens: a rate needs 2 tokens or more"),
+        ({"engine": EngineConfig("echo")}, "--engine echo computes nothing"),
+        ({"engine": EngineConfig(kv_type="q8_0", flash_attention="off")}, "--kv-type q8_0 needs flash attention"),
+        ({"engine": EngineConfig(batch=1)}, "--batch: 1 is not between 32"),
+        ({"runs": 0}, "--runs: 0"),
+        (
+            {"engine": EngineConfig(sampling="greedy"), "url": "http://x", "transports": ("http",)},
+            "--sampling greedy is our own engine's",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_named(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError) as error:
+        ThroughputConfig(replace(REQUESTS, **fields)).check()
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"grammar": 'root ::= "a"'}, "llama-bench knows no grammar"),
+        ({"engine": EngineConfig("replay", profile="jetson-orin-nano")}, "leave out --engine replay"),
+    ],
+)
+def test_a_reference_needs_what_llama_bench_can_do(tmp_path: Path, fields: dict[str, Any], message: str) -> None:
+    program = install(tmp_path)
+    ThroughputConfig(REQUESTS, program).check()
+    with pytest.raises(UsageError) as error:
+        ThroughputConfig(replace(REQUESTS, **fields), program).check()
+    assert message in str(error.value)
+    for wrong in (tmp_path, tmp_path / "missing", Path(__file__)):
+        with pytest.raises(UsageError, match=r"--reference: .* is no program that can be run"):
+            ThroughputConfig(REQUESTS, wrong).check()
+
+
+@given(st.integers(1, 4), st.integers(0, 2), st.integers(0, 2), st.integers(1, 6), st.integers(0, 99))
+def test_every_block_gives_everyone_one_turn_and_the_others_are_last_at_first(
+    n_turns: int, n_others: int, warmup: int, runs: int, seed: int
+) -> None:
+    seen: list[tuple[str, Place]] = []
+    turns = [lambda place, name=f"turn{i}": seen.append((name, place)) for i in range(n_turns)]
+    others = [lambda place, name=f"other{i}": seen.append((name, place)) for i in range(n_others)]
+    progress = Silent()
+    run_blocks(turns, others, replace(REQUESTS, warmup=warmup, runs=runs, seed=seed), progress)
+    everyone = {f"turn{i}" for i in range(n_turns)} | {f"other{i}" for i in range(n_others)}
+    assert progress.expected == progress.done == len(everyone) * (warmup + runs)
+    for block in range(warmup + runs):
+        places = [(name, place) for name, place in seen if place.block == block]
+        assert {name for name, _ in places} == everyone
+        assert [place.position for _, place in places] == list(range(len(everyone)))
+        assert {place.warmup for _, place in places} == {block < warmup}
+    assert all(name.startswith("turn") for name, place in seen if place.block == 0 and place.position < n_turns)
+
+
+def test_the_order_changes_from_block_to_block() -> None:
+    seen: list[str] = []
+    turns = [lambda _place, name=name: seen.append(name) for name in "abc"]
+    run_blocks(turns, [], replace(REQUESTS, warmup=0, runs=12), Silent())
+    assert len({"".join(seen[at : at + 3]) for at in range(0, 36, 3)}) > 2
+
+
+@pytest.fixture
+def writer(tmp_path: Path) -> Iterator[RunWriter]:
+    with RunWriter.create(tmp_path / "results", "throughput", {}) as writer:
+        yield writer
+
+
+def test_the_reference_computes_with_our_settings_behind_our_prompts_length(tmp_path: Path, writer: RunWriter) -> None:
+    engine = EngineConfig(
+        model=tmp_path / "m.gguf",
+        threads=3,
+        gpu_layers=-1,
+        context=512,
+        batch=1024,
+        kv_type="q8_0",
+        flash_attention="on",
+    )
+    depths = [250, 260]
+    bench = LlamaBench(install(tmp_path), replace(REQUESTS, engine=engine), writer, lambda: depths.pop(0))
+    bench(Place(0, 1, warmup=True))
+    bench(Place(1, 0, warmup=False))
+    writer.finish("finished")
+    kept = read_run(writer.path)
+    rows = kept.tables["reference"]
+    assert list(rows["warmup"]) == [True, False]
+    assert list(rows["block"]) == [0, 1]
+    assert list(rows["depth"]) == [250, 260]
+    assert list(rows["n_gen"]) == [16, 16]
+    assert list(rows["decode_ns"]) == [16_000_000, 16_000_000]
+    assert (rows["finished_ns"] > rows["started_ns"]).all()
+    facts = json.loads(rows["facts"].iloc[0])
+    assert facts["model_filename"] == str(tmp_path / "m.gguf")
+    assert (facts["n_threads"], facts["n_gpu_layers"]) == (3, 999)
+    assert (facts["n_batch"], facts["n_ubatch"]) == (512, 512)  # no more than the context, as llama.cpp has it
+    assert (facts["type_k"], facts["type_v"]) == ("q8_0", "q8_0")
+    assert facts["n_prompt"] == 0
+    command = kept.manifest["reference"]["command"]
+    assert command[command.index("--flash-attn") + 1] == "on"
+    assert command[-2:] == ["--n-depth", "260"]
+
+
+def test_without_threads_the_reference_has_those_of_this_process() -> None:
+    import os
+
+    flags = llama_flags(EngineConfig())
+    assert flags[flags.index("--threads") + 1] == str(len(os.sched_getaffinity(0)))
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("crash", "exit code 1: main: error: failed to load model 'x.gguf'"),
+        ("garbage", "not llama-bench's JSON"),
+        ("empty", "not llama-bench's JSON"),
+        ("old", "too old to know --flash-attn auto"),
+    ],
+)
+def test_a_reference_that_fails_says_so_in_one_line(
+    tmp_path: Path, writer: RunWriter, monkeypatch: pytest.MonkeyPatch, fault: str, message: str
+) -> None:
+    monkeypatch.setenv("S2A_STAND_IN_FAULT", fault)
+    bench = LlamaBench(install(tmp_path), REQUESTS, writer, lambda: 0)
+    with pytest.raises(EngineError) as error:
+        bench(Place(0, 0, warmup=False))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)

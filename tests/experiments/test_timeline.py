@@ -1,0 +1,324 @@
+"""Timeline runs in virtual time: the same arrivals for every policy, reproducible, calibrated, whole in their rows."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from s2a_bench.boards.gaps import Constant, Lognormal, Markov, Recorded
+from s2a_bench.boards.profile import Profile
+from s2a_bench.errors import StoreError, UsageError
+from s2a_bench.experiments.timeline.config import TimelineConfig, settings
+from s2a_bench.experiments.timeline.plans import board_of_profile, gaps_of
+from s2a_bench.experiments.timeline.policies import draw, learn
+from s2a_bench.experiments.timeline.rows import KEPT_PLANS, Setting, timeline_rows
+from s2a_bench.experiments.timeline.run import run_timeline
+from s2a_bench.experiments.timeline.traces import recordings
+from s2a_bench.experiments.timeline.view.cells import timelines_of
+from s2a_bench.policy import Plans, Schedule
+from s2a_bench.policy.conformal import Calibration
+from s2a_bench.policy.schedule import safe_start
+from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.schema import SampleRow, TokenRow
+
+ORIN = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
+JITTERY = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,), jitter="profile", plans=300)
+
+
+class Quiet:
+    """Progress that nobody looks at."""
+
+    def opened(self, folder: Path) -> None: ...
+    def stage(self, text: str) -> None: ...
+    def expect(self, samples: int) -> None: ...
+    def advance(self) -> None: ...
+
+
+def ran(config: TimelineConfig, output: Path) -> Run:
+    return read_run(run_timeline(config, output, Quiet()))
+
+
+def test_every_policy_meets_the_same_arrivals(tmp_path: Path) -> None:
+    rows = ran(JITTERY, tmp_path).tables["timelines"]
+    for _, same in rows.groupby("plan"):
+        assert len(same) == 3
+        assert same["request_id"].nunique() == same["last_arrival_ns"].nunique() == same["safe_start_ns"].nunique() == 1
+    assert rows["last_arrival_ns"].nunique() > 290
+
+
+def test_a_seed_repeats_a_run_and_another_seed_does_not(tmp_path: Path) -> None:
+    texts = []
+    for place, seed in enumerate((3, 3, 4)):
+        config = TimelineConfig(
+            rates=(4.8,), profiles=(), tokens_per_skill=(6,), jitter="lognormal:cv=0.2", plans=5, seed=seed
+        )
+        texts.append((ran(config, tmp_path / str(place)).path / "skills.csv").read_text())
+    assert texts[0] == texts[1] != texts[2]
+
+
+def test_skills_stalls_and_metrics_of_a_plan_fit_together(tmp_path: Path) -> None:
+    run = ran(JITTERY, tmp_path)
+    rows = run.tables["timelines"].set_index(["cell", "request_id"])
+    for key, skills in run.tables["skills"].groupby(["cell", "request_id"]):
+        row = rows.loc[key]
+        assert list(skills["index"]) == list(range(8))
+        assert row["start_ns"] == skills["start_ns"].iloc[0]
+        assert abs(row["end_ns"] - skills["end_ns"].iloc[-1]) <= 1
+        gaps = skills["start_ns"].to_numpy()[1:] - skills["end_ns"].to_numpy()[:-1]
+        assert np.abs(gaps - skills["stall_ns"].to_numpy()[1:]).max() <= 1
+        assert abs(row["stall_ns"] - skills["stall_ns"].sum()) <= 8
+        assert (skills["start_ns"] >= skills["arrival_ns"]).all()
+        longest = skills["end_ns"] - skills["start_ns"] - skills["most_ns"]
+        assert longest.max() <= 1
+    assert len(run.tables["skills"]) == 3 * KEPT_PLANS * 8
+    moving = run.tables["timelines"][run.tables["timelines"]["rms_jerk"].notna()]
+    assert set(moving["plan"]) == set(range(KEPT_PLANS))
+
+
+def test_stream_to_act_keeps_its_promise_where_naive_and_the_mean_rule_stall(tmp_path: Path) -> None:
+    config = TimelineConfig(
+        policies=("naive", "s2a-mean", "stream-to-act"),
+        profiles=("jetson-agx-orin",),
+        tokens_per_skill=(6,),
+        jitter="profile",
+        plans=1000,
+    )
+    run = ran(config, tmp_path)
+    share = {cell.policy: cell.p_any_stall for cell in timelines_of(run)}
+    assert share["stream-to-act"] <= 0.02
+    assert share["s2a-mean"] > 0.3
+    assert share["naive"] > 0.9
+    (found,) = run.manifest["calibrations"].values()
+    assert found["plans"] == 400
+    assert found["caution"] == run.tables["timelines"].query("policy == 'stream-to-act'")["caution"].iloc[0] > 0
+
+
+@given(
+    rate=st.floats(0.1, 50),
+    prompt_s=st.floats(0, 5),
+    tokens=st.integers(1, 8),
+    skills=st.integers(1, 20),
+    t_nom_s=st.floats(0.05, 8),
+)
+def test_online_without_jitter_starts_at_the_safe_start_exactly(
+    rate: float, prompt_s: float, tokens: int, skills: int, t_nom_s: float
+) -> None:
+    config = TimelineConfig(
+        profiles=(),
+        rates=(rate,),
+        prompt_s=prompt_s,
+        tokens_per_skill=(tokens,),
+        n_skills=(skills,),
+        t_nom_s=(t_nom_s,),
+    )
+    ((board, setting),) = settings(config)
+    _, plans = draw(config, board, setting, 1, "plans")
+    schedule = learn(config, board, setting).prepare("stream-to-act").schedule(plans)
+    safe_s = safe_start(plans.arrival_s, plans.nominal_s)
+    assert schedule.start_s[0] == pytest.approx(safe_s, rel=1e-9, abs=1e-9)
+    end_s = schedule.start_s[-1] + schedule.duration_s[-1]
+    assert end_s == pytest.approx(safe_s + skills * t_nom_s, rel=2e-5)
+
+
+def test_a_declared_gap_bound_frees_the_robust_rule_from_waiting() -> None:
+    for bound, late in ((None, True), (1.0, False)):
+        config = TimelineConfig(
+            profiles=(), rates=(4.8,), prompt_s=0.5, tokens_per_skill=(6,), t_min=1.0, gap_bound=bound
+        )
+        ((board, setting),) = settings(config)
+        _, plans = draw(config, board, setting, 1, "plans")
+        start_s = learn(config, board, setting).prepare("s2a-robust").schedule(plans).start_s[0, 0]
+        assert start_s == pytest.approx(10.5 if late else 3.5)
+
+
+def test_drawn_tokens_have_the_rate_and_prompt_time_of_their_board() -> None:
+    profile = Profile("p", "P", "paper", 5.0, 1.0, 0.3, Lognormal(0.2, 0.5), rate_cv=0.1)
+    board = board_of_profile(profile, "profile", None)
+    token_s = board.tokens(50, np.random.default_rng(0), 20_000)
+    assert token_s[0].mean() == pytest.approx(1.0 + 0.2, rel=0.01)
+    assert token_s[-1].mean() == pytest.approx(1.0 + 10, rel=0.01)
+    expected_sd = np.hypot(0.3, np.hypot(10 * 0.1, 0.2 * 0.5 * 50**0.5))
+    assert token_s[-1].std() == pytest.approx(expected_sd, rel=0.03)
+    even = board_of_profile(profile, "none", 2.0)
+    assert even.even
+    assert even.prompt_origin == "given"
+    assert even.tokens(2, np.random.default_rng(0), 1)[:, 0] == pytest.approx([2.2, 2.4])
+
+
+def test_a_recording_is_played_where_a_profile_has_one() -> None:
+    profile = Profile("p", "P", "measured", 5.0, 1.0, 0.0, Lognormal(0.2, 0.5), trace_s=(0.1, 0.3))
+    assert board_of_profile(profile, "profile", None).gaps == Recorded(0.2, (0.1, 0.3))
+    assert board_of_profile(profile, "none", None).gaps == Constant(0.2)
+
+
+def test_a_recording_already_holds_the_spread_between_answers() -> None:
+    parametric = Profile("p", "P", "measured", 5.0, 1.0, 0.0, Lognormal(0.2, 0.5), rate_cv=0.1)
+    assert board_of_profile(parametric, "profile", None).rate_cv == 0.1
+    assert board_of_profile(replace(parametric, trace_s=(0.1, 0.3)), "profile", None).rate_cv == 0
+
+
+def test_jitter_is_read_with_its_parameters() -> None:
+    assert gaps_of("none", 0.5) == Constant(0.5)
+    assert gaps_of("lognormal:cv=0.3", 0.5) == Lognormal(0.5, 0.3)
+    text = "markov:cv=0.2,pause_share=0.02,pause_ratio=10,pause_tokens=3"
+    assert gaps_of(text, 0.5) == Markov(0.5, 0.2, 0.02, 10.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("jitter", "message"),
+    [
+        ("lognormal", "cv: missing"),
+        ("lognormal:cv", "'cv' should be key=value"),
+        ("lognormal:cv=wide", "cv=wide should be a number"),
+        ("lognormal:cv=-1", "cv: -1 should be 0 or more"),
+        ("lognormal:cv=0.2,sd=1", "sd: lognormal gaps have no such key"),
+    ],
+)
+def test_jitter_that_is_wrong_is_named(jitter: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        gaps_of(jitter, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (TimelineConfig(policies=()), "--policy: name at least one"),
+        (TimelineConfig(profiles=()), "--profile or --rate: name at least one"),
+        (TimelineConfig(rates=(float("inf"),)), "--rate: inf"),
+        (TimelineConfig(rates=(float("nan"),)), "--rate: nan"),
+        (TimelineConfig(n_skills=(8, 0)), "--n-skills: 0"),
+        (TimelineConfig(tokens_per_skill=(0,)), "--tokens-per-skill: 0"),
+        (TimelineConfig(t_nom_s=(1.0, -1.0)), "--t-nom: -1"),
+        (TimelineConfig(t_nom_s=(1e-9,)), "--t-nom: 1e-09"),
+        (TimelineConfig(t_min=1.2), "--t-min .* 1.2 should be above 0 and at most 1"),
+        (TimelineConfig(t_max=0.9), "--t-max .* 0.9 should be 1 or more"),
+        (TimelineConfig(t_nom_cv=0.6), "--t-nom-cv: 0.6"),
+        (TimelineConfig(prompt_s=-1.0), "--prompt-time: -1"),
+        (TimelineConfig(gap_bound=0.0), "--gap-bound: 0"),
+        (TimelineConfig(epsilon=0.001), "--epsilon: 400 calibration plans promise"),
+        (TimelineConfig(seed=-1), "--seed: -1"),
+        (TimelineConfig(jitter="lognormal:cv=1", plans=10**6), "--plans: .* skills are more than"),
+    ],
+)
+def test_a_configuration_that_makes_no_sense_is_refused(config: TimelineConfig, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        config.check()
+
+
+def recorded_run(output: Path, answers: int, tokens: int) -> Path:
+    """Make a run folder of answers at 5 tokens/s, the first token 1 s after the request, and one warm-up."""
+    with RunWriter.create(output, "throughput", {}) as writer:
+        for place in range(answers + 1):
+            at = place * 10**12
+            marks = [
+                ("", at),
+                ("capture", at + 10**6),
+                ("inference", at + 10**6 + 10**9),
+                ("return", at + 10**6 + 10**9),
+            ]
+            name = f"r{place}"
+            writer.sample(
+                SampleRow(
+                    "loopback",
+                    "loopback",
+                    "",
+                    "none",
+                    "",
+                    "replay",
+                    "request",
+                    "1x1",
+                    0,
+                    0,
+                    not place,
+                    name,
+                    0,
+                    marks=marks,
+                )
+            )
+            writer.tokens(
+                TokenRow(name, "loopback", i, 0, "x", None, at + 10**6 + 10**9 + i * 200_000_000) for i in range(tokens)
+            )
+        return writer.path
+
+
+def test_answers_of_a_run_are_read_from_the_request(tmp_path: Path) -> None:
+    found = recordings(recorded_run(tmp_path, 3, 4))
+    assert len(found) == 3
+    for token_s in found:
+        assert token_s == pytest.approx([1.0, 1.2, 1.4, 1.6])
+
+
+def test_recorded_answers_calibrate(tmp_path: Path) -> None:
+    folder = recorded_run(tmp_path / "recorded", 120, 12)
+    config = TimelineConfig(profiles=(), rates=(5.0,), tokens_per_skill=(3,), n_skills=(4,), calibrate=folder)
+    run = ran(config, tmp_path / "run")
+    (found,) = run.manifest["calibrations"].values()
+    assert found["plans"] == 120
+    assert run.manifest["configuration"]["calibrate"] == str(folder)
+
+
+def test_too_few_or_too_short_answers_are_refused_before_there_is_a_folder(tmp_path: Path) -> None:
+    folder = recorded_run(tmp_path / "recorded", 120, 12)
+    for skills, answers in ((5, 0), (4, 120)):
+        config = TimelineConfig(
+            profiles=(), rates=(5.0,), tokens_per_skill=(3,), n_skills=(skills,), calibrate=folder, epsilon=0.005
+        )
+        with pytest.raises(UsageError, match=f"{answers} of 120 answers have the {3 * skills} tokens"):
+            run_timeline(config, tmp_path / "run", Quiet())
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_without_a_run_or_answers_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="is no run folder"):
+        recordings(tmp_path)
+    with pytest.raises(UsageError, match="holds no answers"):
+        recordings(recorded_run(tmp_path, 0, 3))
+
+
+def test_lambda_that_nothing_can_promise_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    never = Calibration(math.inf, 0.01, 400, 0, 0.0, 0.01, 0.99)
+    monkeypatch.setattr("s2a_bench.experiments.timeline.policies.calibrate", lambda *_: never)
+    config = replace(JITTERY, plans=20)
+    run = ran(config, tmp_path)
+    (doubt,) = run.manifest["warnings"]
+    assert doubt["code"] == "calibration-waits"
+    (found,) = run.manifest["calibrations"].values()
+    assert found["caution"] is None
+    online = next(cell for cell in timelines_of(run) if cell.policy == "stream-to-act")
+    assert online.about("caution") is None
+    assert online.p_any_stall == 0
+    assert list(online.rows["start_ns"]) == list(online.rows["last_arrival_ns"])
+
+
+def test_each_setting_is_a_cell_a_policy(tmp_path: Path) -> None:
+    config = TimelineConfig(profiles=("rtx-4080",), tokens_per_skill=(4, 1), n_skills=(2, 3), t_nom_s=(0.5, 2.0))
+    rows = ran(config, tmp_path).tables["timelines"]
+    assert Counter(rows["policy"]) == dict.fromkeys(config.policies, 8)
+    assert rows["cell"].nunique() == 24
+    assert (rows["caution"].isna() == (rows["policy"] != "stream-to-act")).all()
+
+
+def test_a_plan_of_hours_has_no_sampled_motion(tmp_path: Path) -> None:
+    config = TimelineConfig(profiles=(), rates=(0.001,), tokens_per_skill=(6,), t_nom_s=(4000.0,))
+    rows = ran(config, tmp_path).tables["timelines"]
+    assert rows[["rms_jerk", "peak_jerk", "sparc"]].isna().all().all()
+    assert rows["stalls"].notna().all()
+
+
+def test_more_tokens_than_memory_holds_are_refused() -> None:
+    with pytest.raises(UsageError, match="--n-skills, --tokens-per-skill: 1000000 tokens a plan"):
+        TimelineConfig(n_skills=(1000,), tokens_per_skill=(1000,)).check()
+
+
+def test_a_skill_that_fails_at_once_has_a_row_and_no_motion() -> None:
+    second = np.ones((1, 1))
+    setting = Setting("", "live", 5.0, None, 6, 4, 1.0, mode="live", emulated=False)
+    (row,) = timeline_rows(setting, "naive", Plans(second, second, second, second), Schedule(second, 0 * second), ["a"])
+    assert (row.start_ns, row.end_ns, row.sparc, row.rms_jerk) == (10**9, 10**9, None, None)

@@ -1,0 +1,138 @@
+"""The stall-free region: formula against trial, and the figure that shows both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.collections import PathCollection, QuadMesh
+from matplotlib.figure import Figure
+
+from s2a_bench.experiments.boundary.run import BoundaryConfig, rows, run_boundary
+from s2a_bench.experiments.boundary.view.figure import build_boundary, write_boundary_figure
+from s2a_bench.experiments.boundary.view.tables import board_table, boundary_csv, disagreements, line_table
+from s2a_bench.store.run import Run, read_run
+from s2a_bench.writers.style import paper_column
+
+
+class Quiet:
+    """Progress that nobody looks at."""
+
+    def opened(self, folder: Path) -> None: ...
+    def stage(self, text: str) -> None: ...
+    def expect(self, samples: int) -> None: ...
+    def advance(self) -> None: ...
+
+
+@pytest.fixture(scope="module")
+def even(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return read_run(run_boundary(BoundaryConfig(), tmp_path_factory.mktemp("even"), Quiet()))
+
+
+@pytest.fixture(scope="module")
+def jittery(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    config = BoundaryConfig(jitter="lognormal:cv=0.2", plans=200, points=30)
+    return read_run(run_boundary(config, tmp_path_factory.mktemp("jittery"), Quiet()))
+
+
+def drawn(run: Run) -> Figure:
+    with paper_column():
+        return build_boundary(run)
+
+
+@settings(max_examples=40)
+@given(
+    n_skills=st.integers(2, 40),
+    t_nom_s=st.floats(0.1, 10),
+    t_min=st.floats(0.1, 1),
+    low=st.floats(0.05, 2),
+    factor=st.floats(1.5, 200),
+)
+def test_formula_and_trial_agree_without_jitter(
+    n_skills: int, t_nom_s: float, t_min: float, low: float, factor: float
+) -> None:
+    config = BoundaryConfig(
+        profiles=(),
+        n_skills=n_skills,
+        t_nom_s=t_nom_s,
+        t_min=t_min,
+        rates=(low, low * factor),
+        points=15,
+        most_tokens=7,
+    )
+    for duration in config.durations:
+        for row in rows(config, duration, config.grid):
+            close = abs(row.tokens_per_skill / row.tokens_per_s - row.duration_s) < 1e-5  # a stall too short to be one
+            assert close or row.stall_free == (row.p_stall == 0)
+
+
+def test_the_line_itself_is_stall_free() -> None:
+    config = BoundaryConfig(profiles=(), rates=(1.0, 2.0), points=2, most_tokens=2, t_nom_s=1.0)
+    free = {(row.tokens_per_skill, row.tokens_per_s): row for row in rows(config, "t_nom", config.grid)}
+    assert free[1, 1.0].stall_free
+    assert free[1, 1.0].p_stall == 0
+    assert free[2, 2.0].p_stall == 0
+    assert free[2, 1.0].p_stall == 1
+
+
+def test_with_jitter_the_line_is_a_slope(jittery: Run) -> None:
+    points = jittery.tables["boundary"]
+    mine = points[(points["duration"] == "t_nom") & (points["board"] == "") & (points["tokens_per_skill"] == 4)]
+    share = mine.sort_values("tokens_per_s")["p_stall"].to_numpy()
+    assert (np.diff(share) <= 0).all()
+    assert share[0] == 1
+    assert share[-1] == 0
+    assert ((share > 0) & (share < 1)).sum() >= 2
+    assert disagreements(jittery) > 0
+
+
+def test_the_figure_draws_both_lines_every_trial_and_every_board(even: Run) -> None:
+    axes = drawn(even).axes[0]
+    lines = {line.get_label(): line for line in axes.lines}
+    nominal = next(line for label, line in lines.items() if "T_\\mathrm{nom}" in label)
+    least = next(line for label, line in lines.items() if "T_\\mathrm{min}" in label)
+    assert np.asarray(nominal.get_ydata()) == pytest.approx(np.asarray(nominal.get_xdata()))
+    assert np.asarray(least.get_ydata()) == pytest.approx(np.asarray(least.get_xdata()) / 0.8)
+    trials = [found for found in axes.collections if isinstance(found, PathCollection)]
+    assert sum(len(found.get_offsets()) for found in trials) == 8 * 25
+    squares = [line for line in axes.lines if line.get_marker() == "s"]
+    assert sum(len(line.get_xdata()) for line in squares) == 3 * 4
+    assert axes.get_yscale() == "log"
+    assert {text.get_text() for text in axes.texts} >= {"RTX 4080, 34.2", "stall-free", "naive stalls"}
+
+
+def test_with_jitter_the_share_is_shaded_and_has_a_scale(jittery: Run) -> None:
+    figure = drawn(jittery)
+    (mesh,) = [found for found in figure.axes[0].collections if isinstance(found, QuadMesh)]
+    assert mesh.get_array().size == 8 * 30
+    assert mesh.get_clim() == (0, 1)
+    assert len(figure.axes) == 2
+    assert "200 plans a point" in figure.get_suptitle()
+
+
+def test_the_title_says_whose_rates_are_marked(even: Run) -> None:
+    assert "the paper's rates (not measured here)" in drawn(even).get_suptitle().replace("\n", " ")
+
+
+def test_the_figure_is_written_as_png_and_pdf(even: Run) -> None:
+    assert [path.name for path in write_boundary_figure(even)] == ["boundary.png", "boundary.pdf"]
+
+
+def test_tables_give_the_formula_and_the_first_rate_that_passed(even: Run) -> None:
+    table = line_table(even)
+    assert [row[1] for row in table.rows][:4] == ["1.00", "2.00", "3.00", "4.00"]
+    for row in table.rows:
+        assert float(row[1]) <= float(row[2]) <= float(row[1]) * 1.26
+        assert float(row[3]) <= float(row[4]) <= float(row[3]) * 1.26
+    verdicts = {row[1:3]: row[4:] for row in board_table(even).rows}
+    assert verdicts["4", "0.833"] == ("stall-free", "stalls")
+    assert any("agree at 424 of 424 points" in note for note in board_table(even).notes)
+
+
+def test_the_csv_holds_every_point(even: Run) -> None:
+    lines = boundary_csv(even)["boundary.csv"].splitlines()
+    assert lines[0] == "duration,duration_s,tokens_per_skill,tokens_per_s,board,stall_free,plans,p_stall"
+    assert len(lines) == 1 + 424

@@ -1,0 +1,58 @@
+"""The frame path of a stream."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.experiments.latency.view.files import write_tables
+from s2a_bench.experiments.latency.view.frame_path import frame_table
+from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.schema import FrameRow, SampleRow
+from s2a_bench.trace import Mark
+
+MS = 1_000_000
+PROMPT: list[Mark] = [("", 0), ("cdr_pack", MS), ("network", 2 * MS), ("inference", 4 * MS), ("return", 5 * MS)]
+SAMPLE = SampleRow(
+    "ros/topic", "ros", "topic", "bgr", "", "echo", "stream", "64x48", 0, 0, False, "r0", 3, marks=PROMPT,
+    frame_age_ns=12 * MS,
+)  # fmt: skip
+FRAME: list[Mark] = [("", 10 * MS), ("capture", 11 * MS), ("convert", 13 * MS), ("", 14 * MS), ("network", 17 * MS)]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    with RunWriter.create(tmp_path, "latency", {}) as writer:
+        writer.sample(SAMPLE)
+        writer.sample(replace(SAMPLE, request_id="r1", warmup=True))
+        writer.frame(FrameRow("ros/topic", 3, 9 * MS, FRAME, "r0"))
+        writer.frame(FrameRow("ros/topic", 4, 9 * MS, [("", 0), ("capture", 99 * MS)], "r1"))
+        writer.frame(FrameRow("ros/topic", 5, 9 * MS, [("", 0), ("capture", 99 * MS)]))
+    return read_run(writer.path)
+
+
+def test_only_frames_of_counted_samples_count(run: Run) -> None:
+    table = frame_table(run)
+    assert table is not None
+    assert table.rows == [
+        ("capture", "capture", "1.00"),
+        ("encode", "convert", "2.00"),
+        ("network", "network", "3.00"),
+        ("", "residual", "1.00"),
+        ("", "frame path", "7.00"),
+        ("", "frame path from the intended time", "8.00"),
+        ("", "age when inference starts", "12.0"),
+    ]
+
+
+def test_the_table_is_written_beside_the_others(run: Run) -> None:
+    names = {path.name for path in write_tables(run)}
+    assert {"frames.md", "frames.tex"} <= names
+
+
+def test_a_run_without_a_stream_has_no_such_table(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as writer:
+        writer.sample(SAMPLE)
+    assert frame_table(read_run(writer.path)) is None

@@ -1,0 +1,192 @@
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from s2a_bench.errors import StoreError
+from s2a_bench.experiments.latency.view.figures import (
+    build_distribution,
+    build_latency_bars,
+    build_stage_breakdown,
+    write_figures,
+)
+from s2a_bench.experiments.paper import LABEL, paper_latency
+from s2a_bench.store.run import Run
+from s2a_bench.trace import GROUPS
+from s2a_bench.writers.style import GREY, GROUP_FILLS, cell_looks, paper_column
+
+MakeRun = Callable[..., Run]
+HAND = {
+    "http/as-deployed": {"capture": 1, "image_encode": 3, "network": 2, "inference": 100, "": 1.5, "return": 0.5},
+    "ros/topic": {"capture": 1, "cdr_pack": 0.5, "network": 2, "inference": 100, "return": 0.5},
+}
+
+
+@pytest.fixture(autouse=True)
+def style() -> Iterator[None]:
+    with paper_column():
+        yield
+
+
+def row_names(figure: Figure) -> list[str]:
+    return [label.get_text() for label in figure.axes[0].get_yticklabels()]
+
+
+def bars(figure: Figure, panel: int = 0) -> list[Rectangle]:
+    return [patch for patch in figure.axes[panel].patches if isinstance(patch, Rectangle)]
+
+
+def legend(figure: Figure) -> list[str]:
+    return [text.get_text() for found in figure.legends for text in found.get_texts()]
+
+
+def texts(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.axes[0].texts]
+
+
+def test_bars_are_means_with_their_sd_beside(make_run: MakeRun) -> None:
+    figure = build_latency_bars(make_run(HAND, n=4, spread=0))
+    assert row_names(figure) == ["http/as-deployed\n(jpeg)", "ros/topic\n(bgr)"]
+    assert [bar.get_width() for bar in bars(figure)] == [8.0, 4.0]
+    assert texts(figure) == ["8.00 ± 0.00", "4.00 ± 0.00"]
+    assert figure.axes[0].get_xlim()[0] == 0
+    assert figure.axes[0].get_xlabel() == "e2e without inference (ms)"
+    assert legend(figure) == []
+
+
+def test_the_title_says_how_many_and_what_did_not_really_answer(make_run: MakeRun) -> None:
+    echo = build_latency_bars(make_run(HAND, n=4)).get_suptitle()
+    assert echo == "Mean ± sd: end to end without inference\nn = 4 a cell, 640x480, request mode, echo engine"
+    dummy = make_run(HAND, n=4, engine="llama", manifest={"model": {"dummy": True}})
+    for build in (build_latency_bars, build_stage_breakdown, build_distribution):
+        assert "dummy weights" in build(dummy).get_suptitle()
+
+
+def test_the_papers_values_appear_only_when_asked_for_and_as_another_machines(make_run: MakeRun) -> None:
+    run = make_run(HAND, n=4, spread=0)
+    assert "paper" not in "".join(row_names(build_latency_bars(run)))
+    figure = build_latency_bars(run, against_paper=True)
+    assert row_names(figure)[2:] == ["paper:\nHTTP/JSON", "paper:\nROS-native"]
+    assert [bar.get_width() for bar in bars(figure)][2:] == [101.8, 15.5]
+    assert {mpl.colors.to_hex(bar.get_facecolor()).upper() for bar in bars(figure)[2:]} == {GREY}
+    assert texts(figure)[2:] == ["101.8 ± 8.6", "15.5 ± 1.0"]
+    (label,) = legend(figure)
+    assert label.startswith(LABEL)
+    assert LABEL == "paper (Jetson AGX Orin), another machine"
+    assert "does not say that inference is left out" in label
+
+
+def test_the_papers_values_are_those_of_its_section() -> None:
+    assert [(claim.mean_ms, claim.sd_ms) for claim in paper_latency()] == [(101.8, 8.6), (15.5, 1.0)]
+
+
+def test_the_stacked_groups_and_the_residual_end_at_the_mean_of_the_whole(make_run: MakeRun) -> None:
+    figure = build_stage_breakdown(make_run(HAND, n=4, spread=0))
+    assert len(figure.axes) == 1
+    assert legend(figure) == ["capture", "encode", "pack", "network", "return", "residual"]
+    parts = bars(figure)
+    assert [bar.get_width() for bar in parts[:6]] == [1, 3, 0, 2, 0.5, 1.5]
+    assert [bar.get_x() for bar in parts[:6]] == [0, 1, 4, 4, 6, 6.5]
+    assert parts[5].get_hatch() == "//////"
+    assert texts(figure) == ["8.00", "4.00"]
+
+
+def test_cells_that_differ_widely_get_a_panel_of_shares(make_run: MakeRun) -> None:
+    small = {"loopback": {"capture": 0.2, "inference": 100, "return": 0.2}}
+    figure = build_stage_breakdown(make_run(HAND | small, n=4, spread=0))
+    assert [axes.get_xlabel() for axes in figure.axes] == ["e2e without inference (ms)", "share (%)"]
+    ends = [bar.get_x() + bar.get_width() for bar in bars(figure, 1) if bar.get_hatch() == "//////"]
+    assert ends == pytest.approx([100, 100, 100])
+    capture = [bar.get_width() for bar in bars(figure, 1)][::6]
+    assert capture == pytest.approx([12.5, 25, 50])
+
+
+def test_a_distribution_has_a_line_a_cell_each_of_its_own_colour_and_style(
+    make_run: MakeRun, plausible: dict[str, Any]
+) -> None:
+    figure = build_distribution(make_run(plausible, n=20))
+    axes = figure.axes[0]
+    assert legend(figure) == list(plausible)
+    assert axes.get_xscale() == "log"
+    assert len({(line.get_color(), line.get_linestyle()) for line in axes.get_lines()}) == 5
+    assert all(line.get_ydata()[-1] == 1 for line in axes.get_lines())
+
+
+def test_a_narrow_distribution_stays_linear(make_run: MakeRun) -> None:
+    assert build_distribution(make_run(HAND, n=20)).axes[0].get_xscale() == "linear"
+
+
+def test_a_black_box_is_left_out_by_name_or_shown_with_its_inference(make_run: MakeRun, black_box: Any) -> None:
+    mixed = build_latency_bars(make_run(HAND | {"http/black-box": black_box}, n=4))
+    assert "http/black-box not shown (inference unknown)" in mixed.get_suptitle().replace("\n", " ")
+    assert len(bars(mixed)) == 2
+    alone = build_stage_breakdown(make_run({"http/black-box": black_box}, n=4, spread=0))
+    assert alone.axes[0].get_xlabel() == "e2e, inference included (ms)"
+    assert "server" in legend(alone)
+
+
+def test_every_group_has_a_look_and_every_cell_one_of_its_own() -> None:
+    assert set(GROUP_FILLS) == set(GROUPS)
+    assert len(set(GROUP_FILLS.values())) == len(GROUP_FILLS)
+    names = ["http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "loopback", "a", "b", "c"]
+    looks = cell_looks(names)
+    assert set(looks) == set(names)
+    assert len(set(looks.values())) == len(names)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_no_text_is_clipped_or_smaller_than_seven_points(
+    make_run: MakeRun, plausible: dict[str, Any], count: int
+) -> None:
+    run = make_run(dict(list(plausible.items())[:count]), n=10)
+    for build in (lambda run: build_latency_bars(run, against_paper=True), build_stage_breakdown, build_distribution):
+        figure = build(run)
+        figure.draw_without_rendering()
+        inked = figure.get_tightbbox()
+        assert min(inked.x0, inked.y0) >= 0
+        assert inked.x1 <= figure.get_figwidth()
+        assert inked.y1 <= figure.get_figheight()
+        assert all(text.get_fontsize() >= 7 for text in figure.findobj(mpl.text.Text))
+        assert figure.get_figwidth() == 3.5
+
+
+def test_png_and_pdf_are_written_below_the_run(make_run: MakeRun) -> None:
+    run = make_run(n=3)
+    paths = write_figures(run, against_paper=True)
+    names = ["latency_bars", "stage_breakdown", "distribution"]
+    assert [path.name for path in paths] == [f"{name}.{suffix}" for name in names for suffix in ("png", "pdf")]
+    for path in paths:
+        head = path.read_bytes()
+        assert head.startswith(b"\x89PNG" if path.suffix == ".png" else b"%PDF")
+        assert len(head) > 5_000
+
+
+def test_without_samples_there_are_no_figures(make_run: MakeRun) -> None:
+    run = make_run({})
+    assert write_figures(run) == []
+    assert not (run.path / "figures").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun) -> None:
+    run = make_run(n=1)
+    (run.path / "figures").write_text("")
+    with pytest.raises(StoreError, match=r"cannot write .*figures"):
+        write_figures(run)
+
+
+def test_drawing_leaves_no_global_state(make_run: MakeRun) -> None:
+    before = dict(mpl.rcParams)
+    write_figures(make_run(n=1))
+    assert dict(mpl.rcParams) == before
+
+
+def test_only_views_writers_and_report_import_matplotlib() -> None:
+    root = Path(__file__).parents[3] / "s2a_bench"
+    importers = [path for path in root.rglob("*.py") if re.search(r"(import|from) matplotlib", path.read_text())]
+    places = {path.relative_to(root).parts for path in importers}
+    assert {parts for parts in places if parts[0] not in {"writers", "report"} and "view" not in parts} == set()

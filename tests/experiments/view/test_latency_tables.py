@@ -1,0 +1,227 @@
+import csv
+import io
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from s2a_bench.errors import StoreError
+from s2a_bench.experiments.latency.view.as_csv import csv_texts
+from s2a_bench.experiments.latency.view.files import write_tables
+from s2a_bench.experiments.latency.view.tables import group_table, stage_table, summary_table
+from s2a_bench.experiments.latency.view.terminal import renderables
+from s2a_bench.stats import Ratio, Summary
+from s2a_bench.store.run import Run
+from s2a_bench.store.schema import SampleRow
+from s2a_bench.writers.tables import interval, mean_sd, number, to_latex, to_markdown
+
+MakeRun = Callable[..., Run]
+NONE = "\N{EN DASH}"
+HAND = {
+    "http/as-deployed": {"capture": 1, "image_encode": 3, "base64_encode": 2, "network": 18, "inference": 100, "": 1.5},
+    "ros/topic": {"capture": 1, "cdr_pack": 0.0124, "network": 3, "inference": 100},
+}
+HAND = {name: {**stages, "return": 0.5} for name, stages in HAND.items()}
+
+
+def printed(run: Run) -> str:
+    console = Console(width=100, file=io.StringIO(), color_system=None)
+    for renderable in renderables(run):
+        console.print(renderable)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0, "0.000"),
+        (0.00049, "0.000"),
+        (0.1234, "0.123"),
+        (0.9996, "1.00"),
+        (9.994, "9.99"),
+        (9.996, "10.0"),
+        (12.34, "12.3"),
+        (99.96, "100"),
+        (1234.4, "1234"),
+    ],
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_mean_and_sd_share_their_decimals() -> None:
+    assert mean_sd(Summary(50, 101.84, 8.63, 0, 0, 0)) == "102 ± 9"
+    assert mean_sd(Summary(50, 15.52, 1.04, 0, 0, 0)) == "15.5 ± 1.0"
+    assert mean_sd(Summary(1, 15.52, None, 0, 0, 0)) == "15.5"
+
+
+def test_a_ratio_without_bounds_or_value_says_so() -> None:
+    assert interval(Ratio(6.57, 6.2, 6.904)) == "6.57 [6.20, 6.90]"
+    assert interval(Ratio(6.57, None, None)) == "6.57"
+    assert interval(Ratio(None, None, None)) == interval(None) == NONE
+
+
+def test_the_stage_table_by_hand(make_run: MakeRun) -> None:
+    table = stage_table(make_run(HAND, n=4, spread=0), full=False)
+    assert table.header == ("group", "stage", "http/as-deployed", "ros/topic")
+    assert table.rows == [
+        ("capture", "capture", "1.00", "1.00"),
+        ("encode", "image_encode", "3.00", NONE),
+        ("", "base64_encode", "2.00", NONE),
+        ("pack", "cdr_pack", NONE, "0.012"),
+        ("network", "network", "18.0", "3.00"),
+        ("return", "return", "0.500", "0.500"),
+        ("", "residual", "1.50", "0.000"),
+        ("", "e2e without inference", "26.0", "4.51"),
+        ("", "inference", "100", "100"),
+        ("", "e2e", "126", "105"),
+    ]
+    assert table.notes == (
+        "n = 4 samples a cell, warm-ups left out.",
+        "640x480; payload: http jpeg, ros bgr.",
+        "Echo engine.",
+        "4 of 8 samples have a residual above 5% of e2e without inference.",
+    )
+    assert stage_table(make_run(HAND, n=4, spread=0)).rows[1][2] == "3.00 (3.00 ± 0.00)"
+
+
+def test_the_group_table_has_a_row_a_cell(make_run: MakeRun) -> None:
+    table = group_table(make_run(HAND, n=4, spread=0))
+    assert table.header == ("cell", "capture", "encode", "pack", "network", "return", "e2e w/o infer.", "infer.", "e2e")
+    assert table.rows == [
+        ("http/as-deployed", "1.00", "5.00", NONE, "18.0", "0.500", "26.0", "100", "126"),
+        ("ros/topic", "1.00", NONE, "0.012", "3.00", "0.500", "4.51", "100", "105"),
+    ]
+
+
+def test_the_summary_table_by_hand(make_run: MakeRun, make_row: Callable[..., SampleRow]) -> None:
+    loopback = {"loopback": {"capture": 1, "inference": 100, "return": 0.3}}
+    extra = (make_row("loopback", loopback["loopback"], 9, error="x"),)
+    table = summary_table(make_run(HAND | loopback, n=4, spread=0, extra=extra))
+    assert table.header[-2:] == ("ratio to ros/topic", "ratio to loopback")
+    assert table.rows == [
+        ("http/as-deployed", "4", "0", "26.0 ± 0.0", "26.0", "26.0", "26.0", "5.76 [5.76, 5.76]", "20.0 [20.0, 20.0]"),
+        ("ros/topic", "4", "0", "4.51 ± 0.00", "4.51", "4.51", "4.51", "1", "3.47 [3.47, 3.47]"),
+        ("loopback", "4", "1", "1.30 ± 0.00", "1.30", "1.30", "1.30", NONE, "1"),
+    ]
+    assert table.notes[-1] == "1 samples failed and are in no number here; samples.csv says why."
+
+
+def test_a_black_box_is_absent_where_its_inference_is_unknown(make_run: MakeRun, black_box: Any) -> None:
+    run = make_run(HAND | {"http/black-box": black_box}, n=4, spread=0)
+    assert summary_table(run).rows[1][3:] == (NONE,) * 5
+    assert summary_table(run, "e2e").rows[1][3:5] == ("302 ± 0", "302")
+    assert "End to end in ms" in printed(run)
+
+
+def test_markdown_and_latex_are_tables(make_run: MakeRun) -> None:
+    table = stage_table(make_run(HAND, n=4, spread=0))
+    markdown = to_markdown(table).splitlines()
+    assert markdown[0] == "**Stages in ms: median (mean ± sd)**"
+    assert markdown[2:5] == [
+        "| group | stage | http/as-deployed | ros/topic |",
+        "| --- | --- | ---: | ---: |",
+        "| capture | capture | 1.00 (1.00 ± 0.00) | 1.00 (1.00 ± 0.00) |",
+    ]
+    latex = to_latex(table)
+    assert r"\begin{tabular}{llrr}" in latex
+    assert r"encode & image\_encode & 3.00 (3.00 $\pm$ 0.00) & -- \\" in latex
+    assert latex.count(r"\midrule") == 2
+    assert latex.endswith("\\bottomrule\n\\end{tabular}\n")
+    # Nothing outside comments that LaTeX would take for something else.
+    body = [line for line in latex.splitlines() if not line.startswith("%")]
+    assert not any(char in line.replace(r"\_", "").replace(r"\%", "") for line in body for char in f"_%#±{NONE}")
+
+
+def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -> None:
+    texts = csv_texts(make_run(HAND, n=4, spread=0))
+    stages = list(csv.DictReader(io.StringIO(texts["stages.csv"])))
+    ros = {row["stage"]: row for row in stages if row["cell"] == "ros/topic"}
+    assert list(ros) == ["capture", "cdr_pack", "network", "inference", "return", "residual"]
+    assert ros["cdr_pack"] == {
+        "cell": "ros/topic",
+        "group": "pack",
+        "stage": "cdr_pack",
+        "n": "4",
+        "median": "0.0124",
+        "mean": "0.0124",
+        "sd": "0.0",
+        "p90": "0.0124",
+        "p99": "0.0124",
+        "emulated": "False",
+    }
+    summary = list(csv.DictReader(io.StringIO(texts["summary.csv"])))
+    assert {row["metric"] for row in summary} == {
+        "e2e_without_inference_ms",
+        "e2e_ms",
+        "ttft_ms",
+        "itl_ms",
+        "residual_share",
+    }
+    ratio = next(csv.DictReader(io.StringIO(texts["ratios.csv"])))
+    assert ratio["emulated"] == "False"
+    for text in csv_texts(make_run(HAND, n=4, engine="replay")).values():
+        assert {row["emulated"] for row in csv.DictReader(io.StringIO(text))} == {"True"}
+    assert (ratio["of"], ratio["to"], float(ratio["value"])) == ("http/as-deployed", "ros/topic", 26 / 4.5124)
+
+
+def test_a_cell_in_which_everything_failed_is_in_the_summary(
+    make_run: MakeRun, make_row: Callable[..., SampleRow]
+) -> None:
+    run = make_run({}, extra=(make_row("ros/topic", {"capture": 1}, 1, error="lost"),))
+    assert csv_texts(run)["summary.csv"].splitlines()[1] == "ros/topic,,1,0,0,,,,,,False"
+    assert summary_table(run).rows == [("ros/topic", "0", "1", NONE, NONE, NONE, NONE)]
+
+
+def test_the_files_are_written_below_the_run(make_run: MakeRun) -> None:
+    run = make_run(n=3)
+    paths = write_tables(run)
+    assert sorted(path.name for path in paths) == [
+        "ratios.csv",
+        "stages.csv",
+        "stages.md",
+        "stages.tex",
+        "summary-e2e.md",
+        "summary-e2e.tex",
+        "summary.csv",
+        "summary.md",
+        "summary.tex",
+    ]
+    assert all(path.parent == run.path / "tables" and path.stat().st_size > 50 for path in paths)
+
+
+def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun) -> None:
+    run = make_run(n=1)
+    (run.path / "tables").write_text("")
+    with pytest.raises(StoreError, match=r"cannot write .*tables"):
+        write_tables(run)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6])
+def test_nothing_is_cut_off_in_a_terminal_of_100_columns(
+    make_run: MakeRun, plausible: dict[str, Any], black_box: Any, count: int
+) -> None:
+    cells = dict(list((plausible | {"http/llama-server": black_box}).items())[:count])
+    text = printed(make_run(cells, n=8))
+    assert "…" not in text
+    assert all(len(line) <= 100 for line in text.splitlines())
+    for name in cells:
+        assert name in text  # in the summary, in one piece
+    assert "Echo engine." in text
+
+
+def test_an_empty_run_prints_a_line(make_run: MakeRun) -> None:
+    assert "No samples." in printed(make_run({}))
+
+
+def test_importing_the_tables_imports_no_heavy_library() -> None:
+    code = (
+        "import sys; from s2a_bench.experiments.latency.view import as_json, figures, terminal;"
+        "print([n for n in ('pandas', 'pyarrow', 'matplotlib', 'scipy', 'numpy', 'rich') if n in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

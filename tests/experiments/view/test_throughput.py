@@ -1,0 +1,268 @@
+"""The numbers, tables and figures of a throughput run made by hand."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from matplotlib.patches import Rectangle
+
+from s2a_bench.experiments.paper import paper_throughput
+from s2a_bench.experiments.throughput.view.as_json import throughput_to_json
+from s2a_bench.experiments.throughput.view.cells import BIN, Speed, ratios_of, speeds_of
+from s2a_bench.experiments.throughput.view.figures import (
+    PAPER_LABEL,
+    build_gap_distribution,
+    build_rate_by_position,
+    build_throughput_bars,
+    write_throughput_figures,
+)
+from s2a_bench.experiments.throughput.view.tables import position_table, speed_table, throughput_csv, throughput_tables
+from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.schema import REFERENCE, ReferenceRow, SampleRow, TokenRow
+from s2a_bench.writers.files import write_texts
+from s2a_bench.writers.style import paper_column
+from s2a_bench.writers.terminal import lay_out
+
+SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schema/s2a-bench-1.json").read_text())
+MakeRow = Callable[..., SampleRow]
+Make = Callable[..., Run]
+
+PATHS: Mapping[str, Mapping[str, float]] = {
+    "in-process": {"capture": 1, "inference": 100, "return": 0},
+    "http/as-deployed": {"capture": 1, "network": 5, "inference": 100, "return": 5},
+}
+
+
+@pytest.fixture
+def make(tmp_path: Path, make_row: MakeRow) -> Make:
+    """Make a run: gaps in ms a cell, the same in every request; ``facts`` a cell; llama-bench's rates a block."""
+
+    def made(
+        gaps: Mapping[str, Sequence[float]],
+        *,
+        n: int = 3,
+        facts: Mapping[str, Mapping[str, float]] | None = None,
+        reference: Sequence[float] = (),
+        **manifest: Any,
+    ) -> Run:
+        with RunWriter.create(tmp_path, "throughput", manifest) as run:
+            for block in range(-1, n):
+                for name, ms in gaps.items():
+                    row = make_row(name, PATHS.get(name, PATHS["http/as-deployed"]), block, engine="llama")
+                    pipeline = "loopback" if name == "in-process" else name.partition("/")[0]
+                    told = dict((facts or {}).get(name, {}))
+                    row = _with(row, pipeline=pipeline, warmup=block < 0, n_tokens=len(ms) + 1, facts=told)
+                    run.sample(row)
+                    times = [row.marks[-1][1]]
+                    for gap in ms:
+                        times.append(times[-1] + round(gap * 1e6))
+                    run.tokens(TokenRow(row.request_id, name, i, i, "x", None, at) for i, at in enumerate(times))
+            for block, rate in enumerate(reference, -1):
+                took = round(100 / rate * 1e9)
+                run.append(REFERENCE, [ReferenceRow(block, 0, block < 0, 1, 2, 100, 42, took, {})])
+        return read_run(run.path)
+
+    return made
+
+
+def _with(row: SampleRow, **fields: Any) -> SampleRow:
+    from dataclasses import replace
+
+    return replace(row, **fields)
+
+
+@pytest.fixture(autouse=True)
+def style() -> Iterator[None]:
+    with paper_column():
+        yield
+
+
+def only(run: Run) -> Speed:
+    (speed,) = speeds_of(run)
+    return speed
+
+
+def test_both_rates_by_hand(make: Make) -> None:
+    # 5 tokens, 4 gaps of 20 ms: 50/s at the client; the engine says 5 tokens in 125 ms: 40/s
+    facts = {"predicted_n": 5.0, "predicted_ms": 125.0, "prompt_ms": 200.0, "prompt_eval_ms": 50.0, "prompt_n": 30.0}
+    speed = only(make({"in-process": [20] * 4}, facts={"in-process": {**facts, "energy_j": 2.5}}))
+    assert list(speed.values("decode_tokens_per_s")) == [50.0] * 3
+    assert list(speed.values("tokens_per_s")) == [40.0] * 3
+    assert list(speed.values("image_ms")) == [150.0] * 3
+    assert list(speed.values("prefill_tokens_per_s")) == [150.0] * 3
+    assert list(speed.values("prompt_tokens")) == [30.0] * 3
+    assert list(speed.values("tokens_per_joule")) == [2.0] * 3
+    assert list(speed.values("ttft_ms")) == [100.0] * 3  # without the capture
+    assert speed.told
+    assert list(speed.cell.itl_ms()) == [20.0] * 12
+
+
+def test_a_server_that_tells_nothing_has_the_clients_rate_and_no_zeros(make: Make) -> None:
+    run = make({"http/as-deployed": [10] * 4})
+    speed = only(run)
+    assert list(speed.values("tokens_per_s")) == list(speed.values("decode_tokens_per_s")) == [100.0] * 3
+    for absent in ("prompt_ms", "image_ms", "prompt_eval_ms", "prefill_tokens_per_s", "tokens_per_joule"):
+        assert speed.values(absent).size == 0
+    assert "the server does not tell T_eval" in " ".join(speed_table(run).notes)
+    (cell,) = throughput_to_json(run)["cells"]
+    assert cell["t_eval"] == "client"
+    assert not {"prompt_ms", "image_ms", "tokens_per_joule"} & set(cell)
+
+
+def test_tokens_that_come_together_are_counted_by_the_server(make: Make) -> None:
+    run = make({"http/as-deployed": [30] * 2}, facts={"http/as-deployed": {"predicted_n": 7.0}})
+    speed = only(run)
+    assert list(speed.values("decode_tokens_per_s")) == [pytest.approx(100.0)] * 3  # 6 of 7 tokens in 60 ms
+    assert speed.joined == 12
+    assert "12 tokens came together with another one" in " ".join(speed_table(run).notes)
+
+
+def test_warm_ups_are_in_no_number(make: Make) -> None:
+    run = make({"in-process": [10] * 3}, n=2, reference=[1.0, 80.0, 90.0])
+    assert only(run).cell.n == 2
+    assert only(run).cell.itl_ms().size == 6
+    reference = throughput_to_json(run)["reference"]
+    assert reference["decode_tokens_per_s"]["n"] == 2
+    assert reference["decode_tokens_per_s"]["mean"] == pytest.approx(85.0)
+    assert reference["depths"] == [42]
+
+
+def test_a_slower_part_of_the_answer_shows_at_its_position(make: Make) -> None:
+    gaps = [10.0] * (BIN - 1) + [20.0] * BIN + [40.0] * 3  # tokens 1..31, 32..63, 64..66
+    found = only(make({"in-process": gaps})).by_position()
+    assert {place: list(rates) for place, rates in found.items()} == {
+        (0, 31): [pytest.approx(100.0)] * 3,
+        (32, 63): [pytest.approx(50.0)] * 3,
+        (64, 95): [pytest.approx(25.0)] * 3,
+    }
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.integers(1, 50), min_size=1, max_size=3 * BIN))
+def test_the_bins_hold_every_gap_once(make: Make, gaps: list[int]) -> None:
+    speed = only(make({"in-process": gaps}, n=1))
+    found = speed.by_position()
+    counts = [min(last, len(gaps)) - max(first, 1) + 1 for first, last in found]
+    spent_s = sum(count / rates[0] for count, rates in zip(counts, found.values(), strict=True))
+    assert sum(counts) == len(gaps)
+    assert spent_s == pytest.approx(sum(gaps) / 1e3)
+    assert list(speed.values("decode_tokens_per_s")) == [pytest.approx(len(gaps) / (sum(gaps) / 1e3))]
+
+
+def test_cells_are_compared_with_in_process_and_with_llama_bench(make: Make) -> None:
+    run = make({"http/as-deployed": [20] * 4, "in-process": [10] * 4}, reference=[1.0, 50.0, 80.0, 100.0])
+    found = {(of, to): ratio.value for of, to, ratio in ratios_of(run, speeds_of(run))}
+    assert found == {
+        ("in-process", "llama-bench"): pytest.approx(100 / 80),
+        ("http/as-deployed", "llama-bench"): pytest.approx(50 / 80),
+        ("http/as-deployed", "in-process"): pytest.approx(0.5),
+    }
+    assert [speed.name for speed in speeds_of(run)] == ["in-process", "http/as-deployed"]
+
+
+def test_a_reference_that_broke_off_is_compared_all_the_same(make: Make) -> None:
+    run = make({"in-process": [10] * 4}, n=3, reference=[1.0, 50.0])
+    ((_, _, ratio),) = ratios_of(run, speeds_of(run))
+    assert ratio.value == pytest.approx(2.0)
+
+
+def test_the_json_is_strict_and_valid(make: Make) -> None:
+    facts = {"predicted_n": 70.0, "predicted_ms": 700.0, "prompt_ms": 20.0, "prompt_eval_ms": 5.0, "prompt_n": 9.0}
+    told = {"in-process": {**facts, "energy_j": 3.0}}
+    gaps = {"in-process": [10.0] * 69, "http/as-deployed": [11.0] * 69}
+    run = make(gaps, facts=told, reference=[9.0, 99.0, 98.0, 97.0], reference_command=["x"])
+    whole = json.loads(json.dumps(throughput_to_json(run), allow_nan=False))
+    jsonschema.validate(whole, SCHEMA, cls=jsonschema.Draft202012Validator)
+    cell = whole["cells"][0]
+    assert cell["tokens_per_s"]["mean"] == pytest.approx(100.0)
+    assert cell["positions"][2]["first"] == 64
+    assert [ratio["metric"] for ratio in whole["ratios"]] == ["decode_tokens_per_s"] * 3
+    del cell["positions"]
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(whole, SCHEMA, cls=jsonschema.Draft202012Validator)
+
+
+def test_the_tables_fit_a_terminal_and_are_written(make: Make) -> None:
+    from rich.console import Console
+
+    gaps = {name: [10.0] * 69 for name in ("in-process", "http/as-deployed", "http/best-effort", "ros/topic")}
+    run = make(gaps, reference=[900.0, 1000.0, 1000.0, 1000.0], model={"dummy": True})
+    console = Console(width=100, record=True, file=io.StringIO())
+    tables = throughput_tables(run)
+    assert list(tables) == ["throughput", "prompt", "gaps", "positions"]
+    for table in tables.values():
+        console.print(lay_out(table))
+    text = console.export_text()
+    assert "…" not in text
+    assert "1000 ± 0" in text
+    notes = " ".join(tables["throughput"].notes)
+    assert "Dummy weights." in notes
+    assert "llama-bench decodes behind 42 tokens" in notes
+    names = {path.name for path in write_texts(run, tables, throughput_csv(run))}
+    assert {"throughput.md", "throughput.tex", "throughput.csv", "gaps.md", "positions.csv", "ratios.csv"} <= names
+
+
+def test_the_csv_keeps_every_digit(make: Make) -> None:
+    run = make({"in-process": [7] * 3}, n=1)
+    rows = list(csv.DictReader(io.StringIO(throughput_csv(run)["throughput.csv"])))
+    found = {row["metric"]: row["median"] for row in rows}
+    assert float(found["decode_tokens_per_s"]) == 3 / 0.021
+    assert found["itl_ms"] == "7.0"
+    assert "prompt_ms" not in found
+
+
+def test_answers_of_one_bin_have_no_table_of_positions(make: Make) -> None:
+    assert position_table(make({"in-process": [7] * 3})) is None
+
+
+def test_bars_start_at_zero_and_the_papers_are_labelled(make: Make) -> None:
+    run = make({"in-process": [25] * 4}, n=2, model={"dummy": True})
+    figure = build_throughput_bars(run)
+    bars = [patch.get_width() for patch in figure.axes[0].patches if isinstance(patch, Rectangle)]
+    assert bars == [pytest.approx(40.0)]
+    assert figure.axes[0].get_xlim()[0] == 0
+    assert "dummy weights" in figure.get_suptitle()
+    assert not figure.legends
+    beside = build_throughput_bars(run, against_paper=True)
+    names = [label.get_text() for label in beside.axes[0].get_yticklabels()]
+    assert names == ["in-process", *(f"paper:\n{claim.name}" for claim in paper_throughput())]
+    assert [text.get_text() for text in beside.axes[0].texts] == ["40.0 ± 0.0", "34.2", "4.8", "0.58"]
+    assert [text.get_text() for legend in beside.legends for text in legend.get_texts()] == [PAPER_LABEL]
+    assert beside.axes[0].get_xscale() == "log"
+    assert not [patch for patch in beside.axes[0].patches if isinstance(patch, Rectangle)]  # no bar without a zero
+
+
+def test_the_paper_says_what_table_ii_says() -> None:
+    assert [(claim.name, claim.tokens_per_s) for claim in paper_throughput()] == [
+        ("RTX 4080", 34.2),
+        ("Jetson AGX Orin", 4.8),
+        ("Jetson Orin Nano", 0.58),
+    ]
+
+
+def test_one_late_burst_does_not_hide_the_rates(make: Make) -> None:
+    run = make({"in-process": [10.0] * 40 + [0.001] * 23}, n=1)
+    figure = build_rate_by_position(run)
+    (line,) = figure.axes[0].get_lines()
+    medians: Any = line.get_ydata()
+    assert medians[0] == pytest.approx(100.0)
+    assert figure.axes[0].get_ylim()[1] == pytest.approx(1.5 * max(medians))
+
+
+def test_the_figures_are_written_and_none_without_rates(make: Make) -> None:
+    run = make({"in-process": [10.0] * 40, "http/as-deployed": [1.0] * 40})
+    names = sorted(path.name for path in write_throughput_figures(run, against_paper=True))
+    assert names == [
+        f"{name}.{suffix}" for name in ("gaps", "positions", "throughput_bars") for suffix in ("pdf", "png")
+    ]
+    assert build_gap_distribution(run).axes[0].get_xscale() == "linear"
+    assert write_throughput_figures(make({"in-process": []})) == []

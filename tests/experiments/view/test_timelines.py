@@ -1,0 +1,276 @@
+"""What timelines look like: figure, tables, trace; computed ones and ones that were really executed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from s2a_bench.experiments.timeline.rows import Setting, skill_rows, timeline_rows, token_rows
+from s2a_bench.experiments.timeline.view.as_json import timelines_to_json
+from s2a_bench.experiments.timeline.view.cells import timelines_of
+from s2a_bench.experiments.timeline.view.chrome_trace import to_trace, write_trace
+from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours, write_timeline_figures
+from s2a_bench.experiments.timeline.view.tables import (
+    execution_table,
+    seconds,
+    skill_table,
+    timeline_csv,
+    timeline_tables,
+)
+from s2a_bench.policy import Plans, Schedule
+from s2a_bench.policy.arrivals import uniform
+from s2a_bench.policy.schedule import safe_start, work_conserving
+from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.schema import SKILLS, TIMELINES, TOKENS, TokenRow
+from s2a_bench.writers.style import paper_column
+from s2a_bench.writers.tables import TextTable, to_markdown
+
+MakeRun: TypeAlias = Callable[..., Run]
+BOARD = {"name": "orin", "title": "Orin", "origin": "paper", "prompt_s": 0.5, "prompt_origin": "assumed"}
+STARTS = {"naive": lambda t, _d: t[0], "wait-then-act": lambda t, _d: t[-1], "stream-to-act": safe_start}
+
+
+def plans_of(tokens: int, shift_s: float = 0.0) -> Plans:
+    """Make one plan of 8 skills of 1 s at 4.8 tokens/s."""
+    arrival_s = uniform(0.5 + shift_s, tokens, 4.8, 8)
+    nominal_s = np.ones_like(arrival_s)
+    return Plans(arrival_s, nominal_s, 0.8 * nominal_s, 1.5 * nominal_s)
+
+
+@pytest.fixture
+def computed(tmp_path: Path) -> Run:
+    """Make a run in virtual time: two granularities, three policies on the same arrivals."""
+    with RunWriter.create(tmp_path, "timeline", {"boards": [BOARD]}) as writer:
+        for tokens in (6, 4):
+            setting = Setting("orin", "Orin", 4.8, 0.5, tokens, 8, 1.0)
+            plans = plans_of(tokens)
+            ids = [setting.request_id(0)]
+            writer.append(TOKENS, token_rows(setting.name, uniform(0.5, 1, 4.8, 8 * tokens), ids))
+            for policy, first in STARTS.items():
+                start_s = work_conserving(plans.arrival_s, plans.nominal_s, first(plans.arrival_s, plans.nominal_s))
+                schedule = Schedule(start_s, plans.nominal_s)
+                rows = timeline_rows(setting, policy, plans, schedule, ids)
+                writer.append(TIMELINES, rows)
+                writer.append(SKILLS, skill_rows(rows[0].cell, plans, schedule, ids))
+    return read_run(writer.path)
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Run:
+    """Make a run as an executor leaves it: a request a policy, calls with texts, one skill stretched by half."""
+    with RunWriter.create(tmp_path, "timeline", {}) as writer:
+        setting = Setting("", "tiny dummy", 4.8, None, 6, 8, 1.0, mode="live", emulated=False)
+        for place, (policy, first) in enumerate(STARTS.items()):
+            plans = plans_of(6, 0.1 * place)
+            requested_ns = 10**15 * (place + 1)
+            ids = [setting.request_id(0, policy)]
+            times = uniform(0.5 + 0.1 * place, 1, 4.8, 48)[:, 0]
+            writer.tokens(
+                TokenRow(ids[0], policy, i, 7, "x", None, requested_ns + round(at * 1e9)) for i, at in enumerate(times)
+            )
+            start_s = work_conserving(plans.arrival_s, plans.nominal_s, first(plans.arrival_s, plans.nominal_s))
+            duration_s = plans.nominal_s.copy()
+            duration_s[-1] = 1.5
+            schedule = Schedule(start_s, duration_s)
+            rows = timeline_rows(setting, policy, plans, schedule, ids, requested_ns=[requested_ns], tolerance_s=0.02)
+            writer.append(TIMELINES, rows)
+            texts = [[f"pick(cup{i})" for i in range(8)]]
+            writer.append(SKILLS, skill_rows(rows[0].cell, plans, schedule, ids, texts=texts))
+    return read_run(writer.path)
+
+
+def drawn(run: Run) -> Figure:
+    with paper_column():
+        return build_timelines(run, timelines_of(run))
+
+
+def bars(axes: Any, *, hatched: bool) -> list[Rectangle]:
+    return [patch for patch in axes.patches if isinstance(patch, Rectangle) and bool(patch.get_hatch()) == hatched]
+
+
+def test_a_panel_shows_each_skill_and_each_stall_where_it_was(computed: Run) -> None:
+    figure = drawn(computed)
+    six, four = figure.axes
+    assert [text.get_text() for text in six.get_yticklabels()] == ["tokens", *STARTS]
+    assert len(bars(six, hatched=False)) == len(bars(four, hatched=False)) == 3 * 8
+    stalls = bars(six, hatched=True)
+    assert len(stalls) == 7
+    assert sum(stall.get_width() for stall in stalls) == pytest.approx(1.75)
+    assert {round(stall.get_y() + stall.get_height() / 2) for stall in stalls} == {1}  # naive's lane
+    assert not bars(four, hatched=True)
+    first = {round(bar.get_y() + bar.get_height() / 2): bar for bar in reversed(bars(six, hatched=False))}
+    assert [first[lane].get_x() for lane in (1, 2, 3)] == pytest.approx([1.75, 10.5, 3.5])
+
+
+def test_the_colours_are_the_papers_and_differ_in_grey(computed: Run) -> None:
+    colours = policy_colours(list(STARTS))
+    red = {name: int(colour[1:3], 16) for name, colour in colours.items()}
+    blue = {name: int(colour[5:7], 16) for name, colour in colours.items()}
+    green = {name: int(colour[3:5], 16) for name, colour in colours.items()}
+    assert blue["wait-then-act"] > max(red["wait-then-act"], green["wait-then-act"])
+    assert red["naive"] > green["naive"] > blue["naive"]
+    assert green["stream-to-act"] > max(red["stream-to-act"], blue["stream-to-act"])
+    grey = sorted(0.3 * red[name] + 0.59 * green[name] + 0.11 * blue[name] for name in STARTS)
+    assert min(b - a for a, b in pairwise(grey)) > 15
+    drawn_colours = {bar.get_facecolor() for bar in bars(drawn(computed).axes[0], hatched=False)}
+    assert len(drawn_colours) == 3
+
+
+def test_the_safe_start_and_every_token_are_marked(computed: Run) -> None:
+    axes = drawn(computed).axes[0]
+    lines = [segments for found in axes.collections for segments in [found.get_segments()]]
+    dashed = [segments for found, segments in zip(axes.collections, lines, strict=True) if found.get_linestyle()[0][1]]
+    assert {segments[0][0][0] for segments in dashed} == {3.5}
+    assert sorted(len(segments) for segments in lines) == [1] * 6 + [8, 48]
+
+
+def test_each_panel_has_the_time_axis_it_needs(computed: Run) -> None:
+    six, four = drawn(computed).axes
+    assert six.get_xlim()[1] == pytest.approx(18.5 * 1.02)
+    assert four.get_xlim()[1] == pytest.approx(15.1667 * 1.02, rel=1e-4)
+
+
+def test_the_figure_says_what_is_emulated_and_assumed(computed: Run, live: Run) -> None:
+    title = drawn(computed).get_suptitle()
+    assert "EMULATED in virtual time" in title
+    assert "assumption of ours" in title
+    assert "EMULATED" not in drawn(live).get_suptitle()
+
+
+def test_the_legend_explains_only_what_is_drawn(computed: Run, live: Run) -> None:
+    def labels(run: Run) -> set[str]:
+        return {text.get_text() for text in drawn(run).legends[0].get_texts()}
+
+    assert labels(computed) == {"token", "skill complete", "not started", "$S_0$", "stall"}
+    assert labels(live) - labels(computed) == {"stretched (paler)"}
+
+
+def test_requests_of_their_own_have_their_tokens_in_their_lanes(live: Run) -> None:
+    axes = drawn(live).axes[0]
+    assert [text.get_text() for text in axes.get_yticklabels()] == list(STARTS)
+    ticks = [found.get_segments() for found in axes.collections if len(found.get_segments()) == 48]
+    assert [round(segments[0][0][1]) for segments in ticks] == [1, 2, 3]
+    assert [segments[0][0][0] for segments in ticks] == pytest.approx(
+        [0.5 + 1 / 4.8 + shift for shift in (0, 0.1, 0.2)]
+    )
+
+
+def test_figures_are_written_as_png_and_pdf(computed: Run) -> None:
+    assert [path.name for path in write_timeline_figures(computed)] == ["timeline.png", "timeline.pdf"]
+    assert all(path.stat().st_size > 5000 for path in (computed.path / "figures").iterdir())
+
+
+def check_trace(trace: dict[str, Any]) -> None:
+    """Check what ui.perfetto.dev and chrome://tracing are particular about."""
+    events = trace["traceEvents"]
+    names: dict[tuple[str, int], str] = {}
+    process_of: dict[int, int] = {}
+    ends: dict[int, int] = {}
+    for event in events:
+        assert event["ph"] in {"M", "X", "i"}
+        assert isinstance(event["name"], str)
+        assert isinstance(event["pid"], int)
+        assert event["pid"] > 0
+        if event["ph"] == "M":
+            assert "ts" not in event
+            if event["name"].endswith("_name"):
+                key = (event["name"], event.get("tid", event["pid"]))
+                assert key not in names
+                names[key] = event["args"]["name"]
+            continue
+        assert process_of.setdefault(event["tid"], event["pid"]) == event["pid"]
+        assert isinstance(event["ts"], int)
+        assert event["ts"] >= 0
+        if event["ph"] == "i":
+            assert event["s"] == "t"
+            continue
+        assert event["dur"] > 0
+        assert event["ts"] >= ends.get(event["tid"], 0)  # slices of a thread neither nest nor overlap
+        ends[event["tid"]] = event["ts"] + event["dur"]
+    assert {tid for name, tid in names if name == "thread_name"} == set(process_of)
+    assert {tid for name, tid in names if name == "process_name"} == set(process_of.values())
+
+
+def test_the_trace_is_one_that_viewers_open(computed: Run, live: Run) -> None:
+    for run in (computed, live):
+        trace = json.loads(write_trace(run).read_text())
+        assert set(trace) == {"traceEvents", "displayTimeUnit", "otherData"}
+        check_trace(trace)
+
+
+def test_the_trace_holds_skills_stalls_waiting_and_tokens(computed: Run) -> None:
+    trace = to_trace(computed)
+    threads = {event["tid"]: event["args"]["name"] for event in trace["traceEvents"] if event["name"] == "thread_name"}
+    assert list(threads.values()) == ["tokens", *STARTS] * 2
+    naive = [event for event in trace["traceEvents"] if event["ph"] == "X" and event["tid"] == 2]
+    assert [event["name"] for event in naive][:4] == ["waiting", "skill 1", "stall", "skill 2"]
+    assert [(event["ts"], event["dur"]) for event in naive][:3] == [
+        (0, 1_750_000),
+        (1_750_000, 1_000_000),
+        (2_750_000, 250_000),
+    ]
+    assert sum(event["dur"] for event in naive if event["name"] == "stall") == 1_750_000
+    marks = [event["name"] for event in trace["traceEvents"] if event["ph"] == "i" and event["tid"] == 1]
+    assert len(marks) == 48 + 8
+    assert "EMULATED" in trace["otherData"]["about"]
+
+
+def test_the_trace_names_the_calls_that_a_model_wrote(live: Run) -> None:
+    slices = [event for event in to_trace(live)["traceEvents"] if event["ph"] == "X"]
+    assert {"pick(cup0)", "waiting", "stall"} <= {event["name"] for event in slices}
+    last = [event for event in slices if event["name"] == "pick(cup7)"]
+    assert {event["args"]["stretch"] for event in last} == {1.5}
+
+
+def column(table: TextTable, name: str) -> list[str]:
+    return [row[table.header.index(name)] for row in table.rows]
+
+
+def test_the_table_groups_rows_by_board_and_granularity(computed: Run) -> None:
+    table = execution_table(computed)
+    assert column(table, "board") == ["Orin", "", "", "", "", ""]
+    assert column(table, "L") == ["6", "", "", "4", "", ""]
+    assert column(table, "start") == ["1.75", "10.50", "3.50", "1.33", "7.17", "1.33"]
+    assert column(table, "stalls") == ["7", "0", "0", "0", "0", "0"]
+    assert column(table, "late end") == ["0%", "61%", "0%", "0%", "62%", "0%"]
+
+
+def test_the_skill_table_names_calls_and_stalls(live: Run) -> None:
+    table = skill_table(timelines_of(live)[:1])
+    assert column(table, "skill")[:2] == ["pick(cup0)", "pick(cup1)"]
+    assert column(table, "stall before") == ["0.00"] + ["0.25"] * 7
+    assert column(table, "stretch")[-1] == "1.50"
+
+
+def test_every_table_is_whole_markdown(computed: Run) -> None:
+    for table in timeline_tables(computed).values():
+        lines = [line for line in to_markdown(table).splitlines() if line.startswith("|")]
+        assert len({line.count("|") for line in lines}) == 1
+        assert len(lines) == len(table.rows) + 2
+
+
+def test_csv_keeps_every_digit_and_leaves_out_what_is_absent(computed: Run) -> None:
+    lines = timeline_csv(computed)["timelines.csv"].splitlines()
+    assert "orin/L6/N8/T1/naive,stall_s,1,1.75,1.75,,1.75,1.75" in lines
+    (share,) = [line for line in lines if line.startswith("orin/L6/N8/T1/naive,p_any_stall")]
+    assert share == "orin/L6/N8/T1/naive,p_any_stall,1,,1.0,,,"
+
+
+def test_json_has_no_key_for_what_a_live_run_does_not_know(live: Run) -> None:
+    cells = timelines_to_json(live)["cells"]
+    assert all("prompt_s" not in cell and "caution" not in cell for cell in cells)
+    assert [cell["emulated"] for cell in cells] == [False] * 3
+    assert [cell["mode"] for cell in cells] == ["live"] * 3
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.0, "0.00"), (99.99, "99.99"), (99.996, "100.0"), (-0.25, "-0.25")])
+def test_seconds_take_at_most_five_characters(value: float, text: str) -> None:
+    assert seconds(value) == text

@@ -1,0 +1,46 @@
+"""A server that asks to be left alone is left alone, between samples and for a bounded time."""
+
+from __future__ import annotations
+
+import pytest
+
+from s2a_bench.clock import VirtualClock
+from s2a_bench.frames import open_source
+from s2a_bench.harness.feed import RequestFeed
+from s2a_bench.harness.patience import Patience
+from s2a_bench.harness.plan import Cell, LatencyConfig
+from s2a_bench.harness.session import Place, Session
+from s2a_bench.transport import Route, open_client
+from tests.servers.sockets import head, serving
+from tests.servers.speakers import Cloud
+
+
+@pytest.mark.parametrize(("asked_s", "waited_s"), [(0.0, 0), (1.5, 1.5), (60.0, 60), (3600.0, 60)])
+def test_the_wait_is_what_was_asked_up_to_a_minute(asked_s: float, waited_s: float) -> None:
+    clock, said = VirtualClock(5), []
+    Patience(clock, said.append).wait("http/as-deployed", asked_s)
+    assert clock.now_ns() - 5 == waited_s * 1e9
+    assert said == ([f"waiting {waited_s:g} s, as the server of http/as-deployed asks"] if asked_s else [])
+
+
+@pytest.mark.parametrize(("more", "asked_s"), [(["Retry-After: 7"], 7.0), ([], 0.0)])
+def test_a_refused_sample_is_one_row_with_its_error_and_is_not_sent_again(more: list[str], asked_s: float) -> None:
+    requests = []
+
+    def busy(received: object) -> list[bytes]:
+        requests.append(received)
+        return [head("429 Too Many Requests", "application/json", *more), Cloud().refusal(429, "slow down")]
+
+    with serving(busy) as url:
+        route = Route("http", "as-deployed", url, black_box=True, dialect="openai")
+        client = open_client(route)
+        source = open_source("synthetic", 64, 48, fps=30.0, seed=0)
+        session = Session(
+            Cell("http/as-deployed", route, "jpeg"), client, RequestFeed(source, preencoded=False), LatencyConfig()
+        )
+        measured = session.measure(Place(0, 0, warmup=False))
+        client.close()
+        source.close()
+    assert measured.retry_after_s == asked_s
+    assert "answered 429: slow down" in measured.sample.error
+    assert (measured.fatal, measured.tokens, len(requests)) == (None, [], 1)

@@ -1,0 +1,95 @@
+"""The handler around an engine, and what a server process is told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event, Thread
+
+import pytest
+
+from s2a_bench.errors import EngineError
+from s2a_bench.harness.serving import ServerJob, engine_handler
+from s2a_bench.inference import EngineConfig
+from s2a_bench.trace import Trace
+from s2a_bench.transport import Route
+from s2a_bench.types import Request, Token
+
+
+class Engine:
+    """Yields two tokens, the second when `go` is set."""
+
+    def __init__(self) -> None:
+        self.facts: dict[str, float] = {"prompt_n": 4.0}
+        self.go = Event()
+        self.closed = 0
+        self.fail = False
+
+    def generate(self, request: Request) -> Iterator[Token]:
+        try:
+            if self.fail:
+                raise EngineError("no")
+            yield Token(0, request.prompt)
+            assert self.go.wait(20)
+            yield Token(1, "!")
+        finally:
+            self.closed += 1
+
+    def describe(self) -> dict[str, str | int | float | bool]:
+        return {"engine": "test"}
+
+    def close(self) -> None:
+        pass
+
+
+def test_inference_is_marked_at_the_first_token_and_facts_are_kept() -> None:
+    engine = Engine()
+    engine.go.set()
+    trace = Trace()
+    tokens = list(engine_handler(engine)(Request("a", "hi"), trace))
+    assert [token.text for token in tokens] == ["hi", "!"]
+    assert [stage for stage, _ in trace.marks] == ["", "inference"]
+    assert trace.marks[-1][1] == trace.token_ns[0] <= trace.token_ns[1]
+    assert trace.facts == {"prompt_n": 4.0}
+
+
+def test_a_second_request_waits_and_says_so() -> None:
+    engine = Engine()
+    handle = engine_handler(engine)
+    first, second = Trace(), Trace()
+    running = handle(Request("a", "1"), first)
+    next(running)
+    waiting = Thread(target=lambda: list(handle(Request("b", "2"), second)))
+    waiting.start()
+    engine.go.set()
+    assert [token.text for token in running] == ["!"]
+    waiting.join(20)
+    assert "queue" not in dict(first.marks)
+    assert [stage for stage, _ in second.marks] in (["", "queue", "inference"], ["", "inference"])
+
+
+def test_a_request_left_early_frees_the_engine() -> None:
+    engine = Engine()
+    handle = engine_handler(engine)
+    tokens = handle(Request("a", "1"), Trace())
+    next(tokens)
+    tokens.close()
+    assert engine.closed == 1
+    assert next(handle(Request("b", "2"), Trace())).text == "2"
+
+
+def test_a_failure_frees_the_engine() -> None:
+    engine = Engine()
+    handle = engine_handler(engine)
+    engine.fail = True
+    with pytest.raises(EngineError):
+        list(handle(Request("a", "1"), Trace()))
+    engine.fail = False
+    assert next(handle(Request("b", "2"), Trace())).text == "2"
+
+
+@pytest.mark.parametrize("engine", [EngineConfig("echo"), EngineConfig("llama", Path("/m.gguf"), Path("/p.gguf"), 2)])
+def test_a_job_survives_its_line(engine: EngineConfig) -> None:
+    job = ServerJob(Route("http", "binary", "127.0.0.1:0", payload="raw"), engine, tuned=False)
+    assert "\n" not in job.to_json()
+    assert ServerJob.from_json(job.to_json()) == job

@@ -1,0 +1,108 @@
+"""Doubts about a run's validity."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from s2a_bench.harness.warnings import Counters, SampleGuard
+from s2a_bench.store.schema import SampleRow
+from s2a_bench.trace import Mark
+
+GOOD: list[Mark] = [("", 0), ("network", 90), ("", 91), ("inference", 500), ("return", 600)]
+LOOSE: list[Mark] = [("", 0), ("network", 90), ("", 191), ("inference", 500), ("return", 600)]
+
+
+def row(request: str, **fields: object) -> SampleRow:
+    plain = SampleRow(
+        "ros/topic", "ros", "topic", "bgr", "", "echo", "request", "64x48", 0, 0, False, request, 0, marks=GOOD
+    )
+    return replace(plain, **fields)  # type: ignore[arg-type]
+
+
+def codes(*seen: tuple[SampleRow, int]) -> list[str]:
+    guard = SampleGuard()
+    for sample, fingerprint in seen:
+        guard.see(sample, fingerprint)
+    return [doubt.code for doubt in guard.doubts()]
+
+
+def test_good_samples_raise_no_doubt() -> None:
+    assert codes((row("a"), 1), (row("b"), 2)) == []
+
+
+@pytest.mark.parametrize(
+    ("second", "fingerprint", "code"),
+    [
+        (row("b"), 1, "duplicate-frames"),
+        (row("b", cache_n=7), 2, "prompt-cache"),
+        (row("b", marks=LOOSE), 2, "residual"),
+        (row("b", facts={"frames_lost": 2.0}), 2, "lost-frames"),
+        (row("b", facts={"headers_off_ms": -97.0}, server_prompt_ms=97.5), 2, "ingest-unsure"),
+        (row("b", error="MessagesLost: 3", marks=[]), 2, "lost-messages"),
+        (row("b", error="RequestFailed: x", marks=[]), 2, "failed-samples"),
+    ],
+)
+def test_each_doubt_has_its_code(second: SampleRow, fingerprint: int, code: str) -> None:
+    assert codes((row("a"), 1), (second, fingerprint)) == [code]
+
+
+@pytest.mark.parametrize(("off_ms", "prompt_ms"), [(-2.8, 97.5), (19.0, 5.0), (200.0, 1000.0)])
+def test_headers_that_fit_the_servers_own_time_are_no_doubt(off_ms: float, prompt_ms: float) -> None:
+    assert codes((row("a", facts={"headers_off_ms": off_ms}, server_prompt_ms=prompt_ms), 1)) == []
+
+
+def test_the_same_picture_in_another_cell_is_no_duplicate() -> None:
+    assert codes((row("a"), 1), (row("b", cell="http/binary"), 1)) == []
+
+
+def test_the_residual_of_a_warm_up_does_not_matter() -> None:
+    assert codes((row("a", marks=LOOSE, warmup=True), 1)) == []
+
+
+def test_a_doubt_names_cells_and_the_way_out() -> None:
+    guard = SampleGuard()
+    for number in range(3):
+        guard.see(row(str(number)), 1)
+    (doubt,) = guard.doubts()
+    assert "ros/topic: 2" in doubt.message
+    assert "synthetic" in doubt.advice
+
+
+@pytest.mark.parametrize(
+    ("after", "code"),
+    [
+        (Counters(receive_buffer_errors=4), "udp-receive-buffer"),
+        (Counters(receive_buffer_errors=0, throttles=1), "cpu-throttling"),
+        (Counters(receive_buffer_errors=0, suspended_ns=10**9), "suspended"),
+        (Counters(receive_buffer_errors=0, realtime_offset_ns=-(10**9)), "clock-jump"),
+    ],
+)
+def test_counters_that_rise_are_doubts(after: Counters, code: str) -> None:
+    before = Counters(receive_buffer_errors=0, throttles=0)
+    assert [doubt.code for doubt in after.doubts_since(before)] == [code]
+
+
+def test_failures_in_a_row_end_with_a_success() -> None:
+    guard = SampleGuard()
+    for number, error in enumerate(["x", "x", "", "x"]):
+        guard.see(row(str(number), error=error), number)
+    assert guard.failures_in_a_row("ros/topic") == 1
+    assert guard.successes("ros/topic") == 1
+    assert guard.successes("loopback") == 0
+    assert (guard.last_error("ros/topic"), guard.last_error("loopback")) == ("x", "")
+
+
+def test_what_cannot_be_read_is_no_doubt() -> None:
+    assert Counters(None, None).doubts_since(Counters(3, 5)) == []
+
+
+def test_this_machine_can_be_read() -> None:
+    now = Counters.read()
+    assert now.doubts_since(now) == []
+
+
+def test_packets_lost_by_others_are_no_doubt_about_a_run_without_dds() -> None:
+    assert Counters.read().receive_buffer_errors is not None
+    assert Counters.read(uses_dds=False).receive_buffer_errors is None

@@ -1,0 +1,449 @@
+"""The doctor's checks on recorded trees: an RTX workstation, a Jetson, and what goes wrong on each."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from s2a_bench.frames.v4l2_formats import CameraInfo
+from s2a_bench.harness.warnings import before_run
+from s2a_bench.machine import doctor, environment
+from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, LEVELS, Finding, Machine, examine, worst
+from s2a_bench.machine.doctor.gpu import current_power_mode
+
+CPU = "sys/devices/system/cpu"
+ZONE = "sys/class/thermal/thermal_zone0"
+CLOCK = "sys/devices/system/clocksource/clocksource0"
+
+COMMON = {
+    "proc/loadavg": "0.31 0.40 0.38 1/900 12345\n",
+    "proc/sys/net/core/rmem_max": "4194304\n",
+    "sys/class/net/lo/operstate": "unknown\n",
+    "sys/class/net/eth0/operstate": "up\n",
+    "sys/class/net/wlan0/operstate": "down\n",
+}
+RTX = COMMON | {
+    "etc/os-release": 'NAME="Ubuntu"\nPRETTY_NAME="Ubuntu 22.04.4 LTS"\n',
+    "proc/driver/nvidia/version": "NVRM version: NVIDIA UNIX x86_64 Kernel Module  550.54\n",
+    "proc/cpuinfo": "model name : AMD Ryzen\nflags : fpu avx avx2\n",
+    "proc/meminfo": "MemTotal:       65000000 kB\nMemAvailable:   60000000 kB\n",
+    f"{CPU}/online": "0-3\n",
+    f"{CPU}/cpu0/cpufreq/scaling_governor": "performance\n",
+    f"{CPU}/cpu1/cpufreq/scaling_governor": "performance\n",
+    f"{CPU}/intel_pstate/no_turbo": "1\n",
+    f"{CPU}/cpu0/thermal_throttle/core_throttle_count": "0\n",
+    f"{CLOCK}/current_clocksource": "tsc\n",
+    f"{CLOCK}/available_clocksource": "tsc hpet acpi_pm\n",
+    f"{ZONE}/type": "x86_pkg_temp\n",
+    f"{ZONE}/temp": "45000\n",
+}
+JETSON = COMMON | {
+    "proc/device-tree/model": "NVIDIA Jetson Orin Nano Engineering Reference Developer Kit Super\0",
+    "etc/nv_tegra_release": "# R36 (release), REVISION: 4.3, GCID: 38968081, BOARD: generic, EABI: aarch64\n",
+    "etc/nvpmodel.conf": "< POWER_MODEL ID=0 NAME=15W >\nCPU 1\n< POWER_MODEL ID=1 NAME=25W >\n"
+    "< POWER_MODEL ID=2 NAME=MAXN_SUPER >\n",
+    "var/lib/nvpmodel/status": "pmode:0002",
+    "proc/meminfo": "MemTotal:        7800000 kB\nMemAvailable:    7000000 kB\n",
+    f"{CPU}/online": "0-5\n",
+    f"{CPU}/cpu0/cpufreq/scaling_governor": "schedutil\n",
+    f"{CPU}/cpu0/cpufreq/scaling_min_freq": "1728000\n",
+    f"{CPU}/cpu0/cpufreq/scaling_max_freq": "1728000\n",
+    "sys/class/devfreq/17000000.gpu/min_freq": "1020000000\n",
+    "sys/class/devfreq/17000000.gpu/max_freq": "1020000000\n",
+    "sys/class/devfreq/15340000.vic/min_freq": "115200000\n",
+    "sys/class/devfreq/15340000.vic/max_freq": "601600000\n",
+    f"{CLOCK}/current_clocksource": "arch_sys_counter\n",
+    f"{ZONE}/type": "tj-thermal\n",
+    f"{ZONE}/temp": "51781\n",
+    f"{ZONE}/trip_point_0_type": "passive\n",
+    f"{ZONE}/trip_point_0_temp": "99000\n",
+}
+
+Make = Callable[..., Machine]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Make:
+    """Return a function that writes a tree and makes the machine that has it."""
+
+    roots = (tmp_path / f"root{number}" for number in count())
+
+    def machine(tree: Mapping[str, str], **fields: Any) -> Machine:
+        root = next(roots)
+        root.mkdir()
+        for path, text in tree.items():
+            (root / path).parent.mkdir(parents=True, exist_ok=True)
+            (root / path).write_text(text)
+        silent: dict[str, Any] = {"run": lambda _command: None, "which": lambda _name: None, "cameras": list}
+        known: dict[str, Any] = {"environ": {}, "cpus": frozenset(range(4)), "finds": lambda _package: True}
+        return Machine(root, **(known | silent | {"output": tmp_path} | fields))
+
+    return machine
+
+
+@pytest.fixture(autouse=True)
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let NVML find no driver unless a test gives it one."""
+    give_nvml(monkeypatch)
+
+
+def give_nvml(monkeypatch: pytest.MonkeyPatch, *cards: SimpleNamespace, driver: str = "550.54") -> None:
+    class NVMLError(Exception): ...
+
+    def start() -> None:
+        if not cards:
+            raise NVMLError("NVML Shared Library Not Found")
+
+    def persistence(card: SimpleNamespace) -> int:
+        if card.persistence is None:
+            raise NVMLError("Not Supported")
+        return int(card.persistence)
+
+    def driver_version() -> str:
+        if not driver:
+            raise NVMLError("Not Supported")
+        return driver
+
+    fake = SimpleNamespace(
+        NVMLError=NVMLError,
+        nvmlInit=start,
+        nvmlShutdown=lambda: None,
+        nvmlDeviceGetCount=lambda: len(cards),
+        nvmlDeviceGetHandleByIndex=lambda place: cards[place],
+        nvmlDeviceGetName=lambda card: card.name,
+        nvmlDeviceGetMemoryInfo=lambda _card: SimpleNamespace(free=15 << 30, total=16 << 30),
+        nvmlDeviceGetPersistenceMode=persistence,
+        nvmlSystemGetDriverVersion=driver_version,
+        nvmlDeviceGetCurrentClocksThrottleReasons=lambda card: card.reasons,
+    )
+    monkeypatch.setitem(sys.modules, "pynvml", fake)
+
+
+def card(name: str = "NVIDIA GeForce RTX 4080", reasons: int = 1, persistence: int | None = 1) -> SimpleNamespace:
+    return SimpleNamespace(name=name, reasons=reasons, persistence=persistence)
+
+
+def see(machine: Machine, code: str) -> Finding:
+    (finding,) = examine(machine, [code])
+    return finding
+
+
+HARDWARE = [code for code in CHECKS if code not in {"python", "packages", "compiler", "llama-build"}]
+
+
+def test_a_well_kept_workstation_has_nothing_to_mend(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    give_nvml(monkeypatch, card())
+    found = {finding.code: finding for finding in examine(make(RTX), HARDWARE)}
+    assert {finding.level for finding in found.values()} == {"state"}
+    assert found["gpu"].message == "NVIDIA GeForce RTX 4080, 15.0 of 16.0 GiB free; driver 550.54"
+    assert found["temperature"].message == "hottest: x86_pkg_temp, 45 °C"
+    assert not {"board", "power-mode", "jetson-clocks"} & found.keys()
+
+
+def test_a_well_kept_jetson_has_nothing_to_mend(make: Make) -> None:
+    found = {finding.code: finding for finding in examine(make(JETSON), HARDWARE)}
+    assert {finding.level for finding in found.values()} == {"state"}
+    assert found["board"].message.endswith("Developer Kit Super, Jetson Linux 36.4.3")
+    assert found["power-mode"].message == "MAXN_SUPER"
+    assert found["cpu-governor"].message == "schedutil; see jetson-clocks"
+
+
+def test_an_empty_tree_fails_no_check(make: Make) -> None:
+    found = examine(make({}), HARDWARE)
+    assert {finding.code for finding in found} == {"gpu", "cpus", "disk", "dds", "ros", "middleware", "cameras"}
+    assert worst(found) == "state"
+
+
+CHANGES: list[tuple[dict[str, str], dict[str, str], str, str, str, str]] = [
+    (RTX, {f"{CPU}/cpu1/cpufreq/scaling_governor": "powersave"}, "cpu-governor", "warning", "powersave", "cpupower"),
+    (RTX, {f"{CPU}/intel_pstate/no_turbo": "0"}, "cpu-turbo", "advice", "on: faster", "echo 1 | sudo tee /sys"),
+    (COMMON, {f"{CPU}/cpufreq/boost": "1"}, "cpu-turbo", "advice", "on: faster", "echo 0 | sudo tee /sys"),
+    (COMMON, {f"{CPU}/cpufreq/boost": "0"}, "cpu-turbo", "state", "off", ""),
+    (RTX, {"proc/loadavg": "2.10 1.00 0.50 3/900 1"}, "load", "warning", "2.1 on 4 cores", "top"),
+    (RTX, {f"{CPU}/cpu0/thermal_throttle/core_throttle_count": "7"}, "cpu-throttling", "advice", "7 times", "cooling"),
+    (RTX, {f"{CLOCK}/current_clocksource": "hpet"}, "clock-source", "warning", "hpet", "echo tsc | sudo tee"),
+    (COMMON, {f"{CLOCK}/current_clocksource": "hpet"}, "clock-source", "warning", "hpet", "dmesg"),
+    (COMMON, {f"{CLOCK}/current_clocksource": "kvm-clock"}, "clock-source", "state", "kvm-clock", ""),
+    (
+        RTX,
+        {"proc/sys/net/core/rmem_max": "212992"},
+        "rmem-max",
+        "warning",
+        "212992",
+        "sysctl -w net.core.rmem_max=4194304",
+    ),
+    (RTX, {"sys/fs/cgroup/cpu.max": "150000 100000"}, "cpus", "warning", "after 1.5 CPUs' worth", "--cpuset-cpus"),
+    (RTX, {"sys/fs/cgroup/cpu.max": "max 100000"}, "cpus", "state", "4 of 4", ""),
+    (RTX, {"sys/fs/cgroup/cpu/cpu.cfs_quota_us": "-1"}, "cpus", "state", "4 of 4", ""),
+    (RTX, {f"{CPU}/isolated": "2-3"}, "cpus", "state", "isolated: 2-3", ""),
+    (RTX, {"sys/fs/cgroup/memory.max": str(3 << 30)}, "memory", "advice", "3.0 of 62.0 GiB", "close"),
+    (
+        JETSON,
+        {"proc/meminfo": "MemTotal: 7800000 kB\nMemAvailable: 3000000 kB\n"},
+        "memory",
+        "advice",
+        "2.9 of 7.4",
+        "close",
+    ),
+    (JETSON, {"var/lib/nvpmodel/status": "pmode:0000"}, "power-mode", "advice", "15W, not MAXN", "sudo nvpmodel -m 2"),
+    (
+        JETSON,
+        {f"{CPU}/cpu0/cpufreq/scaling_min_freq": "729600"},
+        "jetson-clocks",
+        "warning",
+        "of CPU follows",
+        "jetson_clocks",
+    ),
+    (
+        JETSON,
+        {"sys/class/devfreq/17000000.gpu/min_freq": "306000000"},
+        "jetson-clocks",
+        "warning",
+        "of GPU follows",
+        "jetson",
+    ),
+    (JETSON, {f"{ZONE}/temp": "96500"}, "temperature", "warning", "tj-thermal is at 96 °C", "--fan"),
+    (JETSON, {f"{ZONE}/temp": "93000"}, "temperature", "state", "tj-thermal, 93 °C", ""),
+]
+
+
+@pytest.mark.parametrize(("tree", "change", "code", "level", "says", "fix"), CHANGES)
+def test_one_change_gives_one_finding(
+    make: Make, tree: dict[str, str], change: dict[str, str], code: str, level: str, says: str, fix: str
+) -> None:
+    finding = see(make(tree | change), code)
+    assert (finding.level, says in finding.message, fix in finding.fix) == (level, True, True), finding
+    assert bool(finding.fix) == (level != "state")
+
+
+def test_a_power_mode_is_asked_of_the_program_where_its_files_are_missing(make: Make) -> None:
+    tree = {path: text for path, text in JETSON.items() if "nvpmodel" not in path}
+    asked: list[Sequence[str]] = []
+
+    def run(command: Sequence[str]) -> str:
+        asked.append(command)
+        return "NV Power Mode: MODE_30W\n2\n"
+
+    assert current_power_mode(make(tree, run=run)) == ("MODE_30W", {})
+    assert asked == [["nvpmodel", "-q"]]
+
+
+def test_a_workstation_is_not_asked_for_nvpmodel(make: Make) -> None:
+    def run(command: Sequence[str]) -> str:
+        raise AssertionError(command)
+
+    assert current_power_mode(make(RTX, run=run)) is None
+
+
+@pytest.mark.parametrize(
+    ("gpu", "code", "level", "says"),
+    [
+        (card(reasons=0x4), "gpu-throttling", "state", "not slowed"),
+        (card(reasons=0x40), "gpu-throttling", "warning", "too warm (hardware)"),
+        (card(reasons=0x28), "gpu-throttling", "warning", "hardware slowdown, too warm (driver)"),
+        (card(persistence=0), "gpu", "advice", "unloads between runs"),
+        (card(persistence=None), "gpu", "state", "driver 550.54"),
+    ],
+)
+def test_the_card_is_asked(
+    make: Make, monkeypatch: pytest.MonkeyPatch, gpu: SimpleNamespace, code: str, level: str, says: str
+) -> None:
+    give_nvml(monkeypatch, gpu)
+    finding = see(make(RTX), code)
+    assert finding.level == level
+    assert says in finding.message
+
+
+def test_a_card_without_its_driver_is_seen_on_the_bus(make: Make) -> None:
+    device = "sys/bus/pci/devices/0000:01:00.0"
+    finding = see(make(COMMON | {f"{device}/vendor": "0x10de\n", f"{device}/class": "0x030000\n"}), "gpu")
+    assert finding.level == "warning"
+    assert "0000:01:00.0" in finding.message
+    sound = {f"{device}/vendor": "0x10de\n", f"{device}/class": "0x040300\n"}  # its HDMI audio alone is no GPU
+    assert see(make(COMMON | sound), "gpu").level == "state"
+
+
+@pytest.mark.parametrize(
+    ("environ", "level", "says"),
+    [
+        ({}, "state", "domain 0, loopback only (127.0.0.1), without multicast"),
+        (
+            {"ROS_DOMAIN_ID": "42", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"},
+            "state",
+            "domain 42, all interfaces: eth0, with",
+        ),
+        ({"ROS_DOMAIN_ID": "300"}, "error", "ROS_DOMAIN_ID: '300'"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "MOON"}, "error", "'MOON' is none of"),
+        ({"CYCLONEDDS_URI": "file:///x.xml"}, "state", "CYCLONEDDS_URI file:///x.xml"),
+    ],
+)
+def test_dds_says_domain_and_interface(make: Make, environ: dict[str, str], level: str, says: str) -> None:
+    finding = see(make(COMMON, environ=environ), "dds")
+    assert finding.level == level
+    assert says in finding.message
+    if level == "error":
+        assert finding.fix == f"unset {next(iter(environ))}"
+
+
+HUMBLE = {"ROS_DISTRO": "humble", "AMENT_PREFIX_PATH": "/opt/ros/humble", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
+OURS = f"python{sys.version_info.major}.{sys.version_info.minor}"
+
+
+@pytest.mark.parametrize(
+    ("tree", "environ", "level", "says", "fix"),
+    [
+        (
+            {"opt/ros/jazzy/setup.bash": ""},
+            {},
+            "advice",
+            "jazzy is installed and not sourced",
+            "source /opt/ros/jazzy/",
+        ),
+        (
+            {"opt/ros/humble/lib/python3.7/site-packages/rclpy/x": ""},
+            HUMBLE,
+            "warning",
+            "rclpy for Python 3.7",
+            "python3.7",
+        ),
+        ({}, HUMBLE, "warning", "humble is sourced without rclpy", "apt install ros-humble-rclpy"),
+        ({f"opt/ros/humble/lib/{OURS}/site-packages/rclpy/x": ""}, HUMBLE, "state", "humble, rmw_cyclonedds_cpp", ""),
+        ({f"opt/ros/humble/local/lib/{OURS}/dist-packages/rclpy/x": ""}, HUMBLE, "state", "humble, rmw", ""),
+    ],
+)
+def test_ros_is_looked_up(
+    make: Make, tree: dict[str, str], environ: dict[str, str], level: str, says: str, fix: str
+) -> None:
+    finding = see(make(tree, environ=environ), "ros")
+    assert finding.level == level
+    assert says in finding.message
+    assert fix in finding.fix
+
+
+def test_a_missing_middleware_is_an_error_that_names_rclpy(make: Make) -> None:
+    finding = see(make(JETSON, finds=lambda _package: False), "middleware")
+    assert finding.level == "error"
+    assert "rclpy" in finding.fix
+    assert "/opt/ros/" in finding.fix
+
+
+def test_cameras_are_listed_with_their_formats(make: Make) -> None:
+    webcam = CameraInfo("/dev/video0", "C920", {"YUYV": [(640, 480), (1920, 1080)], "MJPG": []})
+    bayer = CameraInfo("/dev/video1", "imx219", {"RG10": [(3280, 2464)]})
+    closed = CameraInfo("/dev/video2", problem="no permission to open it")
+    assert see(make({}, cameras=lambda: [webcam, bayer]), "cameras") == Finding(
+        "cameras",
+        "state",
+        "/dev/video0 C920: YUYV up to 1920x1080, MJPG; /dev/video1 imx219: RG10 up to 3280x2464",
+    )
+    assert see(make({}, cameras=lambda: [bayer]), "cameras").level == "advice"
+    assert "usermod" in see(make({}, cameras=lambda: [webcam, closed]), "cameras").fix
+
+
+def test_the_disk_of_a_folder_that_is_not_there_yet_is_its_parents(make: Make, tmp_path: Path) -> None:
+    assert str(tmp_path) in see(make({}, output=tmp_path / "new" / "results"), "disk").message
+
+
+@pytest.mark.parametrize(("free_gib", "level"), [(0.5, "warning"), (3, "advice"), (50, "state")])
+def test_disk_space_is_judged(make: Make, monkeypatch: pytest.MonkeyPatch, free_gib: float, level: str) -> None:
+    room = SimpleNamespace(f_bavail=int(free_gib * (1 << 20)), f_frsize=1024)
+    monkeypatch.setattr(os, "statvfs", lambda _path: room)
+    assert see(make({}), "disk").level == level
+
+
+def test_a_compiler_is_named_with_cuda(make: Make) -> None:
+    answers = {"c++": "g++ (Ubuntu 11.4.0) 11.4.0\nmore", "nvcc": "Cuda compilation tools, release 12.6, V12.6.68"}
+    machine = make({}, which=lambda name: name, run=lambda command: answers.get(command[0]))
+    assert see(machine, "compiler").message == "g++ (Ubuntu 11.4.0) 11.4.0; CUDA 12.6"
+    assert see(make({}), "compiler").level == "advice"
+
+
+def fake_llama(monkeypatch: pytest.MonkeyPatch, info: bytes, *, offload: bool) -> None:
+    import llama_cpp
+
+    monkeypatch.setattr(llama_cpp, "llama_print_system_info", lambda: info)
+    monkeypatch.setattr(llama_cpp, "llama_supports_gpu_offload", lambda: offload)
+
+
+def test_a_cpu_build_beside_a_gpu_is_a_warning_with_the_build_command(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake_llama(monkeypatch, b"CPU : SSE3 = 1 | AVX2 = 1 | ", offload=False)
+    finding = see(make(RTX), "llama-build")
+    assert finding.level == "warning"
+    assert "make setup CUDA=1" in finding.fix
+    assert "GGML_CUDA=on" in finding.fix
+    assert see(make(COMMON), "llama-build").level == "state"  # no GPU, so nothing is lost
+
+
+def test_a_build_without_the_cpus_instructions_is_a_warning(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_llama(monkeypatch, b"CPU : SSE3 = 1 | ", offload=True)
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    assert "without this CPU's AVX2" in see(make(RTX), "llama-build").message
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    assert see(make(RTX), "llama-build").level == "state"
+
+
+def test_a_gpu_build_says_so(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_llama(monkeypatch, b"CUDA : ARCHS = 1200 | USE_GRAPHS = 1 | CPU : AVX2 = 1 | ", offload=True)
+    finding = see(make(RTX), "llama-build")
+    assert finding.level == "state"
+    assert finding.message.endswith("with GPU; USE_GRAPHS AVX2")
+
+
+def test_every_check_exists_and_uses_its_own_code(make: Make) -> None:
+    found = examine(replace(Machine(), output=make({}).output))
+    assert {finding.code for finding in found} <= CHECKS.keys()
+    assert set(BEFORE_RUN) <= CHECKS.keys()
+    assert [finding.code for finding in found] == [code for code in CHECKS if code in {seen.code for seen in found}]
+
+
+SMALL_BUFFER = RTX | {"proc/sys/net/core/rmem_max": "212992"}
+LAX = RTX | {f"{CPU}/cpu0/cpufreq/scaling_governor": "ondemand", f"{CPU}/intel_pstate/no_turbo": "0"}
+LOOSE = JETSON | {f"{CPU}/cpu0/cpufreq/scaling_min_freq": "1", "var/lib/nvpmodel/status": "pmode:0"}
+
+
+@pytest.mark.parametrize(
+    ("tree", "width", "dds", "expected"),
+    [
+        (RTX, 1920, True, []),
+        (SMALL_BUFFER, 1920, True, ["rmem-max"]),
+        (SMALL_BUFFER, 640, True, []),
+        (SMALL_BUFFER, 1920, False, []),
+        (LAX, 640, True, ["cpu-governor"]),
+        (LOOSE, 640, True, ["jetson-clocks"]),
+    ],
+)
+def test_a_run_gets_the_doctors_warnings_that_concern_it(
+    make: Make, tree: dict[str, str], width: int, dds: bool, expected: list[str]
+) -> None:
+    doubts = before_run(width, 480, uses_dds=dds, machine=make(tree))
+    assert [doubt.code for doubt in doubts] == expected
+    assert all(doubt.advice for doubt in doubts)
+
+
+def test_the_worst_level_wins() -> None:
+    assert [worst([Finding("x", level, "m")]) for level in LEVELS] == list(LEVELS)
+    assert worst([]) == "state"
+    assert worst([Finding("x", "warning", "m"), Finding("y", "advice", "m")]) == "warning"
+
+
+def test_a_command_that_is_missing_or_fails_says_nothing() -> None:
+    assert doctor._run(["/no/such/program"]) is None
+    assert doctor._run(["false"]) is None
+    assert doctor._run(["echo", "here"]) == "here\n"
+
+
+def test_a_gpu_whose_driver_tells_no_version_is_still_named(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    give_nvml(monkeypatch, card("Orin (nvgpu)"), driver="")  # as NVML on a Jetson
+    assert see(make({}), "gpu").message.startswith("Orin (nvgpu), ")
+    assert environment.collect()["gpus"] == [{"name": "Orin (nvgpu)"}]

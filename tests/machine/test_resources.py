@@ -1,0 +1,427 @@
+"""What is read beside a run, on recorded lines and files, and what a window makes of it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import types
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from s2a_bench.clock import VirtualClock
+from s2a_bench.machine import resources
+from s2a_bench.machine.resources import READERS, Unreadable, open_readers
+from s2a_bench.machine.resources.host import CpuTimes, Memory
+from s2a_bench.machine.resources.jetson import Jtop, Tegrastats, parse_tegrastats
+from s2a_bench.machine.resources.nvidia import Nvml
+from s2a_bench.machine.resources.rapl import Rapl
+from s2a_bench.machine.resources.sampler import Sampler
+from s2a_bench.store.run import RunWriter, read_run
+from s2a_bench.store.schema import RESOURCES
+
+S = 1_000_000_000
+
+ORIN_NANO = (
+    "05-05-2025 06:05:39 RAM 2639/7620MB (lfb 9x4MB) SWAP 0/3810MB (cached 0MB) "
+    "CPU [1%@729,4%@729,8%@729,4%@729,5%@729,4%@729] GR3D_FREQ 37% cpu@44.156C soc2@43.781C soc0@44.687C "
+    "gpu@45.968C tj@45.968C soc1@45.312C VDD_IN 5263mW/4100mW VDD_CPU_GPU_CV 717mW/700mW VDD_SOC 1794mW/1780mW"
+)
+AGX_ORIN = (
+    "01-30-2026 18:09:55 RAM 14384/62841MB (lfb 303x4MB) SWAP 0/31420MB (cached 0MB) CPU [2%@729,off,3%@729] "
+    "EMC_FREQ 61%@2133 GR3D_FREQ 99%@[1300] NVDEC off VIC off cpu@48.75C soc2@46.593C gpu@58.5C tj@58.312C "
+    "VDD_GPU_SOC 3192mW/3192mW VDD_CPU_CV 1596mW/1596mW VIN_SYS_5V0 5048mW/5048mW NC 0mW/0mW "
+    "VDDQ_VDD2_1V8AO 400mW/400mW"
+)
+JETPACK_4 = "RAM 220/3964MB (lfb 1x1MB) CPU [1%@102,off] GR3D_FREQ 12%@921 GPU@41C POM_5V_IN 2532/2532 POM_5V_GPU 40/40"
+
+
+class Scripted:
+    """A reader that returns what it is told."""
+
+    about = "scripted"
+
+    def __init__(self, *values: Mapping[str, float], cheap: bool = False) -> None:
+        self.values, self.cheap, self.closed, self.reads = list(values), cheap, 0, 0
+
+    def read(self) -> Mapping[str, float]:
+        self.reads += 1
+        return self.values.pop(0) if len(self.values) > 1 else self.values[0]
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def polled(reader: Scripted, times_s: list[float], hz: float = 10) -> Sampler:
+    clock = VirtualClock()
+    sampler = Sampler({"scripted": reader}, hz, clock=clock.now_ns)
+    for time_s in times_s:
+        clock.sleep_until_ns(int(time_s * S))
+        sampler.poll()
+    return sampler
+
+
+def counting(name: str, rate: float, times_s: list[float]) -> Sampler:
+    return polled(Scripted(*({name: rate * time_s} for time_s in times_s)), times_s)
+
+
+def test_an_orin_nanos_line_gives_busy_temperature_and_input_power() -> None:
+    assert parse_tegrastats(ORIN_NANO) == {"gpu_busy": 0.37, "gpu_temperature_c": 45.968, "board_power_w": 5.263}
+
+
+def test_an_agx_orins_board_is_the_sum_of_three_rails_and_counts_none_twice() -> None:
+    values = parse_tegrastats(AGX_ORIN)
+    assert values["board_power_w"] == pytest.approx(3.192 + 1.596 + 5.048)
+    assert values["gpu_busy"] == 0.99
+    assert values["gpu_clock_hz"] == 1300e6
+
+
+def test_the_older_format_without_units_is_read_too() -> None:
+    expected = {"gpu_busy": 0.12, "gpu_clock_hz": 921e6, "gpu_temperature_c": 41.0, "board_power_w": 2.532}
+    assert parse_tegrastats(JETPACK_4) == expected
+
+
+@given(st.text())
+def test_no_line_makes_the_parser_fail(line: str) -> None:
+    parse_tegrastats(line)
+
+
+@given(st.integers(0, len(ORIN_NANO)))
+def test_a_torn_line_never_gives_another_value(cut: int) -> None:
+    assert parse_tegrastats(ORIN_NANO[:cut]).items() <= parse_tegrastats(ORIN_NANO).items()
+
+
+@pytest.fixture
+def tegrastats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Put a program of that name first in PATH; it writes what is in lines.txt, then waits to be ended."""
+    program = tmp_path / "tegrastats"
+    program.write_text(f"#!/bin/sh\necho $@ >{tmp_path}/flags\ncat {tmp_path}/lines.txt\nexec sleep 60\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    return tmp_path
+
+
+def test_tegrastats_takes_the_newest_whole_line_once(tegrastats: Path) -> None:
+    (tegrastats / "lines.txt").write_text(f"{AGX_ORIN}\n{ORIN_NANO}\nRAM 1/2MB VDD_IN 9999mW")
+    reader = Tegrastats()
+    try:
+        values: Mapping[str, float] = {}
+        while not values:
+            values = reader.read()
+        assert values == parse_tegrastats(ORIN_NANO)
+        assert reader.read() == {}
+        assert (tegrastats / "flags").read_text() == "--interval 100\n"
+    finally:
+        reader.close()
+    assert reader._process.returncode is not None
+
+
+def test_without_the_program_the_reader_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(Unreadable, match="no tegrastats"):
+        Tegrastats()
+
+
+def fake_jtop(monkeypatch: pytest.MonkeyPatch, power: dict[str, object], *, runs: bool = True) -> None:
+    class JtopException(Exception): ...
+
+    class jtop:  # noqa: N801 - its name there
+        def __init__(self, interval: float) -> None:
+            assert interval == 0.1
+            self.power = power
+            self.gpu = {"gpu": {"status": {"load": 42.0}, "freq": {"cur": 1_300_500}}}
+            self.temperature = {"gpu": {"temp": 51.5}}
+
+        def start(self) -> None:
+            if not runs:
+                raise JtopException("The jtop.service is not active")
+
+        def close(self) -> None: ...
+
+    module = types.ModuleType("jtop")
+    module.__dict__.update(jtop=jtop, JtopException=JtopException)
+    monkeypatch.setitem(sys.modules, "jtop", module)
+
+
+def test_jtops_named_total_is_the_boards(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_jtop(monkeypatch, {"tot": {"name": "VDD_IN", "power": 7310}, "rail": {"VDD_SOC": {"power": 1300}}})
+    expected = {"board_power_w": 7.31, "gpu_busy": 0.42, "gpu_clock_hz": 1_300_500e3, "gpu_temperature_c": 51.5}
+    assert Jtop().read() == expected
+
+
+def test_jtops_total_of_an_agx_orin_is_added_up_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    watts = {"VDD_GPU_SOC": 3000, "VDD_CPU_CV": 1000, "VIN_SYS_5V0": 5000, "VDDQ_VDD2_1V8AO": 400}
+    rails = {name: {"power": milliwatts} for name, milliwatts in watts.items()}
+    fake_jtop(monkeypatch, {"tot": {"power": 9400}, "rail": rails})
+    assert Jtop().read()["board_power_w"] == 9.0
+
+
+def test_jtop_without_its_service_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_jtop(monkeypatch, {}, runs=False)
+    with pytest.raises(Unreadable, match="systemctl restart jtop"):
+        Jtop()
+
+
+def test_tegrastats_is_left_out_where_jtop_reads_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = {"jtop": "tests:A", "tegrastats": "tests:B"}
+    monkeypatch.setattr(resources, "READERS", opened)
+    monkeypatch.setattr(resources, "resolve_name", lambda where: lambda _pids: where)
+    readers, left_out = open_readers([])
+    assert list(readers) == ["jtop"]
+    assert left_out == {"tegrastats": "jtop is used"}
+
+
+def rapl_tree(root: Path, *energies: int, largest: int = 999) -> None:
+    for number, energy in enumerate(energies):
+        for zone, name in ((f"intel-rapl:{number}", f"package-{number}"), (f"intel-rapl:{number}:0", "core")):
+            (root / zone).mkdir(parents=True, exist_ok=True)
+            (root / zone / "name").write_text(f"{name}\n")
+            (root / zone / "energy_uj").write_text(f"{energy}\n")
+            (root / zone / "max_energy_range_uj").write_text(f"{largest}\n")
+    (root / "intel-rapl:9").mkdir(exist_ok=True)
+    (root / "intel-rapl:9" / "name").write_text("psys\n")
+
+
+def test_rapl_adds_packages_and_undoes_the_wrap(tmp_path: Path) -> None:
+    rapl_tree(tmp_path, 100, 990)
+    reader = Rapl(root=tmp_path)
+    assert reader.about == "2 CPU packages"
+    assert reader.read() == {"package_energy_j": pytest.approx(1090e-6)}
+    rapl_tree(tmp_path, 150, 10)  # 50 more, and 20 more through the wrap at 1000
+    assert reader.read() == {"package_energy_j": pytest.approx(1160e-6)}
+    reader.close()
+    reader.close()
+
+
+@given(st.lists(st.integers(0, 999), min_size=1, max_size=30))
+def test_rapl_never_loses_energy_below_one_wrap_a_reading(steps: list[int]) -> None:
+    from s2a_bench.machine.resources.rapl import Zone
+
+    file = os.memfd_create("energy_uj")
+    try:
+        zone, true_uj = Zone(file, 999), 0
+        for step in steps:
+            true_uj += step
+            os.pwrite(file, f"{true_uj % 1000:<4}".encode(), 0)
+            assert zone.read_uj() == true_uj
+    finally:
+        os.close(file)
+
+
+def test_rapl_without_zones_or_with_damaged_ones_is_unreadable(tmp_path: Path) -> None:
+    with pytest.raises(Unreadable, match="no package zone"):
+        Rapl(root=tmp_path)
+    rapl_tree(tmp_path, 1)
+    (tmp_path / "intel-rapl:0" / "energy_uj").unlink()
+    with pytest.raises(Unreadable, match=r"energy_uj: No such file.*sudo chmod"):
+        Rapl(root=tmp_path)
+
+
+class FakeNvml(types.ModuleType):
+    """Stands in for pynvml with two GPUs; ``refused`` names the functions that these boards do not have."""
+
+    class NVMLError(Exception): ...
+
+    NVML_TEMPERATURE_GPU, NVML_CLOCK_SM = 0, 1
+
+    def __init__(self, *refused: str, gpus: int = 2) -> None:
+        super().__init__("pynvml")
+        answers = {
+            "nvmlInit": lambda: None,
+            "nvmlShutdown": lambda: None,
+            "nvmlSystemGetDriverVersion": lambda: "550.54",
+            "nvmlDeviceGetCount": lambda: gpus,
+            "nvmlDeviceGetHandleByIndex": lambda place: place,
+            "nvmlDeviceGetName": lambda gpu: f"RTX {gpu}",
+            "nvmlDeviceGetUtilizationRates": lambda gpu: types.SimpleNamespace(gpu=(10, 90)[gpu]),
+            "nvmlDeviceGetMemoryInfo": lambda gpu: types.SimpleNamespace(used=(1 << 30, 2 << 30)[gpu]),
+            "nvmlDeviceGetPowerUsage": lambda gpu: (20_500, 200_000)[gpu],
+            "nvmlDeviceGetTotalEnergyConsumption": lambda gpu: (5_000, 7_000)[gpu],
+            "nvmlDeviceGetTemperature": lambda gpu, _sensor: (40, 71)[gpu],
+            "nvmlDeviceGetClockInfo": lambda gpu, _clock: (300, 2_505)[gpu],
+        }
+        for name, answer in answers.items():
+            setattr(self, name, self._refuse if name in refused else answer)
+
+    def _refuse(self, *_: object) -> None:
+        raise self.NVMLError("Not Supported")
+
+
+def test_nvml_adds_up_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pynvml", FakeNvml())
+    reader = Nvml()
+    assert reader.about == "RTX 0, RTX 1 (driver 550.54)"
+    assert reader.read() == {
+        "gpu_busy": 0.9,
+        "gpu_memory_bytes": 3 << 30,
+        "gpu_power_w": 220.5,
+        "gpu_energy_j": 12.0,
+        "gpu_temperature_c": 71,
+        "gpu_clock_hz": 300e6,
+    }
+
+
+def test_nvml_leaves_out_what_a_board_does_not_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakeNvml("nvmlDeviceGetTotalEnergyConsumption", "nvmlDeviceGetPowerUsage")
+    monkeypatch.setitem(sys.modules, "pynvml", fake)
+    reader = Nvml()
+    assert set(reader.read()) == {"gpu_busy", "gpu_memory_bytes", "gpu_temperature_c", "gpu_clock_hz"}
+    fake.nvmlDeviceGetMemoryInfo = fake._refuse  # type: ignore[attr-defined]  # a driver that goes away later
+    assert "gpu_memory_bytes" not in reader.read()
+
+
+@pytest.mark.parametrize("fake", [FakeNvml("nvmlInit"), FakeNvml("nvmlDeviceGetName"), FakeNvml(gpus=0)])
+def test_without_driver_or_gpu_nvml_is_unreadable(fake: FakeNvml, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pynvml", fake)
+    with pytest.raises(Unreadable, match="NVML"):
+        Nvml()
+
+
+def test_the_cpu_clock_of_another_process_counts_its_threads() -> None:
+    code = (
+        "import sys,time,threading\nsum(range(3_000_000))\nprint(time.process_time_ns(), flush=True)\nsys.stdin.read()"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        own_ns = int(process.stdout.readline())
+        read_ns = CpuTimes([process.pid]).read()["server_cpu_ns"]
+        process.communicate(b"")
+    assert own_ns <= read_ns < own_ns + S
+    reader = CpuTimes([process.pid])
+    assert "server_cpu_ns" not in reader.read()
+    assert reader.read()["client_cpu_ns"] > 0
+
+
+def test_memory_is_that_of_the_processes() -> None:
+    values = Memory([os.getpid()]).read()
+    assert values["client_rss_bytes"] == pytest.approx(values["server_rss_bytes"], rel=0.05)
+    assert 0 <= values["cpu_busy"] <= 1
+    assert values["memory_available_bytes"] > 0
+
+
+def test_a_counters_rise_between_edges_is_exact() -> None:
+    sampler = polled(Scripted({"client_cpu_ns": 100}, {"client_cpu_ns": 350}), [1.0, 1.002])
+    assert sampler.window(1 * S, 1 * S + 2_000_000)["client_cpu_ns"] == 250
+
+
+def test_a_window_without_enough_readings_has_no_rise() -> None:
+    sampler = counting("gpu_energy_j", 50, [0.0, 0.1, 0.2, 0.3])
+    assert sampler.window(int(0.14 * S), int(0.15 * S)) == {}
+    assert sampler.window(int(0.05 * S), int(0.15 * S)) == {}
+
+
+@given(
+    rate=st.floats(0.1, 500),
+    start=st.floats(0, 1.0),
+    length=st.floats(0.4, 3.0),
+)
+def test_a_steady_power_gives_its_energy_in_any_window(rate: float, start: float, length: float) -> None:
+    times = [index / 10 for index in range(45)]
+    start_ns, end_ns = int(start * S), int((start + length) * S)
+    facts = counting("gpu_energy_j", rate, times).window(start_ns, end_ns)
+    assert facts["gpu_energy_j"] == pytest.approx(rate * length, rel=1e-6)
+    assert facts["energy_j"] == facts["gpu_energy_j"]
+    assert facts["power_w"] == pytest.approx(rate, rel=1e-6)
+
+
+def test_power_without_a_counter_is_summed_over_the_window() -> None:
+    readings = ({"board_power_w": watts, "gpu_busy": busy} for watts, busy in ((10, 0.0), (20, 0.5), (30, 1.0)))
+    facts = polled(Scripted(*readings), [0.0, 0.1, 0.2]).window(0, int(0.2 * S))
+    assert facts["board_power_w"] == 20
+    assert facts["board_energy_j"] == pytest.approx(4.0)
+    assert facts["energy_j"] == facts["board_energy_j"]
+    assert facts["gpu_busy"] == 0.5
+
+
+def test_the_boards_input_is_not_added_to_its_parts() -> None:
+    clock = VirtualClock()
+    board = Scripted({"board_power_w": 30.0})
+    parts = Scripted({"gpu_energy_j": 0.0, "package_energy_j": 0.0}, {"gpu_energy_j": 2.0, "package_energy_j": 1.0})
+    only_parts = Scripted(*parts.values)
+    for readers, expected in (({"board": board, "parts": parts}, 30.0), ({"parts": only_parts}, 3.0)):
+        sampler = Sampler(readers, 1, clock=clock.now_ns)
+        start_ns = clock.now_ns()
+        sampler.poll()
+        clock.sleep_until_ns(start_ns + S)
+        sampler.poll()
+        assert sampler.window(start_ns, start_ns + S)["energy_j"] == pytest.approx(expected)
+
+
+def test_memory_of_a_window_is_its_peak_and_falls_back_on_the_reading_before() -> None:
+    sampler = polled(Scripted(*({"client_rss_bytes": size} for size in (5, 9, 7))), [0.0, 0.1, 0.2])
+    assert sampler.window(0, int(0.25 * S)) == {"client_rss_bytes": 9}
+    assert sampler.window(int(0.21 * S), int(0.22 * S)) == {"client_rss_bytes": 7}
+    assert sampler.window(int(9.0 * S), int(9.1 * S)) == {}
+
+
+def test_edges_read_only_what_is_cheap() -> None:
+    cheap, dear = Scripted({"client_cpu_ns": 1}, cheap=True), Scripted({"gpu_busy": 0.5})
+    sampler = Sampler({"cpu": cheap, "nvml": dear}, 10)
+    sampler.edge()
+    sampler.edge()
+    sampler.poll()
+    assert (cheap.reads, dear.reads) == (3, 1)
+    assert [row.reader for row in sampler._rows] == ["cpu", "cpu", "cpu", "nvml"]
+
+
+def test_the_thread_polls_until_it_is_told_and_closes_its_readers() -> None:
+    polled_often = threading.Event()
+
+    class Counting(Scripted):
+        def read(self) -> Mapping[str, float]:
+            if self.reads > 3:
+                polled_often.set()
+            return super().read()
+
+    reader = Counting({"gpu_busy": 0.25})
+    with Sampler({"nvml": reader}, 1000, {"rapl": "no package zone"}) as sampler:
+        assert polled_often.wait(30)
+    assert reader.closed == 1
+    told = sampler.describe()
+    assert told["readers"] == {"nvml": "scripted"}
+    assert told["left_out"] == {"rapl": "no package zone"}
+    assert told["polls"] >= 5
+    assert 0 < told["core_share"] < 1
+    assert set(told["cost_us"]) == {"nvml"}
+
+
+def test_a_reader_that_fails_is_left_out_from_then_on_and_ends_no_run() -> None:
+    class Failing(Scripted):
+        def read(self) -> Mapping[str, float]:
+            if self.reads == 2:
+                raise OSError(5, "Input/output error")
+            return super().read()
+
+    failing = Failing({"package_energy_j": 1.0}, cheap=True)
+    sampler = Sampler({"rapl": failing}, 10)
+    for _ in range(4):
+        sampler.edge()
+    assert failing.reads == 2
+    assert sampler.describe()["left_out"] == {"rapl": "stopped after 2 readings: OSError(5, 'Input/output error')"}
+    assert len(sampler._rows) == 2
+
+
+def test_rows_land_in_the_run_folder(tmp_path: Path) -> None:
+    sampler = polled(Scripted({"client_rss_bytes": 4096, "cpu_busy": 0.5}), [0.5])
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        sampler.flush(run)
+        sampler.flush(run)
+    table = read_run(run.path).tables["resources"]
+    assert table["at_ns"].tolist() == [S // 2]
+    assert table["client_rss_bytes"].tolist() == [4096]
+    assert table["gpu_power_w"].isna().all()
+
+
+def test_every_reader_opens_or_says_why_not() -> None:
+    readers, left_out = open_readers([os.getpid()])
+    for reader in readers.values():
+        assert reader.about
+        assert all(name in RESOURCES.columns for name in reader.read())
+        reader.close()
+    assert readers.keys() | left_out.keys() == READERS.keys()
+    assert all(left_out.values())

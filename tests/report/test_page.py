@@ -1,0 +1,454 @@
+"""The page: nothing fetched, nothing unescaped, and the numbers of the tables."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from collections import Counter
+from collections.abc import Callable, Iterator
+from html.parser import HTMLParser
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from s2a_bench.errors import StoreError, UsageError
+from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.experiments.timeline.run import run_timeline
+from s2a_bench.experiments.timeline.view.cells import timelines_of
+from s2a_bench.experiments.timeline.view.tables import execution_table, timeline_csv
+from s2a_bench.report.page.chapters import MOST_CHAPTERS, read_chapters
+from s2a_bench.report.page.files import Outputs, make_report, write_report
+from s2a_bench.report.page.lanes import panels_of, ticks_of
+from s2a_bench.report.page.plots import inline
+from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.schema import CELLS, CellRow, SampleRow
+from s2a_bench.writers.latex import PREAMBLE, document, escape, to_siunitx
+from s2a_bench.writers.tables import ABSENT, TextTable
+
+MakeRun = Callable[..., Run]
+MakeRow = Callable[..., SampleRow]
+HOSTILE = "<script>alert('x')</script>&\"%_$#{}\\"
+VOID = {"meta", "br", "hr", "img", "input", "link"}
+POLICIES = ("naive", "wait-then-act", "stream-to-act")
+
+
+class Quiet:
+    """Progress that nobody looks at."""
+
+    def opened(self, folder: Path) -> None: ...
+    def stage(self, text: str) -> None: ...
+    def expect(self, samples: int) -> None: ...
+    def advance(self) -> None: ...
+
+
+class Page(HTMLParser):
+    """What a page is made of; checks while reading that every element is closed where it should be."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: Counter[str] = Counter()
+        self.attributes: list[tuple[str, str, str]] = []
+        self.cells: list[str] = []
+        self.text = ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags[tag] += 1
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "td":
+            self.cells.append("")
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags[tag] += 1
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == "td":
+            self.cells[-1] += data
+        if not {"script", "style"} & set(self.open):
+            self.text += data
+
+    def values(self, name: str) -> list[str]:
+        return [value for _, found, value in self.attributes if found == name]
+
+
+def timeline(folder: Path, **settings: Any) -> Path:
+    return run_timeline(TimelineConfig(**settings), folder, Quiet())
+
+
+@pytest.fixture(scope="module")
+def computed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return timeline(tmp_path_factory.mktemp("timeline"), profiles=("jetson-agx-orin",), tokens_per_skill=(6, 4))
+
+
+def page_of(*paths: Path, against_paper: bool = False) -> str:
+    output = paths[0].parent / "page.html"
+    report = make_report(read_chapters(paths, against_paper=against_paper), against_paper=against_paper)
+    assert write_report(report, Outputs(output)) == [output]
+    return output.read_text()
+
+
+def sweep_of(folder: Path, runs: list[tuple[dict[str, Any], Path]], *, cells: int | None = None) -> Path:
+    """Make a sweep's folder of run folders, which move there; a Path that is not there is a cell that failed."""
+    facts = {"configuration": {"command": "timeline", "cells": cells or len(runs)}, "environment": {"cpu": "A"}}
+    with RunWriter.create(folder, "sweep", facts, (CELLS,)) as writer:
+        (writer.path / "sweep.toml").write_text('command = "timeline" # as it was\n')
+        for number, (settings, path) in enumerate(runs, 1):
+            kept = writer.path / "cells" / f"{number:04d}-r1"
+            kept.parent.mkdir(exist_ok=True)
+            ended = path.exists()
+            if ended:
+                path.rename(kept)
+            row = CellRow(
+                cell=f"{number:04d}",
+                repeat=1,
+                attempt=1,
+                state="finished" if ended else "failed",
+                error="" if ended else "no room",
+                virtual=True,
+                board="",
+                host="vm",
+                settings=settings,
+                argv=["timeline"],
+                config_hash="0",
+                folder=f"cells/{kept.name}" if ended else "",
+                started="2026-01-01T00:00:00+00:00",
+                wall_s=0.5,
+            )
+            writer.append(CELLS, [row])
+    return writer.path
+
+
+def test_nothing_is_fetched(computed: Path, make_run: MakeRun) -> None:
+    text = page_of(computed, make_run().path, against_paper=True)
+    page = Page(text)
+    assert not page.open
+    assert page.tags["link"] == page.tags["img"] == page.tags["iframe"] == 0
+    assert page.tags["script"] == page.tags["style"] == 1
+    assert not re.search(r"https?://|//\w+\.\w|@import|@font-face", text)
+    outside = [value for name in ("href", "src", "xlink:href", "action") for value in page.values(name)]
+    assert outside
+    assert all(value.startswith(("#", "data:image/png;base64,")) for value in outside)
+    assert all(found.startswith("#") for found in re.findall(r"url\(([^)]*)\)", text))
+
+
+def test_ids_are_its_own_and_references_find_them(computed: Path, make_run: MakeRun) -> None:
+    page = Page(page_of(computed, make_run().path, make_run().path))
+    ids = Counter(page.values("id"))
+    assert set(ids.values()) == {1}
+    assert {value[1:] for value in page.values("href") if value.startswith("#")} <= set(ids)
+
+
+def test_the_page_has_the_numbers_of_the_tables(computed: Path) -> None:
+    page = Page(page_of(computed))
+    table = execution_table(read_run(computed))
+    rows = [text for row in table.rows for text in row]
+    start = page.cells.index(rows[0])
+    assert page.cells[start : start + len(rows)] == rows
+    assert all(note in " ".join(page.text.split()) for note in table.notes)
+    assert "naive stalls in 1 of 2 settings, most on Jetson AGX Orin with L = 6: 1.75 s a plan" in page.text
+    labels = [label.replace("&#39;", "'") for label in re.findall(r'class="label">([^<]*)', page_of(computed))]
+    assert labels == ["emulated", "paper's claim", "assumption"]
+
+
+def test_a_latency_run_says_n_and_interval(make_run: MakeRun) -> None:
+    page = Page(page_of(make_run(manifest={"warnings": [{"code": "load", "message": "busy", "advice": "wait"}]}).path))
+    text = " ".join(page.text.split())
+    assert "50 requests a cell over http/as-deployed, http/best-effort, http/binary, ros/topic, loopback" in text
+    assert re.search(
+        r"http/as-deployed takes [\d.]+ times as long as ros/topic \(ratio of medians, 95 % interval [\d.]+ to [\d.]+",
+        text,
+    )
+    assert "Warning [load]: busy; wait" in text
+    assert "echo engine" in text
+    assert page.tags["svg"] == 3
+
+
+def test_hostile_names_are_text_and_nothing_else(make_run: MakeRun, make_row: MakeRow, plausible: Any) -> None:
+    row = make_row(f"http/{HOSTILE}", plausible["http/binary"], 0, size=HOSTILE)
+    manifest = {
+        "argv": ["x", "latency", "--prompt", HOSTILE],
+        "environment": {"cpu": HOSTILE, HOSTILE: 1},
+        "warnings": [{"code": HOSTILE, "message": HOSTILE, "advice": HOSTILE}],
+        "host": HOSTILE,
+    }
+    run = make_run({}, manifest=manifest, extra=(row,))
+    text = page_of(run.path)
+    page = Page(text)
+    assert page.tags["script"] == 1
+    assert "<script>alert" not in text
+    assert HOSTILE in page.text
+    assert f"http/{HOSTILE}" in page.cells
+
+
+def test_the_command_can_be_pasted_into_a_shell(make_run: MakeRun) -> None:
+    argv = ["/somewhere/__main__.py", "latency", "--prompt", 'it\'s "one" $HOME', "--runs", "3"]
+    page = Page(page_of(make_run({}, manifest={"argv": argv}).path))
+    command = next(line for line in page.text.splitlines() if line.startswith("s2a-bench latency"))
+    said = subprocess.run(["sh", "-c", f"printf '%s\\n' {command}"], capture_output=True, text=True, check=True)
+    assert said.stdout.splitlines() == ["s2a-bench", *argv[1:]]
+
+
+def test_timelines_stand_in_the_page_where_they_were(computed: Path) -> None:
+    six, _ = panels_of(timelines_of(read_run(computed)))
+    assert six.title == "Jetson AGX Orin, 4.8 tokens/s: L = 6, N = 8, T_nom = 1 s"
+    naive, wait, ours = six.lanes
+    assert [bar.kind for bar in naive.bars] == ["skill", *["stall", "skill"] * 7]
+    assert sum(bar.width_s for bar in naive.bars if bar.kind == "stall") == pytest.approx(1.75)
+    assert [lane.start_s for lane in six.lanes] == pytest.approx([1.75, 10.5, 3.5])
+    assert naive.bars[1].text == "naive: stall of 0.25 s before skill 2, 2.75 to 3.00 s"
+    assert ours.bars[0].text == "stream-to-act: skill 1 arrives at 1.75 s, runs 3.50 to 4.50 s, no stall before it"
+    assert (naive.words, wait.words) == (
+        "starts 1.75 s, ends 11.50 s, 7 stalls, 1.75 s",
+        "starts 10.50 s, ends 18.50 s, no stalls",
+    )
+    assert len(six.tokens_s) == 48
+    text = page_of(computed)
+    page = Page(text)
+    assert text.count('<rect class="skill"') == 2 * 3 * 8
+    assert text.count('<rect class="stall"') == 7
+    assert naive.bars[1].text in text  # without a script it is the browser's own tooltip
+    assert page.values("tabindex")
+
+
+@given(st.floats(1e-4, 1e6))
+def test_ticks_are_round_few_and_from_zero(end_s: float) -> None:
+    ticks = ticks_of(end_s)
+    assert ticks[0] == 0
+    assert 2 <= len(ticks) <= 8
+    assert ticks[-1] <= end_s * (1 + 1e-9)
+    assert f"{ticks[1]:e}"[0] in "125"
+
+
+def test_a_sweep_of_timelines_is_shown_as_the_one_run_that_it_amounts_to(tmp_path: Path) -> None:
+    boards = ("rtx-4080", "jetson-agx-orin")
+    cells = [
+        (
+            {"profile": board, "tokens-per-skill": tokens, "policy": policy},
+            timeline(tmp_path, profiles=(board,), tokens_per_skill=(tokens,), policies=(policy,)),
+        )
+        for board, tokens, policy in product(boards, (6, 1), POLICIES)
+    ]
+    folder = sweep_of(tmp_path / "sweeps", cells)
+    whole = read_run(timeline(tmp_path, profiles=boards, tokens_per_skill=(6, 1)))
+    overview, pooled = read_chapters([folder], against_paper=False)
+    assert pooled.content.tables["timelines"] == execution_table(whole)
+    assert pooled.content.csvs == timeline_csv(whole)
+    assert panels_of(pooled.content.timelines) == panels_of(timelines_of(whole))
+    assert len(overview.content.tables["cells"].rows) == 12
+    assert overview.content.summary[0] == "12 of 12 cells of s2a-bench timeline are finished."
+    page = Page(page_of(folder))
+    assert "as it was" in page.text
+    assert page.text.count("sweep on ") >= 2  # its title names the page
+
+
+def test_cells_of_one_name_are_not_made_one(tmp_path: Path) -> None:
+    same: dict[str, Any] = {"profiles": ("rtx-4080",), "tokens_per_skill": (6,)}
+    folder = sweep_of(tmp_path / "sweeps", [({"n": n}, timeline(tmp_path, **same)) for n in (1, 2)])
+    _, first, second = read_chapters([folder], against_paper=False)
+    assert first.content.tables == second.content.tables
+    assert [len(chapter.content.timelines) for chapter in (first, second)] == [3, 3]
+    assert first.name != second.name
+
+
+def test_timelines_of_other_settings_are_kept_apart(tmp_path: Path) -> None:
+    same: dict[str, Any] = {"profiles": ("rtx-4080",), "tokens_per_skill": (6,), "policies": ("naive",)}
+    runs = [({"t-max": most}, timeline(tmp_path, t_max=most, **same)) for most in (1.0, 2.0)]
+    assert len(read_chapters([sweep_of(tmp_path / "sweeps", runs)], against_paper=False)) == 3
+
+
+def test_measured_cells_stand_side_by_side_and_are_not_pooled(tmp_path: Path, make_run: MakeRun) -> None:
+    runs = [({"runs": n}, make_run(n=n).path) for n in range(2, MOST_CHAPTERS + 4)]
+    folder = sweep_of(tmp_path / "sweeps", [*runs, ({"runs": 99}, tmp_path / "no-such")])
+    overview, *chapters = read_chapters([folder], against_paper=False)
+    assert len(chapters) == MOST_CHAPTERS
+    rows = overview.content.tables["overview"].rows
+    assert len(rows) == len(runs) * 5
+    assert [row[:5] for row in rows[:5:4]] == [
+        ("runs 2", "http/as-deployed", "End to end without inference, ms", rows[0][3], "2"),
+        ("runs 2", "loopback", "End to end without inference, ms", rows[0][3], "2"),
+    ]
+    assert "14 cells were run: the first 12" in overview.doubts[0]
+    assert overview.content.tables["cells"].rows[-1][3] == "failed: no room"
+    assert "1 failed" in overview.content.summary[1]
+
+
+@pytest.mark.parametrize(
+    ("state", "error", "said"),
+    [("running", None, "still running, or was killed"), ("failed", "the server died", "(failed: the server died)")],
+)
+def test_an_unfinished_run_is_shown_and_told(make_run: MakeRun, state: str, error: str | None, said: str) -> None:
+    run = make_run(n=3)
+    (run.path / "manifest.json").write_text(json.dumps({**run.manifest, "state": state, "error": error}))
+    (chapter,) = read_chapters([run.path], against_paper=False)
+    assert said in chapter.doubts[0]
+    assert said in Page(page_of(run.path)).text
+
+
+def test_a_run_without_rows_is_told(make_run: MakeRun) -> None:
+    (chapter,) = read_chapters([make_run({}).path], against_paper=False)
+    assert chapter.content.summary == ("The run has no rows: it ended before anything was measured.",)
+
+
+def test_a_timeline_that_was_cut_off_does_not_hide_the_others(computed: Path, tmp_path: Path) -> None:
+    cut = shutil.copytree(computed, tmp_path / "cut")
+    manifest = json.loads((cut / "manifest.json").read_text())
+    del manifest["configuration"]
+    (cut / "manifest.json").write_text(json.dumps({**manifest, "state": "running"}))
+    (cut / "skills.parquet").unlink()
+    (cut / "skills.csv").unlink()
+    chapters = read_chapters([cut, computed], against_paper=False)
+    assert len(chapters) == 2
+    assert chapters[0].doubts
+    assert not chapters[1].doubts
+
+
+def test_rows_that_their_manifest_does_not_fit_are_an_error_where_the_run_claims_to_be_whole(
+    computed: Path, tmp_path: Path
+) -> None:
+    odd = shutil.copytree(computed, tmp_path / "odd")
+    manifest = json.loads((odd / "manifest.json").read_text())
+    (odd / "manifest.json").write_text(json.dumps({**manifest, "boards": [{"name": "x"}]}))
+    with pytest.raises(StoreError, match="do not fit"):
+        read_chapters([odd], against_paper=False)
+
+
+def test_runs_of_unlike_machines_are_told_apart(make_run: MakeRun) -> None:
+    runs = [make_run(n=2, manifest={"environment": {"cpu": cpu, "cores": 2}}).path for cpu in ("A", "B", "A")]
+    report = make_report(read_chapters(runs, against_paper=False), against_paper=False)
+    assert len(report.doubts) == 1
+    assert "cpu: A against B" in report.doubts[0]
+    assert report.doubts[0] in Page(page_of(*runs)).text
+
+
+def test_a_folder_given_twice_is_one_chapter(computed: Path) -> None:
+    assert len(read_chapters([computed, computed / ".." / computed.name], against_paper=False)) == 1
+
+
+def test_every_verdict_has_its_evidence_on_the_page(computed: Path) -> None:
+    text = page_of(computed, against_paper=True)
+    page = Page(text)
+    assert "AGX Orin: naive shows intermittent stalls" in page.text
+    assert "naive at L = 6: 7 stalls of 1.75 s; none at L = 4" in page.text
+    assert "Run: s2a-bench latency" in page.text
+    for verdict in ("confirmed", "not-confirmed", "no-run-given"):
+        assert f'class="claim {verdict}"' in text
+
+
+def test_what_a_report_wrote_may_be_replaced_and_nothing_else(tmp_path: Path, computed: Path) -> None:
+    page, other = tmp_path / "page.html", tmp_path / "mine.html"
+    report = make_report(read_chapters([computed], against_paper=False), against_paper=False)
+    for _ in range(2):
+        Outputs(page, markdown=tmp_path / "page.md").check()
+        write_report(report, Outputs(page, markdown=tmp_path / "page.md"))
+    other.write_text("<html>mine</html>")
+    for outputs, flag in (
+        (Outputs(other), "--output"),
+        (Outputs(tmp_path), "--output"),
+        (Outputs(markdown=other), "--markdown"),
+        (Outputs(latex=other), "--latex"),
+        (Outputs(csv=other), "--csv"),
+    ):
+        with pytest.raises(UsageError, match=flag):
+            outputs.check()
+    assert other.read_text() == "<html>mine</html>"
+
+
+def test_files_lie_in_a_folder_a_run(tmp_path: Path, computed: Path, make_run: MakeRun) -> None:
+    runs = [computed, make_run(n=2).path]
+    report = make_report(read_chapters(runs, against_paper=True), against_paper=True)
+    outputs = Outputs(latex=tmp_path / "tex", csv=tmp_path / "csv", markdown=tmp_path / "all.md")
+    written = {str(path.relative_to(tmp_path)) for path in write_report(report, outputs)}
+    one, other = (path.name for path in runs)
+    assert {f"tex/{one}/timelines.tex", f"tex/{one}/timeline.pdf", f"tex/{other}/stages.tex"} <= written
+    assert {"tex/report.tex", "tex/claims.tex", "csv/claims.csv", f"csv/{other}/ratios.csv", "all.md"} <= written
+    assert (tmp_path / "tex" / one / "timeline.pdf").read_bytes().startswith(b"%PDF")
+    markdown = (tmp_path / "all.md").read_text()
+    assert "| Jetson AGX Orin | 6 | naive | 1.75 | 11.50 | 7 |" in markdown
+    assert "## The paper's claims" in markdown
+
+
+def test_an_svg_for_html_has_no_addresses_and_ids_of_its_own() -> None:
+    svg = (
+        '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" viewBox="0 0 1 1">'
+        "<!-- a -- b --><style>*{a: b}</style>"
+        '<metadata><x rdf="http://purl.org/"/></metadata><path id="p" clip-path="url(#c)"/>'
+        '<use xlink:href="#p"/></svg>'
+    )
+    assert inline(svg, "r-") == (
+        '<svg viewBox="0 0 1 1"><path id="r-p" clip-path="url(#r-c)"/><use href="#r-p"/></svg>'
+    )
+
+
+def test_numbers_are_left_to_siunitx() -> None:
+    table = TextTable(
+        "T_nom",
+        ("cell", "plain", "spread", "mixed"),
+        [("a_b", "1.25", "10.5 ± 0.25", "3 [1.5, 4]"), ("c", ABSENT, "1 ± 0", "12%")],
+        1,
+        frozenset({1}),
+        ("100 % & more",),
+    )
+    text = to_siunitx(table)
+    assert r"\begin{tabular}{lS[table-format=1.2]S[table-format=2.1(2)]r}" in text
+    assert r"a\_b & 1.25 & 10.5 \pm 0.25 & \num{3} [\num{1.5}, \num{4}] \\" in text
+    assert r"c & {--} & 1 \pm 0 & \num{12}\% \\" in text
+    assert r"\caption{T\_nom. 100 \% \& more}" in text
+    assert text.count(r"\midrule") == 2
+    assert r"\begin{longtable}" in to_siunitx(table, long=True)
+
+
+@given(st.text())
+def test_no_text_is_a_command_to_latex(text: str) -> None:
+    escaped = escape(text)
+    assert escaped.isprintable()
+    left = re.sub(r"\\(text[a-z]+\{\}|[{}_%&#$])|\$\\?[a-z^0-9-]+\$", "", escaped)
+    assert not set(left) & set("\\{}_%&#$^~<>|")
+
+
+def tables_of(make_run: MakeRun) -> Iterator[TextTable]:
+    rows: list[tuple[str, ...]] = [(HOSTILE, "1.5 ± 0.2"), ("[x]", ABSENT)]
+    yield TextTable(HOSTILE, (HOSTILE, "n"), rows, 1, notes=(HOSTILE, "λ ≥ 2 → ☃"))
+    (chapter,) = read_chapters([make_run(n=3).path], against_paper=True)
+    yield from chapter.content.tables.values()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("pdflatex"), reason="there is no pdflatex on this machine")
+def test_the_latex_compiles(tmp_path: Path, computed: Path, make_run: MakeRun) -> None:
+    for package in ("siunitx.sty", "booktabs.sty"):
+        if subprocess.run(["kpsewhich", package], capture_output=True, check=False).returncode:
+            pytest.skip(f"TeX has no {package}")
+    odd = shutil.copytree(computed, tmp_path / "50 % of_a #run {x}")
+    report = make_report(read_chapters([odd, make_run(n=3).path], against_paper=True), against_paper=True)
+    write_report(report, Outputs(latex=tmp_path / "tex"))
+    texts = [to_siunitx(table, long=long) for table in tables_of(make_run) for long in (False, True)]
+    (tmp_path / "tex" / "hard.tex").write_text(document(HOSTILE, texts))
+    for name in ("report", "hard"):
+        command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", f"{name}.tex"]
+        done = subprocess.run(
+            command, cwd=tmp_path / "tex", capture_output=True, text=True, errors="replace", check=False, timeout=120
+        )
+        assert done.returncode == 0, done.stdout[-2000:].decode(errors="replace")
+        assert (tmp_path / "tex" / f"{name}.pdf").stat().st_size > 10_000
+    assert "siunitx" in PREAMBLE
+
+
+def test_a_chapter_of_another_command_is_named_and_not_guessed_at(make_run: MakeRun) -> None:
+    run = make_run(n=2)
+    (run.path / "manifest.json").write_text(json.dumps({**run.manifest, "command": "dance"}))
+    (chapter,) = read_chapters([run.path], against_paper=False)
+    assert chapter.content.summary[0].startswith("There is no view of dance runs; this one holds samples (")
