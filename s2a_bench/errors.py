@@ -1,4 +1,6 @@
-"""Every error a user can meet, as one tree; the message names the flag, path or key and the way out.
+"""Every error a user can meet, as one tree; the message names the field, path or key and the way out.
+
+A field of a configuration stands in backquotes, as `runs`: the command line shows it as its flag, --runs.
 
 S2AError
 ├── UsageError           a flag's value, or a combination of flags, makes no sense (exit code 2)

@@ -5,6 +5,7 @@ Modules here import heavy libraries inside their functions only, so that ``--hel
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 from typing import Any
@@ -30,6 +31,7 @@ from s2a_bench.cli import (
 from s2a_bench.errors import S2AError
 
 INTERRUPTED = 130
+FIELD = re.compile(r"`([a-z][a-z0-9_]*)`")
 ParseError: Any = typer.BadParameter.__mro__[1]
 """Click's UsageError: newer typer brings a click of its own, so it cannot be named by import."""
 
@@ -76,7 +78,7 @@ def main() -> None:
         if code == INTERRUPTED:  # newer typer turns Ctrl-C into this code itself
             _say("interrupted", INTERRUPTED)
     except S2AError as error:
-        code = _say(f"error: {error}", error.exit_code)
+        code = _say(f"error: {with_flags(str(error))}", error.exit_code)
     except ParseError as error:
         context = getattr(error, "ctx", None)
         hint = f" (see '{context.command_path} --help')" if context else ""
@@ -87,6 +89,11 @@ def main() -> None:
         sys.stderr.close()
         code = 1
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def with_flags(message: str) -> str:
+    """Return a library's message with its fields, `max_tokens`, as flags, --max-tokens."""
+    return FIELD.sub(lambda field: f"--{field[1].replace('_', '-')}", message)
 
 
 def _say(line: str, code: int) -> int:

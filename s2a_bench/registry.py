@@ -1,0 +1,70 @@
+"""Names by table or by package: what of one kind there is, built in or offered by installed packages.
+
+Built-ins are a table ``name -> "module:attribute"``; other packages add to a kind with entry points of the group
+``s2a_bench.<kind>`` (Python packaging user guide, "entry points"). Nothing is imported before it is asked for by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from importlib.metadata import EntryPoint, entry_points
+from pkgutil import resolve_name
+from typing import Generic, TypeVar
+
+from s2a_bench.errors import UsageError
+
+T = TypeVar("T")
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """The implementations of one kind by name; iterating gives the names, built-ins first."""
+
+    def __init__(self, kind: str, field: str, builtins: Mapping[str, str]) -> None:
+        """Offer ``builtins`` and the entry points of ``s2a_bench.<kind>``; ``field`` is where users write the name."""
+        self.group = f"s2a_bench.{kind}"
+        self.field = field
+        self._builtins = dict(builtins)
+
+    @cached_property
+    def _offered(self) -> dict[str, EntryPoint]:
+        """Return what installed packages add; a built-in name cannot be taken over."""
+        found = {point.name: point for point in entry_points(group=self.group)}
+        return {name: point for name, point in sorted(found.items()) if name not in self._builtins}
+
+    def __getitem__(self, name: str) -> T:
+        """Load an implementation; raises UsageError for an unknown name, and for a package that does not load."""
+        if name in self._builtins:
+            built_in: T = resolve_name(self._builtins[name])
+            return built_in
+        if name not in self._offered:
+            known = ", ".join(self)
+            raise UsageError(f"`{self.field}`: '{name}' is none of {known}; packages add to them as '{self.group}'")
+        point = self._offered[name]
+        try:
+            offered: T = point.load()
+        except Exception as error:  # a package may raise anything while it is imported
+            package = point.dist.name if point.dist else point.value
+            raise UsageError(
+                f"`{self.field}`: '{name}' of the package {package} does not load: {type(error).__name__}: {error}"
+            ) from error
+        return offered
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._builtins or name in self._offered
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._builtins
+        yield from self._offered
+
+    def __len__(self) -> int:
+        return len(self._builtins) + len(self._offered)
+
+    def loaded(self) -> Iterator[tuple[str, T]]:
+        """Yield every name with its implementation, leaving out packages that do not load."""
+        for name in self:
+            try:
+                yield name, self[name]
+            except UsageError:
+                if name in self._builtins:
+                    raise
