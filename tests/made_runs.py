@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import pytest
 
+from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.store.schema import SampleRow, TokenRow
 
 Durations: TypeAlias = Mapping[str, float]
 MakeRun: TypeAlias = Callable[..., Run]

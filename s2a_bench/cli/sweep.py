@@ -13,6 +13,7 @@ import typer
 from s2a_bench.cli.options import listed
 from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError, UsageError
+from s2a_bench.store.sweep import CELLS
 
 if TYPE_CHECKING:
     from s2a_bench.sweep import Workers
@@ -67,7 +68,7 @@ def sweep(
         workers = _workers(plan, ray, jobs)
         if resume is not None:
             stack.enter_context(only_one(resume))
-        writer = RunWriter.reopen(resume) if resume else start_sweep(plan, source, output, boards)
+        writer = RunWriter.reopen(resume, [CELLS]) if resume else start_sweep(plan, source, output, boards)
         if resume is None:
             stack.enter_context(only_one(writer.path))
         progress.opened(writer.path)

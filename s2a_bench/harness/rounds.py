@@ -25,8 +25,8 @@ from s2a_bench.machine import environment
 from s2a_bench.machine.doctor import Machine
 from s2a_bench.machine.resources.sampler import Sampler, open_sampler
 from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
+from s2a_bench.store.requests import FrameRow
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import FrameRow
 from s2a_bench.trace import mark_cost_ns
 from s2a_bench.transport import open_client
 

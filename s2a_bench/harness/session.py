@@ -11,7 +11,7 @@ from s2a_bench.harness.feed import Feed, StreamedFrame, StreamFeed, fingerprint
 from s2a_bench.harness.plan import Cell, LatencyConfig
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.machine.resources.sampler import Sampler
-from s2a_bench.store.schema import FrameRow, SampleRow, TokenRow
+from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import Mark, Trace
 from s2a_bench.transport import Client
 from s2a_bench.types import Frame, Request, Token

@@ -10,7 +10,7 @@ from pathlib import Path
 from s2a_bench.clock import realtime_offset_ns
 from s2a_bench.machine.doctor import BEFORE_RUN, Finding, Machine, examine
 from s2a_bench.machine.doctor.robot import RMEM_WANTED
-from s2a_bench.store.schema import SampleRow
+from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import RESIDUAL_LIMIT, budget
 
 LARGE_PICTURE = 640 * 480

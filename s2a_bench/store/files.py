@@ -71,6 +71,19 @@ def _field(value: Value) -> str:
     return text
 
 
+def count_rows(path: Path) -> int:
+    """Count the rows of a table's Parquet or CSV file without reading their values."""
+    if path.suffix == ".parquet":
+        from pyarrow import parquet
+
+        return int(parquet.read_metadata(path).num_rows)
+    quotes = records = 0
+    for line in whole_records(path.read_bytes()).split(b"\n")[:-1]:
+        quotes += line.count(b'"')
+        records += quotes % 2 == 0
+    return max(records - 1, 0)
+
+
 def whole_records(data: bytes) -> bytes:
     """Return the data up to the end of its last whole record."""
     end = position = quotes = 0
@@ -83,7 +96,10 @@ def whole_records(data: bytes) -> bytes:
 
 
 def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
-    """Read a table's CSV as a ``pyarrow.Table``, without its torn end; a file that is not there is an empty table."""
+    """Read a table's CSV as a ``pyarrow.Table``, without its torn end; a file that is not there is an empty table.
+
+    A column that an older run does not have is null throughout.
+    """
     import pyarrow as pa
     from pyarrow import csv
 
@@ -100,6 +116,7 @@ def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
             convert_options=csv.ConvertOptions(
                 column_types=schema,
                 include_columns=list(columns),
+                include_missing_columns=True,
                 null_values=[""],
                 strings_can_be_null=False,
                 true_values=["true"],
@@ -129,7 +146,11 @@ def read_parquet(path: Path, columns: dict[str, Kind]) -> Any:
     from pyarrow import parquet
 
     try:
-        return parquet.read_table(path, columns=list(columns)).cast(_arrow_schema(columns))
+        schema = _arrow_schema(columns)
+        found = parquet.read_table(path)
+        for name in columns.keys() - set(found.column_names):  # an older run
+            found = found.append_column(name, pa.nulls(len(found), schema.field(name).type))
+        return found.select(list(columns)).cast(schema)
     except (OSError, pa.ArrowException, ValueError) as error:
         raise StoreError(f"{path} is damaged: {str(error).splitlines()[0]}; remove it to read the CSV") from error
 

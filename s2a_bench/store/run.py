@@ -7,7 +7,7 @@ import re
 import socket
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from itertools import count
 from pathlib import Path
@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, final
 
 from s2a_bench.errors import StoreError
 from s2a_bench.store import manifest as manifests
-from s2a_bench.store.files import CsvFile, read_csv, read_parquet, to_pandas, write_parquet
-from s2a_bench.store.schema import FRAMES, SAMPLES, SCHEMA, TABLES, TOKENS, FrameRow, Row, SampleRow, Table, TokenRow
+from s2a_bench.store.files import CsvFile, count_rows, read_csv, read_parquet, to_pandas, write_parquet
+from s2a_bench.store.requests import FRAMES, SAMPLES, TOKENS, FrameRow, SampleRow, TokenRow
+from s2a_bench.store.schema import SCHEMA, Row, Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +41,7 @@ class RunWriter:
         self._manifest = manifest
         self._finished = False
         manifests.write(path, manifest)
-        self._files: dict[str, CsvFile] = {}
+        self._files: dict[Table[Any], CsvFile] = {}
 
     @classmethod
     def create(
@@ -80,17 +81,17 @@ class RunWriter:
         return run
 
     @classmethod
-    def reopen(cls, path: Path) -> RunWriter:
-        """Go on writing a run folder that nobody else writes, with its manifest and the whole records of its tables.
+    def reopen(cls, path: Path, tables: Iterable[Table[Any]]) -> RunWriter:
+        """Go on writing a run folder that nobody else writes, with its manifest and the whole records of ``tables``.
 
         Raises StoreError where it is no run folder, another version's, or cannot be written.
         """
         manifest = manifests.read(path) | {"state": "running", "error": None, "finished": None}
         run = cls(path, manifest)
-        for name, table in TABLES.items():
-            (path / f"{name}.parquet").unlink(missing_ok=True)
-            if (path / f"{name}.csv").exists():
-                run._files[name] = CsvFile(path / f"{name}.csv", table.columns, reopen=True)
+        for table in tables:
+            (path / f"{table.name}.parquet").unlink(missing_ok=True)
+            if (path / f"{table.name}.csv").exists():
+                run._files[table] = CsvFile(path / f"{table.name}.csv", table.columns, reopen=True)
         return run
 
     @property
@@ -100,9 +101,9 @@ class RunWriter:
 
     def append(self, table: Table[Row], rows: Iterable[Row]) -> None:
         """Append rows to a table in one write; the first call creates its file."""
-        if table.name not in self._files:
-            self._files[table.name] = CsvFile(self.path / f"{table.name}.csv", table.columns)
-        self._files[table.name].append(table, rows)
+        if table not in self._files:
+            self._files[table] = CsvFile(self.path / f"{table.name}.csv", table.columns)
+        self._files[table].append(table, rows)
 
     def sample(self, row: SampleRow) -> None:
         """Append one sample."""
@@ -131,8 +132,8 @@ class RunWriter:
         for file in self._files.values():
             file.close()
         try:
-            for name, file in self._files.items():
-                write_parquet(self.path / f"{name}.parquet", read_csv(file.path, TABLES[name].columns))
+            for table, file in self._files.items():
+                write_parquet(self.path / f"{table.name}.parquet", read_csv(file.path, table.columns))
         finally:
             # The state is written even where there is no room for Parquet, or Ctrl-C comes a second time.
             self.update(state=state, error=error, finished=manifests.utc_now())
@@ -154,43 +155,54 @@ class RunWriter:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One run as read: the manifest and one DataFrame a table, empty where the run has no such rows.
+    """One run as read: the manifest, and its tables as DataFrames, each read when it is first asked for.
 
     Times are integers (Int64) in ns, `marks` and `facts` JSON text; a missing value is ``pd.NA``.
     """
 
     path: Path
     manifest: dict[str, Any]
-    tables: dict[str, pd.DataFrame]
+    tables: dict[str, pd.DataFrame] = field(default_factory=dict)
+    """By name, what was read so far; what is put in here is not looked for in the folder."""
+
+    def table(self, table: Table[Any]) -> pd.DataFrame:
+        """Return a table with all its columns, empty where the run has none; raises StoreError for a damaged file."""
+        if table.name not in self.tables:
+            self.tables[table.name] = _read(self.path, table)
+        return self.tables[table.name]
+
+    def row_counts(self) -> dict[str, int]:
+        """Return how many rows each table of the run has, whoever declared it; empty tables are left out."""
+        counts = {name: len(table) for name, table in self.tables.items()}
+        for file in sorted([*self.path.glob("*.parquet"), *self.path.glob("*.csv")]):
+            if file.stem not in counts:
+                counts[file.stem] = count_rows(file)
+        return {name: count for name, count in counts.items() if count}
 
     @property
     def samples(self) -> pd.DataFrame:
         """One row a request."""
-        return self.tables["samples"]
+        return self.table(SAMPLES)
 
     @property
     def tokens(self) -> pd.DataFrame:
         """One row a token."""
-        return self.tables["tokens"]
+        return self.table(TOKENS)
 
     @property
     def frames(self) -> pd.DataFrame:
         """One row a frame of a stream."""
-        return self.tables["frames"]
+        return self.table(FRAMES)
 
 
 def read_run(path: Path) -> Run:
-    """Read a run folder: Parquet where the run came to its end, else the whole records of the CSV files.
-
-    Raises StoreError where it is no run folder, another version's, or damaged.
-    """
+    """Open a run folder for reading; raises StoreError where it is none, or another version's."""
     path = Path(path)
-    manifest = manifests.read(path)
-    return Run(path, manifest, {name: _read(path, table) for name, table in TABLES.items()})
+    return Run(path, manifests.read(path))
 
 
 def _read(path: Path, table: Table[Any]) -> pd.DataFrame:
-    """Read one table."""
+    """Read Parquet where the run came to its end, else the whole records of the CSV file."""
     parquet = path / f"{table.name}.parquet"
     if parquet.exists():
         return to_pandas(read_parquet(parquet, table.columns))

@@ -6,15 +6,45 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.errors import StoreError
 from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.schema import Table
 
 if TYPE_CHECKING:
     import pandas as pd
 
 COMMAND = "sweep"
+
+
+@dataclass(frozen=True, slots=True)
+class CellRow:
+    """One attempt at one cell of a sweep; the latest attempt of a cell is the one that counts.
+
+    ``cell`` names the setting and ``repeat`` which time it ran. ``state`` is finished or failed, ``error`` why.
+    ``board`` is the machine that the cell asked for, empty where any would do; ``host`` the one that it got.
+    ``folder`` is its run folder below the sweep's, empty where it did not come to have one.
+    """
+
+    cell: str
+    repeat: int
+    attempt: int
+    state: str
+    error: str
+    virtual: bool
+    board: str
+    host: str
+    settings: dict[str, Any]
+    argv: list[str]
+    config_hash: str
+    folder: str
+    started: str
+    wall_s: float
+
+
+CELLS: Final[Table[CellRow]] = Table("cells", CellRow)
+"""One row an attempt at a cell of a sweep."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +78,7 @@ def read_sweep(path: Path) -> Sweep:
     run = read_run(path)
     if not is_sweep(run.manifest):
         raise StoreError(f"{path} is the folder of a {run.manifest['command']} run, not of a sweep")
-    attempts = run.tables["cells"]
+    attempts = run.table(CELLS)
     cells = attempts.drop_duplicates(["cell", "repeat"], keep="last").sort_values(["cell", "repeat"], ignore_index=True)
     settings = pd.DataFrame([json.loads(text) for text in cells["settings"]], index=cells.index)
     new = [name for name in settings.columns if name not in cells.columns]

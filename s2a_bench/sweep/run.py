@@ -16,8 +16,7 @@ from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.machine import environment
 from s2a_bench.store.run import RunWriter, read_run
-from s2a_bench.store.schema import CELLS, CellRow
-from s2a_bench.store.sweep import COMMAND, is_sweep
+from s2a_bench.store.sweep import CELLS, COMMAND, CellRow, is_sweep
 from s2a_bench.sweep import Cell, Outcome, Workers
 from s2a_bench.sweep.machine import KIND, difference, facts_of
 from s2a_bench.sweep.perform import run_folder
@@ -102,7 +101,7 @@ class SweepRun:
         self._progress = progress
         self._clock = clock or SystemClock()
         shutil.rmtree(writer.path / UNDER_WAY, ignore_errors=True)
-        self._rows = read_run(writer.path).tables["cells"].to_dict("records")
+        self._rows = read_run(writer.path).table(CELLS).to_dict("records")
         self._latest = latest(self._rows)
 
     @property

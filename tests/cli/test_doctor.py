@@ -14,6 +14,7 @@ import pytest
 from s2a_bench.cli import doctor
 from s2a_bench.machine import doctor as bench
 from s2a_bench.machine.doctor import CHECKS, Finding, Level
+from s2a_bench.machine.resources.rows import RESOURCES
 from s2a_bench.store.run import Run, read_run
 
 ROOT = Path(__file__).parent.parent.parent
@@ -104,7 +105,7 @@ def test_a_run_samples_resources_and_says_what_that_cost(tmp_path: Path) -> None
         assert spent["client_cpu_ns"] > 0
         assert spent["server_cpu_ns"] >= (0 if cell == "loopback" else 1)
         assert spent["client_rss_bytes"] > 1 << 20
-    table = run.tables["resources"]
+    table = run.table(RESOURCES)
     assert set(table["reader"]) == set(told["readers"])
     edges = table[table["reader"] == "cpu"]["client_cpu_ns"]
     assert edges.is_monotonic_increasing

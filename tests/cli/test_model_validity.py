@@ -10,6 +10,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
+from s2a_bench.experiments.model_validity.rows import VALIDITY
 from s2a_bench.plan import Parser, SkillParsed, choose_format, parse_skills
 from s2a_bench.store.run import read_run
 
@@ -66,7 +67,7 @@ def test_a_row_an_answer_is_kept_with_its_text_and_counts(folder: Path) -> None:
     kept = read_run(folder)
     assert kept.manifest["command"] == "model validity"
     assert kept.manifest["model"]["dummy"] is True
-    rows = kept.tables["validity"]
+    rows = kept.table(VALIDITY)
     assert len(rows) == 2 * 2 * 3
     assert sorted(rows["seed"].unique()) == [0, 1, 2]
     held = rows[rows["grammar"]]
@@ -85,7 +86,7 @@ def test_the_counts_are_those_of_the_text(folder: Path) -> None:
 
     kept = read_run(folder)
     format_ = choose_format(parse_skills(FEW, "few.toml"), 4, Tokenizer(Path(kept.manifest["model"]["model"])), 5)
-    for row in kept.tables["validity"].to_dict("records"):
+    for row in kept.table(VALIDITY).to_dict("records"):
         if row["format"] == "4":
             parser = Parser(format_)
             events = [*parser.feed(row["text"]), *parser.close()][:5]

@@ -10,6 +10,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
+from s2a_bench.experiments.study.rows import STUDIES
 from s2a_bench.store.run import read_run
 
 ROOT = Path(__file__).parent.parent.parent
@@ -38,7 +39,7 @@ def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
     assert kept.manifest["state"] == "finished"
     assert kept.manifest["seeds"] == {"study": 0}
     assert (folder / "studies.parquet").exists()
-    rows = kept.tables["studies"]
+    rows = kept.table(STUDIES)
     assert len(rows) == 3 * 17
     assert (rows["plans"] == 100).all()
     for name in ("N -2", "L x 1.25", "gap x 2"):
@@ -55,7 +56,7 @@ def test_json_is_one_object_that_keeps_its_schema(tmp_path: Path) -> None:
     jsonschema.validate(found, schema)
     assert found["command"] == "study-misfit"
     assert [doubt["code"] for doubt in found["warnings"]] == ["few-calibration-plans"]
-    rows = read_run(Path(found["run"])).tables["studies"]
+    rows = read_run(Path(found["run"])).table(STUDIES)
     assert [cell["p_any_stall"] for cell in found["cells"]] == list(rows["p_any_stall"])
     assert [cell["condition"] for cell in found["cells"]] == list(rows["condition"])
     with pytest.raises(jsonschema.ValidationError):

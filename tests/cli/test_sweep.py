@@ -15,6 +15,7 @@ import jsonschema
 import pandas as pd
 import pytest
 
+from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.store.run import read_run
 from s2a_bench.store.sweep import Sweep, read_sweep
 
@@ -101,7 +102,7 @@ def children(pid: int) -> list[int]:
 
 def numbers(found: Sweep) -> pd.DataFrame:
     """Return every timeline of a sweep, by its cell."""
-    rows = [run.tables["timelines"].assign(seed=run.manifest["seeds"]["plans"]) for _, run in found.runs()]
+    rows = [run.table(TIMELINES).assign(seed=run.manifest["seeds"]["plans"]) for _, run in found.runs()]
     return pd.concat(rows, ignore_index=True)
 
 

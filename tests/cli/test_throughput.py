@@ -12,6 +12,7 @@ from typing import Any
 import jsonschema
 import pytest
 
+from s2a_bench.experiments.throughput.rows import REFERENCE
 from s2a_bench.store.run import Run, read_run
 from tests.llama_bench_stand_in import install
 
@@ -70,7 +71,7 @@ def test_in_process_http_and_ros_stand_beside_llama_bench(tmp_path: Path) -> Non
     kept = only_run(tmp_path / "r")
     prompts = set(kept.samples["prompt_n"])
     assert len(prompts) == 1
-    assert set(kept.tables["reference"]["depth"]) == prompts  # like with like: as deep as our prompts are long
+    assert set(kept.table(REFERENCE)["depth"]) == prompts  # like with like: as deep as our prompts are long
     assert whole["reference"]["depths"] == [int(next(iter(prompts)))]
     assert kept.manifest["configuration"]["engine"]["sampling"] == "greedy"
     answers = kept.tokens.groupby("request_id")["text"].apply("".join).groupby(lambda name: name.rsplit("-", 1)[1])
@@ -145,5 +146,5 @@ def test_the_real_llama_bench_understands_what_it_is_asked(tmp_path: Path) -> No
     settings = ["--kv-type", "q8_0", "--batch", "64", "--reference", os.environ[REAL]]
     reference = valid(run(*SMALL, *settings, "--json", output=tmp_path).stdout)["reference"]
     assert reference["decode_tokens_per_s"]["n"] == 2
-    facts = json.loads(only_run(tmp_path).tables["reference"]["facts"].iloc[0])
+    facts = json.loads(only_run(tmp_path).table(REFERENCE)["facts"].iloc[0])
     assert (facts["n_batch"], facts["type_k"], facts["n_threads"], facts["n_gpu_layers"]) == (64, "q8_0", 1, 0)

@@ -12,6 +12,7 @@ from typing import Any
 import jsonschema
 import pytest
 
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.store.run import Run, read_run
 
 ROOT = Path(__file__).parent.parent.parent
@@ -99,8 +100,8 @@ def test_naive_and_stream_to_act_end_at_the_same_instant(whole: dict[str, Any]) 
 def test_the_run_folder_holds_skills_tokens_tables_figure_and_trace(whole: dict[str, Any]) -> None:
     kept = read_run(Path(whole["run"]))
     assert kept.manifest["state"] == "finished"
-    assert len(kept.tables["timelines"]) == 36
-    assert len(kept.tables["skills"]) == 36 * 8
+    assert len(kept.table(TIMELINES)) == 36
+    assert len(kept.table(SKILLS)) == 36 * 8
     assert len(kept.tokens) == 3 * 8 * (6 + 4 + 2 + 1)
     files = {str(path.relative_to(kept.path)) for path in kept.path.rglob("*") if path.is_file()}
     for name in ("timelines", "waiting", "motion", "skills"):

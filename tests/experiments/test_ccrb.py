@@ -12,6 +12,7 @@ import pytest
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.ccrb.view.figures import build_scenario
 from s2a_bench.experiments.ccrb.view.outcomes import Share, rate_span, rate_span_here, scenes_of, share_of, words
@@ -33,7 +34,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Run]:
 
 
 def test_at_the_operating_point_the_papers_outcome_comes_about(made: Callable[..., Run]) -> None:
-    rows = made().tables["rollouts"].set_index("policy")
+    rows = made().table(ROLLOUTS).set_index("policy")
     assert rows["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "none"}
     assert rows["stalls"].to_dict() == {"naive": 4, "wait-then-act": 0, "stream-to-act": 0}
     starts = {"naive": 1_750_000_000, "wait-then-act": 6_750_000_000, "stream-to-act": 3_550_000_000}
@@ -69,7 +70,7 @@ def test_acting_at_once_is_more_often_better_than_worse(made: Callable[..., Run]
 
 def test_with_an_idm_follower_the_operating_point_turns_round(made: Callable[..., Run]) -> None:
     run = made(follower="idm", **GRID)
-    point = run.tables["rollouts"][run.tables["rollouts"]["study"] == "point"].set_index("policy")
+    point = run.table(ROLLOUTS)[run.table(ROLLOUTS)["study"] == "point"].set_index("policy")
     assert point["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "rear"}
     assert point["rear_impact_mps"]["stream-to-act"] > point["rear_impact_mps"]["naive"] + 1
     assert rate_span_here(run, "stop") is None
@@ -89,7 +90,7 @@ def test_random_scenarios_repeat_by_their_seed(tmp_path: Path) -> None:
     for seed in (3, 3, 4):
         with RunProgress() as progress:
             run = read_run(run_ccrb(CcrbConfig(random=10, seed=seed), tmp_path, progress))
-        again.append(run.tables["rollouts"].drop(columns="cell").to_csv())
+        again.append(run.table(ROLLOUTS).drop(columns="cell").to_csv())
     assert again[0] == again[1] != again[2]
 
 
@@ -131,14 +132,14 @@ def test_the_interval_is_clopper_pearsons() -> None:
 
 
 def test_the_deadline_makes_stream_to_act_start_earlier_where_it_must(made: Callable[..., Run]) -> None:
-    rows = made(ttc=True, front_gap_m=30.0).tables["rollouts"].set_index("policy")
+    rows = made(ttc=True, front_gap_m=30.0).table(ROLLOUTS).set_index("policy")
     stream, timed = rows.loc["stream-to-act"], rows.loc["s2a-ttc"]
     assert timed["deadline_ns"] < stream["start_ns"]
     assert timed["start_ns"] == pytest.approx(timed["deadline_ns"], abs=1000)
     assert not timed["late"]
     assert timed["stalls"] == 0
     assert timed["min_front_gap_m"] > stream["min_front_gap_m"] or timed["outcome"] == "none"
-    late = made(ttc=True, front_gap_m=12.0, lead_decel_mps2=6.0).tables["rollouts"].set_index("policy").loc["s2a-ttc"]
+    late = made(ttc=True, front_gap_m=12.0, lead_decel_mps2=6.0).table(ROLLOUTS).set_index("policy").loc["s2a-ttc"]
     assert late["late"]
     assert late["start_ns"] == 1_750_000_000
 

@@ -15,12 +15,15 @@ from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.live import run_ccrb_live
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.view.as_json import ccrb_to_json
 from s2a_bench.experiments.ccrb.view.figures import build_scenario
 from s2a_bench.experiments.ccrb.view.outcomes import origin_notes, token_times_s
 from s2a_bench.experiments.timeline.live.config import LiveConfig
+from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.inference import EngineConfig
+from s2a_bench.store.requests import SAMPLES, TOKENS
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.trace import Trace
 from s2a_bench.transport.loopback import LoopbackClient
@@ -62,7 +65,7 @@ def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: Run
     token_ns = np.rint(np.array(token_times_s(paced)) * 1e9).astype(np.int64)
     assert len(token_ns) == N * L
     arrivals_ns = token_ns[L - 1 :: L]
-    skills = paced.tables["skills"]
+    skills = paced.table(SKILLS)
     by_policy = {cell.rsplit("/", 1)[1]: rows for cell, rows in skills.groupby("cell", sort=False)}
     assert list(by_policy) == ["naive", "wait-then-act", "stream-to-act"]
     for rows in by_policy.values():
@@ -75,14 +78,14 @@ def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: Run
 
 
 def test_what_is_driven_is_the_scenarios_plan_and_not_the_models(paced: Run) -> None:
-    assert list(paced.tables["skills"]["text"][:N]) == ["set_speed(33.3)", "set_speed(16.7)", "set_speed(0)"]
+    assert list(paced.table(SKILLS)["text"][:N]) == ["set_speed(33.3)", "set_speed(16.7)", "set_speed(0)"]
 
 
 def test_each_request_has_a_picture_of_its_own_and_the_warm_up_is_marked(paced: Run) -> None:
-    samples = paced.tables["samples"]
+    samples = paced.table(SAMPLES)
     assert list(samples["frame_index"]) == [0, 1]
     assert list(samples["warmup"]) == [True, False]
-    assert set(paced.tables["tokens"]["request_id"]) == set(samples["request_id"])
+    assert set(paced.table(TOKENS)["request_id"]) == set(samples["request_id"])
     assert paced.manifest["configuration"]["live"]["source"] == "scenario"
 
 
@@ -108,7 +111,7 @@ def test_the_figure_marks_every_token(paced: Run) -> None:
 
 def test_a_replayed_profile_stays_emulated(replayed: LiveConfig, tmp_path: Path) -> None:
     run = drive(replayed, tmp_path / "runs")
-    assert run.tables["rollouts"]["emulated"].all()
+    assert run.table(ROLLOUTS)["emulated"].all()
     first = origin_notes(run)[0]
     assert first.startswith("EMULATED (replayed) tokens over loopback; car simulated. 1")
     assert first.endswith(" tokens/s came.")
@@ -129,4 +132,4 @@ def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
     with pytest.raises(TransportError, match=r"loopback: 1 of 3 skills came; .*tokens\.csv has what the model wrote"):
         drive(replayed, tmp_path / "runs")
     (folder,) = (tmp_path / "runs").iterdir()
-    assert len(read_run(folder).tables["tokens"]) == 2 * L
+    assert len(read_run(folder).table(TOKENS)) == 2 * L

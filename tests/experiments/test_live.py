@@ -22,6 +22,7 @@ from s2a_bench.experiments.timeline.live.asks import asks_of, prior_of
 from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.experiments.timeline.live.run import run_live
 from s2a_bench.experiments.timeline.real_time import run_real_time
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.view.as_json import timelines_to_json
 from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_of
 from s2a_bench.experiments.timeline.view.figures import write_timeline_figures
@@ -198,7 +199,7 @@ def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
     assert codes.count("plan-stream-error") == 1
     assert {found["arrived"] for found in executions.values()} == {tokens // 6}
     assert next(found["started"] for name, found in executions.items() if "wait-then-act" in name) == 0
-    assert len(run.tables["timelines"]) == len([found for found in executions.values() if found["started"]])
+    assert len(run.table(TIMELINES)) == len([found for found in executions.values() if found["started"]])
     assert len(run.tokens) == tokens
 
 
@@ -213,7 +214,7 @@ def test_prose_is_not_executed(config: LiveConfig, tmp_path: Path, monkeypatch: 
     run, _ = live(config, tmp_path)
     executions = run.manifest["executions"].values()
     assert [(found["outcome"], found["started"]) for found in executions] == [("invalid-line", 0)] * 3
-    assert run.tables["timelines"].empty
+    assert run.table(TIMELINES).empty
 
 
 def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
@@ -235,7 +236,7 @@ def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
     run = read_run(view.folder)
     assert run.manifest["state"] == "failed"
     assert {found["outcome"] for found in run.manifest["executions"].values()} == {"stream-error"}
-    skills = run.tables["skills"]
+    skills = run.table(SKILLS)
     assert len(skills[skills["cell"].str.endswith("/naive")]) == 1
     assert (skills["end_ns"] - skills["start_ns"] >= 0.24e9 - 1e6).all()
 

@@ -16,6 +16,8 @@ from s2a_bench.experiments.study import drift as study_drift
 from s2a_bench.experiments.study import jitter as study_jitter
 from s2a_bench.experiments.study import misfit as study_misfit
 from s2a_bench.experiments.study import targets as study_targets
+from s2a_bench.experiments.study.rows import STUDIES as TABLE
+from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.run import STUDIES, StudyConfig, cells_of, results, run_study
 from s2a_bench.experiments.study.view.as_json import study_to_json
 from s2a_bench.experiments.study.view.figures import write_study_figure
@@ -27,8 +29,6 @@ from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.policy.stream_to_act import StreamToAct
 from s2a_bench.store.run import read_run
-from s2a_bench.store.schema import STUDIES as TABLE
-from s2a_bench.store.schema import StudyRow
 
 SCHEMA = Path(__file__).parents[2] / "docs" / "schema" / "s2a-bench-1.json"
 TARGETS = [
@@ -229,8 +229,8 @@ def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest
     assert progress.done == len(cells_of(name, config))
     run = read_run(folder)
     assert run.manifest["configuration"]["study"] == name
-    assert set(run.tables["studies"]["study"]) == {name}
-    assert (run.tables["studies"]["plans"] > 0).all()
+    assert set(run.table(STUDIES)["study"]) == {name}
+    assert (run.table(STUDIES)["plans"] > 0).all()
     tables = study_tables(run)
     assert all(len(row) == len(table.header) for table in tables for row in table.rows)
     assert all("nan" not in entry.lower() for table in tables for row in table.rows for entry in row)
@@ -238,7 +238,7 @@ def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest
     assert [path.name for path in write_study_figure(run)] == [f"{name}.png", f"{name}.pdf"]
     told = study_to_json(run)
     jsonschema.validate(told, json.loads(SCHEMA.read_text()))
-    assert len(told["cells"]) == len(run.tables["studies"])
+    assert len(told["cells"]) == len(run.table(STUDIES))
     assert [each["what"] for each in told.get("targets", [])] == (TARGETS if name == "targets" else [])
 
 

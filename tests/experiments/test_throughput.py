@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from s2a_bench.errors import EngineError, UsageError
 from s2a_bench.experiments.throughput.llama_bench import LlamaBench
+from s2a_bench.experiments.throughput.rows import REFERENCE
 from s2a_bench.experiments.throughput.run import ThroughputConfig
 from s2a_bench.harness.llama_flags import llama_flags
 from s2a_bench.harness.plan import LatencyConfig
@@ -128,7 +129,7 @@ def test_the_reference_computes_with_our_settings_behind_our_prompts_length(tmp_
     bench(Place(1, 0, warmup=False))
     writer.finish("finished")
     kept = read_run(writer.path)
-    rows = kept.tables["reference"]
+    rows = kept.table(REFERENCE)
     assert list(rows["warmup"]) == [True, False]
     assert list(rows["block"]) == [0, 1]
     assert list(rows["depth"]) == [250, 260]

@@ -18,15 +18,16 @@ from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.experiments.timeline.config import TimelineConfig, settings
 from s2a_bench.experiments.timeline.plans import board_of_profile, gaps_of
 from s2a_bench.experiments.timeline.policies import draw, learn
-from s2a_bench.experiments.timeline.rows import KEPT_PLANS, Setting, timeline_rows
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.run import run_timeline
+from s2a_bench.experiments.timeline.to_rows import KEPT_PLANS, Setting, timeline_rows
 from s2a_bench.experiments.timeline.traces import recordings
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.conformal import Calibration
 from s2a_bench.policy.schedule import safe_start
+from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.store.schema import SampleRow, TokenRow
 
 ORIN = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
 JITTERY = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,), jitter="profile", plans=300)
@@ -46,7 +47,7 @@ def ran(config: TimelineConfig, output: Path) -> Run:
 
 
 def test_every_policy_meets_the_same_arrivals(tmp_path: Path) -> None:
-    rows = ran(JITTERY, tmp_path).tables["timelines"]
+    rows = ran(JITTERY, tmp_path).table(TIMELINES)
     for _, same in rows.groupby("plan"):
         assert len(same) == 3
         assert same["request_id"].nunique() == same["last_arrival_ns"].nunique() == same["safe_start_ns"].nunique() == 1
@@ -65,8 +66,8 @@ def test_a_seed_repeats_a_run_and_another_seed_does_not(tmp_path: Path) -> None:
 
 def test_skills_stalls_and_metrics_of_a_plan_fit_together(tmp_path: Path) -> None:
     run = ran(JITTERY, tmp_path)
-    rows = run.tables["timelines"].set_index(["cell", "request_id"])
-    for key, skills in run.tables["skills"].groupby(["cell", "request_id"]):
+    rows = run.table(TIMELINES).set_index(["cell", "request_id"])
+    for key, skills in run.table(SKILLS).groupby(["cell", "request_id"]):
         row = rows.loc[key]
         assert list(skills["index"]) == list(range(8))
         assert row["start_ns"] == skills["start_ns"].iloc[0]
@@ -77,8 +78,8 @@ def test_skills_stalls_and_metrics_of_a_plan_fit_together(tmp_path: Path) -> Non
         assert (skills["start_ns"] >= skills["arrival_ns"]).all()
         longest = skills["end_ns"] - skills["start_ns"] - skills["most_ns"]
         assert longest.max() <= 1
-    assert len(run.tables["skills"]) == 3 * KEPT_PLANS * 8
-    moving = run.tables["timelines"][run.tables["timelines"]["rms_jerk"].notna()]
+    assert len(run.table(SKILLS)) == 3 * KEPT_PLANS * 8
+    moving = run.table(TIMELINES)[run.table(TIMELINES)["rms_jerk"].notna()]
     assert set(moving["plan"]) == set(range(KEPT_PLANS))
 
 
@@ -97,7 +98,7 @@ def test_stream_to_act_keeps_its_promise_where_naive_and_the_mean_rule_stall(tmp
     assert share["naive"] > 0.9
     (found,) = run.manifest["calibrations"].values()
     assert found["plans"] == 400
-    assert found["caution"] == run.tables["timelines"].query("policy == 'stream-to-act'")["caution"].iloc[0] > 0
+    assert found["caution"] == run.table(TIMELINES).query("policy == 'stream-to-act'")["caution"].iloc[0] > 0
 
 
 @given(
@@ -299,7 +300,7 @@ def test_lambda_that_nothing_can_promise_is_a_warning(tmp_path: Path, monkeypatc
 
 def test_each_setting_is_a_cell_a_policy(tmp_path: Path) -> None:
     config = TimelineConfig(profiles=("rtx-4080",), tokens_per_skill=(4, 1), n_skills=(2, 3), t_nom_s=(0.5, 2.0))
-    rows = ran(config, tmp_path).tables["timelines"]
+    rows = ran(config, tmp_path).table(TIMELINES)
     assert Counter(rows["policy"]) == dict.fromkeys(config.policies, 8)
     assert rows["cell"].nunique() == 24
     assert (rows["caution"].isna() == (rows["policy"] != "stream-to-act")).all()
@@ -307,7 +308,7 @@ def test_each_setting_is_a_cell_a_policy(tmp_path: Path) -> None:
 
 def test_a_plan_of_hours_has_no_sampled_motion(tmp_path: Path) -> None:
     config = TimelineConfig(profiles=(), rates=(0.001,), tokens_per_skill=(6,), t_nom_s=(4000.0,))
-    rows = ran(config, tmp_path).tables["timelines"]
+    rows = ran(config, tmp_path).table(TIMELINES)
     assert rows[["rms_jerk", "peak_jerk", "sparc"]].isna().all().all()
     assert rows["stalls"].notna().all()
 

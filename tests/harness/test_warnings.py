@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from s2a_bench.harness.warnings import Counters, SampleGuard
-from s2a_bench.store.schema import SampleRow
+from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import Mark
 
 GOOD: list[Mark] = [("", 0), ("network", 90), ("", 91), ("inference", 500), ("return", 600)]

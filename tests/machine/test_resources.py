@@ -21,9 +21,9 @@ from s2a_bench.machine.resources.host import CpuTimes, Memory
 from s2a_bench.machine.resources.jetson import Jtop, Tegrastats, parse_tegrastats
 from s2a_bench.machine.resources.nvidia import Nvml
 from s2a_bench.machine.resources.rapl import Rapl
+from s2a_bench.machine.resources.rows import RESOURCES
 from s2a_bench.machine.resources.sampler import Sampler
 from s2a_bench.store.run import RunWriter, read_run
-from s2a_bench.store.schema import RESOURCES
 
 S = 1_000_000_000
 
@@ -411,7 +411,7 @@ def test_rows_land_in_the_run_folder(tmp_path: Path) -> None:
     with RunWriter.create(tmp_path, "latency", {}) as run:
         sampler.flush(run)
         sampler.flush(run)
-    table = read_run(run.path).tables["resources"]
+    table = read_run(run.path).table(RESOURCES)
     assert table["at_ns"].tolist() == [S // 2]
     assert table["client_rss_bytes"].tolist() == [4096]
     assert table["gpu_power_w"].isna().all()

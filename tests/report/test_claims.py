@@ -11,14 +11,16 @@ import pytest
 
 from s2a_bench.experiments.boundary.run import BoundaryConfig, run_boundary
 from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.report.claims.checks import CLAIMS, is_board
 from s2a_bench.report.claims.claim import CONFIRMED, NO_RUN, REFUTED, UNTESTABLE
 from s2a_bench.report.claims.verdicts import Judged, claim_table, judge_claims
+from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.store.schema import SampleRow, TokenRow
 
 MakeRun = Callable[..., Run]
 MakeRow = Callable[..., SampleRow]
@@ -224,7 +226,7 @@ def test_timelines_at_other_rates_say_nothing_of_the_papers_boards(tmp_path: Pat
 
 
 def test_a_stall_of_stream_to_act_refutes_its_claim(timelines: Run) -> None:
-    rows = timelines.tables["timelines"].copy()
+    rows = timelines.table(TIMELINES).copy()
     mine = (rows["policy"] == "stream-to-act") & (rows["board"] == "jetson-orin-nano")
     rows.loc[mine, "stalls"] = 2
     rows.loc[mine, "stall_ns"] = 3_000_000_000
@@ -266,13 +268,13 @@ def test_the_operating_point_bears_the_outcomes_out_and_the_diagram_does_not(ccr
 
 
 def test_another_outcome_refutes(ccrb: Run) -> None:
-    rows = ccrb.tables["rollouts"].copy()
+    rows = ccrb.table(ROLLOUTS).copy()
     rows.loc[(rows["study"] == "point") & (rows["policy"] == "naive"), "outcome"] = "none"
     assert claim_of("hit from behind", replace(ccrb, tables=ccrb.tables | {"rollouts": rows})).verdict == REFUTED
 
 
 def test_without_a_phase_diagram_nothing_is_generic(ccrb: Run) -> None:
-    rows = ccrb.tables["rollouts"]
+    rows = ccrb.table(ROLLOUTS)
     point = replace(ccrb, tables=ccrb.tables | {"rollouts": rows[rows["study"] == "point"]})
     judged = claim_of("Naive is less safe", point)
     assert judged.verdict == UNTESTABLE

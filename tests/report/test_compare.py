@@ -24,8 +24,8 @@ from s2a_bench.report.compare.files import write_comparison
 from s2a_bench.report.compare.gates import judge, read_gate
 from s2a_bench.report.compare.metrics import KINDS
 from s2a_bench.report.compare.tables import compare_csv, compare_table, percent
+from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.store.schema import SampleRow
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-compare-1.json").read_text())
 STAGES = {"capture": 1.0, "image_encode": 2.0, "network": 4.0, "inference": 0.5, "return": 2.5}

@@ -26,8 +26,9 @@ from s2a_bench.report.page.chapters import MOST_CHAPTERS, read_chapters
 from s2a_bench.report.page.files import Outputs, make_report, write_report
 from s2a_bench.report.page.lanes import panels_of, ticks_of
 from s2a_bench.report.page.plots import inline
+from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.store.schema import CELLS, CellRow, SampleRow
+from s2a_bench.store.sweep import CELLS, CellRow
 from s2a_bench.writers.latex import PREAMBLE, document, escape, to_siunitx
 from s2a_bench.writers.tables import ABSENT, TextTable
 

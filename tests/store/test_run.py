@@ -13,8 +13,8 @@ import pytest
 
 from s2a_bench.errors import StoreError
 from s2a_bench.store.files import read_csv, read_parquet
+from s2a_bench.store.requests import FRAMES, SAMPLES, TOKENS, FrameRow, SampleRow, TokenRow
 from s2a_bench.store.run import RunWriter, read_run
-from s2a_bench.store.schema import FRAMES, SAMPLES, TOKENS, FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import STAGES
 
 CHAIN = [
@@ -301,12 +301,12 @@ def test_a_full_disk_names_the_file_and_leaves_whole_records(
 ) -> None:
     run = open_run()
     run.sample(sample("r1"))
-    file = run._files["samples"]._file
-    monkeypatch.setattr(run._files["samples"], "_file", FullDisk(file))
+    file = run._files[SAMPLES]._file
+    monkeypatch.setattr(run._files[SAMPLES], "_file", FullDisk(file))
     with pytest.raises(StoreError, match=r"samples\.csv: No space left on device"):
         run.sample(sample("r2"))
     assert (run.path / "samples.csv").read_bytes().endswith(b"\n")
-    monkeypatch.setattr(run._files["samples"], "_file", file)
+    monkeypatch.setattr(run._files[SAMPLES], "_file", file)
     run.sample(sample("r3"))
     assert read_run(run.path).samples["request_id"].tolist() == ["r1", "r3"]
 
@@ -357,7 +357,7 @@ def test_a_damaged_csv_is_an_error_and_not_a_number(open_run: Callable[..., RunW
     path = run.path / "samples.csv"
     path.write_bytes(path.read_bytes().replace(b"11850", b"many"))
     with pytest.raises(StoreError, match=r"samples\.csv is damaged"):
-        read_run(run.path)
+        _ = read_run(run.path).samples
 
 
 def test_the_manifest_holds_only_strict_json(tmp_path: Path) -> None:

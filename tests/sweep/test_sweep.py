@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.sweep import read_sweep
+from s2a_bench.store.sweep import CELLS, read_sweep
 from s2a_bench.sweep import Cell, Command, Outcome
 from s2a_bench.sweep.file import SweepFile, read_sweep_file
 from s2a_bench.sweep.grid import expand, rounds
@@ -294,7 +294,7 @@ def sit(
     folder: Path, workers: Fake, *, plan: Plan = PLAN, retry: bool = False, clock: VirtualClock | None = None
 ) -> Quiet:
     progress = Quiet()
-    with RunWriter.reopen(folder) as writer:
+    with RunWriter.reopen(folder, [CELLS]) as writer:
         run = SweepRun(writer, plan, progress, clock)
         run.work(run.pending(retry_failed=retry), workers)
         run.finish()

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 
 from benchmarks.sweep_scaling import measure, part, work
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.store.sweep import Sweep, read_sweep
 
 ray = pytest.importorskip("ray", reason="the extra 'ray' is not installed")
@@ -88,7 +89,7 @@ def only(folder: Path) -> Sweep:
 
 
 def numbers(found: Sweep) -> pd.DataFrame:
-    return pd.concat([run.tables["timelines"] for _, run in found.runs()], ignore_index=True)
+    return pd.concat([run.table(TIMELINES) for _, run in found.runs()], ignore_index=True)
 
 
 def test_virtual_cells_on_two_nodes_have_the_numbers_that_they_have_without_ray(cluster: Any, tmp_path: Path) -> None:
@@ -121,7 +122,7 @@ def test_the_cell_of_a_lost_node_runs_again_where_the_board_is_then(cluster: Any
     assert list(found.attempts["attempt"]) == [1, 1]
     assert set(found.cells["board"]) == {"orin"}
     assert found.manifest["boards"].keys() == {"orin"}
-    assert sorted(len(run.tables["skills"]) for _, run in found.runs()) == [7, 8]
+    assert sorted(len(run.table(SKILLS)) for _, run in found.runs()) == [7, 8]
 
 
 @pytest.mark.parametrize(

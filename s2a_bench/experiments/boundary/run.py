@@ -13,6 +13,7 @@ import numpy as np
 from s2a_bench.boards.profile import Profile
 from s2a_bench.boards.search import load_profile
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
 from s2a_bench.experiments.study.worlds import generator
 from s2a_bench.experiments.timeline.plans import NO_JITTER, gaps_of
 from s2a_bench.harness.ranges import require
@@ -20,7 +21,6 @@ from s2a_bench.machine import environment
 from s2a_bench.policy.boundary import Grid, analytic, simulate
 from s2a_bench.policy.conformal import TOLERANCE_S
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import BOUNDARY, BoundaryRow
 
 if TYPE_CHECKING:
     from s2a_bench.harness.progress import Progress

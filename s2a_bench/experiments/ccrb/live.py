@@ -16,12 +16,14 @@ import numpy as np
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.plans import Prepared, complete
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.run import drive_point
 from s2a_bench.experiments.timeline.live.asks import Ask
 from s2a_bench.experiments.timeline.live.asks import prepare as prepare_policy
 from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.experiments.timeline.live.link import Link, word
-from s2a_bench.experiments.timeline.rows import Setting
+from s2a_bench.experiments.timeline.rows import SKILLS
+from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
 from s2a_bench.plan import Parser
@@ -31,8 +33,8 @@ from s2a_bench.runtime.events import Event, SkillCame
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.scenario import simulator
 from s2a_bench.scenario.view import SceneSource
+from s2a_bench.store.requests import SAMPLES, TOKENS
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import ROLLOUTS, SAMPLES, SKILLS, TOKENS, TRAJECTORIES
 
 if TYPE_CHECKING:
     from s2a_bench.harness.progress import Progress

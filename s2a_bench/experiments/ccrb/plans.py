@@ -11,7 +11,7 @@ import numpy as np
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.timeline.config import settings
 from s2a_bench.experiments.timeline.policies import draw, learn
-from s2a_bench.experiments.timeline.rows import Setting
+from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.scenario.ccrb import KMH, DrivingPlan, braking_plan, plan_decel, start_deadline
 from s2a_bench.scenario.ttc import NAME as TTC

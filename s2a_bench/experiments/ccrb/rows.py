@@ -1,88 +1,94 @@
-"""Roll-outs as rows: what was tried and what became of it, in the columns of a run folder."""
+"""The rows of a CCRB run: roll-outs, and the trajectories of those that are shown."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Final
 
-import numpy as np
-
-from s2a_bench.experiments.timeline.rows import to_ns
-from s2a_bench.policy import Schedule
-from s2a_bench.policy.metrics import stalls
-from s2a_bench.policy.motion import peak_jerk, rms_jerk, sparc
-from s2a_bench.scenario import EGO, LEAD, REAR
-from s2a_bench.scenario.drive import Trajectory
-from s2a_bench.scenario.ego import PHASES
-from s2a_bench.scenario.outcome import Outcomes
-from s2a_bench.store.schema import RolloutRow, TrajectoryRow
-
-_TOLERANCE_S = 0.02
-"""Shorter stalls do not count (POLICY section 1)."""
-_METRICS = ("min_front_gap_m", "min_rear_gap_m", "min_front_ttc_s", "min_rear_ttc_s", "required_decel_mps2")
+from s2a_bench.store.schema import Table
 
 
-def rollout_rows(
-    about: Mapping[str, Any], schedule: Schedule, outcomes: Outcomes, *, motion: Mapping[str, Any] | None = None
-) -> Iterator[RolloutRow]:
-    """Describe M roll-outs; what ``about`` says is one value for all, or an array with one each."""
-    stall_s = stalls(schedule)
-    rollouts = len(outcomes.code)
-    end_s = schedule.start_s[-1] + schedule.duration_s[-1]
-    shared = {name: value for name, value in about.items() if not isinstance(value, np.ndarray)}
-    own = {name: value for name, value in about.items() if isinstance(value, np.ndarray)}
-    for place in range(rollouts):
-        metrics: dict[str, Any] = {name: _finite(getattr(outcomes, name)[place]) for name in _METRICS}
-        yield RolloutRow(
-            **shared,
-            **{name: value[place].item() for name, value in own.items()},
-            start_ns=to_ns(schedule.start_s[0, place]),
-            end_ns=to_ns(end_s[place]),
-            stalls=int((stall_s[:, place] > _TOLERANCE_S).sum()),
-            stall_ns=to_ns(stall_s[:, place].sum()),
-            outcome=outcomes.name(place),
-            impact_speed_mps=_finite(outcomes.impact_mps[place]),
-            front_impact_mps=_finite(outcomes.front_impact_mps[place]),
-            rear_impact_mps=_finite(outcomes.rear_impact_mps[place]),
-            **metrics,
-            **(motion or {}),
-        )
+@dataclass(frozen=True, slots=True)
+class RolloutRow:
+    """One roll-out of the driving scenario: what was tried, and what became of the cars. SI units.
+
+    ``study`` is what it belongs to: point, phase or random; ``draw`` counts its scenarios. ``title`` names the board.
+    ``late`` says that s2a-ttc could not keep the deadline ``deadline_ns`` (S_front) without stalls; null for others.
+    Studies end when the outcome is decided, and have no least rear gap but that of an impact.
+    Impact speeds are null without that impact, times to collision where the cars never closed in, the required
+    deceleration (DRAC, to the lead) with a front impact, motion where no trajectory is kept, ``prompt_s`` where a model
+    took what it took.
+    """
+
+    cell: str
+    study: str
+    draw: int
+    policy: str
+    board: str
+    title: str
+    emulated: bool
+    simulator: str
+    follower: str
+    gap_behaviour: str
+    reflex: bool
+    lane_change: bool
+    tokens_per_s: float
+    prompt_s: float | None
+    tokens_per_skill: int
+    n_skills: int
+    t_nom_s: float
+    speed_mps: float
+    plan_decel_mps2: float
+    front_gap_m: float
+    lead_decel_mps2: float
+    rear_gap_m: float
+    reaction_s: float
+    start_ns: int
+    end_ns: int
+    stalls: int
+    stall_ns: int
+    deadline_ns: int
+    late: bool | None
+    outcome: str
+    impact_speed_mps: float | None
+    front_impact_mps: float | None
+    rear_impact_mps: float | None
+    min_front_gap_m: float
+    min_rear_gap_m: float | None
+    min_front_ttc_s: float | None
+    min_rear_ttc_s: float | None
+    required_decel_mps2: float | None
+    rms_jerk: float | None = None
+    peak_jerk: float | None = None
+    sparc: float | None = None
 
 
-def motion_of(path: Trajectory) -> dict[str, float]:
-    """Return jerk and smoothness of the ego of a single roll-out, from the request until it rests or crashes."""
-    speed = path.speed_mps[:, EGO, 0]
-    if len(speed) < 3:  # noqa: PLR2004 - over at once
-        return {}
-    step_s = float(path.time_s[1])
-    return {"rms_jerk": rms_jerk(speed, step_s), "peak_jerk": peak_jerk(speed, step_s), "sparc": sparc(speed, step_s)}
+@dataclass(frozen=True, slots=True)
+class TrajectoryRow:
+    """The three cars of a shown roll-out at one time from the request; positions are bumper to bumper.
+
+    ``phase`` says what the ego does: waiting, acting, gap or done; ``skill`` counts from 0, -1 before the first.
+    """
+
+    cell: str
+    at_ns: int
+    phase: str
+    skill: int
+    lead_position_m: float
+    ego_position_m: float
+    rear_position_m: float
+    ego_lateral_m: float
+    lead_speed_mps: float
+    ego_speed_mps: float
+    rear_speed_mps: float
+    lead_acceleration_mps2: float
+    ego_acceleration_mps2: float
+    rear_acceleration_mps2: float
 
 
-def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:
-    """List every recorded moment of a single roll-out."""
-    position, speed, acceleration = (
-        values[..., 0] for values in (path.position_m, path.speed_mps, path.acceleration_mps2)
-    )
-    for place, at_s in enumerate(path.time_s):
-        yield TrajectoryRow(
-            cell=cell,
-            at_ns=to_ns(at_s),
-            phase=PHASES[int(path.phase[place, 0])],
-            skill=int(path.skill[place, 0]),
-            lead_position_m=float(position[place, LEAD]),
-            ego_position_m=float(position[place, EGO]),
-            rear_position_m=float(position[place, REAR]),
-            ego_lateral_m=float(path.lateral_m[place, EGO, 0]),
-            lead_speed_mps=float(speed[place, LEAD]),
-            ego_speed_mps=float(speed[place, EGO]),
-            rear_speed_mps=float(speed[place, REAR]),
-            lead_acceleration_mps2=float(acceleration[place, LEAD]),
-            ego_acceleration_mps2=float(acceleration[place, EGO]),
-            rear_acceleration_mps2=float(acceleration[place, REAR]),
-        )
+ROLLOUTS: Final[Table[RolloutRow]] = Table("rollouts", RolloutRow)
+"""One row a roll-out of the driving scenario."""
 
 
-def _finite(value: float) -> float | None:
-    """Return a plain number; None where there is none."""
-    return float(value) if math.isfinite(value) else None
+TRAJECTORIES: Final[Table[TrajectoryRow]] = Table("trajectories", TrajectoryRow)
+"""One row a moment of a shown roll-out."""

@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.plans import Prepared, prepare, skill_texts
-from s2a_bench.experiments.ccrb.rows import motion_of, rollout_rows, trajectory_rows
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.studies import Scenes, phase_scenes, pieces, random_scenes, study_rows
-from s2a_bench.experiments.timeline.rows import skill_rows, to_ns, token_rows
+from s2a_bench.experiments.ccrb.to_rows import motion_of, rollout_rows, trajectory_rows
+from s2a_bench.experiments.timeline.rows import SKILLS
+from s2a_bench.experiments.timeline.to_rows import skill_rows, to_ns, token_rows
 from s2a_bench.machine import environment
 from s2a_bench.scenario import Simulator, simulator
 from s2a_bench.scenario.drive import drive
 from s2a_bench.scenario.ttc import NAME as TTC
+from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import ROLLOUTS, SKILLS, TOKENS, TRAJECTORIES
 
 if TYPE_CHECKING:
     from s2a_bench.harness.progress import Progress

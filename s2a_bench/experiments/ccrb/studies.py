@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.rows import rollout_rows
+from s2a_bench.experiments.ccrb.rows import RolloutRow
+from s2a_bench.experiments.ccrb.to_rows import rollout_rows
 from s2a_bench.experiments.study.worlds import generator
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.policy import Plans, Policy, Schedule
@@ -23,7 +24,6 @@ from s2a_bench.policy.wait_then_act import WaitThenAct
 from s2a_bench.scenario.ccrb import EGO_LEAST_MPS2, LEAST_IMPACT_MPS, Cars, braking_plan, plan_decel, start_deadline
 from s2a_bench.scenario.drive import drive
 from s2a_bench.scenario.longitudinal import Longitudinal
-from s2a_bench.store.schema import RolloutRow
 
 if TYPE_CHECKING:
     pass

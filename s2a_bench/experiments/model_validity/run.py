@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.model_validity.rows import VALIDITY, ValidityRow
 from s2a_bench.harness.ranges import require
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.models import resolve
@@ -15,7 +16,6 @@ from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.machine import environment
 from s2a_bench.plan import Cost, Format, SkillSet, arms, choose_format, load_skills, paper_format, prompt, score
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import VALIDITY, ValidityRow
 from s2a_bench.types import Request
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.errors import StoreError
+from s2a_bench.experiments.model_validity.rows import VALIDITY
 from s2a_bench.policy.conformal import upper_bound
 from s2a_bench.writers.as_json import frame
 from s2a_bench.writers.tables import ABSENT, TextTable
@@ -66,8 +67,8 @@ class Arm:
 
 def arms_of(run: Run) -> list[Arm]:
     """Count a run's answers; raises StoreError where the folder holds none."""
-    rows = run.tables.get("validity")
-    if rows is None or not len(rows):
+    rows = run.table(VALIDITY)
+    if rows.empty:
         raise StoreError(f"{run.path} holds no answers; run s2a-bench model validity first")
     formats = {about["name"]: about for about in run.manifest["formats"]}
     return [

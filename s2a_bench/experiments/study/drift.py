@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.study.rows import row_of
+from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.run import Cell, StudyConfig
+from s2a_bench.experiments.study.to_rows import row_of
 from s2a_bench.experiments.study.worlds import World, generator
 from s2a_bench.policy import Plans, online
 from s2a_bench.policy.conformal import GRID, TOLERANCE_S, Tracker, choose, scores, take
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import Metrics, measure
 from s2a_bench.policy.stream_to_act import StreamToAct
-from s2a_bench.store.schema import StudyRow
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -12,13 +12,13 @@ from functools import partial
 from typing import Final
 
 from s2a_bench.boards.gaps import Bursty, Gaps, Lognormal, Markov, Recorded
-from s2a_bench.experiments.study.rows import study_row
+from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.run import Cell, StudyConfig
+from s2a_bench.experiments.study.to_rows import study_row
 from s2a_bench.experiments.study.worlds import TOKEN_CV, World, generator
 from s2a_bench.policy.conformal import GRID, calibrate
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import QuantileStart, StreamToAct
-from s2a_bench.store.schema import StudyRow
 
 NAME: Final = "frontier"
 PLANS: Final = 4000

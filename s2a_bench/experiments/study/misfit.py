@@ -10,13 +10,13 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from s2a_bench.experiments.study.rows import study_row
+from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.run import Cell, StudyConfig
+from s2a_bench.experiments.study.to_rows import study_row
 from s2a_bench.experiments.study.worlds import World, generator
 from s2a_bench.policy.conformal import calibrate
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import StreamToAct
-from s2a_bench.store.schema import StudyRow
 
 NAME: Final = "misfit"
 PLANS: Final = 4000

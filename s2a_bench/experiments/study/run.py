@@ -11,9 +11,9 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, TypeAlias
 
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.study.rows import STUDIES as TABLE
+from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.policy.conformal import CONFIDENCE, PLANS, check, coarse, upper_bound
-from s2a_bench.store.schema import STUDIES as TABLE
-from s2a_bench.store.schema import StudyRow
 
 if TYPE_CHECKING:
     from s2a_bench.harness.progress import Progress

@@ -13,14 +13,14 @@ from functools import partial
 from itertools import product
 from typing import Final
 
-from s2a_bench.experiments.study.rows import study_row
+from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.run import Cell, StudyConfig
+from s2a_bench.experiments.study.to_rows import study_row
 from s2a_bench.experiments.study.worlds import World, generator
 from s2a_bench.policy.conformal import calibrate
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import MeanStart, QuantileStart, StreamToAct
 from s2a_bench.policy.wait_then_act import WaitThenAct
-from s2a_bench.store.schema import StudyRow
 
 NAME: Final = "targets"
 PLANS: Final = 5000

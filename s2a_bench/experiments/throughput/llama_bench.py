@@ -14,11 +14,11 @@ from typing import Any
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError
+from s2a_bench.experiments.throughput.rows import REFERENCE, ReferenceRow
 from s2a_bench.harness.llama_flags import llama_flags
 from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.harness.session import Place
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import REFERENCE, ReferenceRow
 
 LONGEST_S = 7200
 """A board that writes half a token a second still ends in time."""

@@ -12,7 +12,7 @@ from typing import Final
 from s2a_bench.boards.search import load_profile
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.plans import NO_JITTER, Board, board_of_profile, board_of_rate
-from s2a_bench.experiments.timeline.rows import Setting
+from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.harness.ranges import LEAST_T_NOM_S, require
 from s2a_bench.policy import PlanShape, Timing
 from s2a_bench.policy import policy as policy_of

@@ -12,8 +12,9 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from s2a_bench.clock import SystemClock, now_ns
-from s2a_bench.experiments.timeline.rows import Setting, skill_rows, timeline_rows
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.run import finite
+from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows
 from s2a_bench.harness.progress import Progress
 from s2a_bench.harness.warnings import Doubt
 from s2a_bench.plan import Gap
@@ -25,7 +26,6 @@ from s2a_bench.runtime.executor import Executor
 from s2a_bench.runtime.record import Record, SkillRun
 from s2a_bench.stats import summarise
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import SKILLS, TIMELINES
 
 SWITCH_S: Final = 0.0005
 """How soon Python's threads give way to one another: at the usual 5 ms a busy thread would make starts that late."""

@@ -11,7 +11,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.study.worlds import generator, recorded_plans, with_skills
 from s2a_bench.experiments.timeline.config import TimelineConfig
 from s2a_bench.experiments.timeline.plans import Board
-from s2a_bench.experiments.timeline.rows import Setting
+from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.policy import Policy
 from s2a_bench.policy import policy as policy_of
 from s2a_bench.policy.conformal import Calibration, calibrate

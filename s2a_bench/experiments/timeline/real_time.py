@@ -12,8 +12,9 @@ from s2a_bench.experiments.timeline.config import TimelineConfig, settings
 from s2a_bench.experiments.timeline.execution import Scene, SideBySide, View, jitter_facts, keep, quick_switching
 from s2a_bench.experiments.timeline.plans import Board
 from s2a_bench.experiments.timeline.policies import draw, learn
-from s2a_bench.experiments.timeline.rows import KEPT_PLANS, Setting
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.run import board_facts, calibration_doubts, finite
+from s2a_bench.experiments.timeline.to_rows import KEPT_PLANS, Setting
 from s2a_bench.experiments.timeline.traces import recordings
 from s2a_bench.harness.warnings import Doubt
 from s2a_bench.machine import environment
@@ -24,8 +25,8 @@ from s2a_bench.runtime.events import Requested, SkillCame, StreamEnded, TokenCam
 from s2a_bench.runtime.executor import SILENCE_S
 from s2a_bench.runtime.record import Record
 from s2a_bench.runtime.timed import TimedRobot
+from s2a_bench.store.requests import TOKENS, TokenRow
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import SKILLS, TIMELINES, TOKENS, TokenRow
 
 if TYPE_CHECKING:
     from s2a_bench.policy import Floats

@@ -1,210 +1,105 @@
-"""Timelines as rows: what a policy made of plans, computed or really executed, in the integers of a run folder.
-
-Whoever has run plans (in virtual time, in real time or with a live model) hands over `Plans` and `Schedule` in
-seconds from the request, and gets the rows that every table and figure of timelines is made of.
-"""
+"""The rows of a timeline run: plans under policies, and their skills."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
-import numpy as np
-
-from s2a_bench.policy import Plans, Schedule
-from s2a_bench.policy.conformal import TOLERANCE_S
-from s2a_bench.policy.metrics import Metrics, measure, stalls
-from s2a_bench.policy.motion import peak_jerk, rms_jerk, sparc, speed_profile
-from s2a_bench.policy.schedule import align, least_end, safe_start
-from s2a_bench.store.schema import SkillRow, TimelineRow, TokenRow
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
-
-KEPT_PLANS: Final = 10
-"""As many plans of a cell keep their tokens, skills and motion; the others only their metrics."""
-
-SAMPLE_S: Final = 0.01
-"""How finely the speed is sampled that jerk and SPARC are taken from."""
-
-SHORTEST_MOTION_S: Final = 1e-9
-"""Shorter motions have no jerk and no SPARC: no sample of theirs moves."""
-LONGEST_MOTION_S: Final = 1000.0
-"""Longer motions have none of these: their samples would fill the memory."""
-
-_SHARES: Final = (
-    "stall_ratio",
-    "start_regret",
-    "signed_start_regret",
-    "start_regret_of_wait",
-    "end_regret",
-    "end_regret_of_wait",
-    "end_regret_elastic",
-    "speed_distortion",
-    "fluidity",
-)
+from s2a_bench.store.schema import Table, Value
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
-    """What plans have in common, whatever the policy."""
+class TimelineRow:
+    """One plan under one policy, with its metrics as `policy.metrics` defines them; times count from the request.
 
+    ``board`` is a profile's name, empty where only a rate was given. ``mode`` says what passed the time: ``virtual``
+    (computed), else a clock; ``emulated`` is true where no model answered. ``requested_ns`` is when the clock showed
+    the request: 0 in virtual time. ``safe_start_ns`` is S0, ``last_arrival_ns`` t_N, ``safe_end_ns`` S0 + P_N,
+    ``least_end_ns`` E_lo. ``any_stall`` counts stalls too short for ``stalls``. Motion is null for plans whose skills
+    are not kept.
+    """
+
+    cell: str
+    policy: str
     board: str
-    """A profile's name; empty where only a rate was given."""
     title: str
+    mode: str
+    emulated: bool
     tokens_per_s: float
     prompt_s: float | None
-    """c; None where a model took what it took."""
     tokens_per_skill: int
     n_skills: int
     t_nom_s: float
-    mode: str = "virtual"
-    emulated: bool = True
-    """Whether no model answered."""
+    plan: int
+    request_id: str
+    requested_ns: int
+    caution: float | None
+    start_ns: int
+    end_ns: int
+    safe_start_ns: int
+    last_arrival_ns: int
+    safe_end_ns: int
+    least_end_ns: int
+    stalls: int
+    any_stall: bool
+    stall_ns: int
+    longest_stall_ns: int
+    stall_ratio: float
+    start_regret: float
+    signed_start_regret: float
+    start_regret_of_wait: float
+    end_regret: float
+    end_regret_of_wait: float
+    end_regret_elastic: float
+    mean_queue_wait_ns: int
+    longest_queue_wait_ns: int
+    mean_action_age_ns: int
+    oldest_action_ns: int
+    speed_distortion: float
+    fluidity: float
+    rms_jerk: float | None = None
+    peak_jerk: float | None = None
+    sparc: float | None = None
 
-    @property
-    def name(self) -> str:
-        """Name the setting; with a policy behind it, the cell."""
-        board = self.board or f"{self.tokens_per_s:g}tps"
-        return f"{board}/L{self.tokens_per_skill}/N{self.n_skills}/T{self.t_nom_s:g}"
 
-    def request_id(self, plan: int, policy: str = "") -> str:
-        """Name a request; policies that share arrivals share the request."""
-        return f"{self.name}/{policy}/{plan}" if policy else f"{self.name}/{plan}"
+@dataclass(frozen=True, slots=True)
+class SkillRow:
+    """One skill of a plan: when its fragment was complete, when it ran; ``stall_ns`` is the stall before it.
 
-
-def timeline_rows(
-    setting: Setting,
-    policy: str,
-    plans: Plans,
-    schedule: Schedule,
-    request_ids: Sequence[str],
-    *,
-    first_plan: int = 0,
-    requested_ns: Sequence[int] | None = None,
-    caution: float | None = None,
-    observed_s: float = 0.0,
-    tolerance_s: float = TOLERANCE_S,
-) -> list[TimelineRow]:
-    """Describe M timelines; ``tolerance_s`` is the longest gap that is no stall for ``any_stall`` (1 us unless told).
-
-    Motion is computed for plans below `KEPT_PLANS`. ``observed_s`` is when the picture was taken, from the request.
+    Times count from the request. ``text`` is the call, empty where no model wrote one. ``due_ns``, of skills that were
+    really executed, is when the reason to start was there; it is null where times were computed.
     """
-    arrival_s, nominal_s, least_s = align(plans.arrival_s, plans.nominal_s, plans.least_s)
-    found = measure(plans, schedule, observed_s=observed_s)
-    safe_s = safe_start(arrival_s, nominal_s)
-    moments_s = {
-        "safe_start_ns": safe_s,
-        "last_arrival_ns": arrival_s[-1],
-        "safe_end_ns": safe_s + nominal_s.sum(axis=0),
-        "least_end_ns": least_end(arrival_s, least_s),
-    }
-    rows = []
-    for place, request_id in enumerate(request_ids):
-        plan = first_plan + place
-        motion: dict[str, Any] = _motion(schedule, nominal_s, place) if plan < KEPT_PLANS else {}
-        rows.append(
-            TimelineRow(
-                cell=f"{setting.name}/{policy}",
-                policy=policy,
-                board=setting.board,
-                title=setting.title,
-                mode=setting.mode,
-                emulated=setting.emulated,
-                tokens_per_s=setting.tokens_per_s,
-                prompt_s=setting.prompt_s,
-                tokens_per_skill=setting.tokens_per_skill,
-                n_skills=setting.n_skills,
-                t_nom_s=setting.t_nom_s,
-                plan=plan,
-                request_id=request_id,
-                requested_ns=requested_ns[place] if requested_ns else 0,
-                caution=caution,
-                any_stall=bool(found.longest_stall_s[place] > tolerance_s),
-                **_numbers(found, place),
-                **{name: to_ns(values[place]) for name, values in moments_s.items()},
-                **motion,
-            )
-        )
-    return rows
+
+    cell: str
+    request_id: str
+    plan: int
+    index: int
+    text: str
+    arrival_ns: int
+    start_ns: int
+    end_ns: int
+    stall_ns: int
+    nominal_ns: int
+    least_ns: int
+    most_ns: int
+    due_ns: int | None = None
 
 
-def skill_rows(
-    cell: str,
-    plans: Plans,
-    schedule: Schedule,
-    request_ids: Sequence[str],
-    *,
-    first_plan: int = 0,
-    texts: Sequence[Sequence[str]] | None = None,
-    due_s: Floats | None = None,
-) -> list[SkillRow]:
-    """List every skill of the plans that are kept; ``texts`` are the calls, a sequence a plan.
-
-    ``due_s``, shape (N, M), says when there was reason to start each skill that was really executed.
-    """
-    arrival_s, nominal_s, least_s, most_s, start_s, duration_s = align(
-        plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s, schedule.start_s, schedule.duration_s
-    )
-    end_s = start_s + duration_s
-    stall_s = np.vstack([np.zeros(start_s.shape[1]), stalls(schedule)])
-    rows = []
-    for place, request_id in enumerate(request_ids[: max(KEPT_PLANS - first_plan, 0)]):
-        for index in range(len(start_s)):
-            at = (index, place)
-            rows.append(
-                SkillRow(
-                    cell=cell,
-                    request_id=request_id,
-                    plan=first_plan + place,
-                    index=index,
-                    text=texts[place][index] if texts else "",
-                    arrival_ns=to_ns(arrival_s[at]),
-                    start_ns=to_ns(start_s[at]),
-                    end_ns=to_ns(end_s[at]),
-                    stall_ns=to_ns(stall_s[at]),
-                    nominal_ns=to_ns(nominal_s[at]),
-                    least_ns=to_ns(least_s[at]),
-                    most_ns=to_ns(most_s[at]),
-                    due_ns=None if due_s is None else to_ns(due_s[at]),
-                )
-            )
-    return rows
+TIMELINES: Final[Table[TimelineRow]] = Table("timelines", TimelineRow)
+"""One row a plan and policy."""
 
 
-def token_rows(cell: str, token_s: Floats, request_ids: Sequence[str]) -> Iterable[TokenRow]:
-    """List every token of the plans that are kept, shape (tokens, M); nobody wrote them, so they have no text."""
-    for place, request_id in enumerate(request_ids[:KEPT_PLANS]):
-        for index, at_s in enumerate(token_s[:, place]):
-            yield TokenRow(request_id, cell, index, -1, "", None, to_ns(at_s))
+def _derive_skill(row: SkillRow) -> dict[str, Value]:
+    """Compute how long a skill lay ready, its duration over the nominal one, and how late the robot had the order."""
+    stretch = (row.end_ns - row.start_ns) / row.nominal_ns if row.nominal_ns else None
+    jitter_ns = None if row.due_ns is None else row.start_ns - row.due_ns
+    return {"queue_wait_ns": row.start_ns - row.arrival_ns, "stretch": stretch, "start_jitter_ns": jitter_ns}
 
 
-def to_ns(seconds: float) -> int:
-    """Round to nanoseconds."""
-    return round(float(seconds) * 1e9)
-
-
-def _numbers(found: Metrics, place: int) -> dict[str, Any]:
-    """Return one timeline's metrics by the names of their columns."""
-    times = ("stall", "longest_stall", "mean_queue_wait", "longest_queue_wait", "mean_action_age", "oldest_action")
-    numbers: dict[str, Any] = {f"{name}_ns": to_ns(getattr(found, f"{name}_s")[place]) for name in times}
-    numbers |= {"start_ns": to_ns(found.first_action_s[place]), "end_ns": to_ns(found.end_s[place])}
-    # Times are exact to a nanosecond, so that what is less of a share is rounding; 0.0 makes -0.0 a zero.
-    numbers |= {name: round(float(getattr(found, name)[place]), 9) + 0.0 for name in _SHARES}
-    return {**numbers, "stalls": int(found.stalls[place])}
-
-
-def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> dict[str, float]:
-    """Return jerk and smoothness of one timeline, under the model of `speed_profile`; none if too long or too short."""
-    start_s, duration_s, nominal_s = (
-        np.ascontiguousarray(values[:, place]) for values in align(schedule.start_s, schedule.duration_s, nominal_s)
-    )
-    if not SHORTEST_MOTION_S <= start_s[-1] + duration_s[-1] - start_s[0] <= LONGEST_MOTION_S:
-        return {}
-    speed = speed_profile(start_s, duration_s, nominal_s, SAMPLE_S)
-    return {
-        "rms_jerk": rms_jerk(speed, SAMPLE_S),
-        "peak_jerk": peak_jerk(speed, SAMPLE_S),
-        "sparc": sparc(speed, SAMPLE_S),
-    }
+SKILLS: Final[Table[SkillRow]] = Table(
+    "skills",
+    SkillRow,
+    {"queue_wait_ns": "int64", "stretch": "float64", "start_jitter_ns": "int64"},
+    _derive_skill,
+)
+"""One row a skill."""

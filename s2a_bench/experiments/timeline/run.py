@@ -11,13 +11,14 @@ from s2a_bench.boards.gaps import to_table
 from s2a_bench.experiments.timeline.config import TimelineConfig, settings
 from s2a_bench.experiments.timeline.plans import Board
 from s2a_bench.experiments.timeline.policies import draw, learn, plans_of
-from s2a_bench.experiments.timeline.rows import Setting, skill_rows, timeline_rows, token_rows
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
+from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows, token_rows
 from s2a_bench.experiments.timeline.traces import recordings
 from s2a_bench.harness.warnings import Doubt
 from s2a_bench.machine import environment
 from s2a_bench.policy.conformal import Calibration
+from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import SKILLS, TIMELINES, TOKENS
 
 if TYPE_CHECKING:
     from s2a_bench.harness.progress import Progress

@@ -17,8 +17,8 @@ from typing import Any
 
 from s2a_bench.clock import now_ns
 from s2a_bench.machine.resources import Reader, open_readers
+from s2a_bench.machine.resources.rows import RESOURCES, ResourceRow
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import RESOURCES, ResourceRow
 
 COUNTERS = ("client_cpu_ns", "server_cpu_ns", "package_energy_j", "gpu_energy_j")
 """Columns that count up; a window's value is the rise."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratio_between, seed_of
 from s2a_bench.experiments.paper import paper_latency, paper_throughput
 from s2a_bench.report.claims.ccrb import CCRB_CLAIMS
@@ -148,7 +149,7 @@ def _region(run: Run, *, above: bool) -> Finding | None:
     """Try the points on one side of R = L / T_min, skills running for T_nom, as naive runs them."""
     from s2a_bench.experiments.boundary.view.tables import grid_of, is_random
 
-    if run.tables["boundary"].empty:
+    if run.table(BOUNDARY).empty:
         return None
     if is_random(run):
         return Finding(UNTESTABLE, "With jitter no line separates the regions; run without it.")

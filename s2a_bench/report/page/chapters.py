@@ -103,7 +103,7 @@ def _unfinished(manifest: Mapping[str, Any]) -> Iterator[str]:
 
 def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
     """Yield the overview, runs that are computed as one, and the others one by one."""
-    manifest, head = sweep.manifest, Run(sweep.path, sweep.manifest, read_run(sweep.path).tables)
+    manifest, head = sweep.manifest, Run(sweep.path, sweep.manifest)
     runs = list(sweep.runs())
     copy = sweep.path / "sweep.toml"
     attached = {copy.name: copy.read_text(encoding="utf-8")} if copy.is_file() else {}

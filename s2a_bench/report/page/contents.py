@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
+from s2a_bench.experiments.model_validity.rows import VALIDITY
+from s2a_bench.experiments.study.rows import STUDIES
 from s2a_bench.report.page import Content
 from s2a_bench.report.page.sentences import (
     boundary_sentences,
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
 def content_of(run: Run, *, against_paper: bool) -> Content:
     """Return what a run shows; of a run without rows nothing, of an unknown command the names of its tables."""
-    if not any(len(table) for table in run.tables.values()):
+    if not run.row_counts():
         return Content(summary=("The run has no rows: it ended before anything was measured.",))
     command = str(run.manifest["command"])
     build = CONTENTS.get(command) or CONTENTS.get(command.partition("-")[0], _other)
@@ -73,7 +75,7 @@ def _study(run: Run, _against_paper: bool) -> Content:
     from s2a_bench.experiments.study.view.tables import study_tables, table_files
     from s2a_bench.writers.csv_text import csv_text
 
-    rows = run.tables["studies"]
+    rows = run.table(STUDIES)
     name = str(rows["study"].iloc[0])
     tables = table_files(study_tables(run))
     csvs = {f"{name}.csv": csv_text(tuple(map(str, rows.columns)), _plain(rows))}
@@ -94,13 +96,13 @@ def _validity(run: Run, _against_paper: bool) -> Content:
     from s2a_bench.experiments.model_validity.view import validity_tables
 
     tables = validity_tables(run)
-    answers = len(run.tables["validity"])
+    answers = len(run.table(VALIDITY))
     return Content((f"{answers} answers to the prompts were parsed, skill by skill.",), tables, list(tables)[:1])
 
 
 def _other(run: Run, _against_paper: bool) -> Content:
     """Tell what lies in a run that has no view of its own."""
-    rows = [f"{name} ({len(table)} rows)" for name, table in run.tables.items() if len(table)]
+    rows = [f"{name} ({count} rows)" for name, count in run.row_counts().items()]
     return Content(summary=(f"There is no view of {run.manifest['command']} runs; this one holds {', '.join(rows)}.",))
 
 

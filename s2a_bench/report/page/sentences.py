@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.latency.view.tables import TITLES
+from s2a_bench.experiments.study.rows import STUDIES
 from s2a_bench.writers.tables import interval, mean_sd, number
 
 if TYPE_CHECKING:
@@ -71,7 +73,7 @@ def boundary_sentences(run: Run) -> list[str]:
     """Say whether the formula holds, and what the paper's line leaves out."""
     from s2a_bench.experiments.boundary.view.tables import DURATIONS, disagreements, grid_of, is_random
 
-    points = len(run.tables["boundary"])
+    points = len(run.table(BOUNDARY))
     said = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
     if is_random(run):
         shares = grid_of(run, DURATIONS[0])["p_stall"]
@@ -86,7 +88,7 @@ def study_sentences(run: Run) -> list[str]:
     """Say how many plans were drawn, and of the targets which were met."""
     from s2a_bench.experiments.study.view.tables import ONLINE, targets
 
-    rows = run.tables["studies"]
+    rows = run.table(STUDIES)
     name = str(rows["study"].iloc[0])
     said = [f"Study {name}: {len(rows)} cells, {int(rows['plans'].sum()):,} drawn plans; nothing is measured."]
     if name == "targets":

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.latency.view.cells import cells_of, engine_note
 from s2a_bench.experiments.latency.view.tables import TITLES
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.report.page import Content
 from s2a_bench.stats import summary_of
+from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import Run
 from s2a_bench.writers.csv_text import csv_text
 from s2a_bench.writers.tables import ABSENT, TextTable, mean_sd, number
@@ -93,13 +95,13 @@ def pooled(sweep: Sweep, runs: Runs) -> tuple[list[Run], Runs]:
 
 
 def _is_virtual(run: Run) -> bool:
-    rows = run.tables["timelines"]
+    rows = run.table(TIMELINES)
     return run.manifest["command"] == "timeline" and len(rows) > 0 and bool((rows["mode"] == "virtual").all())
 
 
 def _overlap(one: Run, other: Run) -> bool:
     """Tell whether two runs have a cell of one name, as repeats without anything random have."""
-    return bool(set(one.tables["timelines"]["cell"]) & set(other.tables["timelines"]["cell"]))
+    return bool(set(one.table(TIMELINES)["cell"]) & set(other.table(TIMELINES)["cell"]))
 
 
 def _joined(sweep: Sweep, runs: Sequence[Run]) -> Run:
@@ -107,9 +109,8 @@ def _joined(sweep: Sweep, runs: Sequence[Run]) -> Run:
     import pandas as pd
 
     tables = {
-        name: pd.concat([run.tables[name] for run in runs], ignore_index=True) if any_rows else first
-        for name, first in runs[0].tables.items()
-        for any_rows in [any(len(run.tables[name]) for run in runs)]
+        table.name: pd.concat([run.table(table) for run in runs], ignore_index=True)
+        for table in (TIMELINES, SKILLS, TOKENS)
     }
     tables["tokens"] = tables["tokens"].drop_duplicates(["request_id", "index"], ignore_index=True)
     manifest = dict(runs[0].manifest)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.figure import Figure
 
+from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.run import BoundaryConfig, rows, run_boundary
 from s2a_bench.experiments.boundary.view.figure import build_boundary, write_boundary_figure
 from s2a_bench.experiments.boundary.view.tables import board_table, boundary_csv, disagreements, line_table
@@ -79,7 +80,7 @@ def test_the_line_itself_is_stall_free() -> None:
 
 
 def test_with_jitter_the_line_is_a_slope(jittery: Run) -> None:
-    points = jittery.tables["boundary"]
+    points = jittery.table(BOUNDARY)
     mine = points[(points["duration"] == "t_nom") & (points["board"] == "") & (points["tokens_per_skill"] == 4)]
     share = mine.sort_values("tokens_per_s")["p_stall"].to_numpy()
     assert (np.diff(share) <= 0).all()

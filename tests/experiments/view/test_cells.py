@@ -5,8 +5,8 @@ import pytest
 
 from s2a_bench.experiments.latency.view.cells import cells_of, engine_note, groups_present, ratios, stages_present
 from s2a_bench.stats import summary_of
+from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run
-from s2a_bench.store.schema import SampleRow
 
 MakeRun = Callable[..., Run]
 HAND = {

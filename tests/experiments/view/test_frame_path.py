@@ -9,8 +9,8 @@ import pytest
 
 from s2a_bench.experiments.latency.view.files import write_tables
 from s2a_bench.experiments.latency.view.frame_path import frame_table
+from s2a_bench.store.requests import FrameRow, SampleRow
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.store.schema import FrameRow, SampleRow
 from s2a_bench.trace import Mark
 
 MS = 1_000_000

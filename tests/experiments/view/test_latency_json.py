@@ -8,8 +8,8 @@ import jsonschema
 import pytest
 
 from s2a_bench.experiments.latency.view.as_json import to_json
+from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run
-from s2a_bench.store.schema import SampleRow
 from s2a_bench.trace import GROUPS, STAGES
 
 MakeRun = Callable[..., Run]

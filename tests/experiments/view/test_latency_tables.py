@@ -14,8 +14,8 @@ from s2a_bench.experiments.latency.view.files import write_tables
 from s2a_bench.experiments.latency.view.tables import group_table, stage_table, summary_table
 from s2a_bench.experiments.latency.view.terminal import renderables
 from s2a_bench.stats import Ratio, Summary
+from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run
-from s2a_bench.store.schema import SampleRow
 from s2a_bench.writers.tables import interval, mean_sd, number, to_latex, to_markdown
 
 MakeRun = Callable[..., Run]

@@ -9,9 +9,9 @@ import pytest
 from scipy.stats import binomtest
 
 from s2a_bench.errors import StoreError
+from s2a_bench.experiments.model_validity.rows import VALIDITY, ValidityRow
 from s2a_bench.experiments.model_validity.view import Share, arms_of, validity_tables, validity_to_json
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.store.schema import VALIDITY, ValidityRow
 
 PAPER = {
     "name": "paper",

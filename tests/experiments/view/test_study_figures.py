@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import StoreError
+from s2a_bench.experiments.study.rows import STUDIES, StudyRow
 from s2a_bench.experiments.study.view.figures import (
     build_drift,
     build_frontier,
@@ -18,7 +19,6 @@ from s2a_bench.experiments.study.view.figures import (
     write_study_figure,
 )
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.store.schema import STUDIES, StudyRow
 from s2a_bench.writers.style import paper_column
 
 PLANS = 1000

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from matplotlib.patches import Rectangle
 
 from s2a_bench.experiments.paper import paper_throughput
+from s2a_bench.experiments.throughput.rows import REFERENCE, ReferenceRow
 from s2a_bench.experiments.throughput.view.as_json import throughput_to_json
 from s2a_bench.experiments.throughput.view.cells import BIN, Speed, ratios_of, speeds_of
 from s2a_bench.experiments.throughput.view.figures import (
@@ -26,8 +27,8 @@ from s2a_bench.experiments.throughput.view.figures import (
     write_throughput_figures,
 )
 from s2a_bench.experiments.throughput.view.tables import position_table, speed_table, throughput_csv, throughput_tables
+from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.store.schema import REFERENCE, ReferenceRow, SampleRow, TokenRow
 from s2a_bench.writers.files import write_texts
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.terminal import lay_out

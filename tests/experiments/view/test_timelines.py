@@ -13,7 +13,8 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from s2a_bench.experiments.timeline.rows import Setting, skill_rows, timeline_rows, token_rows
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
+from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows, token_rows
 from s2a_bench.experiments.timeline.view.as_json import timelines_to_json
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.chrome_trace import to_trace, write_trace
@@ -28,8 +29,8 @@ from s2a_bench.experiments.timeline.view.tables import (
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
+from s2a_bench.store.requests import TOKENS, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.store.schema import SKILLS, TIMELINES, TOKENS, TokenRow
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import TextTable, to_markdown
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.writers.as_json import frame
 from s2a_bench.writers.csv_text import csv_text
 from s2a_bench.writers.tables import ABSENT, TextTable, number
@@ -20,20 +21,20 @@ DURATIONS = ("t_nom", "t_min")
 
 def grid_of(run: Run, duration: str) -> pd.DataFrame:
     """Return the points of the grid for one duration."""
-    rows = run.tables["boundary"]
+    rows = run.table(BOUNDARY)
     return rows[(rows["duration"] == duration) & (rows["board"] == "")]
 
 
 def marks_of(run: Run) -> list[tuple[str, float, pd.DataFrame]]:
     """Return title and rate of each board with its points, in the order asked for."""
-    rows = run.tables["boundary"]
+    rows = run.table(BOUNDARY)
     boards = run.manifest["boards"]
     return [(board["title"], board["tokens_per_s"], rows[rows["board"] == board["name"]]) for board in boards]
 
 
 def is_random(run: Run) -> bool:
     """Tell whether plans differ at a point."""
-    return bool((run.tables["boundary"]["plans"] > 1).any())
+    return bool((run.table(BOUNDARY)["plans"] > 1).any())
 
 
 def board_table(run: Run) -> TextTable:
@@ -79,7 +80,7 @@ def boundary_tables(run: Run) -> dict[str, TextTable]:
 def boundary_csv(run: Run) -> dict[str, str]:
     """Return file name -> CSV text: every point of the plane and of the boards."""
     names = ("duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall")
-    return {"boundary.csv": csv_text(names, run.tables["boundary"][list(names)].itertuples(index=False, name=None))}
+    return {"boundary.csv": csv_text(names, run.table(BOUNDARY)[list(names)].itertuples(index=False, name=None))}
 
 
 def boundary_to_json(run: Run) -> dict[str, Any]:
@@ -89,12 +90,12 @@ def boundary_to_json(run: Run) -> dict[str, Any]:
 
 def disagreements(run: Run) -> int:
     """Count the points where formula and trial differ; with jitter they must, so that only even tokens tell."""
-    rows = run.tables["boundary"]
+    rows = run.table(BOUNDARY)
     return int(((rows["p_stall"] == 0) != rows["stall_free"]).sum())
 
 
 def _cells(run: Run) -> Iterator[dict[str, Any]]:
-    for row in run.tables["boundary"].to_dict("records"):
+    for row in run.table(BOUNDARY).to_dict("records"):
         rate = row.pop("tokens_per_s")
         rho = row["tokens_per_skill"] / rate / row["duration_s"]
         named = {str(name): value for name, value in row.items() if name != "board"}
@@ -109,12 +110,12 @@ def _verdict(point: dict[Any, Any], *, random: bool) -> str:
 
 def _notes(run: Run) -> tuple[str, ...]:
     """Say what a reader must know besides the numbers."""
-    points = len(run.tables["boundary"])
+    points = len(run.table(BOUNDARY))
     notes = [
         "Naive runs every skill for T_nom. The paper draws the line for T_min, which holds if skills may end early."
     ]
     if is_random(run):
-        plans = int(run.tables["boundary"]["plans"].max())
+        plans = int(run.table(BOUNDARY)["plans"].max())
         jitter = run.manifest["configuration"]["jitter"]
         notes.append(f"P: share of {plans} drawn plans with a stall, jitter {jitter}; the formula is for even tokens.")
     else:

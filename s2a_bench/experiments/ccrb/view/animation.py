@@ -10,6 +10,7 @@ import numpy as np
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments.ccrb.view.figures import path_of
 from s2a_bench.experiments.ccrb.view.outcomes import SAID, law_of, rollouts_of, tokens_line
+from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES
 from s2a_bench.scenario.render import Camera
 
@@ -67,7 +68,7 @@ class Panel:
     def __init__(self, run: Run, row: dict[Any, Any]) -> None:
         self._row = row
         self._path = path_of(run, row["cell"])
-        skills = run.tables["skills"]
+        skills = run.table(SKILLS)
         self._texts = skills[skills["cell"] == row["cell"]]["text"].tolist()
         self._camera = Camera(WIDTH, ROAD_HEIGHT)
         self._heading = _headings(self._path)

@@ -8,8 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from s2a_bench.experiments.ccrb.rows import TRAJECTORIES
 from s2a_bench.experiments.ccrb.view.outcomes import SAID, configuration, has, origin_notes, rollouts_of, token_times_s
 from s2a_bench.experiments.ccrb.view.phase_figure import build_phase
+from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.writers.figures import LINE_CHARS, new_figure, save
 from s2a_bench.writers.style import WIDTH_IN
 
@@ -41,7 +43,7 @@ def build_scenario(run: Run) -> Figure:
     """Draw the operating point: a column a policy; positions, speeds and gaps over time."""
     rows = rollouts_of(run, "point").to_dict("records")
     paths = {row["policy"]: _path(run, row) for row in rows}
-    skills = dict(list(run.tables["skills"].groupby("cell", sort=False)))
+    skills = dict(list(run.table(SKILLS).groupby("cell", sort=False)))
     chars = round(LINE_CHARS * WIDE_IN / WIDTH_IN)
     lines = [_title(run), *origin_notes(run)]
     title = "\n".join(textwrap.fill(line, chars, break_on_hyphens=False) for line in lines)
@@ -85,7 +87,7 @@ def write_ccrb_figures(run: Run) -> list[Path]:
 
 def path_of(run: Run, cell: str) -> pd.DataFrame:
     """Return the trajectory of a shown roll-out with times in s, speeds in km/h, and gaps."""
-    rows = run.tables["trajectories"]
+    rows = run.table(TRAJECTORIES)
     path: pd.DataFrame = rows[rows["cell"] == cell].reset_index(drop=True)
     path["time_s"] = path["at_ns"] / 1e9
     for car in LOOKS:

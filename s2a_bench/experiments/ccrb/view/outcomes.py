@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS
+from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb import LEAST_IMPACT_MPS
 from s2a_bench.scenario.follower import LAWS
+from s2a_bench.store.requests import TOKENS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,7 +50,7 @@ class Share:
 
 def rollouts_of(run: Run, study: str) -> pd.DataFrame:
     """Return the roll-outs of the operating point (point), the phase diagram (phase) or random scenarios (random)."""
-    rows = run.tables["rollouts"]
+    rows = run.table(ROLLOUTS)
     return rows[rows["study"] == study].reset_index(drop=True)
 
 
@@ -99,7 +102,7 @@ def rate_span_here(run: Run, gap: str) -> tuple[float, float] | None:
 
 def has(run: Run, study: str) -> bool:
     """Tell whether a run holds a study."""
-    return bool((run.tables["rollouts"]["study"] == study).any())
+    return bool((run.table(ROLLOUTS)["study"] == study).any())
 
 
 def configuration(run: Run) -> dict[str, Any]:
@@ -135,8 +138,8 @@ def tokens_line(run: Run) -> str:
 
 def token_times_s(run: Run) -> list[float]:
     """Return when the tokens of the shown plan arrived, in s from the request."""
-    request_id = run.tables["skills"]["request_id"].iloc[0]
-    tokens = run.tables["tokens"]
+    request_id = run.table(SKILLS)["request_id"].iloc[0]
+    tokens = run.table(TOKENS)
     zero_ns = run.manifest.get("request", {}).get("requested_ns", 0)
     return [(int(at_ns) - zero_ns) / 1e9 for at_ns in tokens[tokens["request_id"] == request_id]["client_ns"]]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.errors import StoreError
+from s2a_bench.experiments.study.rows import STUDIES
 from s2a_bench.experiments.study.view.tables import END, HARD, ONLINE, START, WORLD, WORST
 from s2a_bench.writers.figures import new_figure, save
 
@@ -38,7 +39,7 @@ def write_study_figure(run: Run) -> list[Path]:
 
 def build_targets(run: Run) -> Figure:
     """Draw stream-to-act's share of stalled plans and regrets, a point a setting, against rho."""
-    rows = run.tables["studies"]
+    rows = run.table(STUDIES)
     rows = rows[rows["policy"] == ONLINE]
     hard = rows[rows["rho"] > HARD]
     figure = new_figure(4.9, f"{ONLINE}: {len(rows)} settings, {int(rows['plans'].max()):,} plans each\n{_DRAWN}")
@@ -67,7 +68,7 @@ def build_targets(run: Run) -> Figure:
 
 def build_frontier(run: Run) -> Figure:
     """Draw P(any stall) against start regret as lambda grows, a panel a world, a colour a family of gaps."""
-    rows = run.tables["studies"]
+    rows = run.table(STUDIES)
     epsilon = float(run.manifest["configuration"]["epsilon"])
     plans = int(rows["plans"].max())
     figure = new_figure(5.2, f"What rare stalls cost; {plans:,} plans a point\n{_DRAWN}")
@@ -101,7 +102,7 @@ def build_frontier(run: Run) -> Figure:
 
 def build_drift(run: Run) -> Figure:
     """Draw P(any stall) block by block: prior and lambda fixed, lambda tracked, the prior refitted too."""
-    rows = run.tables["studies"]
+    rows = run.table(STUDIES)
     rows = rows.assign(
         drift=[text.partition(", ")[0] for text in rows["condition"]],
         arm=[text.partition(", ")[2] for text in rows["condition"]],
@@ -138,7 +139,7 @@ def build_drift(run: Run) -> Figure:
 
 def build_misfit(run: Run) -> Figure:
     """Draw what a wrong length, granularity or rate costs: stalls above, late starts below, a line a world."""
-    rows = run.tables["studies"]
+    rows = run.table(STUDIES)
     kinds = {"N": "skills a plan", "L": "tokens a skill", "gap": "mean gap of the prior"}
     rows = rows.assign(
         kind=[text.split()[0] for text in rows["condition"]], step=[text.split()[-1] for text in rows["condition"]]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import StoreError
+from s2a_bench.experiments.study.rows import STUDIES
 from s2a_bench.policy.conformal import upper_bound
 from s2a_bench.writers.tables import ABSENT, TextTable
 
@@ -69,7 +70,7 @@ def regret_at(points: pd.DataFrame, level: float, what: str = "start_regret") ->
 
 def study_tables(run: Run) -> list[TextTable]:
     """Lay out a study's run; raises StoreError where the folder holds none."""
-    rows = run.tables["studies"]
+    rows = run.table(STUDIES)
     name = str(rows["study"].iloc[0]) if len(rows) else ""
     if name not in _TABLES:
         raise StoreError(f"{run.path} holds no study; run s2a-bench study first")

@@ -8,9 +8,9 @@ import numpy as np
 
 from s2a_bench.experiments.latency.view.as_json import about_cell
 from s2a_bench.experiments.throughput.view.cells import (
+    LLAMA_BENCH,
     METRICS,
     RATIO_METRIC,
-    REFERENCE,
     Speed,
     ratios_of,
     reference_depths,
@@ -44,7 +44,7 @@ def _numbers(speed: Speed) -> dict[str, Any]:
 def _reference(run: Run) -> dict[str, Any]:
     """Return what llama-bench said, beside the command that was run."""
     return {
-        "program": REFERENCE,
+        "program": LLAMA_BENCH,
         "command": run.manifest.get("reference", {}).get("command", []),
         "depths": reference_depths(run),
         **summaries([(RATIO_METRIC, np.asarray(reference_values(run)))]),

@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratio_of_blocks, seed_of
+from s2a_bench.experiments.throughput.rows import REFERENCE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,7 +39,7 @@ METRICS = (
 RATIO_METRIC = "decode_tokens_per_s"
 """What cells and the reference are compared by."""
 
-REFERENCE = "llama-bench"
+LLAMA_BENCH = "llama-bench"
 """How the reference is called where cells are listed."""
 
 _SAMPLE = ("request_id", "block", "ttft_ns", "facts")
@@ -152,7 +153,7 @@ def speeds_of(run: Run) -> list[Speed]:
 
 def reference_by_block(run: Run) -> dict[int, list[float]]:
     """Return llama-bench's tokens/s by block, its warm-ups left out."""
-    rows = run.tables["reference"]
+    rows = run.table(REFERENCE)
     counted = rows[~rows["warmup"]]
     return _by_block(counted["block"], counted["n_gen"] / counted["decode_ns"] * 1e9)
 
@@ -164,7 +165,7 @@ def reference_values(run: Run) -> list[float]:
 
 def reference_depths(run: Run) -> list[int]:
     """Return how many tokens lay before those that llama-bench timed: one number where all prompts are alike."""
-    rows = run.tables["reference"]
+    rows = run.table(REFERENCE)
     return sorted({int(depth) for depth in rows[~rows["warmup"]]["depth"]})
 
 
@@ -175,7 +176,7 @@ def ratios_of(run: Run, speeds: list[Speed]) -> Iterator[tuple[str, str, Ratio]]
     for speed in speeds:
         values = speed.by_block(RATIO_METRIC)
         if ratio := ratio_of_blocks(values, reference, seed_of(run)):
-            yield speed.name, REFERENCE, ratio
+            yield speed.name, LLAMA_BENCH, ratio
         if base is not None and speed is not base:
             ratio = ratio_of_blocks(values, base.by_block(RATIO_METRIC), seed_of(run))
             if ratio:

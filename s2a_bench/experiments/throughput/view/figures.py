@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.cells import engine_note
 from s2a_bench.experiments.paper import paper_throughput
-from s2a_bench.experiments.throughput.view.cells import BIN, RATIO_METRIC, REFERENCE, Speed, reference_values, speeds_of
+from s2a_bench.experiments.throughput.view.cells import (
+    BIN,
+    LLAMA_BENCH,
+    RATIO_METRIC,
+    Speed,
+    reference_values,
+    speeds_of,
+)
 from s2a_bench.stats import summarise, summary_of
 from s2a_bench.writers.figures import LINE_CHARS, WIDE_SPREAD, logarithmic, name_rows, new_figure, save, write_beside
 from s2a_bench.writers.style import GREY, cell_looks
@@ -40,7 +47,7 @@ def build_throughput_bars(run: Run, *, against_paper: bool = False) -> Figure:
         rows.append((speed.name, found.mean, found.sd, mean_sd(found), looks[speed.name][0]))
     if reference := reference_values(run):
         found = summarise(reference)
-        rows.append((f"{REFERENCE}\n(decode)", found.mean, found.sd, mean_sd(found), _REFERENCE_FILL))
+        rows.append((f"{LLAMA_BENCH}\n(decode)", found.mean, found.sd, mean_sd(found), _REFERENCE_FILL))
     if against_paper:
         rows += [
             (f"paper:\n{claim.name}", claim.tokens_per_s, None, f"{claim.tokens_per_s:g}", GREY)

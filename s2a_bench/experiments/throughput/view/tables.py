@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 from s2a_bench.experiments.latency.view.cells import engine_note
 from s2a_bench.experiments.throughput.view.cells import (
     BIN,
+    LLAMA_BENCH,
     METRICS,
     RATIO_METRIC,
-    REFERENCE,
     Speed,
     ratios_of,
     reference_depths,
@@ -42,9 +42,9 @@ def speed_table(run: Run) -> TextTable:
         rows.append((*row, *("1" if speed.name == base else interval(found.get((speed.name, base))) for base in bases)))
     if reference:
         summary = summarise(reference)
-        row = [REFERENCE, str(summary.n), "0", ABSENT, mean_sd(summary)]
+        row = [LLAMA_BENCH, str(summary.n), "0", ABSENT, mean_sd(summary)]
         row += [ABSENT] if joule else []
-        rows.append((*row, *("1" if base == REFERENCE else ABSENT for base in bases)))
+        rows.append((*row, *("1" if base == LLAMA_BENCH else ABSENT for base in bases)))
     header: tuple[str, ...] = ("cell", "n", "errors", "N / T_eval", "decode")
     header += ("tokens/J",) if joule else ()
     return TextTable(
@@ -118,7 +118,7 @@ def throughput_csv(run: Run) -> dict[str, str]:
         if (summary := summary_of(values))
     ]
     if reference := reference_values(run):
-        summaries.append((REFERENCE, RATIO_METRIC, *_values(summarise(reference)), False))
+        summaries.append((LLAMA_BENCH, RATIO_METRIC, *_values(summarise(reference)), False))
     positions = [
         (speed.name, first, last, *_values(summarise(rates)), speed.cell.emulated)
         for speed in speeds
@@ -150,7 +150,7 @@ def _notes(run: Run, speeds: list[Speed]) -> tuple[str, ...]:
         notes.append(f"{note[0].upper()}{note[1:]}.")
     if depths := reference_depths(run):
         notes.append(
-            f"{REFERENCE} decodes behind {', '.join(map(str, depths))} tokens, as our requests do; "
+            f"{LLAMA_BENCH} decodes behind {', '.join(map(str, depths))} tokens, as our requests do; "
             "it samples nothing and writes no text."
         )
     if joined := sum(speed.joined for speed in speeds):

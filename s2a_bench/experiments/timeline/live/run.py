@@ -17,7 +17,8 @@ from s2a_bench.experiments.timeline.execution import Scene, SideBySide, View, ji
 from s2a_bench.experiments.timeline.live.asks import Ask, prepare
 from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.experiments.timeline.live.link import Link, word
-from s2a_bench.experiments.timeline.rows import Setting
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
+from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
@@ -28,8 +29,8 @@ from s2a_bench.runtime import Robot, find_robot
 from s2a_bench.runtime.events import StreamBroke
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.runtime.record import Record
+from s2a_bench.store.requests import SAMPLES, TOKENS
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import SAMPLES, SKILLS, TIMELINES, TOKENS
 
 MODE = "live"
 

@@ -6,7 +6,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.stats import summary_of
+from s2a_bench.store.requests import TOKENS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -112,7 +114,7 @@ class Timelines:
 
 def timelines_of(run: Run) -> list[Timelines]:
     """Split a run into its cells, in the order in which they were run; the shown plan is the first."""
-    rows, skills, tokens = run.tables["timelines"], run.tables["skills"], run.tables["tokens"]
+    rows, skills, tokens = run.table(TIMELINES), run.table(SKILLS), run.table(TOKENS)
     skills_of = dict(list(skills.groupby(["cell", "request_id"], sort=False)))
     tokens_of = dict(list(tokens.groupby("request_id", sort=False)))
     found = []

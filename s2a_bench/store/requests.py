@@ -1,0 +1,141 @@
+"""The rows of requests: samples, tokens, and the frames of a stream.
+
+A row's own fields are what was observed; *derived* columns are computed from its chain of marks by `trace.budget`,
+never typed a second time. A stage that the chain does not have is null, never zero; where the request failed every
+derived column is null.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from s2a_bench.store.schema import Kind, Table, Value
+from s2a_bench.trace import STAGES, Budget, Mark, budget
+
+
+@dataclass(frozen=True, slots=True)
+class SampleRow:
+    """One request: which cell, where in the run, its whole chain of marks, and what is known besides.
+
+    ``cell`` is what is compared, e.g. ``http/as-deployed``. ``payload`` is what travels: jpeg, jpeg-preencoded, png
+    or raw over HTTP; bgr, yuyv or compressed over ROS; none for loopback. An empty ``error`` means that the
+    request succeeded. ``frame_age_ns`` is the frame's age when inference starts.
+    """
+
+    cell: str
+    pipeline: str
+    variant: str
+    payload: str
+    connection: str
+    engine: str
+    mode: str
+    size: str
+    block: int
+    position: int
+    warmup: bool
+    request_id: str
+    frame_index: int
+    error: str = ""
+    marks: list[Mark] = field(default_factory=list)
+    payload_bytes: int | None = None
+    n_tokens: int = 0
+    last_token_ns: int | None = None
+    frame_age_ns: int | None = None
+    cache_n: int | None = None
+    prompt_n: int | None = None
+    server_prompt_ms: float | None = None
+    facts: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class TokenRow:
+    """One token: when it left the engine (null where the server is a black box) and when the client saw it."""
+
+    request_id: str
+    cell: str
+    index: int
+    token_id: int
+    text: str
+    engine_ns: int | None
+    client_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRow:
+    """One frame of a stream-mode run; ``used_by`` is the request that looked at it, or empty."""
+
+    cell: str
+    frame_index: int
+    intended_ns: int
+    marks: list[Mark] = field(default_factory=list)
+    used_by: str = ""
+
+
+def _stage_values(spent: Budget) -> dict[str, Value]:
+    """Name each duration of a budget by its column."""
+    return {f"{stage}_ns": duration for stage, duration in spent.stages_ns.items()}
+
+
+FIRST_TOKEN: Final = frozenset({"return", "ingest", "server"})
+"""A chain with one of these stages ends when the client sees the first token; the last two stand for black boxes."""
+
+
+def _derive_sample(row: SampleRow) -> dict[str, Value]:
+    """Compute a sample's durations; a chain that does not reach the first token has no end to end."""
+    if row.error or not any(stage in FIRST_TOKEN for stage, _ in row.marks):
+        return {}
+    spent = budget(row.marks)
+    return {
+        **_stage_values(spent),
+        "e2e_ns": spent.e2e_ns,
+        "e2e_without_inference_ns": spent.e2e_without_inference_ns,
+        "ttft_ns": spent.e2e_ns - spent.stages_ns.get("capture", 0),
+        "residual_ns": spent.residual_ns,
+        "residual_share": spent.residual_share,
+    }
+
+
+def _derive_frame(row: FrameRow) -> dict[str, Value]:
+    """Compute a frame's durations up to its last mark, from capture and from the time it was due."""
+    if not row.marks:
+        return {}
+    spent = budget(row.marks)
+    return {
+        **_stage_values(spent),
+        "path_ns": spent.e2e_ns,
+        "latency_ns": row.marks[-1][1] - row.intended_ns,
+        "residual_ns": spent.residual_ns,
+    }
+
+
+_STAGE_COLUMNS: dict[str, Kind] = {f"{stage}_ns": "int64" for stage in STAGES}
+
+
+SAMPLES: Final[Table[SampleRow]] = Table(
+    "samples",
+    SampleRow,
+    _STAGE_COLUMNS
+    | {
+        "e2e_ns": "int64",
+        "e2e_without_inference_ns": "int64",
+        "ttft_ns": "int64",
+        "residual_ns": "int64",
+        "residual_share": "float64",
+    },
+    _derive_sample,
+)
+"""One row a request. `ttft_ns` counts from the prompt: e2e without `capture` (which stream mode does not have)."""
+
+
+TOKENS: Final[Table[TokenRow]] = Table("tokens", TokenRow)
+"""One row a token."""
+
+
+FRAMES: Final[Table[FrameRow]] = Table(
+    "frames",
+    FrameRow,
+    _STAGE_COLUMNS | {"path_ns": "int64", "latency_ns": "int64", "residual_ns": "int64"},
+    _derive_frame,
+)
+"""One row a frame in stream mode. `latency_ns` counts from the intended time (no coordinated omission)."""
