@@ -1,12 +1,16 @@
-"""Fixtures for every test: a DDS domain and a model cache of this test run's own."""
+"""Fixtures for every test: a DDS domain of this test run's own, and models that cannot end the run."""
 
 from __future__ import annotations
 
+import functools
 import os
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import settings
 
+from s2a_bench.inference.llama_cpp import LlamaCppEngine
+from s2a_bench.inference.smoke import smoke_test
 from tests.made_runs import black_box, make_row, make_run, plausible  # noqa: F401 - fixtures
 
 settings.register_profile("s2a", deadline=None)  # these machines are shared: time is not judged
@@ -24,3 +28,22 @@ def dds_domain() -> int:
     for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "CYCLONEDDS_URI"):
         os.environ.pop(name, None)
     return domain
+
+
+@pytest.fixture(scope="session", autouse=True)
+def models_that_die_fail_their_test() -> Iterator[None]:
+    """Let llama.cpp answer in a process of its own before the first model is loaded in this one.
+
+    Where that process dies, as of an illegal instruction, each test that loads a model fails, and the run goes on.
+    """
+    load = LlamaCppEngine._load
+    smoke = functools.cache(smoke_test)
+
+    def load_what_lives(self: LlamaCppEngine, *files: object) -> object:
+        if message := smoke().message:
+            pytest.fail(message, pytrace=False)
+        return load(self, *files)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LlamaCppEngine, "_load", load_what_lives)
+        yield

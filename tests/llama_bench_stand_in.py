@@ -1,14 +1,15 @@
 """A program that answers like llama.cpp's ``llama-bench -o json`` (build 0c1e570, 2026) without any model.
 
 Run as a script it takes llama-bench's long flags, refuses unknown ones as llama-bench does, and "decodes" at
-``S2A_STAND_IN_RATE`` tokens a second; ``S2A_STAND_IN_FAULT`` is one of crash, garbage, empty, old (it
-reads ``--flash-attn`` as 0 or 1, as all did before 2026).
+``S2A_STAND_IN_RATE`` tokens a second; ``S2A_STAND_IN_FAULT`` is one of crash, illegal (it dies by an
+illegal instruction), garbage, empty, old (it reads ``--flash-attn`` as 0 or 1, as all did before 2026).
 """
 
 from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -51,6 +52,8 @@ def main() -> int:
     if fault == "crash":
         sys.stderr.write("ggml: loading\nmain: error: failed to load model 'x.gguf'\n")
         return 1
+    if fault == "illegal":
+        os.kill(os.getpid(), signal.SIGILL)
     if fault == "garbage":
         sys.stdout.write("| model | size |\n")
         return 0

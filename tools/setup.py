@@ -4,17 +4,21 @@ Standard library only, because it runs before anything is installed: ``python3 t
 the installation is up to date; prints what it does, and one clear line for what is missing.
 
 ``S2A_BENCH_CUDA=1`` (`make setup CUDA=1`) builds llama-cpp-python for an NVIDIA GPU, ``0`` for the CPU; without it the
-build stays what it is, so that a later `make test` does not undo it.
+build stays what it is, so that a later `make test` does not undo it. The same holds for AMX, the matrix unit of some
+x86 CPUs, which is left out of the build where the compiler's code for it does not work.
 """
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import hashlib
 import os
 import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -24,10 +28,17 @@ PYTHON = VENV / "bin" / "python"
 CONSTRAINTS = ROOT / "constraints.txt"
 LOG = VENV / "setup.log"
 BUILD = VENV / "s2a-bench-llama"
-"""Says what llama-cpp-python was built for, cpu or cuda; without it, cpu."""
+"""Says what llama-cpp-python was built for: cpu or cuda, then, on a CPU with AMX, amx or no-amx; without it, cpu.
+
+`broken` behind it: the build died in its test."""
+CPUINFO = Path("/proc/cpuinfo")
+AMX_PROBE = ROOT / "tools" / "amx_probe.cpp"
+NO_AMX = ("-mno-amx-tile", "-mno-amx-int8", "-mno-amx-bf16")
 OLDEST = (3, 10)
 NINJA_STEP = re.compile(r"\[(\d+)/(\d+)\]")
 TAIL = 15
+DIED = 128
+"""An exit code above it says that the test was killed by a signal, as in a shell."""
 CUDA_COMPILERS = ("nvcc", "/usr/local/cuda/bin/nvcc")
 """Where CUDA's compiler is: in PATH, or where NVIDIA installs it."""
 
@@ -54,7 +65,7 @@ def check_machine() -> None:
             "no C++ compiler found, and llama-cpp-python has to be compiled: sudo apt install build-essential "
             "(or set CC and CXX)"
         )
-    if built_for() != wanted_build() == "cuda" and not cuda_compiler():
+    if built_for() != wanted_build() and wanted_build().startswith("cuda") and not cuda_compiler():
         raise SetupError(
             "CUDA=1 needs nvcc, CUDA's compiler: sudo apt install nvidia-cuda-toolkit (on a Jetson: nvidia-jetpack), "
             "or name it in CUDACXX"
@@ -76,17 +87,45 @@ def cuda_compiler() -> str | None:
     return next((found for name in names if (found := shutil.which(name))), None)
 
 
-def has_pip() -> bool:
-    """Tell whether the environment is whole: one whose making was interrupted has no pip."""
+def processor() -> str:
+    """Return the CPU's instruction sets as the kernel lists them, on x86 and on Arm."""
+    listed = re.search(r"^(?:flags|Features)\s*:(.*)", CPUINFO.read_text(), re.MULTILINE) if CPUINFO.exists() else None
+    return listed[1].strip() if listed else ""
+
+
+@functools.cache
+def amx() -> str:
+    """Return amx or no-amx: whether the compiler's code for this CPU's AMX works; "" where either knows none.
+
+    GCC bug 114098: `_tile_loadconfig` promises the optimiser to read 8 of the configuration's 64 bytes, so that the
+    stores to the others are dropped, and the first load of a tile is an illegal instruction.
+    """
+    found = compiler()
+    if "amx_tile" not in processor().split() or found is None:
+        return ""
+    with tempfile.TemporaryDirectory() as folder:
+        probe = str(Path(folder) / "probe")
+        command = [*found.split(), "-O2", "-o", probe, str(AMX_PROBE)]
+        if not succeeds(*command, *NO_AMX, "-DNOTHING"):
+            return ""
+        return "amx" if succeeds(*command, "-mamx-tile") and succeeds(probe) else "no-amx"
+
+
+def succeeds(*command: str) -> bool:
+    """Run a program quietly; return whether it ends with 0."""
     try:
-        probe = [str(PYTHON), "-m", "pip", "--version"]
-        return subprocess.run(probe, capture_output=True, check=False).returncode == 0  # noqa: S603
+        return subprocess.run(command, capture_output=True, check=False).returncode == 0  # noqa: S603 - our own
     except OSError:
         return False
 
 
+def has_pip() -> bool:
+    """Tell whether the environment is whole: one whose making was interrupted has no pip."""
+    return succeeds(str(PYTHON), "-m", "pip", "--version")
+
+
 def built_for() -> str:
-    """Return what llama-cpp-python of the pinned version was built for, cpu or cuda; "" if it is not there."""
+    """Return what llama-cpp-python of the pinned version was built for, see `BUILD`; "" if it is not there."""
     wanted = requirement("llama-cpp-python").partition("==")[2]
     if not any(VENV.glob(f"lib/python*/site-packages/llama_cpp_python-{wanted}.dist-info")):
         return ""
@@ -94,30 +133,82 @@ def built_for() -> str:
 
 
 def wanted_build() -> str:
-    """Return what llama-cpp-python should be built for: what the user said last."""
+    """Return what llama-cpp-python should be built for: what the user said last, and what AMX was judged once.
+
+    On a CPU with AMX a build that says nothing of it, or that broke, is made again.
+    """
     asked = os.environ.get("S2A_BENCH_CUDA", "")
     if asked not in {"", "0", "1"}:
         raise SetupError(f"CUDA={asked}: should be 1 (build for an NVIDIA GPU) or 0 (for the CPU)")
-    if not asked:
-        return built_for() or "cpu"
-    return "cuda" if asked == "1" else "cpu"
+    built = built_for()
+    kind = {"": built.partition(" ")[0] or "cpu", "0": "cpu", "1": "cuda"}[asked]
+    return built if built in {f"{kind} amx", f"{kind} no-amx"} else f"{kind} {amx()}".strip()
 
 
 def build_llama() -> None:
     """Compile llama-cpp-python and note what for; a build for another processor is not taken from pip's cache."""
     build = wanted_build()
+    kind = build.partition(" ")[0]
     flags = ["-v"]
-    if built_for() or build == "cuda":
-        flags += ["--force-reinstall", "--no-deps", "--no-cache-dir", "--no-binary", "llama-cpp-python"]
+    if built_for() or build != "cpu":
+        flags += ["--force-reinstall", "--no-deps", *cache_for(build), "--no-binary", "llama-cpp-python"]
     environment = dict(os.environ)
-    if build == "cuda":
+    if kind == "cuda":
         environment["CMAKE_ARGS"] = f"{os.environ.get('CMAKE_ARGS', '')} -DGGML_CUDA=on".strip()
         environment["CUDACXX"] = str(cuda_compiler())
-    takes = {"cpu": "for this machine in 5 to 10 minutes", "cuda": "for this machine's GPU, which takes long"}[build]
+    if build.endswith("no-amx"):
+        for name in ("CFLAGS", "CXXFLAGS"):
+            environment[name] = f"{os.environ.get(name, '')} {' '.join(NO_AMX)}".strip()
+        print(
+            f"this CPU's AMX stays unused, as code that {compiler()} makes for it fails here (GCC bug 114098); GCC "
+            "13.3 or newer and clang would use it: CC=gcc-14 CXX=g++-14 make clean setup",
+            flush=True,
+        )
+    takes = {"cpu": "for this machine in 5 to 10 minutes", "cuda": "for this machine's GPU, which takes long"}[kind]
     print(f"installing llama-cpp-python: compiled {takes}, once", flush=True)
     BUILD.unlink(missing_ok=True)
     pip(*flags, requirement("llama-cpp-python"), watch=True, environment=environment)
     BUILD.write_text(build)
+
+
+def cache_for(build: str) -> list[str]:
+    """Return pip's option for where this build is kept for the next environment, if anywhere.
+
+    pip knows its wheels by name and version, not by how they were compiled. So each verdict on AMX has a folder of
+    its own, and what is for one GPU, or follows a build that broke, is not kept.
+    """
+    kind, _, verdict = build.partition(" ")
+    asked = [str(PYTHON), "-m", "pip", "cache", "dir"]
+    if kind == "cpu" and verdict and not built_for().endswith("broken"):
+        done = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - our own interpreter
+        if done.returncode == 0 and done.stdout.strip():  # fails where the user has switched the cache off
+            return ["--cache-dir", str(Path(done.stdout.strip()) / f"s2a-bench-{verdict}")]
+    return ["--no-cache-dir"]
+
+
+def try_llama() -> None:
+    """Let llama.cpp answer about a picture in a process of its own; raises SetupError where it cannot.
+
+    A build that dies is marked, so that the next set-up compiles it anew.
+    """
+    if built_for().startswith("cuda") and not has_driver():
+        print("llama.cpp is not tried: the GPU's driver is not here", flush=True)
+        return
+    command = [str(PYTHON), "-m", "s2a_bench.inference.smoke"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S603
+    if done.returncode > DIED:
+        BUILD.write_text(f"{built_for().partition(' ')[0]} broken")
+    if done.returncode:
+        raise SetupError((done.stderr.strip() or f"llama.cpp's test ended with {done.returncode}").splitlines()[-1])
+
+
+def has_driver() -> bool:
+    """Return whether CUDA's driver can be loaded, without which a CUDA build cannot: not in a container build."""
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True
 
 
 def requirement(name: str) -> str:
@@ -164,25 +255,33 @@ def pip(*arguments: str, watch: bool = False, environment: dict[str, str] | None
         raise SetupError(f"{tail}\npip failed; the whole log is {LOG}")
 
 
+def install() -> None:
+    """Make the environment, compile llama-cpp-python, install the rest; only what is missing."""
+    check_machine()
+    if not has_pip():
+        print(f"making {VENV}", flush=True)
+        venv = [sys.executable, "-m", "venv", "--clear", str(VENV)]
+        if subprocess.run(venv, check=False).returncode:  # noqa: S603 - our own interpreter
+            raise SetupError(f"cannot make a virtual environment in {VENV}; is the folder writable?")
+    LOG.write_text("")
+    if built_for() != wanted_build():
+        build_llama()
+    print("installing the other packages", flush=True)
+    pip("--quiet", "--editable", f"{ROOT}[dev]")
+
+
 def main() -> int:
-    """Bring `.venv` up to date."""
+    """Bring `.venv` up to date, and see that llama.cpp works on this processor."""
     stamp = VENV / "s2a-bench-installed"
+    installed, _, tried_on = stamp.read_text().partition("\n") if stamp.exists() else ("", "", "")
     try:
-        up_to_date = stamp.exists() and stamp.read_text() == fingerprint() and PYTHON.exists()
-        if up_to_date and built_for() == wanted_build():
+        if installed != fingerprint() or not PYTHON.exists() or built_for() != wanted_build():
+            install()
+        elif tried_on == processor():
             return 0
-        check_machine()
-        if not has_pip():
-            print(f"making {VENV}", flush=True)
-            venv = [sys.executable, "-m", "venv", "--clear", str(VENV)]
-            if subprocess.run(venv, check=False).returncode:  # noqa: S603 - our own interpreter
-                raise SetupError(f"cannot make a virtual environment in {VENV}; is the folder writable?")
-        LOG.write_text("")
-        if built_for() != wanted_build():
-            build_llama()
-        print("installing the other packages", flush=True)
-        pip("--quiet", "--editable", f"{ROOT}[dev]")
-        stamp.write_text(fingerprint())
+        stamp.unlink(missing_ok=True)
+        try_llama()
+        stamp.write_text(f"{fingerprint()}\n{processor()}")
     except SetupError as error:
         print(f"setup: {error}", file=sys.stderr)
         return 1

@@ -1,4 +1,4 @@
-"""A hardware profile as data: how fast and evenly a board streams tokens. Files are read by `inference.profiles`."""
+"""A hardware profile as data: how fast and evenly a board streams tokens. Files are read by `boards.search`."""
 
 from __future__ import annotations
 

@@ -20,6 +20,7 @@ import httpx
 from s2a_bench import errors
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import EngineError, PortInUse, ServerDied, UsageError
+from s2a_bench.exits import COMPILE_AGAIN, SETUP_AGAIN, how_it_ended
 from s2a_bench.harness.llama_flags import llama_flags
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
@@ -50,6 +51,7 @@ class ServerProcess(ABC):
         )
 
     _speaks_json = True
+    _cure = SETUP_AGAIN
 
     @abstractmethod
     def wait_ready(self) -> None:
@@ -74,8 +76,7 @@ class ServerProcess(ABC):
 
     def death(self) -> ServerDied:
         """Describe how the process ended, with the last line it wrote."""
-        code = self._process.poll()
-        how = f"killed by signal {-code}" if code is not None and code < 0 else f"exit code {code}"
+        how = how_it_ended(self._process.poll(), self._cure)
         lines = self.log.read_text(errors="replace").strip().splitlines()
         last = f": {lines[-1][:200]}" if lines else ""
         return ServerDied(f"the {self.name} server (pid {self.pid}) died, {how}{last}; its log is {self.log}")
@@ -147,6 +148,7 @@ class LlamaServer(ServerProcess):
     """llama.cpp's own server on the same model files: a black box."""
 
     _speaks_json = False
+    _cure = COMPILE_AGAIN
 
     def __init__(self, binary: Path, engine: EngineConfig, port: int, log: Path, *, has_grammar: bool) -> None:
         """Start the binary on ``port``, or any free one for 0; raises UsageError when it cannot be run.

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError, StoreError
+from s2a_bench.exits import how_it_ended
 from s2a_bench.machine.environment import collect
 from s2a_bench.store import manifest as manifests
 from s2a_bench.sweep import Cell, Outcome
@@ -86,7 +87,7 @@ def _outside(argv: list[str], log: Path) -> str:
         return ""
     lines = log.read_text(errors="replace").strip().splitlines()
     told = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
-    how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+    how = how_it_ended(done.returncode)
     return told[-1] if told else f"{how}: {lines[-1][:200]}" if lines else how
 
 

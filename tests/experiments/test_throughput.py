@@ -158,6 +158,7 @@ def test_without_threads_the_reference_has_those_of_this_process() -> None:
     ("fault", "message"),
     [
         ("crash", "exit code 1: main: error: failed to load model 'x.gguf'"),
+        ("illegal", "AMX does not work; compile it on this machine: nothing"),
         ("garbage", "not llama-bench's JSON"),
         ("empty", "not llama-bench's JSON"),
         ("old", "too old to know --flash-attn auto"),

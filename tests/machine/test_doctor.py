@@ -16,6 +16,7 @@ import pytest
 
 from s2a_bench.frames.v4l2_formats import CameraInfo
 from s2a_bench.harness.warnings import before_run
+from s2a_bench.inference.smoke import Smoke
 from s2a_bench.machine import doctor, environment
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, LEVELS, Finding, Machine, examine, worst
 from s2a_bench.machine.doctor.gpu import current_power_mode
@@ -84,6 +85,7 @@ def make(tmp_path: Path) -> Make:
             (root / path).parent.mkdir(parents=True, exist_ok=True)
             (root / path).write_text(text)
         silent: dict[str, Any] = {"run": lambda _command: None, "which": lambda _name: None, "cameras": list}
+        silent["smoke_test"] = lambda: Smoke(0)
         known: dict[str, Any] = {"environ": {}, "cpus": frozenset(range(4)), "finds": lambda _package: True}
         return Machine(root, **(known | silent | {"output": tmp_path} | fields))
 
@@ -397,7 +399,39 @@ def test_a_gpu_build_says_so(make: Make, monkeypatch: pytest.MonkeyPatch) -> Non
     fake_llama(monkeypatch, b"CUDA : ARCHS = 1200 | USE_GRAPHS = 1 | CPU : AVX2 = 1 | ", offload=True)
     finding = see(make(RTX), "llama-build")
     assert finding.level == "state"
-    assert finding.message.endswith("with GPU; USE_GRAPHS AVX2")
+    assert finding.message.endswith("with GPU; USE_GRAPHS AVX2; no AMX in this CPU")
+
+
+XEON = RTX | {"proc/cpuinfo": "model name : Intel Xeon\nflags : avx2 amx_bf16 amx_tile amx_int8\n"}
+NO_AMX = {f"{sys.prefix}/s2a-bench-llama".lstrip("/"): "cpu no-amx"}
+
+
+@pytest.mark.parametrize(
+    ("tree", "info", "level", "says"),
+    [
+        (XEON, b"CPU : AVX2 = 1 | AMX_INT8 = 1 | ", "state", "AMX used"),
+        (XEON | NO_AMX, b"CPU : AVX2 = 1 | ", "advice", "AMX off, as the compiler's code for it does not work"),
+        (XEON, b"CPU : AVX2 = 1 | ", "advice", "AMX off, left out of this build"),
+    ],
+)
+def test_amx_is_used_or_off_for_a_reason(
+    make: Make, monkeypatch: pytest.MonkeyPatch, tree: dict[str, str], info: bytes, level: str, says: str
+) -> None:
+    fake_llama(monkeypatch, info, offload=True)
+    finding = see(make(tree), "llama-build")
+    assert (finding.level, finding.message.endswith(says)) == (level, True), finding
+    assert ("make clean setup" in finding.fix) == (level == "advice")
+
+
+def test_a_build_that_dies_is_an_error_and_never_loaded_here(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "llama_cpp", None)  # importing it would say that it does not load
+    died = Smoke(-4, "llama.cpp failed its test with q8_0 weights: killed by signal 4 (SIGILL)")
+    finding = see(make(RTX, smoke_test=lambda: died), "llama-build")
+    assert finding == Finding("llama-build", "error", died.message, "make clean setup")
+
+
+def test_only_the_doctor_makes_the_smoke_test() -> None:
+    assert "llama-build" not in BEFORE_RUN
 
 
 def test_every_check_exists_and_uses_its_own_code(make: Make) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import platform
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +49,14 @@ def test_the_pinned_llama_cpp_is_the_required_one() -> None:
     assert lines_with("llama-cpp-python==", "constraints.txt") == lines_with("llama-cpp-python==", "pyproject.toml")
 
 
+AMX = "flags\t\t: fpu avx2 amx_bf16 amx_tile amx_int8\n"
+
+
+def write_program(path: Path, lines: str) -> None:
+    path.write_text(f"#!/bin/sh\n{lines}\n")
+    path.chmod(0o755)
+
+
 Calls = list[tuple[tuple[str, ...], dict[str, str]]]
 
 
@@ -56,17 +66,19 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     bin_ = tmp_path / "bin"
     bin_.mkdir()
     for name in ("nvcc", "c++", "cc"):
-        (bin_ / name).write_text("#!/bin/sh\n")
-        (bin_ / name).chmod(0o755)
+        write_program(bin_ / name, "")
     for name, value in {"S2A_BENCH_VENV": str(tmp_path / "venv"), "PATH": str(bin_)}.items():
         monkeypatch.setenv(name, value)
-    for name in ("S2A_BENCH_CUDA", "CMAKE_ARGS", "CUDACXX", "CC", "CXX"):
+    for name in ("S2A_BENCH_CUDA", "CMAKE_ARGS", "CUDACXX", "CC", "CXX", "CFLAGS", "CXXFLAGS"):
         monkeypatch.delenv(name, raising=False)
     spec = importlib.util.spec_from_file_location("setup_script", ROOT / "tools" / "setup.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    monkeypatch.setattr(module, "CPUINFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(module, "has_driver", lambda: True)
+    module.CPUINFO.write_text("flags\t\t: fpu avx2\n")
     return module
 
 
@@ -83,7 +95,7 @@ def calls(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Calls:
         site.mkdir(parents=True, exist_ok=True)
 
     python.parent.mkdir(parents=True)
-    python.touch()
+    write_program(python, f'case "$*" in *cache*) echo {script.VENV.parent / "pip-cache"};; esac')
     monkeypatch.setattr(script, "pip", pip)
     monkeypatch.setattr(script, "has_pip", lambda: True)
     return calls
@@ -141,10 +153,12 @@ def test_a_build_that_broke_off_is_made_again(
     assert built(calls) == ["-DGGML_CUDA=on"]
 
 
+@pytest.mark.parametrize("amx", ["", "no-amx"])
 def test_without_nvcc_cuda_is_one_line_before_anything_is_compiled(
-    script: ModuleType, calls: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    script: ModuleType, calls: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], amx: str
 ) -> None:
     monkeypatch.setenv("S2A_BENCH_CUDA", "1")
+    monkeypatch.setattr(script, "amx", lambda: amx)
     monkeypatch.setattr(script, "CUDA_COMPILERS", ("no-such-nvcc",))
     assert script.main() == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -159,3 +173,166 @@ def test_a_cuda_setting_that_is_none_is_named(
     monkeypatch.setenv("S2A_BENCH_CUDA", "yes")
     assert script.main() == 1
     assert capsys.readouterr().err == "setup: CUDA=yes: should be 1 (build for an NVIDIA GPU) or 0 (for the CPU)\n"
+
+
+def compile_as(script: ModuleType, *, probe: str, flags: str = "") -> None:
+    """Let the CPU have AMX and a stand-in compile the probe into ``probe``; ``flags`` is what it knows besides."""
+    script.CPUINFO.write_text(AMX)
+    lines = f"""
+case "$*" in *-mno-amx*) {flags or "exit 0"};; esac
+while [ "$1" != -o ]; do shift; done
+printf '#!/bin/sh\\n{probe}\\n' > "$2"
+/bin/chmod +x "$2"
+"""
+    write_program(script.VENV.parent / "bin" / "c++", lines)
+
+
+SOUND, WRONG_BYTES, DIES = "exit 0", "exit 1", "kill -ILL $$"
+
+
+@pytest.mark.parametrize(
+    ("probe", "flags", "verdict"),
+    [
+        (SOUND, "", "amx"),
+        (WRONG_BYTES, "", "no-amx"),
+        (DIES, "", "no-amx"),
+        (SOUND, "exit 1", ""),  # a compiler that does not know AMX makes no use of it, and refuses the flags
+    ],
+)
+def test_the_probe_judges_what_the_compiler_makes_of_amx(
+    script: ModuleType, probe: str, flags: str, verdict: str
+) -> None:
+    compile_as(script, probe=probe, flags=flags)
+    assert script.amx() == verdict
+
+
+def test_without_amx_nothing_is_compiled_to_judge_it(script: ModuleType) -> None:
+    compile_as(script, probe=WRONG_BYTES)
+    script.CPUINFO.write_text("flags\t\t: fpu avx2\n")
+    assert script.amx() == ""
+    script.CPUINFO.unlink()
+    assert script.amx.__wrapped__() == ""
+
+
+COMPILER = shutil.which("c++")
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64" or not COMPILER, reason="needs a C++ compiler for x86-64")
+def test_the_probe_itself_is_sound_code(tmp_path: Path) -> None:
+    flags = ["-O2", "-mamx-tile", "-Wall", "-Wextra", "-Werror", "-o", str(tmp_path / "probe")]
+    subprocess.run([str(COMPILER), *flags, str(ROOT / "tools" / "amx_probe.cpp")], check=True)
+    assert subprocess.run([str(tmp_path / "probe")], check=False).returncode in {-4, 0, 1, 2}  # as the CPU has it
+
+
+def test_a_compiler_that_breaks_amx_builds_without_it_and_says_so_once(
+    script: ModuleType, calls: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("CXXFLAGS", "-g  -O1")
+    compile_as(script, probe=WRONG_BYTES)
+    assert script.main() == 0
+    (arguments, environment), *_ = calls
+    off = "-mno-amx-tile -mno-amx-int8 -mno-amx-bf16"
+    assert (environment["CFLAGS"], environment["CXXFLAGS"]) == (off, f"-g  -O1 {off}")
+    assert arguments[arguments.index("--cache-dir") + 1].endswith("/pip-cache/s2a-bench-no-amx")
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "AMX" in line]
+    assert "GCC 13.3 or newer and clang would use it: CC=" in line
+    assert script.built_for() == "cpu no-amx"
+    calls.clear()
+    assert script.main() == 0
+    assert calls == []
+
+
+def test_a_sound_compiler_uses_amx_and_has_a_cache_apart(script: ModuleType, calls: Calls) -> None:
+    compile_as(script, probe=SOUND)
+    assert script.main() == 0
+    (arguments, environment), *_ = calls
+    assert "CFLAGS" not in environment
+    assert arguments[arguments.index("--cache-dir") + 1].endswith("/pip-cache/s2a-bench-amx")
+    assert script.built_for() == "cpu amx"
+    compile_as(script, probe=WRONG_BYTES)  # a later `make test` with another compiler does not undo it
+    script.amx.cache_clear()
+    calls.clear()
+    assert script.main() == 0
+    assert calls == []
+
+
+def test_a_build_from_before_amx_was_judged_is_made_again(script: ModuleType, calls: Calls) -> None:
+    assert script.main() == 0
+    assert script.built_for() == "cpu"
+    calls.clear()
+    compile_as(script, probe=WRONG_BYTES)
+    script.amx.cache_clear()
+    assert script.main() == 0
+    (arguments, _), *_ = calls
+    assert "--force-reinstall" in arguments
+    assert script.built_for() == "cpu no-amx"
+
+
+def test_a_gpu_build_leaves_broken_amx_out_too(
+    script: ModuleType, calls: Calls, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("S2A_BENCH_CUDA", "1")
+    compile_as(script, probe=DIES)
+    assert script.main() == 0
+    (arguments, environment), *_ = calls
+    assert "--no-cache-dir" in arguments
+    assert environment["CMAKE_ARGS"] == "-DGGML_CUDA=on"
+    assert "-mno-amx-tile" in environment["CXXFLAGS"]
+    assert script.built_for() == "cuda no-amx"
+
+
+def break_llama(script: ModuleType, code: int, *said: str) -> None:
+    lines = "\n".join(f"echo '{line}' >&2" for line in said)
+    write_program(script.PYTHON, f'case "$*" in *smoke*) {lines}\nexit {code};; esac')
+
+
+def test_a_build_that_dies_is_not_ready_and_is_compiled_anew_next_time(
+    script: ModuleType, calls: Calls, capsys: pytest.CaptureFixture[str]
+) -> None:
+    break_llama(script, 132, "llama.cpp failed its test: killed by signal 4")
+    assert script.main() == 1
+    assert capsys.readouterr().err == "setup: llama.cpp failed its test: killed by signal 4\n"
+    assert not (script.VENV / "s2a-bench-installed").exists()
+    calls.clear()
+    break_llama(script, 0)
+    assert script.main() == 0
+    (arguments, _), *_ = calls
+    assert {"--force-reinstall", "--no-cache-dir"} <= set(arguments)
+    assert script.built_for() == "cpu"
+    assert (script.VENV / "s2a-bench-installed").exists()
+
+
+def test_a_test_that_fails_otherwise_is_not_ready_but_keeps_the_build(
+    script: ModuleType, calls: Calls, capsys: pytest.CaptureFixture[str]
+) -> None:
+    break_llama(script, 1, "a long story", "No space left on device")
+    assert script.main() == 1
+    assert capsys.readouterr().err == "setup: No space left on device\n"
+    assert script.built_for() == "cpu"
+    calls.clear()
+    break_llama(script, 0)
+    assert script.main() == 0
+    assert built(calls) == []
+
+
+def test_another_processor_is_tried_before_it_is_called_ready(
+    script: ModuleType, calls: Calls, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert script.main() == 0
+    calls.clear()
+    script.CPUINFO.write_text("Features\t: fp asimd\n")
+    break_llama(script, 132, "died")
+    assert script.main() == 1
+    assert "died" in capsys.readouterr().err
+    assert calls == []
+
+
+def test_a_gpu_build_without_its_driver_is_not_tried(
+    script: ModuleType, calls: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("S2A_BENCH_CUDA", "1")
+    monkeypatch.setattr(script, "has_driver", lambda: False)
+    break_llama(script, 1, "libcuda.so.1: cannot open shared object file")
+    assert script.main() == 0
+    assert "not tried: the GPU's driver is not here" in capsys.readouterr().out
+    assert built(calls) == ["-DGGML_CUDA=on"]

@@ -14,6 +14,7 @@ from typing import Any
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError
+from s2a_bench.exits import COMPILE_AGAIN, how_it_ended
 from s2a_bench.experiments.throughput.rows import REFERENCE, ReferenceRow
 from s2a_bench.harness.llama_flags import llama_flags
 from s2a_bench.harness.plan import LatencyConfig
@@ -65,7 +66,8 @@ class LlamaBench:
             raise EngineError(f"--reference {self._program}: {error}") from error
         said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1][:200]
         if done.returncode:
-            raise EngineError(f"--reference {self._program}: exit code {done.returncode}: {said}")
+            how = how_it_ended(done.returncode, COMPILE_AGAIN)
+            raise EngineError(f"--reference {self._program}: {how}: {said}")
         try:
             (test,) = json.loads(done.stdout)
             if not (test["n_gen"] > 0 and test["samples_ns"][0] > 0):

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 if TYPE_CHECKING:
     from s2a_bench.frames.v4l2_formats import CameraInfo
+    from s2a_bench.inference.smoke import Smoke
 
 Level: TypeAlias = Literal["state", "advice", "warning", "error"]
 LEVELS: tuple[Level, ...] = ("state", "advice", "warning", "error")
@@ -61,6 +62,13 @@ def _cameras() -> list[CameraInfo]:
     return list_cameras()
 
 
+def _smoke_test() -> Smoke:
+    """Let llama.cpp answer in a process of its own, which takes seconds."""
+    from s2a_bench.inference.smoke import smoke_test
+
+    return smoke_test()
+
+
 @dataclass(frozen=True, slots=True)
 class Machine:
     """Everything that checks may look at; the defaults are this machine and this process."""
@@ -75,6 +83,7 @@ class Machine:
     finds: Callable[[str], bool] = _finds
     """Whether this Python has a package."""
     cameras: Callable[[], list[CameraInfo]] = _cameras
+    smoke_test: Callable[[], Smoke] = _smoke_test
 
     def read(self, path: str) -> str | None:
         """Return a file's text without blanks and NULs around it; None where it cannot be read."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import re
+import sys
 from importlib.metadata import PackageNotFoundError, requires, version
 
 from packaging.requirements import Requirement
@@ -15,6 +16,9 @@ CUDA_BUILD = (
     "make setup CUDA=1, or CMAKE_ARGS=-DGGML_CUDA=on pip install --no-binary llama-cpp-python --force-reinstall"
 )
 CUDA_BUILD += " --no-cache-dir llama-cpp-python"
+AMX_BUILD = "CC=gcc-14 CXX=g++-14 make clean setup, with GCC 13.3 or newer or clang"
+BUILT_FOR = f"{sys.prefix}/s2a-bench-llama".lstrip("/")
+"""Where `make setup` notes what it built llama-cpp-python for."""
 
 
 def python(machine: Machine) -> Finding:
@@ -62,8 +66,12 @@ def compiler(machine: Machine) -> Finding:
 
 
 def llama_build(machine: Machine) -> Finding:
-    """Say what llama-cpp-python was built for, and whether a GPU lies idle because of it."""
+    """Say what llama-cpp-python was built for, whether GPU or AMX lie idle because of it, and whether it works."""
     from s2a_bench.machine.doctor.gpu import has_nvidia
+
+    seen = machine.smoke_test()
+    if seen.message:
+        return Finding("llama-build", "error", seen.message, "make clean setup")
 
     try:
         import llama_cpp
@@ -76,11 +84,25 @@ def llama_build(machine: Machine) -> Finding:
     text = llama_cpp.llama_print_system_info().decode(errors="replace")
     flags = re.findall(r"(\w+) = 1\b", text)
     offload = bool(llama_cpp.llama_supports_gpu_offload())
-    told = f"llama-cpp-python {llama_cpp.__version__}, {'with' if offload else 'without'} GPU; {' '.join(flags)}"
+    cpuinfo = machine.read("proc/cpuinfo") or ""
+    amx = _amx(machine, cpuinfo, flags)
+    told = f"llama-cpp-python {llama_cpp.__version__}, {'with' if offload else 'without'} GPU; {' '.join(flags)}; {amx}"
     if has_nvidia(machine) and not offload:
         return Finding("llama-build", "warning", f"{told}: the NVIDIA GPU of this machine is not used", CUDA_BUILD)
-    if platform.machine() == "x86_64" and " avx2" in (machine.read("proc/cpuinfo") or "") and "AVX2" not in flags:
+    if platform.machine() == "x86_64" and " avx2" in cpuinfo and "AVX2" not in flags:
         return Finding(
             "llama-build", "warning", f"{told}: built without this CPU's AVX2, far slower", "make clean setup"
         )
+    if amx.startswith("AMX off"):
+        return Finding("llama-build", "advice", told, AMX_BUILD)
     return Finding("llama-build", "state", told)
+
+
+def _amx(machine: Machine, cpuinfo: str, flags: list[str]) -> str:
+    """Say whether this CPU has AMX and llama.cpp uses it."""
+    if " amx_tile" not in cpuinfo:
+        return "no AMX in this CPU"
+    if "AMX_INT8" in flags:
+        return "AMX used"
+    wrong = (machine.read(BUILT_FOR) or "").endswith("no-amx")
+    return "AMX off, as the compiler's code for it does not work" if wrong else "AMX off, left out of this build"

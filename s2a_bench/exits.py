@@ -1,0 +1,21 @@
+"""How a child process ended, in words that say what to do."""
+
+from __future__ import annotations
+
+from signal import SIGILL
+
+SETUP_AGAIN = "run `make setup` again"
+COMPILE_AGAIN = "compile it on this machine"
+"""The way out for a program that is the user's own."""
+
+
+def how_it_ended(code: int | None, cure: str = SETUP_AGAIN) -> str:
+    """Describe a `returncode` of `subprocess`; an illegal instruction says where it comes from, and the ``cure``."""
+    if code is None or code >= 0:
+        return f"exit code {code}"
+    if -code != SIGILL:
+        return f"killed by signal {-code}"
+    return (
+        f"killed by signal {-code} (SIGILL): llama.cpp was compiled for another processor, or by a compiler whose "
+        f"code for AMX does not work; {cure}"
+    )

@@ -1,0 +1,51 @@
+"""How a process that died is told: a server, and a cell of a sweep."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.errors import ServerDied
+from s2a_bench.harness.processes import LlamaServer, OwnServer, ServerProcess
+from s2a_bench.sweep.perform import _outside
+
+
+class Dies(ServerProcess):
+    """Kills itself, as an illegal instruction would."""
+
+    def __init__(self, log: Path, number: str) -> None:
+        code = f"import os, signal; os.kill(os.getpid(), signal.{number})"
+        super().__init__("http", [sys.executable, "-c", code], log)
+
+    def wait_ready(self) -> None:
+        assert self.ends_within(20)
+        raise self.death()
+
+
+def test_a_server_that_met_an_illegal_instruction_says_to_set_up_again(tmp_path: Path) -> None:
+    with Dies(tmp_path / "log", "SIGILL") as server, pytest.raises(ServerDied) as error:
+        server.wait_ready()
+    assert "died, killed by signal 4 (SIGILL): llama.cpp was compiled for another processor" in str(error.value)
+    assert "; run `make setup` again; its log is" in str(error.value)
+
+
+def test_another_signal_is_only_told(tmp_path: Path) -> None:
+    with Dies(tmp_path / "log", "SIGTERM") as server, pytest.raises(ServerDied, match="by signal 15; its log is"):
+        server.wait_ready()
+
+
+def test_only_our_own_server_is_mended_by_our_set_up() -> None:
+    assert "make setup" in OwnServer._cure
+    assert "make setup" not in LlamaServer._cure
+
+
+def test_a_cell_of_a_sweep_that_met_an_illegal_instruction_says_so_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\nkill -ILL $$\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    assert _outside([], tmp_path / "log").endswith("run `make setup` again")
