@@ -2,7 +2,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from s2a_bench.cli import with_flags
+from s2a_bench.cli.adapter import with_flags
 from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
 

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from s2a_bench.experiments.boundary.run import BoundaryConfig, run_boundary
+from s2a_bench.experiments.boundary.config import BoundaryConfig
+from s2a_bench.experiments.boundary.run import run_boundary
 from s2a_bench.experiments.boundary.view.figure import build_boundary
 from s2a_bench.experiments.study.run import StudyConfig, run_study
 from s2a_bench.experiments.study.view.figures import build_frontier, build_targets

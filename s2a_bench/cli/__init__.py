@@ -5,16 +5,15 @@ Modules here import heavy libraries inside their functions only, so that ``--hel
 
 from __future__ import annotations
 
-import re
 import signal
 import sys
 from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 from s2a_bench import __version__
 from s2a_bench.cli import (
-    boundary,
     ccrb,
     compare,
     doctor,
@@ -28,14 +27,44 @@ from s2a_bench.cli import (
     throughput,
     timeline,
 )
+from s2a_bench.cli.adapter import with_flags
 from s2a_bench.errors import S2AError
+from s2a_bench.experiments import EXPERIMENTS
 
 INTERRUPTED = 130
-FIELD = re.compile(r"`([a-z][a-z0-9_]*)`")
 ParseError: Any = typer.BadParameter.__mro__[1]
 """Click's UsageError: newer typer brings a click of its own, so it cannot be named by import."""
 
+
+class Commands(TyperGroup):
+    """The commands by hand and the experiments; an experiment is imported when its command is looked up."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of all commands."""
+        return sorted({*super().list_commands(ctx), *EXPERIMENTS})
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command, that of an experiment made from its declaration."""
+        found = super().get_command(ctx, cmd_name)
+        if found is None and cmd_name in EXPERIMENTS:
+            from s2a_bench.cli.experiment import command_of
+
+            single = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False, add_completion=False)
+            single.command(cmd_name)(command_of(EXPERIMENTS[cmd_name]))
+            found = self.commands[cmd_name] = typer.main.get_command(single)
+        return found
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 - its base has it
+        """List every command with its sentence, without importing what experiments are made of."""
+        abouts = {name: command.get_short_help_str(limit=150) for name, command in self.commands.items()}
+        for name, experiment in EXPERIMENTS.loaded():
+            abouts[name] = experiment.about
+        with formatter.section("Commands"):
+            formatter.write_dl(sorted(abouts.items()))
+
+
 app = typer.Typer(
+    cls=Commands,
     name="s2a-bench",
     help="Measure how a vision-language model is wired to a robot, and when the robot may act.",
     no_args_is_help=True,
@@ -48,7 +77,6 @@ app.command("latency")(latency.latency)
 app.command("throughput")(throughput.throughput)
 app.command("study")(study.study)
 app.command("timeline")(timeline.timeline)
-app.command("boundary")(boundary.boundary)
 app.command("ccrb")(ccrb.ccrb)
 app.command("sweep")(sweep.sweep)
 app.command("compare")(compare.compare)
@@ -89,11 +117,6 @@ def main() -> None:
         sys.stderr.close()
         code = 1
     sys.exit(code if isinstance(code, int) else 0)
-
-
-def with_flags(message: str) -> str:
-    """Return a library's message with its fields, `max_tokens`, as flags, --max-tokens."""
-    return FIELD.sub(lambda field: f"--{field[1].replace('_', '-')}", message)
 
 
 def _say(line: str, code: int) -> int:

@@ -70,4 +70,4 @@ def _commands() -> dict[str, Any]:
     from s2a_bench.cli import app
 
     group: Any = get_command(app)
-    return dict(group.commands)
+    return {name: group.get_command(None, name) for name in group.list_commands(None)}

@@ -1,1 +1,151 @@
-"""What can be measured or tried: one folder each, with what it is asked, how it runs and how it is shown."""
+"""What can be measured or tried: one folder each, with what it is asked, how it runs and how it is shown.
+
+An experiment's ``__init__`` holds its declaration, which imports nothing heavy:
+
+    EXPERIMENT = Experiment(
+        name="boundary",
+        about="Show at which rates and granularities naive execution never stalls.",
+        config="s2a_bench.experiments.boundary.config:BoundaryConfig",
+        run="s2a_bench.experiments.boundary.run:run_boundary",
+        view="s2a_bench.experiments.boundary.view:show",
+    )
+
+Its command, its flags, its chapter on the page, its comparison and its part of the library follow from that. Other
+packages offer experiments as entry points of the group ``s2a_bench.experiments``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias
+
+from s2a_bench.registry import Registry
+
+if TYPE_CHECKING:
+    import numpy as np
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from s2a_bench.options import Options
+    from s2a_bench.progress import Progress
+    from s2a_bench.store.run import Run
+    from s2a_bench.writers.tables import TextTable
+
+Better: TypeAlias = Literal["lower", "higher", "neither"]
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A number that cells of runs have: its unit, which way is better, and the statistic it is judged by.
+
+    ``title`` is what people read, ``statistic`` median or mean. JSON, CSV, comparison and plain table follow from it.
+    """
+
+    name: str
+    unit: str = ""
+    better: Better = "lower"
+    title: str = ""
+    statistic: str = "median"
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """One cell of one run as it is compared.
+
+    ``setting`` is what must be the same on both sides besides the name. ``rows`` gives a metric's values, a row a
+    request (or plan) in the order in which they were made, none where the cell does not have the metric. ``exact``
+    values are computed without chance.
+    """
+
+    name: str
+    setting: Mapping[str, str]
+    n: int
+    errors: int
+    rows: Callable[[str], list[NDArray[np.float64]]]
+    exact: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What a run shows, each part by its file's name.
+
+    ``main`` are the tables that stand open on the page, ``printed`` those on the terminal (None: all), ``notes`` what
+    is said below them. ``csvs`` are whole CSV texts, ``figures`` are drawn when called, ``files`` write themselves into
+    the run folder. ``json`` gives the ``--json`` object. ``lanes`` are timelines to look into.
+    """
+
+    sentences: Sequence[str] = ()
+    tables: Mapping[str, TextTable] = field(default_factory=dict)
+    main: Sequence[str] = ()
+    printed: Sequence[str] | None = None
+    notes: Sequence[str] = ()
+    csvs: Mapping[str, str] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
+    files: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
+    json: Callable[[], dict[str, Any]] = dict
+    lanes: Sequence[Any] = ()
+
+
+class View(Protocol):
+    """How an experiment's runs are shown; ``asked`` are its view options."""
+
+    def __call__(self, run: Run, **asked: Any) -> Shown:
+        """Return what a run shows; reads the store and measures nothing."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """What the runs of an experiment can be compared by.
+
+    ``origin`` says what did not really answer; ``shown`` are the metrics that are compared unless others are named.
+    """
+
+    metrics: Mapping[str, Metric]
+    subjects: Callable[[Run], list[Subject]]
+    origin: Callable[[Run], Sequence[str]]
+    shown: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """The declaration of one experiment; what it names as ``module:attribute`` is imported when it is needed."""
+
+    name: str
+    about: str
+    """What ``--help`` says of it: a sentence."""
+    config: str
+    """Class of its options, an `options.Options`."""
+    run: str
+    """Function ``(config, output, progress) -> run folder``."""
+    view: str
+    """Function, a `View`."""
+    view_options: str = ""
+    """Class of the options that change what is shown and not what is measured."""
+    compared: str = ""
+    """A `Compared`; without it, its runs are not compared."""
+    unit: str = "samples"
+    """What progress counts, and what is kept of a run that breaks off."""
+
+    def run_with(self, config: Options, output: Path, progress: Progress) -> Path:
+        """Run it and return the run folder; raises S2AError for what a user can mend."""
+        folder: Path = resolve_name(self.run)(config, output, progress)
+        return folder
+
+    def show(self, run: Run, **asked: Any) -> Shown:
+        """Return what one of its runs shows."""
+        shown: Shown = resolve_name(self.view)(run, **asked)
+        return shown
+
+
+EXPERIMENTS: Final[Registry[Experiment]] = Registry(
+    "experiments",
+    "command",
+    {
+        "boundary": "s2a_bench.experiments.boundary:EXPERIMENT",
+    },
+)
+"""The experiments by their commands."""

@@ -15,7 +15,6 @@ from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
 from s2a_bench.harness.patience import Patience
 from s2a_bench.harness.plan import LatencyConfig, plan_cells
-from s2a_bench.harness.progress import Progress
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Place, Session
@@ -25,6 +24,7 @@ from s2a_bench.machine import environment
 from s2a_bench.machine.doctor import Machine
 from s2a_bench.machine.resources.sampler import Sampler, open_sampler
 from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
+from s2a_bench.progress import Progress
 from s2a_bench.store.requests import FrameRow
 from s2a_bench.store.run import RunWriter
 from s2a_bench.trace import mark_cost_ns

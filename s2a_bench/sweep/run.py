@@ -23,7 +23,7 @@ from s2a_bench.sweep.perform import run_folder
 from s2a_bench.sweep.plan import Plan
 
 if TYPE_CHECKING:
-    from s2a_bench.harness.progress import Progress
+    from s2a_bench.progress import Progress
 
 COPY = "sweep.toml"
 """The sweep file as it was, in the sweep's folder."""

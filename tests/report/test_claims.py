@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.experiments.boundary.run import BoundaryConfig, run_boundary
+from s2a_bench.experiments.boundary.config import BoundaryConfig
+from s2a_bench.experiments.boundary.run import run_boundary
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb

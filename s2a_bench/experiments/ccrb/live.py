@@ -37,8 +37,8 @@ from s2a_bench.store.requests import SAMPLES, TOKENS
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
-    from s2a_bench.harness.progress import Progress
     from s2a_bench.policy import Floats
+    from s2a_bench.progress import Progress
 
 _MODELLED = ("profile", "rate", "prompt_s", "phase", "phase_rates", "phase_gaps_m", "phase_points", "random")
 """Settings of CcrbConfig that mean nothing here."""

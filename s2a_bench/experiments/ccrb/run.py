@@ -23,7 +23,7 @@ from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
-    from s2a_bench.harness.progress import Progress
+    from s2a_bench.progress import Progress
 
 
 def run_ccrb(config: CcrbConfig, output: Path, progress: Progress, **settings: object) -> Path:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from s2a_bench.harness.plan import LatencyConfig
-from s2a_bench.harness.progress import Progress
 from s2a_bench.harness.rounds import Task, run_requests
+from s2a_bench.progress import Progress
 
 
 def run_latency(config: LatencyConfig, output: Path, progress: Progress) -> Path:

@@ -19,7 +19,7 @@ from s2a_bench.store.run import RunWriter
 from s2a_bench.types import Request
 
 if TYPE_CHECKING:
-    from s2a_bench.harness.progress import Progress
+    from s2a_bench.progress import Progress
 
 COMMAND: Final = "model validity"
 PAPER: Final = "paper"

@@ -16,8 +16,8 @@ from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.policy.conformal import CONFIDENCE, PLANS, check, coarse, upper_bound
 
 if TYPE_CHECKING:
-    from s2a_bench.harness.progress import Progress
     from s2a_bench.harness.warnings import Doubt
+    from s2a_bench.progress import Progress
 
 Cell: TypeAlias = Callable[[], Sequence[StudyRow]]
 """Independent work of a study: a partial of a module's function, so that another process can run it."""

@@ -10,10 +10,10 @@ from pathlib import Path
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.throughput.llama_bench import LlamaBench
 from s2a_bench.harness.plan import LatencyConfig
-from s2a_bench.harness.progress import Progress
 from s2a_bench.harness.rounds import Task, Turn, run_requests
 from s2a_bench.harness.session import Session
 from s2a_bench.inference.llama_settings import check_settings
+from s2a_bench.progress import Progress
 from s2a_bench.store.run import RunWriter
 
 IN_PROCESS = "in-process"

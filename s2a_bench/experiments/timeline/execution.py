@@ -15,11 +15,11 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.run import finite
 from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows
-from s2a_bench.harness.progress import Progress
 from s2a_bench.harness.warnings import Doubt
 from s2a_bench.plan import Gap
 from s2a_bench.policy import Plans, PlanShape, Policy, Schedule
 from s2a_bench.policy.evaluate import TOLERANCE_S
+from s2a_bench.progress import Progress
 from s2a_bench.runtime import Robot
 from s2a_bench.runtime.events import AbortAsked, Event, LiveInbox
 from s2a_bench.runtime.executor import Executor

@@ -21,8 +21,8 @@ from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
-    from s2a_bench.harness.progress import Progress
     from s2a_bench.policy import Floats
+    from s2a_bench.progress import Progress
 
 
 def run_timeline(config: TimelineConfig, output: Path, progress: Progress) -> Path:

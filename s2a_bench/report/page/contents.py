@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
+from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.model_validity.rows import VALIDITY
 from s2a_bench.experiments.study.rows import STUDIES
 from s2a_bench.report.page import Content
 from s2a_bench.report.page.sentences import (
-    boundary_sentences,
     ccrb_sentences,
     latency_sentences,
     study_sentences,
@@ -27,6 +27,9 @@ def content_of(run: Run, *, against_paper: bool) -> Content:
     if not run.row_counts():
         return Content(summary=("The run has no rows: it ended before anything was measured.",))
     command = str(run.manifest["command"])
+    if command in EXPERIMENTS:
+        shown = EXPERIMENTS[command].show(run, against="paper" if against_paper else "")
+        return Content(shown.sentences, shown.tables, shown.main, shown.csvs, shown.figures, shown.lanes)
     build = CONTENTS.get(command) or CONTENTS.get(command.partition("-")[0], _other)
     return build(run, against_paper)
 
@@ -58,14 +61,6 @@ def _timeline(run: Run, _against_paper: bool) -> Content:
     shown = [cell for cell in timelines_of(run) if len(cell.skills)]
     tables, csvs = timeline_tables(run), timeline_csv(run)
     return Content(timeline_sentences(run), tables, ["timelines"], csvs, timeline_figures(run), shown)
-
-
-def _boundary(run: Run, _against_paper: bool) -> Content:
-    from s2a_bench.experiments.boundary.view.figure import boundary_figures
-    from s2a_bench.experiments.boundary.view.tables import boundary_csv, boundary_tables
-
-    tables = boundary_tables(run)
-    return Content(boundary_sentences(run), tables, ["boards"], boundary_csv(run), boundary_figures(run))
 
 
 def _study(run: Run, _against_paper: bool) -> Content:
@@ -110,7 +105,6 @@ CONTENTS: Final[dict[str, Callable[[Run, bool], Content]]] = {
     "latency": _latency,
     "throughput": _throughput,
     "timeline": _timeline,
-    "boundary": _boundary,
     "study": _study,
     "ccrb": _ccrb,
     "model validity": _validity,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.latency.view.tables import TITLES
 from s2a_bench.experiments.study.rows import STUDIES
 from s2a_bench.writers.tables import interval, mean_sd, number
@@ -67,21 +66,6 @@ def timeline_sentences(run: Run) -> list[str]:
     plans = _counts([cell.n for cell in cells], "plan")
     said = [f"{settings} setting{'s' * (settings != 1)} of board and granularity, {plans} a policy in each."]
     return said + [_policy_sentence(policy, mine) for policy, mine in by_policy.items()]
-
-
-def boundary_sentences(run: Run) -> list[str]:
-    """Say whether the formula holds, and what the paper's line leaves out."""
-    from s2a_bench.experiments.boundary.view.tables import DURATIONS, disagreements, grid_of, is_random
-
-    points = len(run.table(BOUNDARY))
-    said = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
-    if is_random(run):
-        shares = grid_of(run, DURATIONS[0])["p_stall"]
-        said.append(f"A plan stalls at {int((shares > 0).sum())} of {len(shares)} points of the grid, run for T_nom.")
-    else:
-        agree = points - disagreements(run)
-        said.append(f"The formula R >= L/T says whether it stalls, and is right at {agree} of {points} points.")
-    return said
 
 
 def study_sentences(run: Run) -> list[str]:

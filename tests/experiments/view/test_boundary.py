@@ -11,11 +11,14 @@ from hypothesis import strategies as st
 from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.figure import Figure
 
+from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY
-from s2a_bench.experiments.boundary.run import BoundaryConfig, rows, run_boundary
-from s2a_bench.experiments.boundary.view.figure import build_boundary, write_boundary_figure
+from s2a_bench.experiments.boundary.run import rows, run_boundary
+from s2a_bench.experiments.boundary.view import show
+from s2a_bench.experiments.boundary.view.figure import build_boundary
 from s2a_bench.experiments.boundary.view.tables import board_table, boundary_csv, disagreements, line_table
 from s2a_bench.store.run import Run, read_run
+from s2a_bench.writers.figures import save
 from s2a_bench.writers.style import paper_column
 
 
@@ -119,7 +122,7 @@ def test_the_title_says_whose_rates_are_marked(even: Run) -> None:
 
 
 def test_the_figure_is_written_as_png_and_pdf(even: Run) -> None:
-    assert [path.name for path in write_boundary_figure(even)] == ["boundary.png", "boundary.pdf"]
+    assert [path.name for path in save(even.path / "figures", show(even).figures)] == ["boundary.png", "boundary.pdf"]
 
 
 def test_tables_give_the_formula_and_the_first_rate_that_passed(even: Run) -> None:

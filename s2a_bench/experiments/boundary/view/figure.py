@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from s2a_bench.experiments.boundary.view.tables import grid_of, is_random, marks_of
-from s2a_bench.writers.figures import LINE_CHARS, new_figure, save
+from s2a_bench.writers.figures import LINE_CHARS, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,11 +61,6 @@ def build_boundary(run: Run) -> Figure:
 def boundary_figures(run: Run) -> dict[str, Callable[[], Figure]]:
     """Return the figure by its file's name."""
     return {"boundary": lambda: build_boundary(run)}
-
-
-def write_boundary_figure(run: Run) -> list[Path]:
-    """Write ``figures/boundary.png`` and ``.pdf``."""
-    return save(run.path / "figures", boundary_figures(run))
 
 
 def _shade_regions(axes: Axes, tokens: np.ndarray, lines: dict[str, float], low: float, high: float) -> None:

@@ -83,9 +83,22 @@ def boundary_csv(run: Run) -> dict[str, str]:
     return {"boundary.csv": csv_text(names, run.table(BOUNDARY)[list(names)].itertuples(index=False, name=None))}
 
 
-def boundary_to_json(run: Run) -> dict[str, Any]:
+def boundary_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints; a cell a point."""
     return frame(run, list(_cells(run)), [])
+
+
+def boundary_sentences(run: Run) -> list[str]:
+    """Say whether the formula holds, and what the paper's line leaves out."""
+    points = len(run.table(BOUNDARY))
+    said = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
+    if is_random(run):
+        shares = grid_of(run, DURATIONS[0])["p_stall"]
+        said.append(f"A plan stalls at {int((shares > 0).sum())} of {len(shares)} points of the grid, run for T_nom.")
+    else:
+        agree = points - disagreements(run)
+        said.append(f"The formula R >= L/T says whether it stalls, and is right at {agree} of {points} points.")
+    return said
 
 
 def disagreements(run: Run) -> int:

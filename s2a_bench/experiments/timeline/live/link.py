@@ -15,12 +15,12 @@ from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.frames import FrameSource
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.plan import plan_cells
-from s2a_bench.harness.progress import Progress
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.harness.warnings import Doubt, before_run
 from s2a_bench.inference.models import resolve
 from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.progress import Progress
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.store.run import RunWriter
 from s2a_bench.trace import Trace

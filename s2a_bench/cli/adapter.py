@@ -1,0 +1,135 @@
+"""From declared options to the command line: the one place that turns a configuration's fields into typer's options."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
+
+import typer
+
+from s2a_bench.errors import UsageError
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
+
+    from s2a_bench.options import Options
+
+FIELD = re.compile(r"`([a-z][a-z0-9_]*)`")
+PLAIN: tuple[type, ...] = (bool, int, float, Path)
+"""What typer reads by itself; every other type is read from text by its field."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flag:
+    """One option of a command: where in the configuration its value goes."""
+
+    name: str
+    """As typed, without dashes in front: max-tokens."""
+    path: tuple[str, ...]
+    """The field, behind the fields of the groups that it is in."""
+    kind: type
+    about: str
+
+    @property
+    def parameter(self) -> inspect.Parameter:
+        """Return it as a parameter of the function that typer reads; None says that it was not given."""
+        spelled = f"--{self.name}"
+        declared = typer.Option(spelled, help=self.about, show_default=False)
+        kind: Any = Annotated[Union[self.kind, None], declared]  # noqa: UP007 - made at run time
+        return inspect.Parameter(self.key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+
+    @property
+    def key(self) -> str:
+        """Return the parameter's name."""
+        return "__".join(self.path)
+
+
+def flags_of(options: type[Options], path: tuple[str, ...] = ()) -> Iterator[Flag]:
+    """Yield the flags of a configuration, those of a group in its place."""
+    for name, field in options.model_fields.items():
+        group = _group(field)
+        if group is not None:
+            yield from flags_of(group, (*path, name))
+        elif not _extra(field).get("hidden"):
+            flag = str(_extra(field).get("flag") or name.replace("_", "-"))
+            yield Flag(flag, (*path, name), _kind(field.annotation), _about(field))
+
+
+def command(
+    function: Callable[..., None],
+    *options: type[Options],
+    about: str,
+    more: Mapping[str, inspect.Parameter] | None = None,
+) -> Callable[..., None]:
+    """Return a function for typer that builds every class of ``options`` from its flags and calls ``function``.
+
+    ``function`` gets one configuration a class, in order, and the values of ``more``, other parameters, by name.
+    """
+    flags = [list(flags_of(each)) for each in options]
+    spelled = {flag.path[-1]: flag.name for each in flags for flag in each}
+    parameters = {flag.key: flag.parameter for each in flags for flag in each} | dict(more or {})
+
+    def run(**given: Any) -> None:
+        try:
+            built = [
+                each(**_nested({flag.path: given.pop(flag.key) for flag in mine}))
+                for each, mine in zip(options, flags, strict=True)
+            ]
+            function(*built, **given)
+        except UsageError as error:
+            raise UsageError(with_flags(str(error), spelled)) from error
+
+    run.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+    run.__doc__ = about
+    return run
+
+
+def with_flags(message: str, spelled: Mapping[str, str] | None = None) -> str:
+    """Return a library's message with its fields, `max_tokens`, as flags, --max-tokens, or as ``spelled``."""
+    return FIELD.sub(lambda field: f"--{(spelled or {}).get(field[1]) or field[1].replace('_', '-')}", message)
+
+
+def _nested(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
+    """Return what was given, by field, groups as dictionaries; what was not given is left to the defaults."""
+    found: dict[str, Any] = {}
+    for path, value in values.items():
+        if value is None:
+            continue
+        inner = found
+        for group in path[:-1]:
+            inner = inner.setdefault(group, {})
+        inner[path[-1]] = value
+    return found
+
+
+def _group(field: FieldInfo) -> type[Options] | None:
+    from s2a_bench.options import Options
+
+    found = field.annotation
+    return found if isinstance(found, type) and issubclass(found, Options) else None
+
+
+def _extra(field: FieldInfo) -> Mapping[str, Any]:
+    return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+
+
+def _kind(annotation: Any) -> type:
+    """Return what typer should read: a plain type, or text."""
+    if get_origin(annotation) in {Union, UnionType}:
+        annotation = next(arg for arg in get_args(annotation) if arg is not NoneType)
+    return annotation if annotation in PLAIN else str
+
+
+def _about(field: FieldInfo) -> str:
+    """Return a field's help, with its default where the text does not speak of it."""
+    about = field.description or ""
+    default = field.get_default(call_default_factory=False)
+    if "[default" in about or default in (None, "", (), False):
+        return about
+    values = default if isinstance(default, tuple) else (default,)
+    return f"{about} [default: {','.join(f'{each:g}' if isinstance(each, float) else str(each) for each in values)}]"

@@ -1,0 +1,98 @@
+"""Which plane a boundary run draws, and what it refuses."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Final
+
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.timeline.plans import NO_JITTER, gaps_of
+from s2a_bench.options import Names, Numbers, Options, WholeNumbers, option
+
+if TYPE_CHECKING:
+    from s2a_bench.boards.profile import Profile
+    from s2a_bench.policy.boundary import Grid
+
+PLANS: Final = 2000
+"""Plans a point with jitter; without, one tells all."""
+MARKS, SHADES = 25, 73
+"""Rates of a grid whose points are drawn one by one, or as shades."""
+
+
+class BoundaryConfig(Options):
+    """Which plane is drawn."""
+
+    profiles: Names = option(
+        ("rtx-4080", "jetson-agx-orin", "jetson-orin-nano"),
+        "boards to mark: names of 'profile list', or paths; several with commas",
+        flag="profile",
+    )
+    tokens_per_skill: WholeNumbers = option((6, 4, 2, 1), "L at which boards are marked")
+    most_tokens: int = option(8, "the plane has L = 1 to this", ge=1, le=1000)
+    rates: Numbers = option((0.3, 60.0), "tokens/s of the plane: from, to")
+    points: int | None = option(
+        None,
+        f"rates tried between them, on a logarithmic scale [default: {MARKS}; with jitter {SHADES}]",
+        ge=2,
+        le=1000,
+    )
+    n_skills: int = option(8, "N, skills a plan", ge=2, le=10_000)
+    t_nom_s: float = option(1.0, "seconds a skill takes", flag="t-nom", gt=0, allow_inf_nan=False)
+    t_min: float = option(0.8, "least duration of a skill, as a factor of T_nom", gt=0, le=1)
+    jitter: str = option(
+        NO_JITTER, "none (tokens come evenly), or a family of gaps, as lognormal:cv=0.2: P(stall) is shaded"
+    )
+    plans: int | None = option(None, f"plans a point [default: 1; with jitter {PLANS}]", ge=1, le=1_000_000)
+    seed: int = option(0, "seed of everything that is drawn", ge=0)
+
+    @cached_property
+    def boards(self) -> list[Profile]:
+        """Read the profiles; raises UsageError for one that there is not."""
+        from s2a_bench.boards.search import load_profile
+
+        return [load_profile(name) for name in self.profiles]
+
+    @property
+    def virtual(self) -> bool:
+        """Return True: nothing is measured."""
+        return True
+
+    @property
+    def durations(self) -> dict[str, float]:
+        """Return what a skill may take, in s: as naive runs it, and at the least."""
+        return {"t_nom": self.t_nom_s, "t_min": self.t_min * self.t_nom_s}
+
+    @property
+    def grid(self) -> Grid:
+        """Return the plane's points."""
+        import numpy as np
+
+        from s2a_bench.policy.boundary import Grid
+
+        rates = np.geomspace(self.rates[0], self.rates[-1], self.rates_tried)
+        return Grid(tuple(range(1, self.most_tokens + 1)), tuple(float(rate) for rate in rates))
+
+    @property
+    def rates_tried(self) -> int:
+        """Return how many rates the grid has."""
+        return self.points if self.points is not None else MARKS if self.jitter == NO_JITTER else SHADES
+
+    @property
+    def plans_a_point(self) -> int:
+        """Return how many plans are tried at each point."""
+        return self.plans if self.plans is not None else 1 if self.jitter == NO_JITTER else PLANS
+
+    def check(self) -> None:
+        """Refuse what makes no sense together; raises UsageError naming the fields."""
+        if len(self.rates) != 2 or not 0 < self.rates[0] < self.rates[1] < float("inf"):  # noqa: PLR2004 - from, to
+            raise UsageError("`rates`: should be two tokens/s, the lower first, as 0.3,60")
+        for tokens in self.tokens_per_skill:
+            if not 1 <= tokens <= 1000:  # noqa: PLR2004
+                raise UsageError(f"`tokens_per_skill`: {tokens} should be 1 or more and at most 1000")
+        if self.jitter == NO_JITTER and self.plans_a_point > 1:
+            raise UsageError("`plans`: without `jitter` all plans are the same; leave it out")
+        gaps_of(self.jitter, 1.0)
+
+    def to_manifest(self) -> dict[str, object]:
+        """Return the options as plain data, with the numbers that follow from others."""
+        return {**self.model_dump(), "plans": self.plans_a_point, "points": self.rates_tried}

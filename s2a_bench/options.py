@@ -1,0 +1,102 @@
+"""Options declared once: a documented, typed, bounded field of a configuration, and all else follows from it.
+
+From a field come its flag and ``--help``, its validation, the sweep axis, the manifest's entry and the table in docs/.
+A configuration that exists is valid: what makes no sense raises UsageError, which names the field, where it is made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from s2a_bench.errors import UsageError
+
+Made = TypeVar("Made", bound="Options")
+
+
+class Options(BaseModel):
+    """Base of configurations; an option is a field made with `option`, a group of options a field of such a class."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def __init__(self, **given: Any) -> None:
+        """Keep what is given, the defaults for the rest; raises UsageError naming the field."""
+        try:
+            super().__init__(**given)
+        except ValidationError as error:
+            raise UsageError(_line(error.errors()[0], type(self))) from None
+
+    def model_post_init(self, _context: Any) -> None:
+        """Check what depends on several fields."""
+        self.check()
+
+    def check(self) -> None:
+        """Raise UsageError, naming the fields, for values that make no sense together."""
+
+    @property
+    def virtual(self) -> bool:
+        """Whether a run computes in virtual time, so that several may share a machine; a measuring one may not."""
+        return False
+
+    def but(self: Made, **changes: Any) -> Made:  # noqa: PYI019 - typing has Self since Python 3.11
+        """Return a copy with some fields changed, checked like a new one."""
+        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | changes)
+
+    def to_manifest(self) -> dict[str, Any]:
+        """Return the options as plain data."""
+        return self.model_dump()
+
+
+def option(default: Any, about: str, *, flag: str = "", **bounds: Any) -> Any:
+    """Declare a field: ``about`` is its help, ``flag`` its name on the command line where that is not the field's.
+
+    ``bounds`` are pydantic's: ge, gt, le, lt, min_length, pattern.
+    """
+    return Field(default, description=about, json_schema_extra={"flag": flag} if flag else None, **bounds)
+
+
+def _line(error: ErrorDetails, options: type[Options]) -> str:
+    """Return one line for what is wrong with one field."""
+    field = str(error["loc"][0]) if error["loc"] else ""
+    if error["type"] == "extra_forbidden":
+        return f"`{field}` is none of the options {', '.join(options.model_fields)}"
+    if error["type"] == "missing":
+        return f"`{field}` is needed"
+    if error["type"] == "value_error":
+        return f"`{field}`: {error['ctx']['error']}"
+    said = error["msg"].removeprefix("Input ").removeprefix("Value ")
+    return f"`{field}`: {error['input']!r} {said}"
+
+
+def _listed(value: Any) -> Any:
+    """Split text at commas, make a tuple of any other value, and keep each element once."""
+    if isinstance(value, str):
+        value = [part.strip() for part in value.split(",") if part.strip()]
+    elif not isinstance(value, Iterable):
+        value = [value]
+    return tuple(dict.fromkeys(value))
+
+
+def one_of(names: Callable[[], Iterable[str]]) -> AfterValidator:
+    """Return a validator: the value, or each of several, is one of ``names()``, asked when it is needed."""
+
+    def check(value: Any) -> Any:
+        for each in value if isinstance(value, tuple) else (value,):
+            if each not in (known := tuple(names())):
+                raise ValueError(f"'{each}' is none of {', '.join(known)}")
+        return value
+
+    return AfterValidator(check)
+
+
+Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
+"""Several names; as text with commas between them, each once."""
+
+Numbers = Annotated[tuple[float, ...], BeforeValidator(_listed)]
+"""Several numbers; as text with commas between them, each once."""
+
+WholeNumbers = Annotated[tuple[int, ...], BeforeValidator(_listed)]
+"""Several whole numbers; as text with commas between them, each once."""

@@ -1,0 +1,90 @@
+"""A field of a configuration is its flag, its bounds, its help and the name in its errors."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from s2a_bench.cli.adapter import command, flags_of
+from s2a_bench.errors import UsageError
+from s2a_bench.options import Names, Options, WholeNumbers, option
+
+
+class Engine(Options):
+    threads: int = option(0, "CPU threads; 0: all", ge=0)
+    model: Path | None = option(None, "a GGUF file")
+
+
+class Asked(Options):
+    runs: int = option(50, "samples", ge=1, le=100)
+    t_nom_s: float = option(1.0, "seconds a skill takes", flag="t-nom", gt=0)
+    names: Names = option(("a", "b"), "several with commas")
+    lengths: WholeNumbers = option((6,), "L")
+    quick: bool = option(False, "a first look")
+    engine: Engine = Engine()
+
+    def check(self) -> None:
+        if self.quick and self.runs > 10:
+            raise UsageError("`runs`: 10 at most with `quick`, and `t_nom_s` as it is")
+
+
+def run(*arguments: str) -> Asked:
+    got: list[Asked] = []
+    app = typer.Typer()
+    app.command()(command(got.append, Asked, about="Try it."))
+    result = CliRunner().invoke(app, arguments, catch_exceptions=True)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return got[0]
+
+
+def test_what_is_not_given_keeps_its_default() -> None:
+    assert run() == Asked()
+
+
+def test_flags_reach_their_fields_and_groups() -> None:
+    asked = run("--runs", "7", "--t-nom", "2", "--names", "x, y,x", "--lengths", "4,2", "--quick", "--threads", "3")
+    assert asked == Asked(runs=7, t_nom_s=2, names=["x", "y"], lengths=(4, 2), quick=True, engine=Engine(threads=3))
+    assert run("--model", "m.gguf").engine.model == Path("m.gguf")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["--runs", "0"], "--runs: 0 should be greater than or equal to 1"),
+        (["--t-nom", "0"], "--t-nom: 0.0 should be greater than 0"),
+        (["--lengths", "4,x"], "--lengths: 'x' should be a valid integer, unable to parse string as an integer"),
+        (["--threads", "-1"], "--threads: -1 should be greater than or equal to 0"),
+        (["--quick"], "--runs: 10 at most with --quick, and --t-nom as it is"),
+    ],
+)
+def test_a_value_out_of_bounds_is_one_line_that_names_the_flag(arguments: list[str], line: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        run(*arguments)
+    assert str(caught.value) == line
+
+
+def test_the_library_names_the_field() -> None:
+    with pytest.raises(UsageError, match=r"^`t_nom_s`: -1 should be greater than 0$"):
+        Asked(t_nom_s=-1)
+    with pytest.raises(UsageError, match=r"^`speed` is none of the options runs, t_nom_s, names"):
+        Asked(speed=1)
+
+
+def test_a_changed_copy_is_checked_like_a_new_one() -> None:
+    assert Asked(runs=5).but(quick=True).runs == 5
+    with pytest.raises(UsageError, match="10 at most"):
+        Asked().but(quick=True)
+
+
+def test_help_tells_the_default_of_every_field() -> None:
+    about = {flag.name: flag.about for flag in flags_of(Asked)}
+    assert about["runs"] == "samples [default: 50]"
+    assert about["names"] == "several with commas [default: a,b]"
+    assert about["t-nom"] == "seconds a skill takes [default: 1]"
+    assert list(about) == ["runs", "t-nom", "names", "lengths", "quick", "threads", "model"]
+    assert inspect.signature(command(print, Asked, about="Try it.")).parameters["runs"].default is None
