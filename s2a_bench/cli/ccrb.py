@@ -189,7 +189,7 @@ def _run(
 def _write_scenario(config: CcrbConfig, path: Path, progress: RunProgress) -> None:
     """Write the OpenSCENARIO file and its road."""
     from s2a_bench.experiments.ccrb.plans import prepare
-    from s2a_bench.scenario.openscenario import write_openscenario
+    from s2a_bench.scenario.ccrb.openscenario import write_openscenario
 
     ready = prepare(config)
     for written in write_openscenario(path, config.cars, ready.driving, ready.schedules):

@@ -1,10 +1,4 @@
-"""Where it is tried: CCRB with a car behind, in simulators that share one control interface.
-
-    cars = Cars()                                     # roles, geometry, Euro NCAP parameters: ccrb.py
-    plan = braking_plan(cars, n_skills=5, t_nom_s=0.8)      # speed set-points
-    schedule = policy("naive").schedule(plans)        # when each skill runs
-    found = drive(simulator("longitudinal"), cars, plan, schedule)  # drive.py
-    found.outcomes.name(0), found.outcomes.min_front_gap_m
+"""Where it is tried: scenarios, a folder each (ccrb), in simulators that share one control interface.
 
 Arrays hold M roll-outs in lock step; `LEAD`, `EGO` and `REAR` index the cars. SI units, float seconds.
 """

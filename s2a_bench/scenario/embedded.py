@@ -1,6 +1,6 @@
 """The embedded simulator: highway-env's kinematic bicycles on its road, driven by our accelerations.
 
-highway-env integrates with explicit Euler steps and steers by its own lane controller. Pictures: `render`.
+highway-env integrates with explicit Euler steps and steers by its own lane controller. Pictures: `ccrb.render`.
 """
 
 from __future__ import annotations

@@ -10,8 +10,8 @@ import pytest
 from s2a_bench.errors import SimulatorError, UsageError
 from s2a_bench.policy import Schedule
 from s2a_bench.scenario.carla import Carla
-from s2a_bench.scenario.ccrb import Cars, braking_plan
-from s2a_bench.scenario.drive import drive
+from s2a_bench.scenario.ccrb.cars import Cars, braking_plan
+from s2a_bench.scenario.ccrb.drive import drive
 from tests.scenario.carla_stand_in import World, package
 
 START = np.array([[40.0], [0.0], [-14.0]])

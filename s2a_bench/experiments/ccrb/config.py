@@ -13,8 +13,8 @@ from s2a_bench.harness.ranges import require
 from s2a_bench.plan import load_skills
 from s2a_bench.plan.skillset import GAPS, Durations, Gap
 from s2a_bench.scenario import SIMULATORS
-from s2a_bench.scenario.ccrb import EGO_LEAST_MPS2, KMH, Cars, braking_plan
-from s2a_bench.scenario.follower import FOLLOWERS
+from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, KMH, Cars, braking_plan
+from s2a_bench.scenario.ccrb.follower import FOLLOWERS
 
 SKILL_SET: Final = "driving"
 LONG_S: Final = 600.0

@@ -32,7 +32,7 @@ from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.runtime.events import Event, SkillCame
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.scenario import simulator
-from s2a_bench.scenario.view import SceneSource
+from s2a_bench.scenario.ccrb.source import SceneSource
 from s2a_bench.store.requests import SAMPLES, TOKENS
 from s2a_bench.store.run import RunWriter
 

@@ -13,9 +13,9 @@ from s2a_bench.experiments.timeline.config import settings
 from s2a_bench.experiments.timeline.policies import draw, learn
 from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.policy import Plans, Policy, Schedule
-from s2a_bench.scenario.ccrb import KMH, DrivingPlan, braking_plan, plan_decel, start_deadline
-from s2a_bench.scenario.ttc import NAME as TTC
-from s2a_bench.scenario.ttc import ttc_aware
+from s2a_bench.scenario.ccrb.cars import KMH, DrivingPlan, braking_plan, plan_decel, start_deadline
+from s2a_bench.scenario.ccrb.ttc import NAME as TTC
+from s2a_bench.scenario.ccrb.ttc import ttc_aware
 
 
 @dataclass(frozen=True, slots=True)

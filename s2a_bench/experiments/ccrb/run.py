@@ -17,8 +17,8 @@ from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.experiments.timeline.to_rows import skill_rows, to_ns, token_rows
 from s2a_bench.machine import environment
 from s2a_bench.scenario import Simulator, simulator
-from s2a_bench.scenario.drive import drive
-from s2a_bench.scenario.ttc import NAME as TTC
+from s2a_bench.scenario.ccrb.drive import drive
+from s2a_bench.scenario.ccrb.ttc import NAME as TTC
 from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import RunWriter
 

@@ -21,8 +21,15 @@ from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.clairvoyant import Clairvoyant
 from s2a_bench.policy.naive import Naive
 from s2a_bench.policy.wait_then_act import WaitThenAct
-from s2a_bench.scenario.ccrb import EGO_LEAST_MPS2, LEAST_IMPACT_MPS, Cars, braking_plan, plan_decel, start_deadline
-from s2a_bench.scenario.drive import drive
+from s2a_bench.scenario.ccrb.cars import (
+    EGO_LEAST_MPS2,
+    LEAST_IMPACT_MPS,
+    Cars,
+    braking_plan,
+    plan_decel,
+    start_deadline,
+)
+from s2a_bench.scenario.ccrb.drive import drive
 from s2a_bench.scenario.longitudinal import Longitudinal
 
 if TYPE_CHECKING:

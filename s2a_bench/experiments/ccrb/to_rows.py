@@ -14,9 +14,9 @@ from s2a_bench.policy import Schedule
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.motion import peak_jerk, rms_jerk, sparc
 from s2a_bench.scenario import EGO, LEAD, REAR
-from s2a_bench.scenario.drive import Trajectory
-from s2a_bench.scenario.ego import PHASES
-from s2a_bench.scenario.outcome import Outcomes
+from s2a_bench.scenario.ccrb.drive import Trajectory
+from s2a_bench.scenario.ccrb.ego import PHASES
+from s2a_bench.scenario.ccrb.outcome import Outcomes
 
 _TOLERANCE_S = 0.02
 """Shorter stalls do not count (POLICY section 1)."""

@@ -12,7 +12,7 @@ from s2a_bench.experiments.ccrb.view.figures import path_of
 from s2a_bench.experiments.ccrb.view.outcomes import SAID, law_of, rollouts_of, tokens_line
 from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES
-from s2a_bench.scenario.render import Camera
+from s2a_bench.scenario.ccrb.render import Camera
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.ccrb import LEAST_IMPACT_MPS
-from s2a_bench.scenario.follower import LAWS
+from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
+from s2a_bench.scenario.ccrb.follower import LAWS
 from s2a_bench.store.requests import TOKENS
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from s2a_bench.scenario import EGO, LEAD, REAR, State
-from s2a_bench.scenario.ccrb import CAR_WIDTH_M, LEAST_IMPACT_MPS, OUTCOMES
+from s2a_bench.scenario.ccrb.cars import CAR_WIDTH_M, LEAST_IMPACT_MPS, OUTCOMES
 from s2a_bench.scenario.lockstep import LockStep
 
 if TYPE_CHECKING:

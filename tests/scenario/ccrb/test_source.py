@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.scenario.ccrb import Cars
-from s2a_bench.scenario.render import COLOURS
-from s2a_bench.scenario.view import SceneSource
+from s2a_bench.scenario.ccrb.cars import Cars
+from s2a_bench.scenario.ccrb.render import COLOURS
+from s2a_bench.scenario.ccrb.source import SceneSource
 
 
 def test_frames_differ_and_two_sources_deliver_the_same_ones() -> None:

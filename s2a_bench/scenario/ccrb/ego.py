@@ -14,8 +14,8 @@ import numpy as np
 from s2a_bench.errors import UsageError
 from s2a_bench.plan.skillset import GAPS, Gap
 from s2a_bench.policy import Schedule
-from s2a_bench.scenario.braking import needed
-from s2a_bench.scenario.ccrb import EGO_JERK_MPS3, EGO_LEAST_MPS2, EGO_LOOP_S, EGO_MOST_MPS2, Cars, DrivingPlan
+from s2a_bench.scenario.ccrb.braking import needed
+from s2a_bench.scenario.ccrb.cars import EGO_JERK_MPS3, EGO_LEAST_MPS2, EGO_LOOP_S, EGO_MOST_MPS2, Cars, DrivingPlan
 from s2a_bench.scenario.lockstep import LockStep
 
 if TYPE_CHECKING:

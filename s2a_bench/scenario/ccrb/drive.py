@@ -10,11 +10,11 @@ import numpy as np
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Schedule
 from s2a_bench.scenario import EGO, LEAD, REAR, Command, Simulator, State
-from s2a_bench.scenario.ccrb import LEAD_JERK_MPS3, Cars, DrivingPlan
-from s2a_bench.scenario.ego import DONE, Ego
-from s2a_bench.scenario.follower import Seen, follower
+from s2a_bench.scenario.ccrb.cars import LEAD_JERK_MPS3, Cars, DrivingPlan
+from s2a_bench.scenario.ccrb.ego import DONE, Ego
+from s2a_bench.scenario.ccrb.follower import Seen, follower
+from s2a_bench.scenario.ccrb.outcome import Outcomes, Watch
 from s2a_bench.scenario.lockstep import LockStep
-from s2a_bench.scenario.outcome import Outcomes, Watch
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

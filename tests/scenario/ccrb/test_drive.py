@@ -17,9 +17,9 @@ from s2a_bench.policy.clairvoyant import Clairvoyant
 from s2a_bench.policy.naive import Naive
 from s2a_bench.policy.wait_then_act import WaitThenAct
 from s2a_bench.scenario import EGO, LEAD, REAR, simulator
-from s2a_bench.scenario.ccrb import Cars, braking_plan
-from s2a_bench.scenario.drive import Driven, drive
-from s2a_bench.scenario.ego import ACTING, GAP, WAITING
+from s2a_bench.scenario.ccrb.cars import Cars, braking_plan
+from s2a_bench.scenario.ccrb.drive import Driven, drive
+from s2a_bench.scenario.ccrb.ego import ACTING, GAP, WAITING
 
 POLICIES = {"naive": Naive(), "wait": WaitThenAct(), "stream": Clairvoyant()}
 LISTED = {

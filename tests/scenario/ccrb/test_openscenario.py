@@ -15,7 +15,7 @@ from s2a_bench.errors import SimulatorError, UsageError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.plans import prepare
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.openscenario import problems, write_openscenario
+from s2a_bench.scenario.ccrb.openscenario import problems, write_openscenario
 
 
 @pytest.mark.parametrize("gap", GAPS)

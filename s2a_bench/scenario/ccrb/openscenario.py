@@ -16,8 +16,8 @@ import numpy as np
 
 from s2a_bench.errors import SimulatorError, UsageError
 from s2a_bench.policy import Schedule
-from s2a_bench.scenario.ccrb import EGO_LEAST_MPS2, LEAD_JERK_MPS3, Cars, DrivingPlan
-from s2a_bench.scenario.follower import MOST_MPS2
+from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, LEAD_JERK_MPS3, Cars, DrivingPlan
+from s2a_bench.scenario.ccrb.follower import MOST_MPS2
 
 if TYPE_CHECKING:
     from s2a_bench.plan.skillset import Gap

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 
 from s2a_bench.errors import UsageError
-from s2a_bench.scenario.braking import BRAKES_MPS2, needed
-from s2a_bench.scenario.ccrb import Cars
+from s2a_bench.scenario.ccrb.braking import BRAKES_MPS2, needed
+from s2a_bench.scenario.ccrb.cars import Cars
 from s2a_bench.scenario.lockstep import LockStep
 
 if TYPE_CHECKING:

@@ -9,11 +9,11 @@ import numpy as np
 from s2a_bench.clock import now_ns
 from s2a_bench.frames import check_size
 from s2a_bench.scenario import LEAD, REAR
-from s2a_bench.scenario.render import Camera
+from s2a_bench.scenario.ccrb.render import Camera
 from s2a_bench.types import Encoding, Frame
 
 if TYPE_CHECKING:
-    from s2a_bench.scenario.ccrb import Cars
+    from s2a_bench.scenario.ccrb.cars import Cars
 
 LOOP_FRAMES: Final = 1000
 """After so many frames the cars are back where they began: a road has an end."""
