@@ -32,7 +32,7 @@ from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.runtime.events import Event, SkillCame
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.scenario import simulator
-from s2a_bench.scenario.ccrb.source import SceneSource
+from s2a_bench.scenario.ccrb.source import RoadSource
 from s2a_bench.store.requests import SAMPLES, TOKENS
 from s2a_bench.store.run import RunWriter
 
@@ -58,7 +58,7 @@ def run_ccrb_live(config: CcrbConfig, live: LiveConfig, output: Path, progress: 
         world = stack.enter_context(closing(simulator(config.simulator, **settings)))
         live, (ask,) = word(live, progress)
         requests = live.requests
-        source = SceneSource(config.cars, requests.width, requests.height, fps=requests.fps)
+        source = RoadSource(config.cars, requests.width, requests.height, fps=requests.fps)
         own = {name: value for name, value in asdict(config).items() if name not in _MODELLED}
         manifest = {
             "configuration": {

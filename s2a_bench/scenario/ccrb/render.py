@@ -22,7 +22,7 @@ AHEAD_M: Final = 15.0
 """How far ahead of the ego the middle of the picture lies."""
 
 
-class Camera:
+class TopView:
     """Looks down on the road, and follows the ego."""
 
     def __init__(self, width: int, height: int) -> None:

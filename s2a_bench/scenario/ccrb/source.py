@@ -9,7 +9,7 @@ import numpy as np
 from s2a_bench.clock import now_ns
 from s2a_bench.frames import check_size
 from s2a_bench.scenario import LEAD, REAR
-from s2a_bench.scenario.ccrb.render import Camera
+from s2a_bench.scenario.ccrb.render import TopView
 from s2a_bench.types import Encoding, Frame
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ LOOP_FRAMES: Final = 1000
 """After so many frames the cars are back where they began: a road has an end."""
 
 
-class SceneSource:
+class RoadSource:
     """A FrameSource of a single scenario, seen from above as in the animation, the ego and what is round it.
 
     All three drive on at v0 with the gaps that they have at t = 0; every frame is one period further down the road.
@@ -33,7 +33,7 @@ class SceneSource:
         """Draw once, as the first picture takes longer."""
         check_size(width, height, smallest=16)
         self.width, self.height = width, height
-        self._camera = Camera(width, height)
+        self._view = TopView(width, height)
         self._gaps_m = np.zeros(3)
         self._gaps_m[LEAD], self._gaps_m[REAR] = float(cars.front_gap_m), -float(cars.rear_gap_m)  # type: ignore[arg-type]
         self._ahead_m = float(cars.speed_mps) / fps  # type: ignore[arg-type]
@@ -53,4 +53,4 @@ class SceneSource:
     def _picture(self, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
         """Return the pixels of a frame."""
         flat = np.zeros(3)
-        return self._camera.picture(self._gaps_m + self._ahead_m * (index % LOOP_FRAMES), flat, flat)
+        return self._view.picture(self._gaps_m + self._ahead_m * (index % LOOP_FRAMES), flat, flat)

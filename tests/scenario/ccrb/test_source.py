@@ -8,11 +8,11 @@ import pytest
 from s2a_bench.errors import UsageError
 from s2a_bench.scenario.ccrb.cars import Cars
 from s2a_bench.scenario.ccrb.render import COLOURS
-from s2a_bench.scenario.ccrb.source import SceneSource
+from s2a_bench.scenario.ccrb.source import RoadSource
 
 
 def test_frames_differ_and_two_sources_deliver_the_same_ones() -> None:
-    one, other = (SceneSource(Cars(), 320, 64) for _ in range(2))
+    one, other = (RoadSource(Cars(), 320, 64) for _ in range(2))
     frames, again = [one.read() for _ in range(3)], [other.read() for _ in range(3)]
     assert [frame.index for frame in frames] == [0, 1, 2]
     assert {(frame.width, frame.height, frame.encoding) for frame in frames} == {(320, 64, "rgb8")}
@@ -23,7 +23,7 @@ def test_frames_differ_and_two_sources_deliver_the_same_ones() -> None:
 
 
 def test_the_cars_stand_at_their_gaps() -> None:
-    data = SceneSource(Cars(front_gap_m=20.0, rear_gap_m=10.0), 640, 96).read().data
+    data = RoadSource(Cars(front_gap_m=20.0, rear_gap_m=10.0), 640, 96).read().data
     left = {car: int(np.argwhere((data == colour).all(axis=2))[:, 1].min()) for car, colour in COLOURS.items()}
     lead, ego, rear = (left[car] for car in sorted(left))
     # 8 pixels a metre; cars are 5 m long, and gaps are from bumper to bumper.
@@ -32,4 +32,4 @@ def test_the_cars_stand_at_their_gaps() -> None:
 
 def test_a_tiny_size_is_refused() -> None:
     with pytest.raises(UsageError, match="--size: 8x8 should be 16x16 or more"):
-        SceneSource(Cars(), 8, 8)
+        RoadSource(Cars(), 8, 8)

@@ -12,7 +12,7 @@ from s2a_bench.experiments.ccrb.view.figures import path_of
 from s2a_bench.experiments.ccrb.view.outcomes import SAID, law_of, rollouts_of, tokens_line
 from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES
-from s2a_bench.scenario.ccrb.render import Camera
+from s2a_bench.scenario.ccrb.render import TopView
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -70,7 +70,7 @@ class Panel:
         self._path = path_of(run, row["cell"])
         skills = run.table(SKILLS)
         self._texts = skills[skills["cell"] == row["cell"]]["text"].tolist()
-        self._camera = Camera(WIDTH, ROAD_HEIGHT)
+        self._view = TopView(WIDTH, ROAD_HEIGHT)
         self._heading = _headings(self._path)
         self._hit_at = _first_impact(self._path, row["outcome"])
         moving = self._path[[f"{car}_speed_mps" for car in ROLES]].max(axis=1) > _REST_MPS
@@ -88,7 +88,7 @@ class Panel:
         lateral, heading = np.zeros(3), np.zeros(3)
         lateral[EGO], heading[EGO] = now["ego_lateral_m"], self._heading[place]
         crashed = _HITS[self._row["outcome"]] if hit else frozenset[int]()
-        picture = self._camera.picture(position, lateral, heading, crashed)
+        picture = self._view.picture(position, lateral, heading, crashed)
         facts = (
             f"{float(now['time_s']):5.2f} s   ego {float(now['ego_speed_kmh']):4.1f} km/h   "
             f"front gap {max(float(now['front_gap_m']), 0):4.1f} m   rear gap {max(float(now['rear_gap_m']), 0):4.1f} m"
