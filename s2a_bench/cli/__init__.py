@@ -14,7 +14,6 @@ from typer.core import TyperGroup
 
 from s2a_bench import __version__
 from s2a_bench.cli import (
-    ccrb,
     compare,
     doctor,
     latency,
@@ -77,7 +76,6 @@ app.command("latency")(latency.latency)
 app.command("throughput")(throughput.throughput)
 app.command("study")(study.study)
 app.command("timeline")(timeline.timeline)
-app.command("ccrb")(ccrb.ccrb)
 app.command("sweep")(sweep.sweep)
 app.command("compare")(compare.compare)
 app.command("report")(report.report)

@@ -146,6 +146,7 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
     "command",
     {
         "boundary": "s2a_bench.experiments.boundary:EXPERIMENT",
+        "ccrb": "s2a_bench.experiments.ccrb:EXPERIMENT",
     },
 )
 """The experiments by their commands."""

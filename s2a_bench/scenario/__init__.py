@@ -93,6 +93,6 @@ SIMULATORS: dict[str, str] = {
 def simulator(name: str, **settings: object) -> Simulator:
     """Build a simulator with its defaults or other settings; raises UsageError for an unknown name."""
     if name not in SIMULATORS:
-        raise UsageError(f"--simulator: '{name}' is none of {', '.join(SIMULATORS)}")
+        raise UsageError(f"`simulator`: '{name}' is none of {', '.join(SIMULATORS)}")
     build: Callable[..., Simulator] = resolve_name(SIMULATORS[name])
     return build(**settings)

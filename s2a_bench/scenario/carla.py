@@ -47,13 +47,13 @@ class Carla:
             import carla
         except ImportError as error:
             raise SimulatorError(
-                "--simulator carla: the package carla is not installed; pip install 's2a-bench[carla]' "
+                "`simulator` carla: the package carla is not installed; pip install 's2a-bench[carla]' "
                 "(x86-64, Python 3.10 to 3.12)"
             ) from error
         self._carla: Any = carla
         name, _, port = host.partition(":")
         if port and not port.isdecimal():
-            raise UsageError(f"--host: '{host}' should be HOST or HOST:PORT")
+            raise UsageError(f"`host`: '{host}' should be HOST or HOST:PORT")
         try:
             client = carla.Client(name, int(port or 2000))
             client.set_timeout(timeout_s)
@@ -64,7 +64,7 @@ class Carla:
             self._world.apply_settings(settings)
         except RuntimeError as error:
             raise SimulatorError(
-                f"--host {host}: no CARLA server answers ({error}); start one, as ./CarlaUE4.sh -RenderOffScreen"
+                f"`host` {host}: no CARLA server answers ({error}); start one, as ./CarlaUE4.sh -RenderOffScreen"
             ) from error
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:

@@ -85,7 +85,7 @@ def test_a_live_run_prints_one_object_and_leaves_a_whole_folder(tmp_path: Path) 
     [
         (["--simulator", "gazebo"], 2, "--simulator: 'gazebo' is none of longitudinal, embedded, carla"),
         (["--phase-gaps", "6"], 2, "--phase-gaps: should be two numbers"),
-        (["--phase-rates", "a,b"], 2, "--phase-rates: 'a,b' should be numbers"),
+        (["--phase-rates", "a,b"], 2, "--phase-rates: 'a' should be a valid number"),
         (["--openscenario", "x.txt"], 2, "--openscenario: x.txt should end in .xosc"),
         (["--lane-change"], 2, "--lane-change: the longitudinal simulator knows one lane"),
         (["--simulator", "carla", "--host", "localhost:1"], 1, "carla"),
@@ -97,7 +97,7 @@ def test_a_live_run_prints_one_object_and_leaves_a_whole_folder(tmp_path: Path) 
         (["--live", "--phase"], 2, "--phase is about tokens that are modelled; leave it out with --live"),
         (["--live", "--random", "9"], 2, "--random is about tokens that are modelled; leave it out with --live"),
         (["--live", "--openscenario", "x.xosc"], 2, "--openscenario is about tokens that are modelled"),
-        (["--live", "--pace", "-1"], 2, "--pace: -1 should be above 0"),
+        (["--live", "--pace", "-1"], 2, "--pace: -1.0 should be greater than 0"),
         (["--live", "--pace", "0.01"], 2, "the whole plan takes"),
         (["--live", "--transport", "pigeon"], 2, "--transport: 'pigeon' is none of http, ros, loopback"),
         (["--live", "--engine", "echo"], 2, "--engine echo writes no plans"),

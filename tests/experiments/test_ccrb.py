@@ -15,9 +15,11 @@ from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.ccrb.view.figures import build_scenario
-from s2a_bench.experiments.ccrb.view.outcomes import Share, rate_span, rate_span_here, scenes_of, share_of, words
+from s2a_bench.experiments.ccrb.view.outcomes import Share, rate_span, rate_span_here, scenes_of, share_of
 from s2a_bench.experiments.ccrb.view.phase_figure import build_phase, region_of
+from s2a_bench.experiments.ccrb.view.sentences import findings
 from s2a_bench.plan.skillset import GAPS
+from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.run import Run, read_run
 
 GRID = {"phase": True, "phase_points": (21, 13)}
@@ -69,7 +71,7 @@ def test_acting_at_once_is_more_often_better_than_worse(made: Callable[..., Run]
 
 
 def test_with_an_idm_follower_the_operating_point_turns_round(made: Callable[..., Run]) -> None:
-    run = made(follower="idm", **GRID)
+    run = made(scenario=CcrbOptions(follower="idm"), **GRID)
     point = run.table(ROLLOUTS)[run.table(ROLLOUTS)["study"] == "point"].set_index("policy")
     assert point["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "rear"}
     assert point["rear_impact_mps"]["stream-to-act"] > point["rear_impact_mps"]["naive"] + 1
@@ -108,13 +110,13 @@ def test_studies_are_driven_fast_enough_to_be_of_use(made: Callable[..., Run]) -
     assert studies["rollouts_per_cpu_s"] > 0
 
 
-def test_the_words_name_every_gap_behaviour(made: Callable[..., Run]) -> None:
+def test_the_findings_name_every_gap_behaviour(made: Callable[..., Run]) -> None:
     run = made(**GRID)
-    said = words(run)
+    said = findings(run)
     assert [line.split(":")[0] for line in said] == list(GAPS)
     assert "holds nowhere" in said[GAPS.index("hold")]
     assert rate_span(run, "hold") is None
-    assert words(made()) == []
+    assert findings(made()) == []
 
 
 def test_the_regions_of_the_diagram_cover_it_and_the_figures_can_be_drawn(made: Callable[..., Run]) -> None:
@@ -132,14 +134,19 @@ def test_the_interval_is_clopper_pearsons() -> None:
 
 
 def test_the_deadline_makes_stream_to_act_start_earlier_where_it_must(made: Callable[..., Run]) -> None:
-    rows = made(ttc=True, front_gap_m=30.0).table(ROLLOUTS).set_index("policy")
+    rows = made(ttc=True, scenario=CcrbOptions(front_gap_m=30.0)).table(ROLLOUTS).set_index("policy")
     stream, timed = rows.loc["stream-to-act"], rows.loc["s2a-ttc"]
     assert timed["deadline_ns"] < stream["start_ns"]
     assert timed["start_ns"] == pytest.approx(timed["deadline_ns"], abs=1000)
     assert not timed["late"]
     assert timed["stalls"] == 0
     assert timed["min_front_gap_m"] > stream["min_front_gap_m"] or timed["outcome"] == "none"
-    late = made(ttc=True, front_gap_m=12.0, lead_decel_mps2=6.0).table(ROLLOUTS).set_index("policy").loc["s2a-ttc"]
+    late = (
+        made(ttc=True, scenario=CcrbOptions(front_gap_m=12.0, lead_decel_mps2=6.0))
+        .table(ROLLOUTS)
+        .set_index("policy")
+        .loc["s2a-ttc"]
+    )
     assert late["late"]
     assert late["start_ns"] == 1_750_000_000
 
@@ -147,19 +154,25 @@ def test_the_deadline_makes_stream_to_act_start_earlier_where_it_must(made: Call
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({"simulator": "gazebo"}, "--simulator: 'gazebo' is none of longitudinal, embedded, carla"),
-        ({"follower": "drunk"}, "--follower: 'drunk' is none of careful, idm"),
-        ({"gap": "panic"}, "--gap-behaviour: 'panic' is none of stop, coast, hold, cruise"),
-        ({"front_gap_m": 0.0}, "--front-gap: 0 should be above 0"),
-        ({"n_skills": 0}, "--skills: 0 should be 1 or more"),
-        ({"t_nom_s": 0.1}, "the plan brakes at"),
-        ({"lane_change": True}, "--lane-change: .* take --simulator embedded"),
-        ({"phase_rates": (5.0, 2.0)}, "--phase-rates: should be two numbers, the lower first"),
+        ({"simulator": "gazebo"}, "`simulator`: 'gazebo' is none of longitudinal, embedded, carla"),
+        ({"scenario": {"follower": "drunk"}}, "`follower`: 'drunk' is none of careful, idm"),
+        ({"scenario": {"gap": "panic"}}, "`gap`: 'panic' should be 'stop', 'coast', 'hold' or 'cruise'"),
+        ({"scenario": {"front_gap_m": 0.0}}, "`front_gap_m`: 0.0 should be greater than 0"),
+        ({"scenario": {"n_skills": 0}}, "`n_skills`: 0 should be greater than or equal to 1"),
+        ({"scenario": {"t_nom_s": 0.1}}, "the plan brakes at"),
+        ({"scenario": {"lane_change": True}}, "`lane_change`: .* take `simulator` embedded"),
+        ({"phase_rates": (5.0, 2.0)}, "`phase_rates`: should be two numbers .*, the lower first"),
         ({"rate": 0.01}, "which is no driving"),
-        ({"profile": "abacus"}, "--profile: 'abacus' is none of"),
-        ({"policies": ("hope",)}, "--policy: 'hope' is none of"),
+        ({"rate": float("nan")}, "`rate`: nan should be"),
+        ({"profile": "abacus"}, "'abacus' is none of"),
+        ({"policies": ("hope",)}, "'hope' is none of"),
+        ({"asked": {"pace": 5.0}}, "`pace` is about a model that answers; it needs `live`"),
+        (
+            {"asked": {"live": True}, "random": 5},
+            "`random` is about tokens that are modelled; leave it out with `live`",
+        ),
     ],
 )
 def test_what_makes_no_sense_is_refused(asked: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        CcrbConfig(**asked).check()
+        CcrbConfig(**asked)

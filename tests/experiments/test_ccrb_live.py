@@ -13,16 +13,16 @@ import pytest
 from s2a_bench.boards.file import to_toml
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import TransportError
+from s2a_bench.experiments.ccrb.asked import Asked
 from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.live import run_ccrb_live
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
-from s2a_bench.experiments.ccrb.view.as_json import ccrb_to_json
+from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.ccrb.view.figures import build_scenario
-from s2a_bench.experiments.ccrb.view.outcomes import origin_notes, token_times_s
-from s2a_bench.experiments.timeline.live.config import LiveConfig
+from s2a_bench.experiments.ccrb.view.outcomes import token_times_s
+from s2a_bench.experiments.ccrb.view.sentences import origin_notes
+from s2a_bench.experiments.ccrb.view.tables import ccrb_json
 from s2a_bench.experiments.timeline.rows import SKILLS
-from s2a_bench.harness.plan import LatencyConfig
-from s2a_bench.inference import EngineConfig
+from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.requests import SAMPLES, TOKENS
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.trace import Trace
@@ -31,34 +31,28 @@ from s2a_bench.types import Request, Token
 
 SCHEMA = json.loads((Path(__file__).parent.parent.parent / "docs" / "schema" / "s2a-bench-1.json").read_text())
 N, L, T_NS = 3, 6, 800_000_000
+REPLAYED = Asked(live=True, transport="loopback", engine="replay")
 FACTS = {"title": "A board", "origin": "measured", "tokens_per_s": 120.0, "prompt_s": 0.05}
 
 
-def asked(engine: EngineConfig, skills: str) -> LiveConfig:
-    requests = LatencyConfig(
-        transports=("loopback",), http=("as-deployed",), width=64, height=48, engine=engine, runs=1, warmup=1
-    )
-    return LiveConfig(requests=requests, skills=skills, tokens_per_skill=(L,), n_skills=(N,))
-
-
-def drive(live: LiveConfig, folder: Path) -> Run:
-    config = CcrbConfig(n_skills=N, tokens_per_skill=L)
+def drive(asked: Asked, folder: Path, profile: str = "jetson-agx-orin") -> Run:
+    config = CcrbConfig(scenario=CcrbOptions(n_skills=N), tokens_per_skill=L, asked=asked, profile=profile)
     with RunProgress() as progress:
-        return read_run(run_ccrb_live(config, live, folder, progress))
+        return read_run(run_ccrb(config, folder, progress))
 
 
 @pytest.fixture
-def replayed(tmp_path: Path) -> LiveConfig:
-    """A board of 120 tokens a second, replayed."""
+def fast(tmp_path: Path) -> str:
+    """A board of 120 tokens a second."""
     path = tmp_path / "fast.toml"
     path.write_text(to_toml({**FACTS, "gaps": {"family": "constant"}}))
-    return asked(EngineConfig("replay", profile=str(path)), "household")
+    return str(path)
 
 
 @pytest.fixture(scope="module")
 def paced(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The tiny dummy model, held back to 40 tokens a second."""
-    return drive(asked(EngineConfig("llama", threads=1, pace=40.0), "driving"), tmp_path_factory.mktemp("runs"))
+    return drive(Asked(live=True, transport="loopback", threads=1, pace=40.0), tmp_path_factory.mktemp("runs"))
 
 
 def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: Run) -> None:
@@ -95,7 +89,7 @@ def test_a_paced_dummy_is_live_and_says_what_is_set_and_what_means_nothing(paced
     assert "Dummy weights: what the plan says means nothing" in notes
     assert "Open loop: one request at t = 0" in notes
     assert "EMULATED" not in notes
-    printed = ccrb_to_json(paced)
+    printed = ccrb_json(paced)
     jsonschema.validate(printed, SCHEMA)
     assert {cell["emulated"] for cell in printed["cells"]} == {False}
     assert {cell["rate_tokens_per_s"] for cell in printed["cells"]} == {40.0}
@@ -109,17 +103,17 @@ def test_the_figure_marks_every_token(paced: Run) -> None:
     assert [len(line.get_xdata()) for line in marks] == [N * L]  # type: ignore[arg-type]
 
 
-def test_a_replayed_profile_stays_emulated(replayed: LiveConfig, tmp_path: Path) -> None:
-    run = drive(replayed, tmp_path / "runs")
+def test_a_replayed_profile_stays_emulated(fast: str, tmp_path: Path) -> None:
+    run = drive(REPLAYED, tmp_path / "runs", fast)
     assert run.table(ROLLOUTS)["emulated"].all()
     first = origin_notes(run)[0]
     assert first.startswith("EMULATED (replayed) tokens over loopback; car simulated. 1")
     assert first.endswith(" tokens/s came.")
-    assert ccrb_to_json(run)["live"]["emulated"] is True
+    assert ccrb_json(run)["live"]["emulated"] is True
 
 
 def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
-    replayed: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fast: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = LoopbackClient.request
 
@@ -130,6 +124,6 @@ def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
 
     monkeypatch.setattr(LoopbackClient, "request", cut)
     with pytest.raises(TransportError, match=r"loopback: 1 of 3 skills came; .*tokens\.csv has what the model wrote"):
-        drive(replayed, tmp_path / "runs")
+        drive(REPLAYED, tmp_path / "runs", fast)
     (folder,) = (tmp_path / "runs").iterdir()
     assert len(read_run(folder).table(TOKENS)) == 2 * L

@@ -29,7 +29,7 @@ def test_without_the_package_the_way_to_it_is_said(monkeypatch: pytest.MonkeyPat
 
 
 def test_without_a_server_its_address_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(SimulatorError, match=r"--host robot:2100: no CARLA server answers .*start one"):
+    with pytest.raises(SimulatorError, match=r"`host` robot:2100: no CARLA server answers .*start one"):
         connect(monkeypatch, None, "robot:2100")
 
 

@@ -1,1 +1,14 @@
-"""Car-to-car rear braking with a car behind: who hits whom under which policy."""
+"""Car-to-car rear braking under each policy: who hits whom, and when."""
+
+from s2a_bench.experiments import Experiment
+
+EXPERIMENT = Experiment(
+    name="ccrb",
+    about="Drive car-to-car rear braking with a car behind, under each policy, in virtual time: who hits whom, "
+    "and when.",
+    config="s2a_bench.experiments.ccrb.config:CcrbConfig",
+    run="s2a_bench.experiments.ccrb.run:run_ccrb",
+    view="s2a_bench.experiments.ccrb.view:show",
+    view_options="s2a_bench.experiments.ccrb.config:CcrbView",
+    unit="parts",
+)

@@ -1,163 +1,139 @@
-"""What a CCRB run compares: policies, a board, the scenario's numbers, a simulator; and what it refuses."""
+"""What a CCRB run compares: policies, a board or a model, the scenario, a simulator; and what it refuses."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from pydantic import Field
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.timeline.config import TimelineConfig
-from s2a_bench.harness.ranges import require
-from s2a_bench.plan import load_skills
-from s2a_bench.plan.skillset import GAPS, Durations, Gap
+from s2a_bench.experiments.ccrb.asked import Asked, live_config
+from s2a_bench.options import Names, Numbers, Options, one_of, option
 from s2a_bench.scenario import SIMULATORS
-from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, KMH, Cars, braking_plan
-from s2a_bench.scenario.ccrb.follower import FOLLOWERS
+from s2a_bench.scenario.ccrb.options import SKILL_SET, CcrbOptions
 
-SKILL_SET: Final = "driving"
+if TYPE_CHECKING:
+    from s2a_bench.experiments.timeline.config import TimelineConfig
+    from s2a_bench.experiments.timeline.live.config import LiveConfig
+
 LONG_S: Final = 600.0
 """Plans that take longer than this are no driving."""
-MOST_RANDOM: Final = 100_000
+SPANS: Final = {"phase_rates": 10_000.0, "phase_gaps_m": 1000.0}
+"""Fields with a span, from and to, and the most that it may reach."""
+MODELLED: Final = ("rate", "prompt_s", "phase", "random", "openscenario")
+"""Fields about tokens that are modelled, besides the profile: refused where a model answers."""
 
 
-@dataclass(frozen=True)
-class CcrbConfig:
-    """The defaults are the operating point at which the paper's outcome comes about."""
+class CcrbConfig(Options):
+    """What is driven; the defaults are the operating point at which the paper's outcome comes about."""
 
-    policies: tuple[str, ...] = ("naive", "wait-then-act", "stream-to-act")
-    profile: str = "jetson-agx-orin"
-    """A board; unused with a rate."""
-    rate: float | None = None
-    prompt_s: float | None = None
-    """c; None: the profile's, and 0 for a rate."""
-    tokens_per_skill: int = 6
-    n_skills: int = 5
-    """Speed set-points; a lane change comes on top."""
-    t_nom_s: float | None = None
-    """None: as the driving skill set has it."""
-    speed_kmh: float = 50.0
-    plan_decel_mps2: float | None = None
-    """a_p; None: down to rest, or to half the speed before a lane change."""
-    front_gap_m: float = 40.0
-    lead_decel_mps2: float = 2.0
-    rear_gap_m: float = 14.0
-    reaction_s: float = 1.3
-    gap: str = "stop"
-    follower: str = "careful"
-    simulator: str = "longitudinal"
-    reflex: bool = False
-    ttc: bool = False
-    """Whether stream-to-act with the deadline of the car ahead is added."""
-    lane_change: bool = False
-    phase: bool = False
-    phase_rates: tuple[float, ...] = (2.0, 12.0)
-    phase_gaps_m: tuple[float, ...] = (6.0, 30.0)
-    phase_points: tuple[int, int] = (41, 25)
-    random: int = 0
-    """Random scenarios; 0: none."""
-    seed: int = 0
+    policies: Names = option(
+        ("naive", "wait-then-act", "stream-to-act"),
+        "naive, wait-then-act, stream-to-act, and those for study; several with commas",
+        flag="policy",
+    )
+    profile: str = option("jetson-agx-orin", "the board: a name of 'profile list', or a path")
+    rate: float | None = option(None, "a board of which only the tokens/s are known", gt=0, allow_inf_nan=False)
+    prompt_s: float | None = option(
+        None,
+        "seconds before decoding, c [default: the profile's; with --rate 0]",
+        flag="prompt-time",
+        ge=0,
+        allow_inf_nan=False,
+    )
+    tokens_per_skill: int = option(6, "L, the delimiter included", ge=1, le=1000)
+    scenario: CcrbOptions = Field(default_factory=CcrbOptions)
+    simulator: Annotated[str, one_of(lambda: SIMULATORS)] = option(
+        "longitudinal", "longitudinal (along the lane), embedded (highway-env), carla"
+    )
+    host: str = option("localhost:2000", "carla: where the server is, HOST or HOST:PORT")
+    ttc: bool = option(False, "add s2a-ttc: stream-to-act that starts by the lead's deadline")
+    phase: bool = option(False, "also the phase diagram over rate and rear gap, for every gap behaviour")
+    phase_rates: Numbers = option((2.0, 12.0), "tokens/s of the phase diagram: from, to")
+    phase_gaps_m: Numbers = option((6.0, 30.0), "m to the car behind in the phase diagram: from, to", flag="phase-gaps")
+    phase_points: tuple[int, int] = Field((41, 25), json_schema_extra={"hidden": True})
+    random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000)
+    seed: int = option(0, "seed of everything that is drawn", ge=0)
+    asked: Asked = Field(default_factory=Asked)
+    openscenario: Path | None = option(None, "also write the scenario as an OpenSCENARIO file, its road beside it")
 
-    @cached_property
-    def durations(self) -> Durations:
-        """Return how long a set-point takes: the skill set's, scaled to T_nom where that is given."""
-        durations = next(skill.durations for skill in load_skills(SKILL_SET).skills if skill.name == "set_speed")
-        factor = 1.0 if self.t_nom_s is None else self.t_nom_s / durations.nominal_s
-        return Durations(durations.least_s * factor, durations.nominal_s * factor, durations.most_s * factor)
+    @property
+    def virtual(self) -> bool:
+        """Whether nothing but this process computes."""
+        return not self.asked.live and self.simulator != "carla"
 
-    @cached_property
-    def lane_durations(self) -> Durations:
-        """Return how long a lane change takes."""
-        return next(skill.durations for skill in load_skills(SKILL_SET).skills if skill.name == "change_lane")
+    @property
+    def world(self) -> dict[str, Any]:
+        """Return the settings of the simulator."""
+        return {"host": self.host} if self.simulator == "carla" else {}
 
     @cached_property
     def timeline(self) -> TimelineConfig:
         """Return the timeline run whose plans these are: one setting, even tokens."""
-        nominal_s = self.durations.nominal_s
+        from s2a_bench.experiments.timeline.config import TimelineConfig
+
+        durations, rate = self.scenario.durations, self.asked.pace if self.asked.live else self.rate
         return TimelineConfig(
             policies=self.policies,
-            profiles=() if self.rate is not None else (self.profile,),
-            rates=(self.rate,) if self.rate is not None else (),
+            profiles=() if rate is not None else (self.profile,),
+            rates=(rate,) if rate is not None else (),
             prompt_s=self.prompt_s,
             tokens_per_skill=(self.tokens_per_skill,),
-            n_skills=(self.n_skills + self.lane_change,),
-            t_nom_s=(nominal_s,),
-            t_min=self.durations.least_s / nominal_s,
-            t_max=self.durations.most_s / nominal_s,
+            n_skills=(self.scenario.skills,),
+            t_nom_s=(durations.nominal_s,),
+            t_min=durations.least_s / durations.nominal_s,
+            t_max=durations.most_s / durations.nominal_s,
             seed=self.seed,
         )
 
-    @property
-    def cars(self) -> Cars:
-        """Return the scenario of the operating point."""
-        return Cars(
-            front_gap_m=self.front_gap_m,
-            lead_decel_mps2=self.lead_decel_mps2,
-            rear_gap_m=self.rear_gap_m,
-            reaction_s=self.reaction_s,
-            speed_mps=self.speed_kmh * KMH,
-            gap=self.gap_behaviour,
-            follower=self.follower,
-            reflex=self.reflex,
-        )
-
-    @property
-    def gap_behaviour(self) -> Gap:
-        """Return what the ego does between skills; raises UsageError for what it cannot do."""
-        for gap in GAPS:
-            if gap == self.gap:
-                return gap
-        raise UsageError(f"--gap-behaviour: '{self.gap}' is none of {', '.join(GAPS)}")
+    @cached_property
+    def request(self) -> LiveConfig:
+        """Return how the model is asked in a live run."""
+        return live_config(self, SKILL_SET)
 
     def check(self) -> None:
-        """Refuse what makes no sense; raises UsageError naming the flag."""
-        _known("--simulator", self.simulator, SIMULATORS)
-        _known("--follower", self.follower, FOLLOWERS)
-        require("--skills", [self.n_skills], 1, 100)
-        require("--tokens-per-skill", [self.tokens_per_skill], 1, 1000)
-        require("--t-nom", [self.durations.nominal_s], 0, 60, above=True)
-        require("--speed", [self.speed_kmh], 0, 200, above=True)
-        require("--front-gap", [self.front_gap_m], 0, 1000, above=True)
-        require("--rear-gap", [self.rear_gap_m], 0, 1000, above=True)
-        require("--lead-decel", [self.lead_decel_mps2], 0, 10, above=True)
-        require("--reaction", [self.reaction_s], 0, 10)
-        require("--random", [self.random], 0, MOST_RANDOM)
-        require("--phase-rates", self.phase_rates, 0, above=True)
-        require("--phase-gaps", self.phase_gaps_m, 0, 1000, above=True)
-        for flag, values in (("--phase-rates", self.phase_rates), ("--phase-gaps", self.phase_gaps_m)):
-            if len(values) != 2 or not values[0] < values[1]:  # noqa: PLR2004 - from, to
-                raise UsageError(f"{flag}: should be two numbers, the lower first")
-        if self.plan_decel_mps2 is not None:
-            require("--plan-decel", [self.plan_decel_mps2], 0, -EGO_LEAST_MPS2, above=True)
-        if self.rate is not None:
-            require("--rate", [self.rate], 0, above=True)
-        if self.lane_change and self.simulator == "longitudinal":
-            raise UsageError("--lane-change: the longitudinal simulator knows one lane; take --simulator embedded")
-        _ = self.gap_behaviour
+        """Refuse what makes no sense together; raises UsageError naming the fields."""
+        for name, most in SPANS.items():
+            span = getattr(self, name)
+            if len(span) != 2 or not 0 < span[0] < span[1] <= most:  # noqa: PLR2004 - from, to
+                raise UsageError(f"`{name}`: should be two numbers above 0 and at most {most:g}, the lower first")
+        if self.scenario.lane_change and self.simulator == "longitudinal":
+            raise UsageError("`lane_change`: the longitudinal simulator knows one lane; take `simulator` embedded")
+        if self.openscenario is not None and self.openscenario.suffix != ".xosc":
+            raise UsageError(f"`openscenario`: {self.openscenario} should end in .xosc")
+        if self.asked.live:
+            self._check_live()
         self.timeline.check()
         self._check_length()
-        first = braking_plan(
-            self.cars, self.n_skills, self.durations.nominal_s, decel_mps2=self.plan_decel_mps2
-        ).set_point_mps
-        if (steepest := float(first[0, 0] - first[1, 0]) / self.durations.nominal_s) > -EGO_LEAST_MPS2:
-            raise UsageError(
-                f"--skills x --t-nom: the plan brakes at {steepest:.3g} m/s^2, which is more than the ego can; "
-                "allow more time, or give --plan-decel"
-            )
+
+    def to_manifest(self) -> dict[str, Any]:
+        """Return the options as plain data, those of the scenario among them, without those of the other mode."""
+        left_out = {"scenario", "asked", "openscenario"}
+        left_out |= {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"} if self.asked.live else set()
+        own = {**self.model_dump(exclude=left_out), **self.scenario.to_manifest()}
+        return {**own, "t_nom_s": self.scenario.durations.nominal_s, "time": "virtual"}
+
+    def _check_live(self) -> None:
+        """Refuse what is about tokens that are modelled, and what the model cannot be asked."""
+        for name in MODELLED if self.asked.replayed else (*MODELLED, "profile"):
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")
+        self.request.check()
 
     def _check_length(self) -> None:
         """Refuse plans that no drive could wait for."""
         board = self.timeline.boards[0]
-        whole_s = board.prompt_s + self.tokens_per_skill * (self.n_skills + 1) / board.tokens_per_s
+        whole_s = board.prompt_s + self.tokens_per_skill * (self.scenario.n_skills + 1) / board.tokens_per_s
         if whole_s > LONG_S:
             raise UsageError(
-                f"--rate, --pace or --profile: the whole plan takes {whole_s:.0f} s to arrive, "
+                f"`rate`, `pace` or `profile`: the whole plan takes {whole_s:.0f} s to arrive, "
                 f"which is no driving; at most {LONG_S:.0f} s"
             )
 
 
-def _known(flag: str, name: str, names: Iterable[str]) -> None:
-    """Refuse a name that a table does not have."""
-    if name not in (known := list(names)):
-        raise UsageError(f"{flag}: '{name}' is none of {', '.join(known)}")
+class CcrbView(Options):
+    """What is drawn besides tables and figures."""
+
+    animation: bool = option(False, "write the animation (GIF, MP4): half a minute", flag="animation/--no-animation")

@@ -7,7 +7,6 @@ parsed, as arrivals are those of parsed skills; the set-points that the ego driv
 from __future__ import annotations
 
 from contextlib import ExitStack, closing
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,11 +15,10 @@ import numpy as np
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.plans import Prepared, complete
+from s2a_bench.experiments.ccrb.point import drive_point
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.run import drive_point
 from s2a_bench.experiments.timeline.live.asks import Ask
 from s2a_bench.experiments.timeline.live.asks import prepare as prepare_policy
-from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.experiments.timeline.live.link import Link, word
 from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.experiments.timeline.to_rows import Setting
@@ -40,33 +38,22 @@ if TYPE_CHECKING:
     from s2a_bench.policy import Floats
     from s2a_bench.progress import Progress
 
-_MODELLED = ("profile", "rate", "prompt_s", "phase", "phase_rates", "phase_gaps_m", "phase_points", "random")
-"""Settings of CcrbConfig that mean nothing here."""
 
-
-def run_ccrb_live(config: CcrbConfig, live: LiveConfig, output: Path, progress: Progress, **settings: object) -> Path:
-    """Ask for one plan and drive it under every policy; ``settings`` go to the simulator. Raises S2AError.
+def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
+    """Ask for one plan and drive it under every policy; raises S2AError.
 
     Whatever happens, the requests so far are in the folder.
     """
-    config.check()
-    live.check()
     limit_threads()
-    if live.requests.dds_tuning == "tuned":
+    if config.request.requests.dds_tuning == "tuned":
         keep_large_blocks()
     with ExitStack() as stack:
-        world = stack.enter_context(closing(simulator(config.simulator, **settings)))
-        live, (ask,) = word(live, progress)
+        world = stack.enter_context(closing(simulator(config.simulator, **config.world)))
+        live, (ask,) = word(config.request, progress)
         requests = live.requests
-        source = RoadSource(config.cars, requests.width, requests.height, fps=requests.fps)
-        own = {name: value for name, value in asdict(config).items() if name not in _MODELLED}
+        source = RoadSource(config.scenario.cars, requests.width, requests.height, fps=requests.fps)
         manifest = {
-            "configuration": {
-                **own,
-                "t_nom_s": config.durations.nominal_s,
-                "time": "virtual",
-                "live": {**live.to_manifest(), "source": source.name},
-            },
+            "configuration": {**config.to_manifest(), "live": {**live.to_manifest(), "source": source.name}},
             "environment": environment.collect(),
             "seeds": {"sampling": requests.seed},
         }
@@ -104,7 +91,7 @@ def _hear(config: CcrbConfig, ask: Ask, link: Link, prior: GapPrior | None) -> P
     link.saw(feed.token_ns)
     request_id = measured.sample.request_id
     link.writer.update(request={"request_id": request_id, "requested_ns": requested_ns})
-    times = config.durations
+    times = config.scenario.durations
     setting = Setting(
         board="",
         title=f"live {link.cell.name}",

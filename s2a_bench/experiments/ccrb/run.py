@@ -2,88 +2,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict
+from contextlib import closing
 from pathlib import Path
 from time import process_time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.plans import Prepared, prepare, skill_texts
+from s2a_bench.experiments.ccrb.plans import prepare
+from s2a_bench.experiments.ccrb.point import drive_point
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.studies import Scenes, phase_scenes, pieces, random_scenes, study_rows
-from s2a_bench.experiments.ccrb.to_rows import motion_of, rollout_rows, trajectory_rows
+from s2a_bench.experiments.ccrb.studies import pieces, studies, study_rows
 from s2a_bench.experiments.timeline.rows import SKILLS
-from s2a_bench.experiments.timeline.to_rows import skill_rows, to_ns, token_rows
+from s2a_bench.experiments.timeline.to_rows import token_rows
 from s2a_bench.machine import environment
-from s2a_bench.scenario import Simulator, simulator
-from s2a_bench.scenario.ccrb.drive import drive
-from s2a_bench.scenario.ccrb.ttc import NAME as TTC
+from s2a_bench.scenario import simulator
 from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
     from s2a_bench.progress import Progress
 
+_BOARD = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin")
 
-def run_ccrb(config: CcrbConfig, output: Path, progress: Progress, **settings: object) -> Path:
-    """Drive all roll-outs and return the run folder; ``settings`` go to the simulator. Raises S2AError."""
-    config.check()
-    world = simulator(config.simulator, **settings)
-    try:
-        board = config.timeline.boards[0]
+
+def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
+    """Drive all roll-outs and return the run folder; raises S2AError."""
+    if config.asked.live:
+        from s2a_bench.experiments.ccrb.live import run_ccrb_live
+
+        return run_ccrb_live(config, output, progress)
+    with closing(simulator(config.simulator, **config.world)) as world:
+        board, ready = config.timeline.boards[0], prepare(config)
         manifest = {
-            "configuration": {**asdict(config), "t_nom_s": config.durations.nominal_s, "time": "virtual"},
+            "configuration": config.to_manifest(),
             "environment": environment.collect(),
             "seeds": {"plans": config.seed},
-            "boards": [
-                {
-                    "name": board.name,
-                    "title": board.title,
-                    "origin": board.origin,
-                    "tokens_per_s": board.tokens_per_s,
-                    "prompt_s": board.prompt_s,
-                    "prompt_origin": board.prompt_origin,
-                }
-            ],
+            "boards": [{name: getattr(board, name) for name in _BOARD}],
         }
+        if config.openscenario is not None:
+            from s2a_bench.scenario.ccrb.openscenario import write_openscenario
+
+            written = write_openscenario(config.openscenario, config.scenario, ready.schedules)
+            manifest["openscenario"] = [str(path) for path in written]
         with RunWriter.create(output, "ccrb", manifest, (ROLLOUTS, TRAJECTORIES, SKILLS, TOKENS)) as writer:
             progress.opened(writer.path)
             progress.stage("driving the operating point")
-            ready = prepare(config)
             tokens_s = ready.plans.token_s
             assert tokens_s is not None  # noqa: S101 - drawn plans have tokens
             writer.append(TOKENS, token_rows(ready.setting.name, tokens_s, [ready.request_id]))
             drive_point(config, ready, world, writer)
             _drive_studies(config, writer, progress)
             return writer.path
-    finally:
-        world.close()
-
-
-def drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: RunWriter) -> None:
-    """Drive the policies one after the other, and keep everything."""
-    setting = ready.setting
-    for name, schedule in ready.schedules.items():
-        driven = drive(world, config.cars, ready.driving, schedule, record=True)
-        path = driven.trajectory
-        assert path is not None  # noqa: S101 - as asked for
-        cell = f"{setting.name}/{config.gap}/{name}"
-        about = {
-            **_about(config, ready, world),
-            "cell": cell,
-            "policy": name,
-            "late": ready.late if name == TTC else None,
-        }
-        writer.append(ROLLOUTS, rollout_rows(about, schedule, driven.outcomes, motion=motion_of(path)))
-        texts = [skill_texts(ready.driving)]
-        writer.append(SKILLS, skill_rows(cell, ready.plans, schedule, [ready.request_id], texts=texts))
-        writer.append(TRAJECTORIES, trajectory_rows(cell, path))
 
 
 def _drive_studies(config: CcrbConfig, writer: RunWriter, progress: Progress) -> None:
     """Drive phase diagram and random scenarios, and say how fast that went."""
-    work = list(_studies(config))
+    work = list(studies(config))
     if not work:
         return
     progress.stage("driving " + " and ".join(dict.fromkeys(study for study, _ in work)))
@@ -101,40 +75,3 @@ def _drive_studies(config: CcrbConfig, writer: RunWriter, progress: Progress) ->
             writer.append(ROLLOUTS, piece[1])
             progress.advance()
     writer.update(studies={"rollouts": driven, "rollouts_per_cpu_s": driven / spent_s})
-
-
-def _studies(config: CcrbConfig) -> Iterator[tuple[str, Scenes]]:
-    """List what is to be driven besides the operating point."""
-    if config.phase:
-        yield "phase", phase_scenes(config)
-    if config.random:
-        yield "random", random_scenes(config)
-
-
-def _about(config: CcrbConfig, ready: Prepared, world: Simulator) -> dict[str, Any]:
-    """Return what the roll-outs of the operating point have in common."""
-    setting = ready.setting
-    return {
-        "study": "point",
-        "draw": 0,
-        "board": setting.board,
-        "title": setting.title,
-        "emulated": setting.emulated,
-        "simulator": world.name,
-        "follower": config.follower,
-        "gap_behaviour": config.gap,
-        "reflex": config.reflex,
-        "lane_change": config.lane_change,
-        "tokens_per_s": setting.tokens_per_s,
-        "prompt_s": setting.prompt_s,
-        "tokens_per_skill": config.tokens_per_skill,
-        "n_skills": setting.n_skills,
-        "t_nom_s": setting.t_nom_s,
-        "speed_mps": float(ready.driving.set_point_mps[0, 0]),
-        "plan_decel_mps2": ready.decel_mps2,
-        "front_gap_m": config.front_gap_m,
-        "lead_decel_mps2": config.lead_decel_mps2,
-        "rear_gap_m": config.rear_gap_m,
-        "reaction_s": config.reaction_s,
-        "deadline_ns": to_ns(ready.deadline_s),
-    }

@@ -15,7 +15,9 @@ _CCRB_RUN: Final = "s2a-bench ccrb"
 
 def _outcome(policy: str, run: Run) -> Finding | None:
     """Judge what becomes of the cars under one policy at the operating point."""
-    from s2a_bench.experiments.ccrb.view.outcomes import PAPER, SAID, configuration, law_of, rollouts_of, tokens_line
+    from s2a_bench.experiments.ccrb.view.outcomes import configuration, rollouts_of
+    from s2a_bench.experiments.ccrb.view.sentences import tokens_line
+    from s2a_bench.scenario.ccrb.words import PAPER, SAID, law
 
     rows = rollouts_of(run, "point")
     rows = rows[rows["policy"] == policy]
@@ -27,7 +29,7 @@ def _outcome(policy: str, run: Run) -> Finding | None:
         f"Ours: {SAID[str(row['outcome'])]}{speed}. {tokens_line(run)} At one operating point: "
         f"R = {row['tokens_per_s']:g}, front gap {asked['front_gap_m']:g} m, rear gap {asked['rear_gap_m']:g} m, "
         f"gap behaviour {asked['gap']}; "
-        f"{law_of(run)}."
+        f"{law(asked)}."
     )
     return Finding(CONFIRMED if row["outcome"] == PAPER[policy] else REFUTED, said)
 

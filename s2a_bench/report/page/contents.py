@@ -10,7 +10,6 @@ from s2a_bench.experiments.model_validity.rows import VALIDITY
 from s2a_bench.experiments.study.rows import STUDIES
 from s2a_bench.report.page import Content
 from s2a_bench.report.page.sentences import (
-    ccrb_sentences,
     latency_sentences,
     study_sentences,
     throughput_sentences,
@@ -78,15 +77,6 @@ def _study(run: Run, _against_paper: bool) -> Content:
     return Content(study_sentences(run), tables, list(tables), csvs, figures)
 
 
-def _ccrb(run: Run, _against_paper: bool) -> Content:
-    from s2a_bench.experiments.ccrb.view.figures import ccrb_figures
-    from s2a_bench.experiments.ccrb.view.tables import ccrb_csv, ccrb_tables
-
-    tables = ccrb_tables(run)
-    main = [name for name in ("outcomes", "phase", "random") if name in tables]
-    return Content(ccrb_sentences(run), tables, main, ccrb_csv(run), ccrb_figures(run))
-
-
 def _validity(run: Run, _against_paper: bool) -> Content:
     from s2a_bench.experiments.model_validity.view import validity_tables
 
@@ -106,7 +96,6 @@ CONTENTS: Final[dict[str, Callable[[Run, bool], Content]]] = {
     "throughput": _throughput,
     "timeline": _timeline,
     "study": _study,
-    "ccrb": _ccrb,
     "model validity": _validity,
 }
 """Command, or its first word (study of study-drift), -> what its run shows."""

@@ -82,17 +82,6 @@ def study_sentences(run: Run) -> list[str]:
     return said
 
 
-def ccrb_sentences(run: Run) -> list[str]:
-    """Say what became of the cars, and where that ordering of the policies holds."""
-    from s2a_bench.experiments.ccrb.view.outcomes import SAID, rollouts_of, words
-
-    said = [
-        f"{row['policy']}: {SAID[row['outcome']]}, {row['stalls']} stalls of {row['stall_ns'] / 1e9:.2f} s."
-        for row in rollouts_of(run, "point").to_dict("records")
-    ]
-    return said + [f"Phase diagram, gap behaviour {line}" for line in words(run)]
-
-
 def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
     """Say how one policy does over its settings."""
     stalling = [cell for cell in cells if cell.p_any_stall > 0]

@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from s2a_bench.plan.skillset import Gap
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
     from s2a_bench.policy import Floats
@@ -52,7 +51,7 @@ class Cars:
     gap: Gap | NDArray[np.str_] = "stop"
     """What the ego does between skills, while none is valid; one name, or an array of them."""
     follower: str = "careful"
-    """The trailing car's law, a name of `follower.FOLLOWERS`."""
+    """The trailing car's law, a name of FOLLOWERS."""
     reflex: bool = False
     """Whether the ego brakes by itself where the plan would not: `ego.Reflex`."""
 
@@ -75,6 +74,8 @@ def braking_plan(
     With ``lane_change`` one more skill follows, which keeps the last speed; then a_p is half of that unless given, so
     that there is speed left to change lanes with.
     """
+    import numpy as np
+
     speed, nominal = np.broadcast_arrays(np.atleast_1d(np.asarray(cars.speed_mps, float)), np.asarray(t_nom_s, float))
     decel = plan_decel(cars, n_skills, nominal, lane_change=lane_change) if decel_mps2 is None else decel_mps2
     steps = np.arange(n_skills + 1.0)[:, np.newaxis]
@@ -87,6 +88,8 @@ def braking_plan(
 
 def plan_decel(cars: Cars, n_skills: int, t_nom_s: ArrayLike, *, lane_change: bool = False) -> Floats:
     """Return a_p in m/s^2 unless a plan is given another one: v0 / (N T), half of it before a lane change."""
+    import numpy as np
+
     decel: Floats = np.asarray(cars.speed_mps, float) / (n_skills * np.asarray(t_nom_s, float))
     return decel / 2 if lane_change else decel
 
@@ -99,6 +102,8 @@ def start_deadline(cars: Cars, plan_decel_mps2: ArrayLike) -> Floats:
     The lead's jerk (which gives time) and the ego's lag (which takes it) are left out. Negative: too late from the
     beginning.
     """
+    import numpy as np
+
     room, lead, speed, own = np.broadcast_arrays(
         np.maximum(np.asarray(cars.front_gap_m, float) - SAFETY_M, 0.0),
         np.asarray(cars.lead_decel_mps2, float),

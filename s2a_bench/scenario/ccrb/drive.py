@@ -74,10 +74,10 @@ def drive(
     rollouts = np.broadcast_shapes(schedule.start_s.shape, (1, 1))[1]
     if any(plan.lane) and not simulator.steers:
         raise UsageError(
-            f"--lane-change: the simulator '{simulator.name}' knows one lane only; take --simulator embedded"
+            f"`lane_change`: the simulator '{simulator.name}' knows one lane only; take `simulator` embedded"
         )
     if simulator.most is not None and rollouts > simulator.most:
-        raise UsageError(f"--simulator: '{simulator.name}' runs {simulator.most} roll-out at a time, not {rollouts}")
+        raise UsageError(f"`simulator`: '{simulator.name}' runs {simulator.most} roll-out at a time, not {rollouts}")
     return _Drive(simulator, cars, plan, schedule, rollouts).run(record=record, resting_mps=resting_mps)
 
 

@@ -43,7 +43,7 @@ class Ego(LockStep):
     def __init__(self, cars: Cars, plan: DrivingPlan, schedule: Schedule, rollouts: int) -> None:
         gaps = np.broadcast_to(np.asarray(cars.gap), (rollouts,))
         if unknown := set(gaps.tolist()) - set(GAPS):
-            raise UsageError(f"--gap-behaviour: '{min(unknown)}' is none of {', '.join(GAPS)}")
+            raise UsageError(f"`gap`: '{min(unknown)}' is none of {', '.join(GAPS)}")
         shape = (len(plan.lane), rollouts)
         self._start_s = np.broadcast_to(np.asarray(schedule.start_s, float), shape)
         self._duration_s = np.broadcast_to(np.asarray(schedule.duration_s, float), shape)

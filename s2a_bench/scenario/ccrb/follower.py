@@ -16,11 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, ClassVar, Final, Protocol
 
 import numpy as np
 
 from s2a_bench.errors import UsageError
+from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.braking import BRAKES_MPS2, needed
 from s2a_bench.scenario.ccrb.cars import Cars
 from s2a_bench.scenario.lockstep import LockStep
@@ -61,6 +63,9 @@ class Seen:
 class Follower(Protocol):
     """A law for the trailing car of M roll-outs; it remembers from step to step."""
 
+    law: ClassVar[str]
+    """The law in words; ``{reaction:g}`` stands for the reaction time in s."""
+
     def acceleration(self, seen: Seen, step_s: float) -> Floats:
         """Return the acceleration in m/s^2 for the next step, shape (M,)."""
         ...
@@ -72,6 +77,11 @@ class Follower(Protocol):
 
 class Careful(LockStep):
     """The careful driver."""
+
+    law: ClassVar[str] = (
+        "careful follower: brakes as needed to stay 1 m behind the ego, seen {reaction:g} s ago and "
+        "extrapolated; at most 7 m/s\N{SUPERSCRIPT TWO}, built up in 0.6 s"
+    )
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
         self._reaction_s = np.broadcast_to(np.asarray(cars.reaction_s, float), (rollouts,))
@@ -105,6 +115,11 @@ class Careful(LockStep):
 
 class Idm(LockStep):
     """The Intelligent Driver Model with delay."""
+
+    law: ClassVar[str] = (
+        "IDM follower on the ego seen {reaction:g} s ago, headway such that it keeps its gap at first; "
+        "at most 7 m/s\N{SUPERSCRIPT TWO}, built up in 0.6 s"
+    )
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
         speed = np.broadcast_to(np.asarray(cars.speed_mps, float), (rollouts,))
@@ -141,20 +156,9 @@ def apply_brake(force_mps2: Floats, want_mps2: Floats, step_s: float) -> Floats:
     return force_mps2 + change
 
 
-FOLLOWERS: dict[str, Callable[[Cars, int], Follower]] = {"careful": Careful, "idm": Idm}
-"""Value of ``--follower`` -> its law."""
-
-LAWS: Final = {
-    "careful": "careful follower: brakes as needed to stay 1 m behind the ego, seen {reaction:g} s ago and "
-    "extrapolated; at most 7 m/s\N{SUPERSCRIPT TWO}, built up in 0.6 s",
-    "idm": "IDM follower on the ego seen {reaction:g} s ago, headway such that it keeps its gap at first; "
-    "at most 7 m/s\N{SUPERSCRIPT TWO}, built up in 0.6 s",
-}
-"""Each law in words, to be shown beside every rear outcome."""
-
-
 def follower(cars: Cars, rollouts: int) -> Follower:
     """Build the trailing car's law for M roll-outs; raises UsageError for an unknown name."""
     if cars.follower not in FOLLOWERS:
-        raise UsageError(f"--follower: '{cars.follower}' is none of {', '.join(FOLLOWERS)}")
-    return FOLLOWERS[cars.follower](cars, rollouts)
+        raise UsageError(f"`follower`: '{cars.follower}' is none of {', '.join(FOLLOWERS)}")
+    build: Callable[[Cars, int], Follower] = resolve_name(FOLLOWERS[cars.follower])
+    return build(cars, rollouts)

@@ -18,6 +18,7 @@ from s2a_bench.errors import SimulatorError, UsageError
 from s2a_bench.policy import Schedule
 from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, LEAD_JERK_MPS3, Cars, DrivingPlan
 from s2a_bench.scenario.ccrb.follower import MOST_MPS2
+from s2a_bench.scenario.ccrb.options import CcrbOptions
 
 if TYPE_CHECKING:
     from s2a_bench.plan.skillset import Gap
@@ -33,18 +34,18 @@ LANES: Final = {0: "-2", 1: "-1"}
 AFTER_S: Final = 20.0
 
 
-def write_openscenario(path: Path, cars: Cars, plan: DrivingPlan, schedules: Mapping[str, Schedule]) -> list[Path]:
+def write_openscenario(path: Path, asked: CcrbOptions, schedules: Mapping[str, Schedule]) -> list[Path]:
     """Write ``PATH`` as one file a policy, STEM-POLICY.xosc, and STEM.xodr; return what was written.
 
     Takes the first roll-out. Raises UsageError for a path that cannot be written, SimulatorError without the package.
     """
     if path.suffix != ".xosc":
-        raise UsageError(f"--openscenario: {path} should end in .xosc")
+        raise UsageError(f"`openscenario`: {path} should end in .xosc")
     try:
         from scenariogeneration import xodr
     except ImportError as error:
         raise SimulatorError(
-            "--openscenario: the package scenariogeneration is not installed; pip install 's2a-bench[scenario]'"
+            "`openscenario`: the package scenariogeneration is not installed; pip install 's2a-bench[scenario]'"
         ) from error
     road = path.with_suffix(".xodr")
     drive = xodr.OpenDrive(path.stem)
@@ -56,10 +57,10 @@ def write_openscenario(path: Path, cars: Cars, plan: DrivingPlan, schedules: Map
         drive.write_xml(str(road))
         for name, schedule in schedules.items():
             file = path.with_name(f"{path.stem}-{name}.xosc")
-            _scenario(name, cars, plan, schedule, road.name).write_xml(str(file))
+            _scenario(name, asked.cars, asked.driving, schedule, road.name).write_xml(str(file))
             written.append(file)
     except OSError as error:
-        raise UsageError(f"--openscenario: cannot write {path}: {error.strerror}") from error
+        raise UsageError(f"`openscenario`: cannot write {path}: {error.strerror}") from error
     return written
 
 

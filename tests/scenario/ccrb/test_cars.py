@@ -7,8 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.plans import prepare, skill_texts
 from s2a_bench.plan import load_skills
 from s2a_bench.policy import Plans
 from s2a_bench.policy.arrivals import uniform
@@ -19,6 +17,7 @@ from s2a_bench.scenario.ccrb.braking import needed
 from s2a_bench.scenario.ccrb.cars import SAFETY_M, Cars, braking_plan, start_deadline
 from s2a_bench.scenario.ccrb.drive import drive
 from s2a_bench.scenario.ccrb.follower import IDM_COMFORT_MPS2, IDM_HASTE, IDM_STANDSTILL_M, idm_acceleration
+from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.ttc import ttc_aware
 
 
@@ -35,10 +34,10 @@ def test_before_a_lane_change_half_the_speed_is_left() -> None:
 
 @pytest.mark.parametrize("lane_change", [False, True])
 def test_the_plan_is_made_of_calls_of_the_driving_skill_set(lane_change: bool) -> None:
-    config = CcrbConfig(lane_change=lane_change, simulator="embedded", n_skills=5)
+    asked = CcrbOptions(lane_change=lane_change, n_skills=5)
     known = {str(call) for call in load_skills("driving").calls}
-    assert set(skill_texts(prepare(config).driving)) <= known
-    assert len(prepare(config).driving.lane) == 5 + lane_change
+    assert set(asked.texts) <= known
+    assert len(asked.driving.lane) == 5 + lane_change
 
 
 def least_gap(cars: Cars, decel: float, start_s: float) -> float:

@@ -132,7 +132,7 @@ def test_a_lane_change_needs_a_simulator_that_steers() -> None:
     cars = Cars()
     plan = braking_plan(cars, 5, 0.8, lane_change=True)
     each = schedule("naive", n_skills=6)
-    with pytest.raises(UsageError, match=r"--lane-change: .* take --simulator embedded"):
+    with pytest.raises(UsageError, match=r"`lane_change`: .* take `simulator` embedded"):
         drive(simulator("longitudinal"), cars, plan, each)
 
 
@@ -158,8 +158,8 @@ def test_a_world_for_one_refuses_many() -> None:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"gap": "panic"}, "--gap-behaviour: 'panic'"),
-        ({"follower": "drunk"}, "--follower: 'drunk' is none of careful, idm"),
+        ({"gap": "panic"}, "`gap`: 'panic'"),
+        ({"follower": "drunk"}, "`follower`: 'drunk' is none of careful, idm"),
     ],
 )
 def test_names_that_there_are_not_are_refused(changed: dict[str, str], message: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -9,10 +11,12 @@ import numpy as np
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments.ccrb.view.figures import path_of
-from s2a_bench.experiments.ccrb.view.outcomes import SAID, law_of, rollouts_of, tokens_line
+from s2a_bench.experiments.ccrb.view.outcomes import configuration, rollouts_of
+from s2a_bench.experiments.ccrb.view.sentences import tokens_line
 from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES
 from s2a_bench.scenario.ccrb.render import TopView
+from s2a_bench.scenario.ccrb.words import SAID, law
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,28 +41,28 @@ _HITS: Final[dict[str, frozenset[int]]] = {
 _INK, _PAPER, _RED, _FAINT = (20, 20, 20), (255, 255, 255), (200, 60, 0), (110, 110, 110)
 
 
-def write_animation(run: Run) -> list[Path]:
-    """Write ``figures/scenario.gif`` and ``.mp4`` in real time; raises StoreError where that fails.
+def animation_files(run: Run) -> dict[str, Callable[[Path], None]]:
+    """Return what writes the animation in real time, by file name; raises StoreError where that fails.
 
     A panel stops at its first impact: what comes after one is not modelled.
     """
-    frames = list(frames_of(run))
-    folder = run.path / "figures"
-    gif, film = folder / "scenario.gif", folder / "scenario.mp4"
-    try:
-        folder.mkdir(exist_ok=True)
-        _write_gif(gif, frames)
-        _write_film(film, frames)
-    except OSError as error:
-        raise StoreError(f"cannot write {folder}: {error}; the roll-outs are kept") from error
-    return [gif, film]
+    drawn = cache(partial(frames_of, run))
+
+    def write(as_file: Callable[[Path, list[Image]], None], path: Path) -> None:
+        try:
+            path.parent.mkdir(exist_ok=True)
+            as_file(path, drawn())
+        except OSError as error:
+            raise StoreError(f"cannot write {path}: {error}; the roll-outs are kept") from error
+
+    return {"figures/scenario.gif": partial(write, _write_gif), "figures/scenario.mp4": partial(write, _write_film)}
 
 
 def frames_of(run: Run, frames_a_s: int = FRAMES_A_S) -> list[Image]:
     """Draw every frame of the animation."""
     panels = [Panel(run, row) for row in rollouts_of(run, "point").to_dict("records")]
     until_s = max(panel.until_s for panel in panels)
-    foot = f"{tokens_line(run)} Yellow: lead, green: ego, blue: car behind, red: impact.\n{law_of(run)}"
+    foot = f"{tokens_line(run)} Yellow: lead, green: ego, blue: car behind, red: impact.\n{law(configuration(run))}"
     return [_frame(panels, step / frames_a_s, foot) for step in range(int(until_s * frames_a_s) + 1)]
 
 

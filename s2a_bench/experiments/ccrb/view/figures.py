@@ -5,14 +5,15 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from s2a_bench.experiments.ccrb.rows import TRAJECTORIES
-from s2a_bench.experiments.ccrb.view.outcomes import SAID, configuration, has, origin_notes, rollouts_of, token_times_s
+from s2a_bench.experiments.ccrb.view.outcomes import configuration, has, rollouts_of, token_times_s
 from s2a_bench.experiments.ccrb.view.phase_figure import build_phase
+from s2a_bench.experiments.ccrb.view.sentences import origin_notes
 from s2a_bench.experiments.timeline.rows import SKILLS
-from s2a_bench.writers.figures import LINE_CHARS, new_figure, save
+from s2a_bench.scenario.ccrb.words import SAID, operating_point
+from s2a_bench.writers.figures import LINE_CHARS, new_figure
 from s2a_bench.writers.style import WIDTH_IN
 
 if TYPE_CHECKING:
@@ -80,11 +81,6 @@ def ccrb_figures(run: Run) -> dict[str, Callable[[], Figure]]:
     return builders
 
 
-def write_ccrb_figures(run: Run) -> list[Path]:
-    """Write ``figures/scenario.*``, and ``figures/phase.*`` where the run has a phase diagram."""
-    return save(run.path / "figures", ccrb_figures(run))
-
-
 def path_of(run: Run, cell: str) -> pd.DataFrame:
     """Return the trajectory of a shown roll-out with times in s, speeds in km/h, and gaps."""
     rows = run.table(TRAJECTORIES)
@@ -150,9 +146,8 @@ def _verdict(row: dict[Any, Any]) -> str:
 def _title(run: Run) -> str:
     asked = configuration(run)
     return (
-        f"CCRB with a car behind ({asked['simulator']} simulator): {asked['speed_kmh']:g} km/h, front gap "
-        f"{asked['front_gap_m']:g} m, lead -{asked['lead_decel_mps2']:g} m/s\N{SUPERSCRIPT TWO}, rear gap "
-        f"{asked['rear_gap_m']:g} m, N = {asked['n_skills']}, L = {asked['tokens_per_skill']}"
+        f"CCRB with a car behind ({asked['simulator']} simulator): {operating_point(asked)}, "
+        f"N = {asked['n_skills']}, L = {asked['tokens_per_skill']}"
     )
 
 

@@ -1,4 +1,4 @@
-"""What a CCRB run says: the operating point, and where in its studies the paper's ordering of the policies holds."""
+"""What a CCRB run holds: the operating point, and where in its studies the paper's ordering of the policies holds."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.timeline.rows import SKILLS
-from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
-from s2a_bench.scenario.ccrb.follower import LAWS
+from s2a_bench.scenario.ccrb.words import PAPER
 from s2a_bench.store.requests import TOKENS
 
 if TYPE_CHECKING:
@@ -17,14 +16,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import Run
 
-PAPER: Final = {"naive": "rear", "wait-then-act": "front", "stream-to-act": "none"}
-"""The outcomes that the paper states (section V-F)."""
-SAID: Final = {
-    "none": "no impact",
-    "front": "hits the lead",
-    "rear": "hit from behind",
-    "both": "hit from behind, hits the lead",
-}
+_TIMES: Final = ("start", "end", "stall", "deadline")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +44,11 @@ def rollouts_of(run: Run, study: str) -> pd.DataFrame:
     """Return the roll-outs of the operating point (point), the phase diagram (phase) or random scenarios (random)."""
     rows = run.table(ROLLOUTS)
     return rows[rows["study"] == study].reset_index(drop=True)
+
+
+def cells_of(run: Run) -> list[dict[str, Any]]:
+    """Return each policy's roll-out at the operating point: names and metrics, times in s; what it lacks is no key."""
+    return [_cell(row) for row in rollouts_of(run, "point").to_dict("records")]
 
 
 def scenes_of(run: Run, study: str, gap: str) -> pd.DataFrame:
@@ -111,31 +108,6 @@ def configuration(run: Run) -> dict[str, Any]:
     return found
 
 
-def law_of(run: Run) -> str:
-    """Say how the trailing car drives: the rear outcome hangs on it."""
-    asked = configuration(run)
-    return LAWS[asked["follower"]].format(reaction=asked["reaction_s"])
-
-
-def origin_notes(run: Run) -> tuple[str, ...]:
-    """Say what the numbers are made of, and which laws they hang on."""
-    asked = configuration(run)
-    notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
-    notes.append(f"Rear: {law_of(run)}.")
-    notes.append(f"Front: while no skill is valid the ego does '{asked['gap']}'; the reflex layer is {_switch(asked)}.")
-    return tuple(notes)
-
-
-def tokens_line(run: Run) -> str:
-    """Say in one line where the tokens come from."""
-    if (live := run.manifest.get("live")) is None:
-        return f"EMULATED tokens, {run.manifest['boards'][0]['tokens_per_s']:g}/s."
-    kind = "EMULATED (replayed)" if live["emulated"] else "LIVE"
-    pace = live.get("paced_tokens_per_s")
-    paced = f", paced to {pace:g} tokens/s (the rate is set)" if pace else ""
-    return f"{kind} tokens over {live['transport']}{paced}; car simulated."
-
-
 def token_times_s(run: Run) -> list[float]:
     """Return when the tokens of the shown plan arrived, in s from the request."""
     request_id = run.table(SKILLS)["request_id"].iloc[0]
@@ -144,50 +116,18 @@ def token_times_s(run: Run) -> list[float]:
     return [(int(at_ns) - zero_ns) / 1e9 for at_ns in tokens[tokens["request_id"] == request_id]["client_ns"]]
 
 
-def _live_notes(run: Run) -> list[str]:
-    """Say what is real of a run on a model's tokens, and what is not."""
-    live = run.manifest["live"]
-    rate = rollouts_of(run, "point")["tokens_per_s"].iloc[0]
-    notes = [tokens_line(run)]
-    if "paced_tokens_per_s" not in live:
-        notes = [f"{notes[0]} {rate:g} tokens/s came."]
-    notes.append("Open loop: one request at t = 0 about the rendered scene; the road does not change the answer.")
-    driven = "the set-points driven are those of the scenario."
-    dummy = f"Dummy weights: what the plan says means nothing; {driven}"
-    notes.append(dummy if live.get("dummy") else f"What the plan says is not driven; {driven}")
-    return notes
+def _cell(row: dict[Any, Any]) -> dict[str, Any]:
+    """Return one roll-out with the keys of the JSON object."""
+    import pandas as pd
 
-
-def _emulated_notes(run: Run) -> list[str]:
-    """Say what modelled tokens are made of."""
-    board = run.manifest["boards"][0]
-    rates = {"paper": "the paper's rate (table II)", "measured": "a measured rate", "given": "a rate as given"}
-    rate = f"{rates[board['origin']]}, {board['tokens_per_s']:g}/s"
-    notes = [f"EMULATED: no model answered; tokens come evenly at {rate}."]
-    if board["prompt_origin"] == "assumed":
-        notes.append(f"c = {board['prompt_s']:g} s before decoding is an assumption of ours.")
-    return notes
-
-
-def words(run: Run) -> list[str]:
-    """Say what the phase diagram shows, gap behaviour by gap behaviour."""
-    return [_finding(run, gap) for gap in GAPS] if has(run, "phase") else []
-
-
-def _finding(run: Run, gap: str) -> str:
-    """Say where the paper's ordering holds under one gap behaviour."""
-    share = share_of(scenes_of(run, "phase", gap), "paper")
-    said = f"{gap}: the paper's ordering holds at {share.value:.1%} of the diagram"
-    span, here = rate_span(run, gap), rate_span_here(run, gap)
-    if span is None:
-        return f"{gap}: the paper's ordering holds nowhere in the diagram."
-    at = f"at a rear gap of {configuration(run)['rear_gap_m']:g} m"
-    where = f"{at} for {here[0]:.1f} to {here[1]:.1f}" if here else f"{at} nowhere"
-    return f"{said}, for R = {span[0]:.1f} to {span[1]:.1f} tokens/s; {where}."
-
-
-def _switch(asked: dict[str, Any]) -> str:
-    return "on" if asked["reflex"] else "off"
+    plain = {str(name): value for name, value in row.items() if not pd.isna(value)}
+    for name in ("study", "draw", "title"):
+        plain.pop(name, None)
+    for name in _TIMES:
+        plain[f"{name}_s"] = plain.pop(f"{name}_ns") / 1e9
+    plain["rate_tokens_per_s"] = plain.pop("tokens_per_s")
+    plain["profile"] = plain.pop("board") or None
+    return plain
 
 
 def _compared(theirs: pd.DataFrame, mine: pd.DataFrame, column: str) -> tuple[pd.Series[Any], pd.Series[Any]]:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.ccrb.view.outcomes import configuration, law_of, rate_span_here, scenes_of, share_of
+from s2a_bench.experiments.ccrb.view.outcomes import configuration, rate_span_here, scenes_of, share_of
 from s2a_bench.plan.skillset import GAPS
+from s2a_bench.scenario.ccrb.words import ORDERING, ahead, law
 from s2a_bench.writers.figures import LINE_CHARS, new_figure
 from s2a_bench.writers.style import WIDTH_IN
 
@@ -52,12 +53,12 @@ def build_phase(run: Run) -> Figure:
     asked = configuration(run)
     chars = round(LINE_CHARS * WIDE_IN / WIDTH_IN)
     scene = (
-        f"Who has an impact? Front gap {asked['front_gap_m']:g} m, lead -{asked['lead_decel_mps2']:g} "
-        f"m/s\N{SUPERSCRIPT TWO}, reaction {asked['reaction_s']:g} s, N = {asked['n_skills']}, "
-        f"L = {asked['tokens_per_skill']}. The paper's ordering: naive hit from behind, wait-then-act hits the lead, "
-        "stream-to-act nobody."
+        f"{ahead(asked)}, reaction {asked['reaction_s']:g} s, N = {asked['n_skills']}, L = {asked['tokens_per_skill']}"
     )
-    lines = [scene, f"Rear: {law_of(run)}. EMULATED: tokens come evenly."]
+    lines = [
+        f"Who has an impact? {scene[0].upper()}{scene[1:]}. {ORDERING}",
+        f"Rear: {law(asked)}. EMULATED: tokens come evenly.",
+    ]
     figure = new_figure(2.9, "\n".join(textwrap.fill(line, chars) for line in lines), WIDE_IN)
     grid = figure.subplots(1, len(GAPS), sharex=True, sharey=True)
     seen: set[str] = set()

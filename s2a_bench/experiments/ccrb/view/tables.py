@@ -1,26 +1,30 @@
-"""The tables of a CCRB run for people, and for programs as CSV."""
+"""The tables of a CCRB run for people, and for programs as CSV and JSON."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from s2a_bench.experiments.ccrb.metrics import MARGINS, OUTCOMES
 from s2a_bench.experiments.ccrb.view.outcomes import (
-    SAID,
     Share,
+    cells_of,
     configuration,
     has,
-    origin_notes,
     rate_span,
     rate_span_here,
     rollouts_of,
     scenes_of,
     share_of,
 )
+from s2a_bench.experiments.ccrb.view.sentences import origin_notes
 from s2a_bench.plan.skillset import GAPS
+from s2a_bench.scenario.ccrb.words import ORDERING, SAID, law, operating_point
+from s2a_bench.writers.as_json import frame
 from s2a_bench.writers.csv_text import csv_text
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
+    from s2a_bench.experiments import Metric
     from s2a_bench.store.run import Run
 
 ORDERINGS = {
@@ -37,33 +41,23 @@ ORDERINGS = {
 def outcome_table(run: Run) -> TextTable:
     """Lay out what became of the three cars under each policy."""
     rows = []
-    for row in rollouts_of(run, "point").to_dict("records"):
-        said = SAID[row["outcome"]] + (" (late)" if row["late"] is True else "")
-        start, stall = (f"{row[name] / 1e9:.2f}" for name in ("start_ns", "stall_ns"))
-        metrics = ("impact_speed_mps", "min_front_gap_m", "min_rear_gap_m")
-        rows.append((row["policy"], said, start, str(row["stalls"]), stall, *(_entry(row[name]) for name in metrics)))
+    for cell in cells_of(run):
+        said = SAID[cell["outcome"]] + (" (late)" if cell.get("late") else "")
+        rows.append((cell["policy"], said, *(_entry(cell, metric) for metric in OUTCOMES)))
     asked = configuration(run)
-    title = (
-        f"CCRB with a car behind, {asked['simulator']} simulator: {asked['speed_kmh']:g} km/h, front gap "
-        f"{asked['front_gap_m']:g} m, lead -{asked['lead_decel_mps2']:g} m/s\N{SUPERSCRIPT TWO}, rear gap "
-        f"{asked['rear_gap_m']:g} m"
-    )
-    header = ("policy", "outcome", "start s", "stalls", "stalled s", "impact m/s", "front gap m", "rear gap m")
+    title = f"CCRB with a car behind, {asked['simulator']} simulator: {operating_point(asked)}"
+    header = ("policy", "outcome", *map(_title, OUTCOMES))
     return TextTable(title, header, rows, 2, notes=(*origin_notes(run), *_deadline_note(run)))
 
 
 def margin_table(run: Run) -> TextTable:
     """Lay out how near an impact was, and how smoothly the ego drove."""
-    rows = []
-    for row in rollouts_of(run, "point").to_dict("records"):
-        metrics = ("min_front_ttc_s", "min_rear_ttc_s", "required_decel_mps2", "rms_jerk", "peak_jerk")
-        rows.append((row["policy"], *(_entry(row[name]) for name in metrics), _entry(row["sparc"])))
+    rows = [(cell["policy"], *(_entry(cell, metric) for metric in MARGINS)) for cell in cells_of(run)]
     notes = (
         "TTC: least time to collision. DRAC: greatest deceleration required towards the lead, closing^2 / (2 gap).",
         "Motion: the ego's simulated speed until it rests (with the jolt then) or hits the lead: a crash looks smooth.",
     )
-    header = ("policy", "TTC front s", "TTC rear s", "DRAC m/s\N{SUPERSCRIPT TWO}", "RMS jerk", "peak jerk", "SPARC")
-    return TextTable("Margins and motion", header, rows, 1, notes=notes)
+    return TextTable("Margins and motion", ("policy", *map(_title, MARGINS)), rows, 1, notes=notes)
 
 
 def phase_table(run: Run) -> TextTable:
@@ -114,9 +108,32 @@ def ccrb_csv(run: Run) -> dict[str, str]:
     return {"orderings.csv": csv_text(("study", "gap_behaviour", "ordering", "k", "n", "share", "low", "high"), rows)}
 
 
+def ccrb_json(run: Run) -> dict[str, Any]:
+    """Return the object that ``--json`` prints, as docs/schema/s2a-bench-1.json describes it; SI units, float seconds.
+
+    A cell a policy at the operating point; studies are summed up as shares, their roll-outs are in the run folder.
+    """
+    studies = [_study(run, study, gap) for study in ("phase", "random") if has(run, study) for gap in GAPS]
+    live = {"live": run.manifest["live"]} if "live" in run.manifest else {}
+    return frame(run, cells_of(run), [], **live, follower_law=law(configuration(run)), studies=studies)
+
+
+def _study(run: Run, study: str, gap: str) -> dict[str, Any]:
+    """Return the shares of one study under one gap behaviour."""
+    scenes = scenes_of(run, study, gap)
+    shares = {}
+    for name in ORDERINGS:
+        share = share_of(scenes, name)
+        interval = {"ci95": list(share.interval)} if study == "random" else {}
+        shares[name] = {"k": share.k, "value": share.value, **interval}
+    span = rate_span(run, gap) if study == "phase" else None
+    rates = {} if span is None else {"paper_rates_tokens_per_s": list(span)}
+    return {"study": study, "gap_behaviour": gap, "scenarios": len(scenes), "orderings": shares, **rates}
+
+
 def _ordering_notes() -> tuple[str, ...]:
     return (
-        "The paper's ordering: naive hit from behind, wait-then-act hits the lead, stream-to-act nobody.",
+        ORDERING,
         "Worse, better: than stream-to-act, by an impact more than 0.5 m/s faster or slower; behind: from there alone.",
     )
 
@@ -127,11 +144,16 @@ def _deadline_note(run: Run) -> tuple[str, ...]:
     return (f"S_front = {deadline_s:.2f} s: who brakes as planned from then on keeps 2 m to the lead.",)
 
 
-def _entry(value: Any) -> str:
-    """Write a number that may be missing."""
-    import pandas as pd
+def _title(metric: Metric) -> str:
+    return f"{metric.title} {metric.unit}".strip()
 
-    return ABSENT if pd.isna(value) else number(value)
+
+def _entry(cell: dict[str, Any], metric: Metric) -> str:
+    """Return a metric of a cell as text."""
+    value = cell.get(metric.name)
+    if value is None:
+        return ABSENT
+    return str(value) if isinstance(value, int) else number(value)
 
 
 def _span(found: tuple[float, float] | None) -> str:

@@ -1,0 +1,128 @@
+"""What can be asked of the scenario: the cars' numbers, the plan's set-points; and what it refuses."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Final
+
+from s2a_bench.errors import UsageError
+from s2a_bench.options import Options, one_of, option
+from s2a_bench.plan.skillset import GAPS, Durations, Gap
+from s2a_bench.scenario.ccrb import FOLLOWERS
+from s2a_bench.scenario.ccrb.cars import (
+    EGO_LEAST_MPS2,
+    KMH,
+    Cars,
+    DrivingPlan,
+    braking_plan,
+    plan_decel,
+    start_deadline,
+)
+
+if TYPE_CHECKING:
+    from s2a_bench.plan import Skill
+
+SKILL_SET: Final = "driving"
+
+
+class CcrbOptions(Options):
+    """One scenario; the defaults are the operating point at which the paper's outcome comes about."""
+
+    n_skills: int = option(5, "N, speed set-points down to rest", flag="skills", ge=1, le=100)
+    t_nom_s: float | None = option(
+        None, "seconds a set-point takes [default: the skill set's 0.8]", flag="t-nom", gt=0, le=60
+    )
+    speed_kmh: float = option(50.0, "of all three cars in the beginning, km/h", flag="speed", gt=0, le=200)
+    plan_decel_mps2: float | None = option(
+        None,
+        "m/s^2 that the plan brakes with [default: as needed to come to rest]",
+        flag="plan-decel",
+        gt=0,
+        le=-EGO_LEAST_MPS2,
+    )
+    front_gap_m: float = option(40.0, "m to the lead; Euro NCAP: 12 or 40", flag="front-gap", gt=0, le=1000)
+    lead_decel_mps2: float = option(2.0, "m/s^2 of the lead; Euro NCAP: 2 or 6", flag="lead-decel", gt=0, le=10)
+    rear_gap_m: float = option(14.0, "m to the car behind", flag="rear-gap", gt=0, le=1000)
+    reaction_s: float = option(1.3, "seconds until the car behind reacts", flag="reaction", ge=0, le=10)
+    gap: Gap = option("stop", f"what the ego does while no skill is valid: {', '.join(GAPS)}", flag="gap-behaviour")
+    follower: Annotated[str, one_of(lambda: FOLLOWERS)] = option(
+        "careful", f"the law of the car behind: {', '.join(FOLLOWERS)}"
+    )
+    reflex: bool = option(False, "let the ego brake by itself below the plan")
+    lane_change: bool = option(False, "end the plan with a lane change; not along the lane")
+
+    @cached_property
+    def durations(self) -> Durations:
+        """Return how long a set-point takes: the skill set's, scaled to T_nom where that is given."""
+        durations = _skill("set_speed").durations
+        factor = 1.0 if self.t_nom_s is None else self.t_nom_s / durations.nominal_s
+        return Durations(durations.least_s * factor, durations.nominal_s * factor, durations.most_s * factor)
+
+    @cached_property
+    def lane_durations(self) -> Durations:
+        """Return how long a lane change takes."""
+        return _skill("change_lane").durations
+
+    @property
+    def skills(self) -> int:
+        """Return how many skills the plan has, the lane change included."""
+        return self.n_skills + self.lane_change
+
+    @property
+    def cars(self) -> Cars:
+        """Return the three cars as they begin."""
+        return Cars(
+            front_gap_m=self.front_gap_m,
+            lead_decel_mps2=self.lead_decel_mps2,
+            rear_gap_m=self.rear_gap_m,
+            reaction_s=self.reaction_s,
+            speed_mps=self.speed_kmh * KMH,
+            gap=self.gap,
+            follower=self.follower,
+            reflex=self.reflex,
+        )
+
+    @property
+    def decel_mps2(self) -> float:
+        """Return a_p, what the plan brakes with."""
+        if self.plan_decel_mps2 is not None:
+            return self.plan_decel_mps2
+        return float(plan_decel(self.cars, self.n_skills, self.durations.nominal_s, lane_change=self.lane_change))
+
+    @property
+    def driving(self) -> DrivingPlan:
+        """Return the plan's set-points and lanes."""
+        nominal_s = self.durations.nominal_s
+        return braking_plan(
+            self.cars, self.n_skills, nominal_s, decel_mps2=self.decel_mps2, lane_change=self.lane_change
+        )
+
+    @property
+    def deadline_s(self) -> float:
+        """Return S_front, by when the plan must start to keep its distance to the lead."""
+        return float(start_deadline(self.cars, self.decel_mps2))
+
+    @property
+    def texts(self) -> list[str]:
+        """Return the plan's calls as the driving skill set writes them."""
+        plan = self.driving
+        points = plan.set_point_mps[1:, 0] / KMH
+        return [
+            "change_lane(left)" if lane else f"set_speed({round(float(kmh), 1):g})"
+            for kmh, lane in zip(points, plan.lane, strict=True)
+        ]
+
+    def check(self) -> None:
+        """Refuse plans that the ego cannot follow; raises UsageError naming the fields."""
+        first = self.driving.set_point_mps
+        if (steepest := float(first[0, 0] - first[1, 0]) / self.durations.nominal_s) > -EGO_LEAST_MPS2:
+            raise UsageError(
+                f"`n_skills` x `t_nom_s`: the plan brakes at {steepest:.3g} m/s^2, which is more than the ego can; "
+                "allow more time, or give `plan_decel_mps2`"
+            )
+
+
+def _skill(name: str) -> Skill:
+    from s2a_bench.plan import load_skills
+
+    return next(skill for skill in load_skills(SKILL_SET).skills if skill.name == name)

@@ -1,0 +1,118 @@
+"""Many scenarios at once: a plane over rate and rear gap, and random ones; driven along the lane, in lock step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from s2a_bench.policy import Schedule
+from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, LEAST_IMPACT_MPS, Cars, braking_plan, plan_decel
+from s2a_bench.scenario.ccrb.drive import drive
+from s2a_bench.scenario.ccrb.options import CcrbOptions
+from s2a_bench.scenario.ccrb.outcome import Outcomes
+from s2a_bench.scenario.longitudinal import Longitudinal
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+RESTING_MPS: Final = LEAST_IMPACT_MPS
+"""The trailing car counts as stopped: at rest the ego cannot be hit any more, but the gap still shrinks."""
+
+RANGES: Final[dict[str, tuple[float, float]]] = {
+    "tokens_per_s": (1.0, 20.0),
+    "prompt_s": (0.1, 1.0),
+    "t_nom_s": (0.5, 1.5),
+    "speed_mps": (30 / 3.6, 80 / 3.6),
+    "front_gap_m": (12.0, 60.0),
+    "lead_decel_mps2": (2.0, 6.0),
+    "rear_gap_m": (6.0, 30.0),
+    "reaction_s": (0.7, 1.8),
+}
+"""What random scenarios are drawn from, uniformly; the rate on a logarithmic scale."""
+LENGTHS: Final = (1, 2, 3, 4, 5, 6)
+SKILLS: Final = (3, 4, 5, 6, 8)
+
+
+@dataclass(frozen=True, slots=True)
+class Scenes:
+    """M scenarios: arrays of shape (M,), the cars' numbers by the names of `Cars`, the plans' by those of rows."""
+
+    numbers: dict[str, Any]
+
+    def __len__(self) -> int:
+        return len(self.numbers["n_skills"])
+
+    def cut(self, part: slice) -> Scenes:
+        """Return some of them."""
+        return Scenes({name: values[part] for name, values in self.numbers.items()})
+
+    def times(self, count: int) -> Scenes:
+        """Return them ``count`` times, one block after the other."""
+        return Scenes({name: np.tile(values, count) for name, values in self.numbers.items()})
+
+    def cars(self, gap: NDArray[np.str_], asked: CcrbOptions) -> Cars:
+        """Return their cars; the gap behaviour is one for each, the laws are those of ``asked``."""
+        names = ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "speed_mps")
+        numbers = {name: self.numbers[name] for name in names}
+        return Cars(**numbers, gap=gap, follower=asked.follower, reflex=asked.reflex)
+
+
+def plane(
+    asked: CcrbOptions,
+    rates: Sequence[float],
+    gaps_m: Sequence[float],
+    points: tuple[int, int],
+    *,
+    prompt_s: float,
+    tokens_per_skill: int,
+) -> Scenes:
+    """Lay rate and rear gap, each from and to, out as a grid, the rate on a logarithmic scale; the rest as asked."""
+    (slow, fast), (near, far) = rates, gaps_m
+    axes = np.geomspace(slow, fast, points[0]), np.linspace(near, far, points[1])
+    rate, gap = (values.ravel() for values in np.meshgrid(*axes, indexing="ij"))
+    cars = asked.cars
+    fixed = {
+        "prompt_s": prompt_s,
+        "tokens_per_skill": tokens_per_skill,
+        "n_skills": asked.n_skills,
+        "t_nom_s": asked.durations.nominal_s,
+        "speed_mps": cars.speed_mps,
+        "front_gap_m": cars.front_gap_m,
+        "lead_decel_mps2": cars.lead_decel_mps2,
+        "reaction_s": cars.reaction_s,
+    }
+    numbers = {name: np.full(rate.shape, value) for name, value in fixed.items()}
+    decel = asked.plan_decel_mps2 or plan_decel(cars, asked.n_skills, asked.durations.nominal_s)
+    numbers["plan_decel_mps2"] = np.full(rate.shape, decel)
+    return Scenes({**numbers, "tokens_per_s": rate, "rear_gap_m": gap, "draw": np.arange(len(rate))})
+
+
+def draw(rng: np.random.Generator, count: int) -> Scenes:
+    """Draw random scenarios.
+
+    A plan that the ego cannot follow (more than its full braking) is not drawn: its skills get longer.
+    """
+    numbers: dict[str, Any] = {
+        name: rng.uniform(low, high, count) for name, (low, high) in RANGES.items() if name != "tokens_per_s"
+    }
+    low, high = np.log(RANGES["tokens_per_s"])
+    numbers["tokens_per_s"] = np.exp(rng.uniform(low, high, count))
+    numbers["tokens_per_skill"] = rng.choice(np.array(LENGTHS), count)
+    n_skills = numbers["n_skills"] = rng.choice(np.array(SKILLS), count)
+    numbers["draw"] = np.arange(count)
+    least_s = numbers["speed_mps"] / (n_skills * -EGO_LEAST_MPS2 * 0.75)
+    numbers["t_nom_s"] = np.maximum(numbers["t_nom_s"], least_s)
+    numbers["plan_decel_mps2"] = numbers["speed_mps"] / (n_skills * numbers["t_nom_s"])
+    return Scenes(numbers)
+
+
+def drive_along(scenes: Scenes, cars: Cars, schedule: Schedule) -> Outcomes:
+    """Drive the scenarios with the bare integrator; there is no least rear gap but that of an impact."""
+    at = scenes.numbers
+    plan = braking_plan(cars, int(at["n_skills"].max()), at["t_nom_s"], decel_mps2=at["plan_decel_mps2"])
+    outcomes = drive(Longitudinal(), cars, plan, schedule, resting_mps=RESTING_MPS).outcomes
+    outcomes.min_rear_gap_m[np.isnan(outcomes.rear_impact_mps)] = np.nan
+    return outcomes
