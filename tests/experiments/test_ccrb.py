@@ -12,12 +12,15 @@ import pytest
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.metrics import MARGINS, OUTCOMES
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
+from s2a_bench.experiments.ccrb.view import show
 from s2a_bench.experiments.ccrb.view.figures import build_scenario
 from s2a_bench.experiments.ccrb.view.outcomes import Share, rate_span, rate_span_here, scenes_of, share_of
 from s2a_bench.experiments.ccrb.view.phase_figure import build_phase, region_of
 from s2a_bench.experiments.ccrb.view.sentences import findings
+from s2a_bench.experiments.ccrb.view.tables import ccrb_json, ccrb_tables
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.run import Run, read_run
@@ -149,6 +152,23 @@ def test_the_deadline_makes_stream_to_act_start_earlier_where_it_must(made: Call
     )
     assert late["late"]
     assert late["start_ns"] == 1_750_000_000
+
+
+def test_the_metrics_are_keys_of_the_cells_and_columns_of_the_tables(made: Callable[..., Run]) -> None:
+    run = made()
+    keys = {key for cell in ccrb_json(run)["cells"] for key in cell}
+    assert {metric.name for metric in (*OUTCOMES, *MARGINS)} <= keys
+    tables = ccrb_tables(run)
+    assert tables["outcomes"].header[2:4] == ("start s", "stalls")
+    assert tables["margins"].header[4] == "RMS jerk m/s\N{SUPERSCRIPT THREE}"
+    assert tables["outcomes"].rows[0][:4] == ("naive", "hit from behind", "1.75", "4")
+
+
+def test_the_run_shows_what_its_options_ask_for(made: Callable[..., Run]) -> None:
+    assert set(show(made()).tables) == {"margins", "outcomes"}
+    assert set(show(made(**GRID)).figures) == {"scenario", "phase"}
+    assert set(show(made(), animation=True).files) == {"figures/scenario.gif", "figures/scenario.mp4"}
+    assert not show(made()).files
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, option
+from s2a_bench.scenario.ccrb.options import SKILL_SET
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.ccrb.config import CcrbConfig
     from s2a_bench.experiments.timeline.live.config import LiveConfig
 
-REPLAY_SKILLS, REPLAY_TOKENS = "household", 6
-"""What the replay engine writes whatever it is asked: household plans, of so many tokens a skill."""
 SIZE: Final = (640, 480)
 
 
@@ -21,13 +20,11 @@ class Asked(Options):
     """Which model answers, over which transport; None is not given."""
 
     live: bool = option(False, "take the tokens of a model that really answers, about the rendered scene")
-    transport: str | None = option(
-        None, "--live: ros, ros/action, http, http/VARIANT, loopback [default: ros]", min_length=1
-    )
+    transport: str | None = option(None, "--live: ros, ros/action, http, http/VARIANT, loopback [default: ros]")
     pace: float | None = option(
         None, "--live: hold the answer back to so many tokens/s [default: the model's own]", gt=0, allow_inf_nan=False
     )
-    engine: str | None = option(None, "--live: llama, replay (EMULATED) [default: llama]", min_length=1)
+    engine: str | None = option(None, "--live: llama, replay (EMULATED) [default: llama]")
     model: Path | None = option(None, "--live: GGUF model [default: the tiny dummy]")
     mmproj: Path | None = option(None, "--live: GGUF vision tower that goes with --model")
     threads: int | None = option(None, "--live: CPU threads of the model [default: all]", ge=0)
@@ -44,11 +41,11 @@ class Asked(Options):
                 raise UsageError(f"`{name}` is about a model that answers; it needs `live`")
 
 
-def live_config(config: CcrbConfig, skill_set: str) -> LiveConfig:
+def live_config(config: CcrbConfig) -> LiveConfig:
     """Return how the model is asked for the plan of a ccrb run; raises UsageError naming the field."""
     import os
 
-    from s2a_bench.experiments.timeline.live.config import LiveConfig
+    from s2a_bench.experiments.timeline.live.config import REPLAY_SKILLS, REPLAY_TOKENS, LiveConfig
     from s2a_bench.harness.plan import LatencyConfig
     from s2a_bench.inference import EngineConfig
     from s2a_bench.ros.config import domain_id
@@ -82,7 +79,7 @@ def live_config(config: CcrbConfig, skill_set: str) -> LiveConfig:
     return LiveConfig(
         requests=requests,
         policies=config.policies,
-        skills=REPLAY_SKILLS if asked.replayed else skill_set,
+        skills=REPLAY_SKILLS if asked.replayed else SKILL_SET,
         tokens_per_skill=(config.tokens_per_skill,),
         n_skills=(config.scenario.skills,),
     )

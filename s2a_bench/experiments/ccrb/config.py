@@ -12,7 +12,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.ccrb.asked import Asked, live_config
 from s2a_bench.options import Names, Numbers, Options, one_of, option
 from s2a_bench.scenario import SIMULATORS
-from s2a_bench.scenario.ccrb.options import SKILL_SET, CcrbOptions
+from s2a_bench.scenario.ccrb.options import CcrbOptions
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.timeline.config import TimelineConfig
@@ -91,7 +91,7 @@ class CcrbConfig(Options):
     @cached_property
     def request(self) -> LiveConfig:
         """Return how the model is asked in a live run."""
-        return live_config(self, SKILL_SET)
+        return live_config(self)
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
