@@ -16,7 +16,6 @@ import pytest
 from s2a_bench.errors import UnlikeRuns, UsageError
 from s2a_bench.report.compare.alike import differences
 from s2a_bench.report.compare.as_json import compare_to_json
-from s2a_bench.report.compare.batches import STATISTICS
 from s2a_bench.report.compare.comparison import Compared, compare, metrics_of, open_comparison, read_side, shown_metrics
 from s2a_bench.report.compare.doubts import doubts
 from s2a_bench.report.compare.figure import build_forest
@@ -24,6 +23,7 @@ from s2a_bench.report.compare.files import write_comparison
 from s2a_bench.report.compare.gates import judge, read_gate
 from s2a_bench.report.compare.metrics import KINDS
 from s2a_bench.report.compare.tables import compare_csv, compare_table, percent
+from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run, RunWriter, read_run
 

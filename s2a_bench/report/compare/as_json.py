@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.report.compare.batches import BATCHES
 from s2a_bench.report.compare.comparison import LEVEL
+from s2a_bench.stats.batches import BATCHES
 
 if TYPE_CHECKING:
     from s2a_bench.report.compare.comparison import Compared, Comparison

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Final
 from s2a_bench.errors import UnlikeRuns, UsageError
 from s2a_bench.experiments.latency.view.cells import seed_of
 from s2a_bench.report.compare.alike import Difference, differences, in_words
-from s2a_bench.report.compare.batches import STATISTICS
-from s2a_bench.report.compare.change import Change, change_between, holm
 from s2a_bench.report.compare.metrics import HIGHER, KINDS, NEITHER, Kind, Metric, Subject
+from s2a_bench.stats.batches import STATISTICS
+from s2a_bench.stats.change import Change, change_between, holm
 
 if TYPE_CHECKING:
-    from s2a_bench.report.compare.batches import Floats
+    from s2a_bench.stats.batches import Floats
     from s2a_bench.store.run import Run
 
 LEVEL: Final = 0.05

@@ -13,8 +13,8 @@ from fnmatch import fnmatchcase
 from typing import Final
 
 from s2a_bench.errors import UsageError
-from s2a_bench.report.compare.change import holm
 from s2a_bench.report.compare.comparison import LEVEL, Compared, Comparison, changes, metric_of
+from s2a_bench.stats.change import holm
 
 _FLAG: Final = "--fail-if"
 _FORM: Final = re.compile(r"(?:(?P<cells>.+):)?(?P<metric>[\w.]+)\s*(?P<sign>>|<\s*-)\s*(?P<limit>\d+(?:\.\d+)?)\s*%")

@@ -17,7 +17,7 @@ from s2a_bench.trace import GROUPS, STAGES
 if TYPE_CHECKING:
     import pandas as pd
 
-    from s2a_bench.report.compare.batches import Floats, Rows
+    from s2a_bench.stats.batches import Floats, Rows
     from s2a_bench.store.run import Run
 
 LOWER, HIGHER, NEITHER = "lower", "higher", "neither"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from s2a_bench.report.compare.batches import BATCHES
 from s2a_bench.report.compare.comparison import LEVEL
+from s2a_bench.stats.batches import BATCHES
 from s2a_bench.writers.csv_text import csv_text
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
-from s2a_bench.report.compare.batches import FEWEST_ROWS, Launch, Rows
 from s2a_bench.stats import Ratio
+from s2a_bench.stats.batches import FEWEST_ROWS, Launch, Rows
 
 if TYPE_CHECKING:
     import numpy as np

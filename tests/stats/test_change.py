@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.signal import lfilter
 
-from s2a_bench.report.compare.batches import Launch, Rows
-from s2a_bench.report.compare.change import change_between, holm
+from s2a_bench.stats.batches import Launch, Rows
+from s2a_bench.stats.change import change_between, holm
 
 Floats: TypeAlias = NDArray[np.float64]
 LEVEL = 0.05
