@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias, final
 
 if TYPE_CHECKING:
@@ -47,26 +48,7 @@ class Launch:
         owners = np.repeat(np.arange(len(self.batches)), [len(batch) for batch in self.batches])[order]
         self.values: Floats = values[order]
         self.counts = np.cumsum(owners[:, None] == np.arange(len(self.batches)), axis=0)
-        levels = np.array([row[0] if len(row) == 1 else np.median(row) for row in rows])
-        self._memory = _neighbours(levels)
-
-    @property
-    def dependent(self) -> bool:
-        """Tell whether requests remember longer than a batch lasts: about (1 + r) / (1 - r) requests."""
-        return (1 + self._memory) > self.n_rows / len(self.batches) * (1 - self._memory)
-
-    @property
-    def hidden(self) -> float:
-        """Return by how much the variance between batches falls short of that of their mean, batches being alike.
-
-        As if the requests were an autoregressive series of order 1, whose mean over m requests has the variance below.
-        """
-        r, n, k = self._memory, self.n_rows, len(self.batches)
-
-        def variance(m: float) -> float:
-            return float((1 + r) / (1 - r) - 2 * r * (1 - r**m) / (m * (1 - r) ** 2)) / m
-
-        return variance(n) * (k - 1) / (variance(n / k) - variance(n)) if k > 1 else 1.0
+        self.levels = np.array([row[0] if len(row) == 1 else np.median(row) for row in rows])
 
     def allows(self, statistic: str) -> bool:
         """Tell whether there are enough values for an interval."""
@@ -113,10 +95,41 @@ class Launch:
         return self.values[low]
 
 
-def _neighbours(values: Floats) -> float:
-    """Return how alike neighbours are, from 0 to 0.95: the lag-1 correlation of ranks (outliers matter little)."""
-    from scipy import stats
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """How alike neighbours of a series of ``n`` rows are, which was cut into ``k`` batches.
 
-    ranks = stats.rankdata(values) - (len(values) + 1) / 2
-    spread = float(ranks @ ranks)
-    return min(0.95, max(0.0, float(ranks[1:] @ ranks[:-1]) / spread)) if spread else 0.0
+    ``r``, from 0 to 0.95, is the lag-1 correlation of ranks (outliers matter little).
+    """
+
+    r: float
+    n: int
+    k: int
+
+    @classmethod
+    def of(cls, levels: Floats) -> Memory:
+        """Measure it on one number a row, in order of time."""
+        from scipy import stats
+
+        ranks = stats.rankdata(levels) - (len(levels) + 1) / 2
+        spread = float(ranks @ ranks)
+        r = min(0.95, max(0.0, float(ranks[1:] @ ranks[:-1]) / spread)) if spread else 0.0
+        return cls(r, len(levels), min(BATCHES, len(levels)))
+
+    @property
+    def dependent(self) -> bool:
+        """Whether rows remember longer than a batch lasts: about (1 + r) / (1 - r) rows."""
+        return (1 + self.r) > self.n / self.k * (1 - self.r)
+
+    @property
+    def hidden(self) -> float:
+        """Return by how much the variance between batches falls short of that of their mean, batches being alike.
+
+        As if the rows were an autoregressive series of order 1, whose mean over m rows has the variance below.
+        """
+        r, n, k = self.r, self.n, self.k
+
+        def variance(m: float) -> float:
+            return float((1 + r) / (1 - r) - 2 * r * (1 - r**m) / (m * (1 - r) ** 2)) / m
+
+        return variance(n) * (k - 1) / (variance(n / k) - variance(n)) if k > 1 else 1.0

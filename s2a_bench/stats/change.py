@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 from s2a_bench.stats import Ratio
-from s2a_bench.stats.batches import FEWEST_ROWS, Launch, Rows
+from s2a_bench.stats.batches import FEWEST_ROWS, Launch, Memory, Rows
 
 if TYPE_CHECKING:
     import numpy as np
@@ -62,10 +62,12 @@ def change_between(
     seed: int,
     confidence: float = 0.95,
     exact: bool = False,
+    paired: bool = False,
 ) -> Change:
     """Compare a statistic of two sides, each of one launch or more; every launch has at least one value.
 
-    ``exact`` values are computed, not sampled: any difference is one.
+    ``exact`` values are computed, not sampled: any difference is one. ``paired`` sides are cells of one launch: row i
+    of both was measured in block i, so the same batches are drawn of both, and what slowed both down cancels.
 
     The test is Welch's t on the logarithm of the statistic (on the statistic itself where it may be zero or less);
     the interval is that of the same t, so both agree. What the t is told about the spread of a side:
@@ -80,11 +82,14 @@ def change_between(
     rng = np.random.default_rng(seed)
     launches = [[Launch(rows) for rows in side] for side in (baseline, other)]
     draws = [side[0].draw(rng) if len(side) == 1 else None for side in launches]
+    if paired:
+        draws[1] = draws[0]
     below, above = (_Side.of(side, statistic, drawn, exact) for side, drawn in zip(launches, draws, strict=True))
-    plain = _Test.of(below, above, confidence)
+    plain = _Test.of(below, above, confidence, paired)
     if below.positive and above.positive:
-        test = _Test.of(below.log(), above.log(), confidence)
-        ratio = Ratio(*(None if value is None else math.exp(value) for value in (test.shift, test.low, test.high)))
+        test = _Test.of(below.log(), above.log(), confidence, paired)
+        low, high = (None if bound is None else math.exp(bound) for bound in (test.low, test.high))
+        ratio = Ratio(above.level / below.level, low, high)
     else:
         test = plain
         ratio = Ratio(above.mean / below.mean if below.mean > 0 else None, None, None)
@@ -95,8 +100,23 @@ def change_between(
         Ratio(plain.shift, plain.low, plain.high),
         _superiority(launches, draws, confidence),
         test.p,
-        any(side[0].dependent for side in launches if len(side) == 1),
+        test.dependent,
     )
+
+
+def ratio_of_blocks(
+    above: Mapping[int, Sequence[float]], below: Mapping[int, Sequence[float]], seed: int
+) -> Ratio | None:
+    """Divide the medians of two cells of one launch, given by block; paired where both have the same blocks.
+
+    None where a cell has no values.
+    """
+    import numpy as np
+
+    if not above or not below:
+        return None
+    rows = [[np.asarray(cell[block], dtype=np.float64) for block in sorted(cell)] for cell in (below, above)]
+    return change_between(rows[:1], rows[1:], "median", seed=seed, paired=above.keys() == below.keys()).ratio
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -112,11 +132,11 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 @dataclass(frozen=True, slots=True)
 class _Side:
-    """A statistic of one side: of each launch, and of every resample where there is only one launch."""
+    """A statistic of one side: of each launch; of every resample, and of every row, where there is only one launch."""
 
     points: Floats
     copies: Floats | None
-    launch: Launch
+    levels: Floats
     exact: bool
 
     @classmethod
@@ -124,22 +144,28 @@ class _Side:
         """Compute them; no resamples where there are too few values for an interval."""
         import numpy as np
 
+        first = launches[0]
         points = np.array([launch.statistic(statistic) for launch in launches])
-        copies = (
-            launches[0].replicate(statistic, drawn) if drawn is not None and launches[0].allows(statistic) else None
-        )
-        return cls(points, copies, launches[0], exact)
+        copies = first.replicate(statistic, drawn) if drawn is not None and first.allows(statistic) else None
+        return cls(points, copies, first.levels, exact)
 
     @property
     def positive(self) -> bool:
-        """Tell whether it has a logarithm throughout."""
+        """Whether it has a logarithm throughout."""
         return all((values > 0).all() for values in (self.points, self.copies) if values is not None)
 
     def log(self) -> _Side:
         """Return the same on the logarithmic scale."""
         import numpy as np
 
-        return _Side(np.log(self.points), None if self.copies is None else np.log(self.copies), self.launch, self.exact)
+        copies = None if self.copies is None else np.log(self.copies)
+        levels = np.log(np.maximum(self.levels, np.finfo(np.float64).tiny))  # single rows may be zero; ranks count
+        return _Side(np.log(self.points), copies, levels, self.exact)
+
+    def less(self, other: _Side) -> _Side:
+        """Return the differences, block by block, to a side that was measured in the same blocks."""
+        copies = None if self.copies is None or other.copies is None else self.copies - other.copies
+        return _Side(self.points - other.points, copies, self.levels - other.levels, self.exact)
 
     @property
     def mean(self) -> float:
@@ -154,6 +180,11 @@ class _Side:
         return math.exp(self.log().mean)
 
     @property
+    def dependent(self) -> bool:
+        """Whether it is one launch whose neighbours are too much alike."""
+        return len(self.points) == 1 and Memory.of(self.levels).dependent
+
+    @property
     def variance(self) -> tuple[float, int] | None:
         """Return the variance of that mean with its degrees of freedom; None where nothing tells them."""
         if self.exact:
@@ -163,37 +194,42 @@ class _Side:
         if self.copies is None:
             return None
         # Drawing k batches with replacement shows (k - 1) / k of the variance.
-        k = len(self.launch.batches)
+        memory = Memory.of(self.levels)
+        k = memory.k
         # Equal values have no variance, whatever rounding says.
         varies = self.copies.max() > self.copies.min()
-        return (float(self.copies.var()) * k / (k - 1) * self.launch.hidden if varies else 0.0), k - 1
+        return (float(self.copies.var()) * k / (k - 1) * memory.hidden if varies else 0.0), k - 1
 
 
 @dataclass(frozen=True, slots=True)
 class _Test:
-    """Welch's t of two means; no interval and no p where a side has no variance to go by."""
+    """Welch's t of two means, Student's of paired ones; no interval and no p where a side has no variance to go by."""
 
     shift: float
     low: float | None
     high: float | None
     p: float | None
+    dependent: bool
 
     @classmethod
-    def of(cls, below: _Side, above: _Side, confidence: float) -> _Test:
+    def of(cls, below: _Side, above: _Side, confidence: float, paired: bool) -> _Test:
         """Test the second side against the first."""
         from scipy import stats
 
+        sides = [above.less(below)] if paired else [below, above]
+        dependent = any(side.dependent for side in sides)
         shift = above.mean - below.mean
-        if below.variance is None or above.variance is None:
-            return cls(shift, None, None, None)
-        (first, df_first), (second, df_second) = below.variance, above.variance
-        total = first + second
+        known = [side.variance for side in sides if side.variance is not None]
+        if len(known) < len(sides):
+            return cls(shift, None, None, None, dependent)
+        total = sum(variance for variance, _ in known)
         if total == 0:  # nothing varies: every difference is certain
-            return cls(shift, shift, shift, 0.0 if shift else 1.0)
-        df = total**2 / (first**2 / df_first + second**2 / df_second)
+            return cls(shift, shift, shift, 0.0 if shift else 1.0, dependent)
+        freedom = total**2 / sum(variance**2 / df for variance, df in known)
         error = math.sqrt(total)
-        reach = float(stats.t.ppf((1 + confidence) / 2, df)) * error
-        return cls(shift, shift - reach, shift + reach, float(2 * stats.t.sf(abs(shift) / error, df)))
+        reach = float(stats.t.ppf((1 + confidence) / 2, freedom)) * error
+        p = float(2 * stats.t.sf(abs(shift) / error, freedom))
+        return cls(shift, shift - reach, shift + reach, p, dependent)
 
 
 def _superiority(

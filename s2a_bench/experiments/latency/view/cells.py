@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from s2a_bench.stats import Ratio, ratio_of_medians
+from s2a_bench.stats import Ratio
+from s2a_bench.stats.change import ratio_of_blocks
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT, STAGES
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ def ratios(cells: list[Cell], seed: int) -> Iterator[tuple[str, Cell, Cell, Rati
 
 
 def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | None:
-    """Divide the medians of two cells; block by block where both have the same number of samples in each block.
+    """Divide the medians of two cells, block by block.
 
     None where they cannot be compared: a llama-server's `ingest` slices and resizes the picture, which our engine
     counts as inference, so that only e2e means the same on both sides.
@@ -131,18 +132,6 @@ def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | Non
     if metric == "e2e_without_inference" and cell.has_ingest != base.has_ingest:
         return None
     return ratio_of_blocks(cell.by_block(metric), base.by_block(metric), seed)
-
-
-def ratio_of_blocks(above: dict[int, list[float]], below: dict[int, list[float]], seed: int) -> Ratio | None:
-    """Divide the medians of values by block; paired where both have as many in each block, None where one has none."""
-    if not above or not below:
-        return None
-    shapes = {len(values) for values in (*above.values(), *below.values())}
-    if above.keys() == below.keys() and len(shapes) == 1:
-        blocks = sorted(above)
-        return ratio_of_medians([above[block] for block in blocks], [below[block] for block in blocks], seed=seed)
-    values, others = ([value for block in blocks.values() for value in block] for blocks in (above, below))
-    return ratio_of_medians(values, others, seed=seed, paired=False)
 
 
 def seed_of(run: Run) -> int:

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratio_of_blocks, seed_of
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, seed_of
 from s2a_bench.experiments.throughput.rows import REFERENCE
+from s2a_bench.stats.change import ratio_of_blocks
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,0 +1,125 @@
+"""The ratio of two cells of one launch: pairing by block, and how often the interval holds the truth."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import TypeAlias
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from s2a_bench.stats import Ratio
+from s2a_bench.stats.change import change_between, ratio_of_blocks
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+def blocks_of(values: Sequence[float] | Floats) -> Mapping[int, list[float]]:
+    return {block: [float(value)] for block, value in enumerate(values)}
+
+
+def ratio(above: Sequence[float] | Floats, below: Sequence[float] | Floats, seed: int = 1) -> Ratio:
+    found = ratio_of_blocks(blocks_of(above), blocks_of(below), seed)
+    assert found is not None
+    return found
+
+
+def remembering(rng: np.random.Generator, n: int, correlation: float) -> Floats:
+    """Draw a series of standard deviation 1 whose neighbours are alike (AR(1))."""
+    noise = rng.standard_normal(n + 300) * math.sqrt(1 - correlation**2)
+    return np.asarray(lfilter([1], [1, -correlation], noise)[300:])
+
+
+def width(found: Ratio) -> float:
+    assert found.low is not None
+    assert found.high is not None
+    return found.high - found.low
+
+
+def test_the_ratio_is_that_of_the_medians() -> None:
+    assert ratio([2, 4, 60], [1, 2, 3]) == Ratio(2.0, None, None)
+
+
+@pytest.mark.parametrize(
+    ("n", "correlation", "shared", "least"),
+    [
+        (10, 0.0, 0.0, 183),  # of Binomial(200, 0.95), below 183 are 1 in 100
+        (10, 0.4, 0.8, 183),
+        (20, 0.4, 0.0, 174),  # too short to tell how alike neighbours are: 9 in 10
+        (50, 0.0, 0.0, 183),
+        (50, 0.4, 0.8, 183),
+        (200, 0.4, 0.0, 183),
+        (200, 0.8, 0.8, 183),
+    ],
+)
+def test_the_interval_covers_a_known_ratio_about_as_often_as_it_says(
+    n: int, correlation: float, shared: float, least: int
+) -> None:
+    """``shared`` is how much of their ups and downs two cells have from the machine, which slows both."""
+    rng = np.random.default_rng(7)
+    covered = 0
+    for trial in range(200):
+        load = shared * remembering(rng, n, correlation)
+        own = [math.sqrt(1 - shared**2) * remembering(rng, n, correlation) for _ in range(2)]
+        found = ratio(6 * np.exp(0.15 * (load + own[0])), np.exp(0.15 * (load + own[1])), seed=trial)
+        assert found.low is not None
+        assert found.high is not None
+        covered += found.low <= 6 <= found.high
+    assert covered >= least
+
+
+def test_pairing_cancels_what_slows_both_cells_at_once() -> None:
+    load = np.random.default_rng(3).lognormal(0, 0.5, 60)
+    assert width(ratio(3 * load, load)) < 1e-9
+    assert width(ratio(3 * load, load[:-1])) > 0.3
+
+
+def test_samples_of_one_block_stay_together() -> None:
+    # Values do not differ inside of blocks: ten samples a block add no certainty.
+    levels = [1.0, 3.0, 2.0, 1.5, 2.5, 1.2] * 4
+    single = ratio(levels, np.ones(24))
+    many = ratio_of_blocks({block: [value] * 10 for block, value in enumerate(levels)}, blocks_of(np.ones(24)), 1)
+    assert many is not None
+    assert width(many) == pytest.approx(width(single), rel=0.1)
+
+
+def test_the_same_seed_gives_the_same_interval() -> None:
+    values = np.random.default_rng(1).lognormal(0, 1, 30)
+    assert ratio(values, values[::-1], 5) == ratio(values, values[::-1], 5)
+    assert ratio(values, values[::-1], 5) != ratio(values, values[::-1], 6)
+
+
+def test_a_wider_confidence_gives_a_wider_interval() -> None:
+    rows = np.random.default_rng(1).lognormal(0, 1, (30, 1))
+    sides = [list(np.ones((30, 1)))], [list(rows)]
+    narrow, wide = (change_between(*sides, "median", seed=5, confidence=by, paired=True).ratio for by in (0.5, 0.99))
+    assert width(narrow) < width(wide)
+
+
+@pytest.mark.parametrize(
+    ("above", "below", "expected"),
+    [
+        ([4.0], [2.0], Ratio(2.0, None, None)),
+        ([4.0, 6.0], [2.0], Ratio(2.5, None, None)),
+        ([1.0] * 5, [0.0] * 5, Ratio(None, None, None)),
+        ([5.0] * 4, [2.0] * 4, Ratio(2.5, None, None)),
+        ([5.0] * 5, [2.0] * 5, Ratio(2.5, pytest.approx(2.5), pytest.approx(2.5))),  # type: ignore[arg-type]
+        ([1.0] * 6, [0.0, 0.0, 0.0, 1.0, 1.0, 1.0], Ratio(2.0, None, None)),
+    ],
+)
+def test_what_allows_no_interval_has_none_and_is_strict_json(
+    above: list[float], below: list[float], expected: Ratio
+) -> None:
+    found = ratio(above, below)
+    assert found == expected
+    json.dumps(asdict(found), allow_nan=False)
+
+
+def test_a_cell_without_values_has_no_ratio() -> None:
+    assert ratio_of_blocks({}, blocks_of([1.0]), 0) is None
+    assert ratio_of_blocks(blocks_of([1.0]), {}, 0) is None
