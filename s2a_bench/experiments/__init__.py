@@ -16,7 +16,7 @@ packages offer experiments as entry points of the group ``s2a_bench.experiments`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from s2a_bench.writers.tables import TextTable
 
 Better: TypeAlias = Literal["lower", "higher", "neither"]
+Rows: TypeAlias = "list[NDArray[np.float64]]"
+"""The values of a metric: one array a request or plan, in the order in which they were made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +66,7 @@ class Subject:
     setting: Mapping[str, str]
     n: int
     errors: int
-    rows: Callable[[str], list[NDArray[np.float64]]]
+    rows: Callable[[str], Rows]
     exact: bool = False
 
 
@@ -102,12 +104,19 @@ class Compared:
     """What the runs of an experiment can be compared by.
 
     ``origin`` says what did not really answer; ``shown`` are the metrics that are compared unless others are named.
+    ``own`` gives the metrics that only some runs have, as the stages of a transport from elsewhere.
     """
 
     metrics: Mapping[str, Metric]
     subjects: Callable[[Run], list[Subject]]
     origin: Callable[[Run], Sequence[str]]
     shown: tuple[str, ...]
+    own: Callable[[Run], Iterable[Metric]] = lambda _: ()
+
+
+def by_name(metrics: Iterable[Metric]) -> dict[str, Metric]:
+    """Index metrics by their names."""
+    return {metric.name: metric for metric in metrics}
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +148,11 @@ class Experiment:
         """Return what one of its runs shows."""
         shown: Shown = resolve_name(self.view)(run, **asked)
         return shown
+
+    def compared_by(self) -> Compared | None:
+        """Return what its runs are compared by; None where they are not."""
+        compared: Compared | None = resolve_name(self.compared) if self.compared else None
+        return compared
 
 
 EXPERIMENTS: Final[Registry[Experiment]] = Registry(

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,25 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import UnlikeRuns, UsageError
+from s2a_bench.experiments import EXPERIMENTS, Experiment, Metric
+from s2a_bench.experiments.latency.view import compared as latency
+from s2a_bench.experiments.throughput.view import compared as throughput
+from s2a_bench.experiments.timeline.view import compared as timeline
+from s2a_bench.registry import Registry
 from s2a_bench.report.compare.alike import differences
 from s2a_bench.report.compare.as_json import compare_to_json
-from s2a_bench.report.compare.comparison import Compared, compare, metrics_of, open_comparison, read_side, shown_metrics
+from s2a_bench.report.compare.comparison import (
+    ComparedRuns,
+    compare,
+    metrics_of,
+    open_comparison,
+    read_side,
+    shown_metrics,
+)
 from s2a_bench.report.compare.doubts import doubts
 from s2a_bench.report.compare.figure import build_forest
 from s2a_bench.report.compare.files import write_comparison
 from s2a_bench.report.compare.gates import judge, read_gate
-from s2a_bench.report.compare.metrics import KINDS
 from s2a_bench.report.compare.tables import compare_csv, compare_table, percent
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.store.requests import SampleRow
@@ -69,16 +81,16 @@ def launch(tmp_path: Path, make_row: MakeRow) -> Launch:
     return make
 
 
-def opened(first: Run, second: Run, *, unlike: bool = False, least: float = 0.05) -> Compared:
+def opened(first: Run, second: Run, *, unlike: bool = False, least: float = 0.05) -> ComparedRuns:
     return open_comparison([first], [second], unlike=unlike, least=least)
 
 
-def compared(first: Run, second: Run, *names: str, **settings: Any) -> Compared:
+def compared(first: Run, second: Run, *names: str, **settings: Any) -> ComparedRuns:
     both = opened(first, second, **settings)
     return compare(both, metrics_of(both, names) if names else shown_metrics(both))
 
 
-def verdicts(found: Compared) -> list[str]:
+def verdicts(found: ComparedRuns) -> list[str]:
     return [one.verdict for one in found.comparisons]
 
 
@@ -113,11 +125,31 @@ def test_a_change_below_the_smallest_effect_is_none_however_sure_it_is(launch: L
 
 
 def test_what_is_better_depends_on_the_metric() -> None:
-    directions = {name: metric.better for kind in KINDS.values() for name, metric in kind.metrics.items()}
+    every = [latency.COMPARED, throughput.COMPARED, timeline.COMPARED]
+    directions = {name: metric.better for by in every for name, metric in by.metrics.items()}
     assert directions["e2e"] == directions["stall_s"] == directions["itl"] == "lower"
     assert directions["tokens_per_s"] == directions["fluidity"] == "higher"
-    assert all(metric.statistic in STATISTICS for kind in KINDS.values() for metric in kind.metrics.values())
-    assert all(name in kind.metrics for kind in KINDS.values() for name in kind.shown)
+    assert all(metric.statistic in STATISTICS for by in every for metric in by.metrics.values())
+    assert all(name in by.metrics for by in every for name in by.shown)
+
+
+def test_metrics_that_only_one_run_has_can_be_named(launch: Launch, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = replace(latency.COMPARED, own=lambda run: [Metric(f"squash{run.manifest['more']}", "ms")])
+    monkeypatch.setattr(latency, "COMPARED", own)
+    both = opened(*(launch(seed, n=6, manifest={**MANIFEST, "more": seed}) for seed in (1, 2)))
+    assert list(both.metrics)[-2:] == ["squash1", "squash2"]
+
+
+def test_a_declared_experiment_is_compared_by_what_it_declares(launch: Launch, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.report.compare.comparison._UNDECLARED", {})
+    runs = launch(1, n=6), launch(2, n=6)
+    with pytest.raises(UsageError, match=r"runs of latency cannot be compared, only those of"):
+        opened(*runs)
+    declared = replace(EXPERIMENTS["boundary"], compared="s2a_bench.experiments.latency.view.compared:COMPARED")
+    monkeypatch.setattr("s2a_bench.experiments.boundary.EXPERIMENT", declared)
+    registry = Registry[Experiment]("experiments", "command", {"latency": "s2a_bench.experiments.boundary:EXPERIMENT"})
+    monkeypatch.setattr("s2a_bench.report.compare.comparison.EXPERIMENTS", registry)
+    assert opened(*runs).by is latency.COMPARED
 
 
 def test_cells_without_a_partner_are_listed_and_not_compared(launch: Launch) -> None:
@@ -266,7 +298,7 @@ def test_what_is_no_gate_is_refused_with_an_example(text: str) -> None:
         read_gate(text)
 
 
-def outcomes(found: Compared, *gates: str, strict: bool = False) -> set[str]:
+def outcomes(found: ComparedRuns, *gates: str, strict: bool = False) -> set[str]:
     return {one.outcome for one in judge(found, [read_gate(gate) for gate in gates], strict=strict)}
 
 

@@ -10,7 +10,7 @@ from s2a_bench.report.compare.comparison import LEVEL
 from s2a_bench.stats.batches import BATCHES
 
 if TYPE_CHECKING:
-    from s2a_bench.report.compare.comparison import Compared, Comparison
+    from s2a_bench.report.compare.comparison import ComparedRuns, Comparison
     from s2a_bench.report.compare.doubts import Doubt
     from s2a_bench.report.compare.gates import Judgement
     from s2a_bench.stats import Ratio
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 SCHEMA = "s2a-bench-compare/1"
 
 
-def compare_to_json(compared: Compared, judgements: Sequence[Judgement], doubts: Sequence[Doubt]) -> dict[str, Any]:
+def compare_to_json(compared: ComparedRuns, judgements: Sequence[Judgement], doubts: Sequence[Doubt]) -> dict[str, Any]:
     """Return the object; shares are fractions, values have the unit of their metric."""
     return {
         "schema": SCHEMA,

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UnlikeRuns, UsageError
+from s2a_bench.experiments import EXPERIMENTS, Compared, Metric, Subject, by_name
 from s2a_bench.experiments.latency.view.cells import seed_of
 from s2a_bench.report.compare.alike import Difference, differences, in_words
-from s2a_bench.report.compare.metrics import HIGHER, KINDS, NEITHER, Kind, Metric, Subject
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.stats.change import Change, change_between, holm
 
 if TYPE_CHECKING:
-    from s2a_bench.stats.batches import Floats
+    from s2a_bench.experiments import Rows
     from s2a_bench.store.run import Run
 
 LEVEL: Final = 0.05
 """The chance to call any difference one where there is none, over all comparisons together."""
+
+_UNDECLARED: Final = {
+    name: f"s2a_bench.experiments.{name}.view.compared:COMPARED" for name in ("latency", "throughput", "timeline")
+}
+"""Commands that are no declared experiments yet -> what their runs are compared by."""
 
 SAME, UNCLEAR, TOO_FEW = "same", "unclear", "too few"
 
@@ -56,12 +62,16 @@ class Comparison:
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
-    """Everything that is known of two sides. ``only`` lists the cells that have no partner, a side each."""
+class ComparedRuns:
+    """Everything that is known of two sides: what their command declares, and what belongs together.
+
+    ``only`` lists the cells that have no partner, a side each.
+    """
 
     baseline: tuple[Run, ...]
     other: tuple[Run, ...]
-    kind: Kind
+    by: Compared
+    metrics: Mapping[str, Metric]
     differences: tuple[Difference, ...]
     pairs: tuple[Pair, ...]
     only: tuple[tuple[str, ...], tuple[str, ...]]
@@ -79,7 +89,7 @@ class Compared:
         return str(self.baseline[0].manifest["command"])
 
 
-def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bool, least: float) -> Compared:
+def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bool, least: float) -> ComparedRuns:
     """Find what belongs together. ``least`` is the smallest share that is called a change.
 
     Raises UnlikeRuns where machine, model or setting differ and ``unlike`` does not allow it, UsageError where the
@@ -89,8 +99,7 @@ def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bo
     commands = list(dict.fromkeys(str(run.manifest["command"]) for run in runs))
     if len(commands) > 1:
         raise UsageError(f"these are runs of {' and '.join(commands)}: name runs of one command")
-    if commands[0] not in KINDS:
-        raise UsageError(f"runs of {commands[0]} cannot be compared, only those of {', '.join(KINDS)}")
+    by = _declared(commands[0])
     if (len(baseline) > 1) != (len(other) > 1):
         raise UsageError(
             "name several launches on both sides, or one on each: the test goes by launches or by requests"
@@ -99,14 +108,25 @@ def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bo
     fatal = [difference for difference in found if difference.fatal]
     if fatal and not unlike:
         raise UnlikeRuns(f"the runs are unlike: {in_words(fatal)}; --unlike compares them all the same")
-    kind = KINDS[commands[0]]
-    sides = [[{cell.name: cell for cell in kind.subjects(run)} for run in side] for side in (baseline, other)]
+    sides = [[{cell.name: cell for cell in by.subjects(run)} for run in side] for side in (baseline, other)]
     pairs, only, settings = _match(*sides)
     if settings and not unlike:
         raise UnlikeRuns(f"cells of one name differ: {in_words(settings)}; --unlike compares them all the same")
     if not pairs:
         raise UnlikeRuns(f"no cell is in every run: {', '.join(only[0])} against {', '.join(only[1])}")
-    return Compared(tuple(baseline), tuple(other), kind, (*settings, *found), tuple(pairs), only, least)
+    metrics = {**by.metrics, **by_name(metric for run in runs for metric in by.own(run))}
+    return ComparedRuns(tuple(baseline), tuple(other), by, metrics, (*settings, *found), tuple(pairs), only, least)
+
+
+def _declared(command: str) -> Compared:
+    """Return what runs of a command are compared by; raises UsageError where nothing is declared."""
+    if command in _UNDECLARED:
+        found: Compared = resolve_name(_UNDECLARED[command])
+        return found
+    if command in EXPERIMENTS and (by := EXPERIMENTS[command].compared_by()):
+        return by
+    there = ", ".join([*_UNDECLARED, *(name for name, found in EXPERIMENTS.loaded() if found.compared)])
+    raise UsageError(f"runs of {command} cannot be compared, only those of {there}")
 
 
 def _match(
@@ -129,9 +149,9 @@ def _match(
     return pairs, (left[0], left[1]), list(settings)
 
 
-def metrics_of(compared: Compared, names: Sequence[str]) -> list[tuple[Metric, str]]:
+def metrics_of(compared: ComparedRuns, names: Sequence[str]) -> list[tuple[Metric, str]]:
     """Return metric and statistic of each NAME or NAME.STATISTIC; ``all`` is every metric. Raises UsageError."""
-    metrics = compared.kind.metrics
+    metrics = compared.metrics
     wanted: dict[tuple[Metric, str], None] = {}
     for name in names:
         if name == "all":
@@ -141,14 +161,14 @@ def metrics_of(compared: Compared, names: Sequence[str]) -> list[tuple[Metric, s
     return list(wanted)
 
 
-def shown_metrics(compared: Compared) -> list[tuple[Metric, str]]:
+def shown_metrics(compared: ComparedRuns) -> list[tuple[Metric, str]]:
     """Return the metrics that are compared unless others are named."""
-    return [(compared.kind.metrics[name], compared.kind.metrics[name].statistic) for name in compared.kind.shown]
+    return [(compared.metrics[name], compared.metrics[name].statistic) for name in compared.by.shown]
 
 
-def metric_of(compared: Compared, name: str, flag: str) -> tuple[Metric, str]:
+def metric_of(compared: ComparedRuns, name: str, flag: str) -> tuple[Metric, str]:
     """Read NAME or NAME.STATISTIC; raises UsageError listing what there is, also where no cell has it."""
-    metrics = compared.kind.metrics
+    metrics = compared.metrics
     metric, dot, statistic = name.rpartition(".")
     if name in metrics:
         found, statistic = metrics[name], metrics[name].statistic
@@ -163,7 +183,7 @@ def metric_of(compared: Compared, name: str, flag: str) -> tuple[Metric, str]:
     return found, statistic
 
 
-def compare(compared: Compared, wanted: Sequence[tuple[Metric, str]]) -> Compared:
+def compare(compared: ComparedRuns, wanted: Sequence[tuple[Metric, str]]) -> ComparedRuns:
     """Compare every cell by every metric that it has on both sides, and judge what changed."""
     found = [found for metric, statistic in wanted for found in changes(compared, metric, statistic)]
     corrected = holm([comparison.change.p for comparison in found])
@@ -174,7 +194,7 @@ def compare(compared: Compared, wanted: Sequence[tuple[Metric, str]]) -> Compare
     return replace(compared, comparisons=tuple(judged))
 
 
-def changes(compared: Compared, metric: Metric, statistic: str) -> Iterator[Comparison]:
+def changes(compared: ComparedRuns, metric: Metric, statistic: str) -> Iterator[Comparison]:
     """Yield what changed in each cell that has the metric on both sides; not corrected, not judged."""
     for pair in compared.pairs:
         if rows := _rows(pair, metric.name):
@@ -184,9 +204,9 @@ def changes(compared: Compared, metric: Metric, statistic: str) -> Iterator[Comp
             yield Comparison(pair, metric, statistic, (n[0], n[1]), change)
 
 
-def _rows(pair: Pair, metric: str) -> tuple[list[list[Floats]], list[list[Floats]]] | None:
+def _rows(pair: Pair, metric: str) -> tuple[list[Rows], list[Rows]] | None:
     """Return the rows of every launch; None where one has none."""
-    sides = [[list(subject.rows(metric)) for subject in side] for side in (pair.baseline, pair.other)]
+    sides = [[subject.rows(metric) for subject in side] for side in (pair.baseline, pair.other)]
     return (sides[0], sides[1]) if all(all(side) for side in sides) else None
 
 
@@ -201,9 +221,9 @@ def verdict(change: Change, p_holm: float | None, metric: Metric, least: float) 
     relative, bounds = change.relative, change.bounds
     if p_holm < LEVEL and (relative is None or abs(relative) >= least):
         rises = change.other > change.baseline
-        if metric.better == NEITHER:
+        if metric.better == "neither":
             return "higher" if rises else "lower"
-        return "better" if rises == (metric.better == HIGHER) else "worse"
+        return "better" if rises == (metric.better == "higher") else "worse"
     return SAME if bounds and max(map(abs, bounds)) <= least else UNCLEAR
 
 

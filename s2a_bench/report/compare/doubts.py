@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from s2a_bench.report.compare.alike import in_words
-from s2a_bench.report.compare.comparison import Compared
+from s2a_bench.report.compare.comparison import ComparedRuns
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,18 +18,18 @@ class Doubt:
     advice: str
 
 
-def doubts(compared: Compared) -> list[Doubt]:
+def doubts(compared: ComparedRuns) -> list[Doubt]:
     """List what there is to doubt or to know, the weightiest first."""
     return [doubt for look in (_unlike, _runs, _test, _cells, _differs) for doubt in look(compared)]
 
 
-def _unlike(compared: Compared) -> Iterator[Doubt]:
+def _unlike(compared: ComparedRuns) -> Iterator[Doubt]:
     """Look at what would forbid the comparison."""
     if fatal := [one for one in compared.differences if one.fatal]:
         yield Doubt("unlike", f"the runs are unlike: {in_words(fatal)}", "read a change as that of all this together")
 
 
-def _runs(compared: Compared) -> Iterator[Doubt]:
+def _runs(compared: ComparedRuns) -> Iterator[Doubt]:
     """Look at how the runs ended, and at what they doubted themselves."""
     for run in (*compared.baseline, *compared.other):
         if (state := run.manifest["state"]) != "finished":
@@ -38,7 +38,7 @@ def _runs(compared: Compared) -> Iterator[Doubt]:
             yield Doubt("warnings", f"{run.path} has warnings: {', '.join(codes)}", "look at them in its manifest")
 
 
-def _test(compared: Compared) -> Iterator[Doubt]:
+def _test(compared: ComparedRuns) -> Iterator[Doubt]:
     """Look at whether the intervals can be believed."""
     measured = any(pair.baseline[0].setting.get("mode") != "virtual" for pair in compared.pairs)
     if measured and not compared.launches:
@@ -55,7 +55,7 @@ def _test(compared: Compared) -> Iterator[Doubt]:
         )
 
 
-def _cells(compared: Compared) -> Iterator[Doubt]:
+def _cells(compared: ComparedRuns) -> Iterator[Doubt]:
     """Look at cells without a partner, and at failed requests."""
     for side, cells in zip(("A", "B"), compared.only, strict=True):
         if cells:
@@ -67,7 +67,7 @@ def _cells(compared: Compared) -> Iterator[Doubt]:
                 yield Doubt("errors", f"{pair.name}: {failed} of {total} requests failed in {side}", "see samples.csv")
 
 
-def _differs(compared: Compared) -> Iterator[Doubt]:
+def _differs(compared: ComparedRuns) -> Iterator[Doubt]:
     """Look at what else is not the same: often the very thing that is compared."""
     if harmless := [one for one in compared.differences if not one.fatal]:
         yield Doubt("differs", in_words(harmless), "this may be what you compare")

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.report.compare.comparison import Compared, Comparison
+    from s2a_bench.report.compare.comparison import ComparedRuns, Comparison
 
 _LOOKS: Final = {
     "better": ("#009E73", "^"),
@@ -27,7 +27,7 @@ _LOOKS: Final = {
 """Verdict -> colour and marker, so that colour alone tells nothing."""
 
 
-def build_forest(compared: Compared) -> Figure | None:
+def build_forest(compared: ComparedRuns) -> Figure | None:
     """Draw the changes in per cent; the band is what is too small to be called a change.
 
     Every metric has its own axis. Cells that are alike to the last digit are counted, not drawn; None where no row is

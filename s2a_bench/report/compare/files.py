@@ -14,10 +14,10 @@ from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import to_latex, to_markdown
 
 if TYPE_CHECKING:
-    from s2a_bench.report.compare.comparison import Compared
+    from s2a_bench.report.compare.comparison import ComparedRuns
 
 
-def write_comparison(folder: Path, compared: Compared, whole: Mapping[str, Any]) -> list[Path]:
+def write_comparison(folder: Path, compared: ComparedRuns, whole: Mapping[str, Any]) -> list[Path]:
     """Write compare.md, .tex, .csv, .json, .png and .pdf; no figure where nothing has a size. Raises StoreError."""
     table = compare_table(compared)
     texts = {

@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from typing import Final
 
 from s2a_bench.errors import UsageError
-from s2a_bench.report.compare.comparison import LEVEL, Compared, Comparison, changes, metric_of
+from s2a_bench.report.compare.comparison import LEVEL, ComparedRuns, Comparison, changes, metric_of
 from s2a_bench.stats.change import holm
 
 _FLAG: Final = "--fail-if"
@@ -59,7 +59,7 @@ def read_gate(text: str) -> Gate:
     return Gate(text, found["cells"] or "", found["metric"], rises, limit if rises else -limit)
 
 
-def judge(compared: Compared, gates: Sequence[Gate], *, strict: bool) -> list[Judgement]:
+def judge(compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool) -> list[Judgement]:
     """Judge every gate in every cell it is about.
 
     A gate trips where the change is past the limit *and* is one: its p-value, corrected by Holm for all cells of all
@@ -74,7 +74,7 @@ def judge(compared: Compared, gates: Sequence[Gate], *, strict: bool) -> list[Ju
     ]
 
 
-def _concerned(compared: Compared, gate: Gate) -> list[Comparison]:
+def _concerned(compared: ComparedRuns, gate: Gate) -> list[Comparison]:
     """Return the comparisons that a gate is about."""
     metric, statistic = metric_of(compared, gate.metric, _FLAG)
     every = list(changes(compared, metric, statistic))

@@ -10,13 +10,13 @@ from s2a_bench.writers.csv_text import csv_text
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
-    from s2a_bench.report.compare.comparison import Compared, Comparison
+    from s2a_bench.report.compare.comparison import ComparedRuns, Comparison
 
 _HEADER = ("cell", "n", "A", "B", "change [95 %]", "P(B > A)", "p", "verdict")
 _LEAST_P = 0.0005
 
 
-def compare_table(compared: Compared) -> TextTable:
+def compare_table(compared: ComparedRuns) -> TextTable:
     """Lay out a row a comparison below the name of its metric."""
     rows: list[tuple[str, ...]] = []
     rules = set()
@@ -30,7 +30,7 @@ def compare_table(compared: Compared) -> TextTable:
     return TextTable(f"{compared.command}: B against A", _HEADER, rows, 1, frozenset(rules - {0}), notes(compared))
 
 
-def notes(compared: Compared) -> tuple[str, ...]:
+def notes(compared: ComparedRuns) -> tuple[str, ...]:
     """Say what A and B are, and how a verdict comes about."""
     unit = "launches" if compared.launches else f"{BATCHES} batches in time of each launch"
     return (
@@ -41,14 +41,14 @@ def notes(compared: Compared) -> tuple[str, ...]:
     )
 
 
-def title(compared: Compared) -> str:
+def title(compared: ComparedRuns) -> str:
     """Say what A and B are, and what did not really answer."""
     sides = (", ".join(run.path.resolve().name for run in side) for side in (compared.baseline, compared.other))
-    origin = dict.fromkeys(note for run in (*compared.baseline, *compared.other) for note in compared.kind.origin(run))
+    origin = dict.fromkeys(note for run in (*compared.baseline, *compared.other) for note in compared.by.origin(run))
     return " ".join(("A: {}. B: {}.".format(*sides), *origin))
 
 
-def compare_csv(compared: Compared) -> str:
+def compare_csv(compared: ComparedRuns) -> str:
     """Write a row a comparison, every digit kept."""
     header = ("cell", "metric", "statistic", "unit", "n_baseline", "n_other", "baseline", "other", "ratio", "ratio_low",
               "ratio_high", "difference", "difference_low", "difference_high", "superiority", "superiority_low",

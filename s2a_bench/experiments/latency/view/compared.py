@@ -1,0 +1,89 @@
+"""What latency runs are compared by: times of a request, its stages and groups, and what its tokens show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from s2a_bench.experiments import Compared, Metric, Subject, by_name
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note
+from s2a_bench.trace import GROUPS, STAGES
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from s2a_bench.experiments import Rows
+    from s2a_bench.experiments.latency.view.cells import Floats
+    from s2a_bench.store.run import Run
+
+TOKEN_METRICS: Final = (Metric("itl", "ms"), Metric("token_delay", "ms"))
+"""What the tokens of a request show, so that a row has several values."""
+
+
+def subject_of(cell: Cell, rows: Callable[[str], Rows]) -> Subject:
+    """Return a cell of requests as it is compared."""
+    return Subject(cell.name, cell.about, cell.n, cell.errors, rows)
+
+
+def origin_of(run: Run) -> list[str]:
+    """Say what did not really answer the requests of a run."""
+    note = engine_note(run, cells_of(run))
+    return [f"{note[0].upper()}{note[1:]}."] if note else []
+
+
+def token_rows(cell: Cell, name: str) -> Rows | None:
+    """Return the rows of one of `TOKEN_METRICS`, else None."""
+    return _TOKEN_ROWS[name](cell) if name in _TOKEN_ROWS else None
+
+
+def singles(values: Floats) -> Rows:
+    """Make each value a row."""
+    return list(values[:, None])
+
+
+def _subjects(run: Run) -> list[Subject]:
+    return [subject_of(cell, partial(_rows, cell)) for cell in cells_of(run)]
+
+
+def _rows(cell: Cell, name: str) -> Rows:
+    """Return the rows of a stage, a group, a column or the gaps between tokens."""
+    if (found := token_rows(cell, name)) is not None:
+        return found
+    if name.startswith(_GROUP):
+        return singles(cell.group_ms(name.removeprefix(_GROUP)))
+    return singles(cell.values_ms(name))
+
+
+def _per_request(cell: Cell, values: Callable[[pd.DataFrame], pd.Series[float]]) -> Rows:
+    """Return what is derived from each request's tokens, a row a request that has any."""
+    tokens = cell.tokens[cell.tokens["request_id"].isin(cell.good["request_id"])].sort_values(["request_id", "index"])
+    found: dict[str, Floats] = {
+        str(request): np.asarray(values(mine).dropna(), dtype=np.float64) / 1e6
+        for request, mine in tokens.groupby("request_id", sort=False)
+    }
+    return [found[request] for request in cell.good["request_id"] if found.get(request, _NOTHING).size]
+
+
+_TOKEN_ROWS: Final[Mapping[str, Callable[[Cell], Rows]]] = {
+    "itl": lambda cell: _per_request(cell, lambda tokens: tokens["client_ns"].diff()),
+    "token_delay": lambda cell: _per_request(cell, lambda tokens: tokens["client_ns"] - tokens["engine_ns"]),
+}
+_NOTHING: Final = np.empty(0)
+_GROUP: Final = "group."
+
+COMPARED: Final = Compared(
+    metrics=by_name(
+        [
+            *(Metric(name, "ms") for name in ("e2e_without_inference", "e2e", "ttft", "frame_age")),
+            *TOKEN_METRICS,
+            *(Metric(name, "ms") for name in (*STAGES, "residual")),
+            *(Metric(f"{_GROUP}{name}", "ms") for name in GROUPS),
+        ]
+    ),
+    subjects=_subjects,
+    origin=origin_of,
+    shown=("e2e_without_inference", "e2e", "itl"),
+)
