@@ -41,13 +41,13 @@ def compare(
     json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
 ) -> None:
     """Compare run B with run A: effect sizes with intervals, one stated test, gates for CI (exit code 3)."""
-    from s2a_bench.report.compare.as_json import compare_to_json
+    from s2a_bench.report.compare.as_json import compare_json
     from s2a_bench.report.compare.comparison import compare as compare_runs
     from s2a_bench.report.compare.comparison import metrics_of, open_comparison, read_side, shown_metrics
-    from s2a_bench.report.compare.doubts import doubts
     from s2a_bench.report.compare.files import write_comparison
     from s2a_bench.report.compare.gates import judge, read_gate
     from s2a_bench.report.compare.tables import compare_table
+    from s2a_bench.report.compare.warnings import warnings_of
     from s2a_bench.writers.terminal import lay_out
 
     gates = [read_gate(text) for text in fail_if or ()]
@@ -58,10 +58,10 @@ def compare(
     names = [name for text in metric or () for name in listed(text)]
     compared = compare_runs(compared, metrics_of(compared, names) if names else shown_metrics(compared))
     judgements = judge(compared, gates, strict=strict)
-    found = doubts(compared)
-    whole = compare_to_json(compared, judgements, found)
-    for doubt in found:
-        _say(f"note [{doubt.code}]: {doubt.message}; {doubt.advice}")
+    found = warnings_of(compared)
+    whole = compare_json(compared, judgements, found)
+    for warning in found:
+        _say(f"note [{warning.code}]: {warning.message}; {warning.advice}")
     written = write_comparison(output, compared, whole) if output else []
     if json_:
         print_json(whole)

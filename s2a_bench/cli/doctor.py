@@ -57,7 +57,7 @@ def _as_json(findings: list[Finding]) -> dict[str, Any]:
     """Return the object of ``--json``: every finding, and the warnings and errors as runs store them."""
     from dataclasses import asdict
 
-    from s2a_bench.harness.warnings import doubts_of
+    from s2a_bench.harness.warnings import warnings_of
     from s2a_bench.machine import environment
     from s2a_bench.machine.doctor import worst
     from s2a_bench.store.schema import SCHEMA
@@ -68,5 +68,5 @@ def _as_json(findings: list[Finding]) -> dict[str, Any]:
         "environment": environment.collect(),
         "worst": worst(findings),
         "checks": [asdict(finding) for finding in findings],
-        "warnings": [doubt.to_manifest() for doubt in doubts_of(findings)],
+        "warnings": [warning.to_manifest() for warning in warnings_of(findings)],
     }

@@ -162,15 +162,15 @@ def _draw(folder: Path, *, against_paper: bool) -> None:
 
 def _show(folder: Path, progress: RunProgress, *, as_json: bool, verbose: bool) -> None:
     """Print what the user asked for."""
-    from s2a_bench.experiments.latency.view.as_json import to_json
+    from s2a_bench.experiments.latency.view.as_json import latency_json
     from s2a_bench.experiments.latency.view.terminal import renderables
     from s2a_bench.store.run import read_run
 
     run = read_run(folder)
-    for doubt in run.manifest["warnings"]:
-        progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
+    for warning in run.manifest["warnings"]:
+        progress.say(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}")
     if as_json:
-        print_json(to_json(run))
+        print_json(latency_json(run))
         return
     console = open_console()
     for part in renderables(run):

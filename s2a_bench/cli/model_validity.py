@@ -61,7 +61,7 @@ def validity(
 
 def _show(folder: Path, *, as_json: bool) -> None:
     """Write the tables, and print what the user asked for."""
-    from s2a_bench.experiments.model_validity.view import validity_tables, validity_to_json
+    from s2a_bench.experiments.model_validity.view import validity_json, validity_tables
     from s2a_bench.store.run import read_run
     from s2a_bench.writers.files import write_texts
     from s2a_bench.writers.terminal import lay_out
@@ -70,7 +70,7 @@ def _show(folder: Path, *, as_json: bool) -> None:
     tables = validity_tables(run)
     write_texts(run, tables, {})
     if as_json:
-        print_json(validity_to_json(run))
+        print_json(validity_json(run))
         return
     console = open_console()
     for table in tables.values():

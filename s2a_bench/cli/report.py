@@ -38,9 +38,9 @@ def report(
     outputs.check()
     found = make_report(read_chapters(runs, against_paper=bool(against)), against_paper=bool(against))
     errors = Console(stderr=True)
-    unfinished = [f"{chapter.title}: {doubt}" for chapter in found.chapters for doubt in chapter.doubts]
-    for doubt in (*found.doubts, *unfinished):
-        errors.print(f"warning: {doubt}", markup=False, highlight=False, soft_wrap=True)
+    unfinished = [f"{chapter.title}: {caveat}" for chapter in found.chapters for caveat in chapter.caveats]
+    for caveat in (*found.caveats, *unfinished):
+        errors.print(f"warning: {caveat}", markup=False, highlight=False, soft_wrap=True)
     written = write_report(found, outputs)
     console = Console()
     if found.judged:

@@ -42,8 +42,8 @@ def study(
         try:
             folder = run_study(name, config, output, progress)
             run = read_run(folder)
-            for doubt in run.manifest["warnings"]:
-                progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
+            for warning in run.manifest["warnings"]:
+                progress.say(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}")
             progress.stage("drawing")
             _show(run, as_json=json_)
         except (S2AError, KeyboardInterrupt):
@@ -54,7 +54,7 @@ def study(
 
 def _show(run: Run, *, as_json: bool) -> None:
     """Write tables and figure, and print what the user asked for."""
-    from s2a_bench.experiments.study.view.as_json import study_to_json
+    from s2a_bench.experiments.study.view.as_json import study_json
     from s2a_bench.experiments.study.view.figures import write_study_figure
     from s2a_bench.experiments.study.view.tables import study_tables, table_files
     from s2a_bench.writers.files import write_texts
@@ -64,7 +64,7 @@ def _show(run: Run, *, as_json: bool) -> None:
     write_texts(run, table_files(tables), {})
     write_study_figure(run)
     if as_json:
-        print_json(study_to_json(run))
+        print_json(study_json(run))
         return
     console = open_console()
     for table in tables:

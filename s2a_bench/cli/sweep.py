@@ -131,7 +131,7 @@ def _show_plan(plan: Plan, jobs: int, resume: Path | None, output: Path, *, as_j
     workers = _workers(plan, "", jobs)
     expected = expect(cells, plan.rest_s, jobs, earlier(output, plan.command), workers)
     if as_json:
-        print_json(sweep_text.plan_to_json(cells, expected, collect()))
+        print_json(sweep_text.plan_json(cells, expected, collect()))
         return
     sweep_text.print_plan(plan, cells, expected)
 
@@ -143,6 +143,6 @@ def _show(folder: Path, *, as_json: bool) -> None:
 
     found = read_sweep(folder)
     if as_json:
-        print_json(sweep_text.sweep_to_json(found))
+        print_json(sweep_text.sweep_json(found))
         return
     sweep_text.print_sweep(found)

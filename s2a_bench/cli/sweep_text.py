@@ -59,7 +59,7 @@ def print_sweep(sweep: Sweep) -> None:
     console.print(f"sweep folder: {sweep.path}", markup=False, highlight=False, soft_wrap=True)
 
 
-def plan_to_json(cells: Sequence[Cell], expected: Expected, environment: dict[str, Any]) -> dict[str, Any]:
+def plan_json(cells: Sequence[Cell], expected: Expected, environment: dict[str, Any]) -> dict[str, Any]:
     """Return what would run as the ``--json`` object."""
     time = {"source": expected.source}
     return {
@@ -85,7 +85,7 @@ def plan_to_json(cells: Sequence[Cell], expected: Expected, environment: dict[st
     }
 
 
-def sweep_to_json(sweep: Sweep) -> dict[str, Any]:
+def sweep_json(sweep: Sweep) -> dict[str, Any]:
     """Return how a sweep went as the ``--json`` object."""
     return {
         "schema": "s2a-bench/1",

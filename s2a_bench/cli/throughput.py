@@ -165,17 +165,17 @@ def _draw(folder: Path, *, against_paper: bool) -> None:
 
 def _show(folder: Path, progress: RunProgress, *, as_json: bool) -> None:
     """Print what the user asked for."""
-    from s2a_bench.experiments.throughput.view.as_json import throughput_to_json
+    from s2a_bench.experiments.throughput.view.as_json import throughput_json
     from s2a_bench.experiments.throughput.view.tables import throughput_tables
     from s2a_bench.store.run import read_run
     from s2a_bench.writers.terminal import lay_out
 
     run = read_run(folder)
     tables = throughput_tables(run)
-    for doubt in run.manifest["warnings"]:
-        progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
+    for warning in run.manifest["warnings"]:
+        progress.say(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}")
     if as_json:
-        print_json(throughput_to_json(run))
+        print_json(throughput_json(run))
         return
     console = open_console()
     for table in tables.values():

@@ -211,7 +211,7 @@ def draw(folder: Path) -> None:
 
 def show(folder: Path, progress: RunProgress, *, as_json: bool, per_skill: bool) -> None:
     """Print what the user asked for of any run of timelines."""
-    from s2a_bench.experiments.timeline.view.as_json import timelines_to_json
+    from s2a_bench.experiments.timeline.view.as_json import timelines_json
     from s2a_bench.experiments.timeline.view.cells import timelines_of
     from s2a_bench.experiments.timeline.view.tables import timeline_tables
     from s2a_bench.store.run import read_run
@@ -219,10 +219,10 @@ def show(folder: Path, progress: RunProgress, *, as_json: bool, per_skill: bool)
 
     run = read_run(folder)
     tables = timeline_tables(run)
-    for doubt in run.manifest["warnings"]:
-        progress.say(f"warning [{doubt['code']}]: {doubt['message']}; {doubt['advice']}")
+    for warning in run.manifest["warnings"]:
+        progress.say(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}")
     if as_json:
-        print_json(timelines_to_json(run))
+        print_json(timelines_json(run))
         return
     console = open_console()
     one_setting = len({cell.setting for cell in timelines_of(run)}) == 1

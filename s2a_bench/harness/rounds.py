@@ -12,8 +12,8 @@ from typing import Any, TypeAlias
 from s2a_bench.clock import SystemClock
 from s2a_bench.errors import TransportError
 from s2a_bench.frames import FrameSource, open_source
+from s2a_bench.harness.backoff import Backoff
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
-from s2a_bench.harness.patience import Patience
 from s2a_bench.harness.plan import LatencyConfig, plan_cells
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet
@@ -34,8 +34,8 @@ GIVE_UP_AFTER = 5
 """Failures of one cell in a row, after which the run ends."""
 
 
-Turn: TypeAlias = Callable[[Place], None]
-"""Something that has its turn once a block: it measures and keeps what it measured."""
+Slot: TypeAlias = Callable[[Place], None]
+"""A callable run once per block: it measures and keeps what it measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Task:
     """Goes into the manifest's ``configuration``."""
     names: Mapping[str, str] = field(default_factory=dict)
     """What the command calls a cell."""
-    others: Callable[[LatencyConfig, RunWriter, Sequence[Session]], Sequence[Turn]] = lambda *_: ()
+    others: Callable[[LatencyConfig, RunWriter, Sequence[Session]], Sequence[Slot]] = lambda *_: ()
     """Makes what else has a turn in every block; the config has the model files that were found."""
 
 
@@ -112,35 +112,37 @@ class _Sources:
 
 
 def _measure(task: Task, config: LatencyConfig, sources: _Sources, writer: RunWriter, progress: Progress) -> None:
-    """Start the servers, measure all blocks, and write down what there is to doubt."""
+    """Start the servers, measure all blocks, and write down what there is to warn of."""
     machine = Machine(output=writer.path)
     uses_dds = "ros" in config.transports
-    doubts = before_run(config.width, config.height, uses_dds=uses_dds, machine=machine)
+    warnings = before_run(config.width, config.height, uses_dds=uses_dds, machine=machine)
     before = Counters.read(uses_dds=uses_dds)
     guard = SampleGuard()
     with ExitStack() as stack:
         progress.stage(f"starting {len(config.transports)} servers")
         servers = ServerSet(config, stack, writer.path)
         facts = servers.start()
-        writer.update(servers=facts, model=servers.model(facts), warnings=[doubt.to_manifest() for doubt in doubts])
+        writer.update(
+            servers=facts, model=servers.model(facts), warnings=[warning.to_manifest() for warning in warnings]
+        )
         pids = [server["pid"] for server in facts.values()]
         sampler = stack.enter_context(open_sampler(config.sample_resources_hz, pids))
         sessions = list(_sessions(task, config, servers, sources, sampler, stack))
         asked = {session.cell.name: session.client.describe() for session in sessions}
         writer.update(asked={name: how for name, how in asked.items() if how})
-        patience = Patience(SystemClock(), progress.stage)
-        turns = [_turn(session, servers, writer, guard, patience, sampler) for session in sessions]
+        backoff = Backoff(SystemClock(), progress.stage)
+        slots = [_slot(session, servers, writer, guard, backoff, sampler) for session in sessions]
         try:
-            run_blocks(turns, task.others(config, writer, sessions), config, progress)
+            run_blocks(slots, task.others(config, writer, sessions), config, progress)
             for session in sessions:
                 _write_frames(writer, session.frames(keep=0))
                 if not guard.successes(session.cell.name):
                     last = guard.last_error(session.cell.name)
                     raise TransportError(f"no request of {session.cell.name} succeeded, at last with {last}")
         finally:
-            doubts += [*guard.doubts(), *Counters.read(uses_dds=uses_dds).doubts_since(before)]
+            warnings += [*guard.warnings(), *Counters.read(uses_dds=uses_dds).warnings_since(before)]
             sampler.flush(writer)
-            writer.update(warnings=[doubt.to_manifest() for doubt in doubts], resources=sampler.describe())
+            writer.update(warnings=[warning.to_manifest() for warning in warnings], resources=sampler.describe())
 
 
 def _sessions(
@@ -170,31 +172,31 @@ def _sessions(
         yield Session(named, client, feed, config, recorder, sampler)
 
 
-def run_blocks(turns: Sequence[Turn], others: Sequence[Turn], config: LatencyConfig, progress: Progress) -> None:
-    """Give everyone a turn a block, in a new random order each time; in the first block the others come last.
+def run_blocks(slots: Sequence[Slot], others: Sequence[Slot], config: LatencyConfig, progress: Progress) -> None:
+    """Run every slot once a block, in a new random order each time; in the first block the others come last.
 
     So that what is compared with the requests can learn from the first of them how long their prompts are.
     """
-    everyone = [*turns, *others]
+    everyone = [*slots, *others]
     progress.expect(len(everyone) * (config.warmup + config.runs))
     random = Random(config.seed)  # noqa: S311 - an order, not a secret
     for block in range(config.warmup + config.runs):
         progress.stage("warming up" if block < config.warmup else "measuring")
         order = random.sample(everyone, len(everyone))
-        for position, turn in enumerate(order if block else sorted(order, key=lambda turn: turn in others)):
-            turn(Place(block, position, block < config.warmup))
+        for position, slot in enumerate(order if block else sorted(order, key=lambda slot: slot in others)):
+            slot(Place(block, position, block < config.warmup))
             progress.advance()
 
 
-def _turn(
+def _slot(
     session: Session,
     servers: ServerSet,
     writer: RunWriter,
     guard: SampleGuard,
-    patience: Patience,
+    backoff: Backoff,
     sampler: Sampler,
-) -> Turn:
-    """Return a session's turn: one request, kept at once, and a look at whether the run can go on."""
+) -> Slot:
+    """Return a session's slot: one request, kept at once, and a look at whether the run can go on."""
 
     def measure(place: Place) -> None:
         measured = session.measure(place)
@@ -209,7 +211,7 @@ def _turn(
         if guard.failures_in_a_row(session.cell.name) >= GIVE_UP_AFTER:
             name, error = session.cell.name, measured.sample.error
             raise TransportError(f"{name} failed {GIVE_UP_AFTER} times in a row, at last with {error}")
-        patience.wait(session.cell.name, measured.retry_after_s)
+        backoff.wait(session.cell.name, measured.retry_after_s)
 
     return measure
 

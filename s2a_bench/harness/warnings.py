@@ -1,4 +1,4 @@
-"""Doubts about a run's validity, as typed warnings that say what to do next."""
+"""What is seen of a run that bears on its validity, as typed warnings that say what to do next."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from s2a_bench.clock import realtime_offset_ns
 from s2a_bench.machine.doctor import BEFORE_RUN, Finding, Machine, examine
 from s2a_bench.machine.doctor.robot import RMEM_WANTED
+from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import RESIDUAL_LIMIT, budget
 
@@ -20,33 +21,20 @@ HEADERS_OFF_MS, HEADERS_OFF_SHARE = 20.0, 0.25
 """Beyond both, a llama-server's headers did not leave when its slot started."""
 
 
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """One warning: what was seen, and the way out."""
-
-    code: str
-    message: str
-    advice: str
-
-    def to_manifest(self) -> dict[str, str]:
-        """Return it as plain data."""
-        return {"code": self.code, "message": self.message, "advice": self.advice}
-
-
-def before_run(width: int, height: int, *, uses_dds: bool, machine: Machine | None = None) -> list[Doubt]:
+def before_run(width: int, height: int, *, uses_dds: bool, machine: Machine | None = None) -> list[RunWarning]:
     """Return the doctor's warnings that concern a run, for pictures of this size in pixels."""
     codes = [*BEFORE_RUN, *(["rmem-max"] if uses_dds and width * height > LARGE_PICTURE else [])]
-    return doubts_of(examine(machine or Machine(), codes))
+    return warnings_of(examine(machine or Machine(), codes))
 
 
-def doubts_of(findings: Iterable[Finding]) -> list[Doubt]:
+def warnings_of(findings: Iterable[Finding]) -> list[RunWarning]:
     """Return the doctor's warnings and errors as runs store them."""
-    return [Doubt(seen.code, seen.message, seen.fix) for seen in findings if seen.level in {"warning", "error"}]
+    return [RunWarning(seen.code, seen.message, seen.fix) for seen in findings if seen.level in {"warning", "error"}]
 
 
 @dataclass(slots=True)
 class Counters:
-    """Machine counters whose rise during a run is a reason for doubt; an unreadable one is None."""
+    """Machine counters whose rise during a run is a reason to warn; an unreadable one is None."""
 
     receive_buffer_errors: int | None = None
     throttles: int | None = None
@@ -65,12 +53,12 @@ class Counters:
             realtime_offset_ns(),
         )
 
-    def doubts_since(self, before: Counters) -> list[Doubt]:
+    def warnings_since(self, before: Counters) -> list[RunWarning]:
         """Compare with an earlier reading."""
-        doubts = []
+        warnings = []
         if _rise(before.receive_buffer_errors, self.receive_buffer_errors):
-            doubts.append(
-                Doubt(
+            warnings.append(
+                RunWarning(
                     "udp-receive-buffer",
                     f"the kernel dropped {_rise(before.receive_buffer_errors, self.receive_buffer_errors)} UDP packets "
                     "for want of receive buffer: DDS had to send them again, 200 ms later",
@@ -78,18 +66,20 @@ class Counters:
                 )
             )
         if _rise(before.throttles, self.throttles):
-            doubts.append(Doubt("cpu-throttling", "the CPU was throttled during the run", "cool it, and run again"))
+            warnings.append(
+                RunWarning("cpu-throttling", "the CPU was throttled during the run", "cool it, and run again")
+            )
         if abs(self.suspended_ns - before.suspended_ns) > CLOCK_STEP_NS:
-            doubts.append(Doubt("suspended", "the machine was suspended during the run", "run again"))
+            warnings.append(RunWarning("suspended", "the machine was suspended during the run", "run again"))
         if abs(self.realtime_offset_ns - before.realtime_offset_ns) > CLOCK_STEP_NS:
-            doubts.append(
-                Doubt(
+            warnings.append(
+                RunWarning(
                     "clock-jump",
                     "the wall clock was set during the run; latencies are unaffected, ROS time stamps are not",
                     "let NTP settle, and run again",
                 )
             )
-        return doubts
+        return warnings
 
 
 @dataclass(slots=True)
@@ -142,7 +132,7 @@ class SampleGuard:
         """Count a cell's samples that took part in its numbers."""
         return self._succeeded.get(cell, 0)
 
-    def doubts(self) -> list[Doubt]:
+    def warnings(self) -> list[RunWarning]:
         """Say what was seen."""
         return [
             *_told(
@@ -185,11 +175,11 @@ def _count(counts: dict[str, int], cell: str) -> None:
     counts[cell] = counts.get(cell, 0) + 1
 
 
-def _told(counts: dict[str, int], code: str, what: str, advice: str) -> list[Doubt]:
+def _told(counts: dict[str, int], code: str, what: str, advice: str) -> list[RunWarning]:
     if not counts:
         return []
     where = ", ".join(f"{cell}: {count}" for cell, count in counts.items())
-    return [Doubt(code, f"{what} ({where})", advice)]
+    return [RunWarning(code, f"{what} ({where})", advice)]
 
 
 def _rise(before: int | None, after: int | None) -> int:

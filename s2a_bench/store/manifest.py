@@ -7,6 +7,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,19 @@ from s2a_bench.errors import StoreError
 from s2a_bench.store.schema import SCHEMA
 
 NAME = "manifest.json"
+
+
+@dataclass(frozen=True, slots=True)
+class RunWarning:
+    """One warning: what was seen, and the way out."""
+
+    code: str
+    message: str
+    advice: str
+
+    def to_manifest(self) -> dict[str, str]:
+        """Return it as plain data."""
+        return {"code": self.code, "message": self.message, "advice": self.advice}
 
 
 def utc_now() -> str:

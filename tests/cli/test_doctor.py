@@ -61,7 +61,7 @@ def test_json_is_one_object_that_the_schema_describes() -> None:
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate({name: value for name, value in told.items() if name != key}, SCHEMA)
     levels = {check["code"]: check["level"] for check in told["checks"]}
-    assert {doubt["code"] for doubt in told["warnings"]} == {
+    assert {warning["code"] for warning in told["warnings"]} == {
         code for code, level in levels.items() if level in {"warning", "error"}
     }
 

@@ -55,7 +55,7 @@ def test_json_is_one_object_that_keeps_its_schema(tmp_path: Path) -> None:
     schema = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
     jsonschema.validate(found, schema)
     assert found["command"] == "study-misfit"
-    assert [doubt["code"] for doubt in found["warnings"]] == ["few-calibration-plans"]
+    assert [warning["code"] for warning in found["warnings"]] == ["few-calibration-plans"]
     rows = read_run(Path(found["run"])).table(STUDIES)
     assert [cell["p_any_stall"] for cell in found["cells"]] == list(rows["p_any_stall"])
     assert [cell["condition"] for cell in found["cells"]] == list(rows["condition"])

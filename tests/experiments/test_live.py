@@ -23,7 +23,7 @@ from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.experiments.timeline.live.run import run_live
 from s2a_bench.experiments.timeline.real_time import run_real_time
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.experiments.timeline.view.as_json import timelines_to_json
+from s2a_bench.experiments.timeline.view.as_json import timelines_json
 from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_of
 from s2a_bench.experiments.timeline.view.figures import write_timeline_figures
 from s2a_bench.harness.feed import RequestFeed
@@ -120,7 +120,7 @@ def check(run: Run, transport: str) -> None:
     assert list(naive.skills["text"]) == list(wait.skills["text"]) == list(online.skills["text"])
     assert run.manifest["live"]["transport"] == transport
     assert run.manifest["start_jitter"]["starts"] == 24
-    jsonschema.validate(timelines_to_json(run), SCHEMA)
+    jsonschema.validate(timelines_json(run), SCHEMA)
 
 
 def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: LiveConfig, tmp_path: Path) -> None:
@@ -302,7 +302,7 @@ def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
     assert run.manifest["configuration"]["time"] == "real-time"
     assert run.manifest["start_jitter"]["starts"] == 64
     assert any("EMULATED, executed in real time" in note for note in origin_notes(run, cells))
-    jsonschema.validate(timelines_to_json(run), SCHEMA)
+    jsonschema.validate(timelines_json(run), SCHEMA)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from s2a_bench.experiments.study import targets as study_targets
 from s2a_bench.experiments.study.rows import STUDIES as TABLE
 from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.run import STUDIES, StudyConfig, cells_of, results, run_study
-from s2a_bench.experiments.study.view.as_json import study_to_json
+from s2a_bench.experiments.study.view.as_json import study_json
 from s2a_bench.experiments.study.view.figures import write_study_figure
 from s2a_bench.experiments.study.view.tables import regret_at, study_tables, table_files, targets
 from s2a_bench.experiments.study.worlds import World, generator, recorded_plans
@@ -236,7 +236,7 @@ def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest
     assert all("nan" not in entry.lower() for table in tables for row in table.rows for entry in row)
     assert len(table_files(tables)) == len(tables)
     assert [path.name for path in write_study_figure(run)] == [f"{name}.png", f"{name}.pdf"]
-    told = study_to_json(run)
+    told = study_json(run)
     jsonschema.validate(told, json.loads(SCHEMA.read_text()))
     assert len(told["cells"]) == len(run.table(STUDIES))
     assert [each["what"] for each in told.get("targets", [])] == (TARGETS if name == "targets" else [])

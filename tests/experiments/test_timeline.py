@@ -288,8 +288,8 @@ def test_lambda_that_nothing_can_promise_is_a_warning(tmp_path: Path, monkeypatc
     monkeypatch.setattr("s2a_bench.experiments.timeline.policies.calibrate", lambda *_: never)
     config = replace(JITTERY, plans=20)
     run = ran(config, tmp_path)
-    (doubt,) = run.manifest["warnings"]
-    assert doubt["code"] == "calibration-waits"
+    (warning,) = run.manifest["warnings"]
+    assert warning["code"] == "calibration-waits"
     (found,) = run.manifest["calibrations"].values()
     assert found["caution"] is None
     online = next(cell for cell in timelines_of(run) if cell.policy == "stream-to-act")

@@ -1,4 +1,4 @@
-"""Doubts about a run's validity."""
+"""Warnings about a run's validity."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def codes(*seen: tuple[SampleRow, int]) -> list[str]:
     guard = SampleGuard()
     for sample, fingerprint in seen:
         guard.see(sample, fingerprint)
-    return [doubt.code for doubt in guard.doubts()]
+    return [warning.code for warning in guard.warnings()]
 
 
-def test_good_samples_raise_no_doubt() -> None:
+def test_good_samples_raise_no_warning() -> None:
     assert codes((row("a"), 1), (row("b"), 2)) == []
 
 
@@ -44,12 +44,12 @@ def test_good_samples_raise_no_doubt() -> None:
         (row("b", error="RequestFailed: x", marks=[]), 2, "failed-samples"),
     ],
 )
-def test_each_doubt_has_its_code(second: SampleRow, fingerprint: int, code: str) -> None:
+def test_each_warning_has_its_code(second: SampleRow, fingerprint: int, code: str) -> None:
     assert codes((row("a"), 1), (second, fingerprint)) == [code]
 
 
 @pytest.mark.parametrize(("off_ms", "prompt_ms"), [(-2.8, 97.5), (19.0, 5.0), (200.0, 1000.0)])
-def test_headers_that_fit_the_servers_own_time_are_no_doubt(off_ms: float, prompt_ms: float) -> None:
+def test_headers_that_fit_the_servers_own_time_are_no_warning(off_ms: float, prompt_ms: float) -> None:
     assert codes((row("a", facts={"headers_off_ms": off_ms}, server_prompt_ms=prompt_ms), 1)) == []
 
 
@@ -61,13 +61,13 @@ def test_the_residual_of_a_warm_up_does_not_matter() -> None:
     assert codes((row("a", marks=LOOSE, warmup=True), 1)) == []
 
 
-def test_a_doubt_names_cells_and_the_way_out() -> None:
+def test_a_warning_names_cells_and_the_way_out() -> None:
     guard = SampleGuard()
     for number in range(3):
         guard.see(row(str(number)), 1)
-    (doubt,) = guard.doubts()
-    assert "ros/topic: 2" in doubt.message
-    assert "synthetic" in doubt.advice
+    (warning,) = guard.warnings()
+    assert "ros/topic: 2" in warning.message
+    assert "synthetic" in warning.advice
 
 
 @pytest.mark.parametrize(
@@ -79,9 +79,9 @@ def test_a_doubt_names_cells_and_the_way_out() -> None:
         (Counters(receive_buffer_errors=0, realtime_offset_ns=-(10**9)), "clock-jump"),
     ],
 )
-def test_counters_that_rise_are_doubts(after: Counters, code: str) -> None:
+def test_counters_that_rise_are_warnings(after: Counters, code: str) -> None:
     before = Counters(receive_buffer_errors=0, throttles=0)
-    assert [doubt.code for doubt in after.doubts_since(before)] == [code]
+    assert [warning.code for warning in after.warnings_since(before)] == [code]
 
 
 def test_failures_in_a_row_end_with_a_success() -> None:
@@ -94,15 +94,15 @@ def test_failures_in_a_row_end_with_a_success() -> None:
     assert (guard.last_error("ros/topic"), guard.last_error("loopback")) == ("x", "")
 
 
-def test_what_cannot_be_read_is_no_doubt() -> None:
-    assert Counters(None, None).doubts_since(Counters(3, 5)) == []
+def test_what_cannot_be_read_is_no_warning() -> None:
+    assert Counters(None, None).warnings_since(Counters(3, 5)) == []
 
 
 def test_this_machine_can_be_read() -> None:
     now = Counters.read()
-    assert now.doubts_since(now) == []
+    assert now.warnings_since(now) == []
 
 
-def test_packets_lost_by_others_are_no_doubt_about_a_run_without_dds() -> None:
+def test_packets_lost_by_others_are_no_warning_about_a_run_without_dds() -> None:
     assert Counters.read().receive_buffer_errors is not None
     assert Counters.read(uses_dds=False).receive_buffer_errors is None

@@ -460,9 +460,9 @@ LOOSE = JETSON | {f"{CPU}/cpu0/cpufreq/scaling_min_freq": "1", "var/lib/nvpmodel
 def test_a_run_gets_the_doctors_warnings_that_concern_it(
     make: Make, tree: dict[str, str], width: int, dds: bool, expected: list[str]
 ) -> None:
-    doubts = before_run(width, 480, uses_dds=dds, machine=make(tree))
-    assert [doubt.code for doubt in doubts] == expected
-    assert all(doubt.advice for doubt in doubts)
+    warnings = before_run(width, 480, uses_dds=dds, machine=make(tree))
+    assert [warning.code for warning in warnings] == expected
+    assert all(warning.advice for warning in warnings)
 
 
 def test_the_worst_level_wins() -> None:

@@ -21,7 +21,7 @@ from s2a_bench.experiments.throughput.view import compared as throughput
 from s2a_bench.experiments.timeline.view import compared as timeline
 from s2a_bench.registry import Registry
 from s2a_bench.report.compare.alike import differences
-from s2a_bench.report.compare.as_json import compare_to_json
+from s2a_bench.report.compare.as_json import compare_json
 from s2a_bench.report.compare.comparison import (
     ComparedRuns,
     compare,
@@ -30,11 +30,11 @@ from s2a_bench.report.compare.comparison import (
     read_side,
     shown_metrics,
 )
-from s2a_bench.report.compare.doubts import doubts
 from s2a_bench.report.compare.figure import build_forest
 from s2a_bench.report.compare.files import write_comparison
 from s2a_bench.report.compare.gates import judge, read_gate
 from s2a_bench.report.compare.tables import compare_csv, compare_table, percent
+from s2a_bench.report.compare.warnings import warnings_of
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run, RunWriter, read_run
@@ -156,7 +156,7 @@ def test_cells_without_a_partner_are_listed_and_not_compared(launch: Launch) -> 
     found = compared(launch(1, cells=("ros/topic", "loopback")), launch(2, cells=("ros/topic", "http/binary")), "e2e")
     assert [one.pair.name for one in found.comparisons] == ["ros/topic"]
     assert found.only == (("loopback",), ("http/binary",))
-    assert [doubt.message for doubt in doubts(found) if doubt.code == "only"] == [
+    assert [warning.message for warning in warnings_of(found) if warning.code == "only"] == [
         "only in A: loopback",
         "only in B: http/binary",
     ]
@@ -182,7 +182,9 @@ def test_another_machine_or_model_is_refused_unless_told(
     with pytest.raises(UnlikeRuns) as caught:
         opened(first, second)
     assert str(caught.value) == f"the runs are unlike: {said}; --unlike compares them all the same"
-    told = next(doubt for doubt in doubts(compared(first, second, "e2e", unlike=True)) if doubt.code == "unlike")
+    told = next(
+        warning for warning in warnings_of(compared(first, second, "e2e", unlike=True)) if warning.code == "unlike"
+    )
     assert told.message == f"the runs are unlike: {said}"
 
 
@@ -233,13 +235,13 @@ def test_runs_of_two_commands_are_never_compared(launch: Launch, tmp_path: Path)
 
 
 def test_what_went_wrong_in_a_run_is_told(launch: Launch, tmp_path: Path, make_row: MakeRow) -> None:
-    doubtful = {**MANIFEST, "warnings": [{"code": "load", "message": "m", "advice": "a"}]}
-    with RunWriter.create(tmp_path, "latency", doubtful) as run:
+    warned = {**MANIFEST, "warnings": [{"code": "load", "message": "m", "advice": "a"}]}
+    with RunWriter.create(tmp_path, "latency", warned) as run:
         for block in range(20):
             run.sample(make_row("loopback", STAGES, block, error="lost" if block < 3 else ""))
         run.finish("interrupted")
-    found = doubts(compared(launch(1, cells=("loopback",)), read_run(run.path), "e2e"))
-    said = {doubt.code: doubt.message for doubt in found}
+    found = warnings_of(compared(launch(1, cells=("loopback",)), read_run(run.path), "e2e"))
+    said = {warning.code: warning.message for warning in found}
     assert said["state"].endswith("is interrupted, not finished")
     assert said["warnings"].endswith("has warnings: load")
     assert said["errors"] == "loopback: 3 of 20 requests failed in B"
@@ -252,7 +254,7 @@ def test_repeated_launches_are_compared_by_launch(launch: Launch) -> None:
     found = compare(both, metrics_of(both, ["e2e"]))
     assert found.launches
     assert [one.n for one in found.comparisons] == [(180, 180)] * 4
-    assert "one-launch" not in {doubt.code for doubt in doubts(found)}
+    assert "one-launch" not in {warning.code for warning in warnings_of(found)}
     assert "over launches" in compare_table(found).notes[1]
     with pytest.raises(UsageError, match="several launches on both sides, or one on each"):
         open_comparison(sides[0], sides[1][:1], unlike=False, least=0.05)
@@ -340,7 +342,7 @@ def test_a_gate_on_a_cell_that_there_is_not_is_answered_by_those_there_are(launc
 
 def test_the_json_object_is_what_its_schema_says(launch: Launch) -> None:
     found = compared(launch(1), launch(2, factor=1.2), "e2e", "e2e.p99")
-    whole = compare_to_json(found, judge(found, [read_gate("e2e>5%")], strict=False), doubts(found))
+    whole = compare_json(found, judge(found, [read_gate("e2e>5%")], strict=False), warnings_of(found))
     jsonschema.validate(whole, SCHEMA)
     json.dumps(whole, allow_nan=False)
     assert [one["verdict"] for one in whole["comparisons"]] == ["worse"] * 4 + ["too few"] * 4

@@ -282,7 +282,7 @@ def test_measured_cells_stand_side_by_side_and_are_not_pooled(tmp_path: Path, ma
         ("runs 2", "http/as-deployed", "End to end without inference, ms", rows[0][3], "2"),
         ("runs 2", "loopback", "End to end without inference, ms", rows[0][3], "2"),
     ]
-    assert "14 cells were run: the first 12" in overview.doubts[0]
+    assert "14 cells were run: the first 12" in overview.caveats[0]
     assert overview.content.tables["cells"].rows[-1][3] == "failed: no room"
     assert "1 failed" in overview.content.summary[1]
 
@@ -295,7 +295,7 @@ def test_an_unfinished_run_is_shown_and_told(make_run: MakeRun, state: str, erro
     run = make_run(n=3)
     (run.path / "manifest.json").write_text(json.dumps({**run.manifest, "state": state, "error": error}))
     (chapter,) = read_chapters([run.path], against_paper=False)
-    assert said in chapter.doubts[0]
+    assert said in chapter.caveats[0]
     assert said in Page(page_of(run.path)).text
 
 
@@ -313,8 +313,8 @@ def test_a_timeline_that_was_cut_off_does_not_hide_the_others(computed: Path, tm
     (cut / "skills.csv").unlink()
     chapters = read_chapters([cut, computed], against_paper=False)
     assert len(chapters) == 2
-    assert chapters[0].doubts
-    assert not chapters[1].doubts
+    assert chapters[0].caveats
+    assert not chapters[1].caveats
 
 
 def test_rows_that_their_manifest_does_not_fit_are_an_error_where_the_run_claims_to_be_whole(
@@ -330,9 +330,9 @@ def test_rows_that_their_manifest_does_not_fit_are_an_error_where_the_run_claims
 def test_runs_of_unlike_machines_are_told_apart(make_run: MakeRun) -> None:
     runs = [make_run(n=2, manifest={"environment": {"cpu": cpu, "cores": 2}}).path for cpu in ("A", "B", "A")]
     report = make_report(read_chapters(runs, against_paper=False), against_paper=False)
-    assert len(report.doubts) == 1
-    assert "cpu: A against B" in report.doubts[0]
-    assert report.doubts[0] in Page(page_of(*runs)).text
+    assert len(report.caveats) == 1
+    assert "cpu: A against B" in report.caveats[0]
+    assert report.caveats[0] in Page(page_of(*runs)).text
 
 
 def test_a_folder_given_twice_is_one_chapter(computed: Path) -> None:

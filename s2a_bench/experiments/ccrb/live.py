@@ -71,7 +71,7 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
             progress.stage("driving the operating point")
             drive_point(config, ready, world, writer)
         finally:
-            writer.update(warnings=[doubt.to_manifest() for doubt in link.doubts])
+            writer.update(warnings=[warning.to_manifest() for warning in link.warnings])
         return writer.path
 
 

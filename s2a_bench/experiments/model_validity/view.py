@@ -87,7 +87,7 @@ def validity_tables(run: Run) -> dict[str, TextTable]:
     return tables
 
 
-def validity_to_json(run: Run) -> dict[str, Any]:
+def validity_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints; a cell a format and way to ask."""
     return frame(run, [_cell(run, arm) for arm in arms_of(run)], [])
 

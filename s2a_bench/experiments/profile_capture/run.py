@@ -128,7 +128,7 @@ def capture(config: CaptureConfig, stage: Callable[[str], None], advance: Callab
     """
     config.check()
     limit_threads()
-    doubts = before_run(config.width, config.height, uses_dds=False)
+    warnings = before_run(config.width, config.height, uses_dds=False)
     with ExitStack() as stack:
         stage("loading the model")
         engine = open_model(config.engine)
@@ -141,11 +141,11 @@ def capture(config: CaptureConfig, stage: Callable[[str], None], advance: Callab
             stage("warming up" if number < config.warmup else "measuring")
             recorded.append(next(asked))
             advance()
-        doubts += Counters.read(uses_dds=False).doubts_since(before)
+        warnings += Counters.read(uses_dds=False).warnings_since(before)
         described = engine.describe()
     stage("fitting the gaps")
-    warnings = [f"{doubt.code}: {doubt.message}; {doubt.advice}" for doubt in doubts]
-    return document(config, recorded, described, warnings)
+    said = [f"{warning.code}: {warning.message}; {warning.advice}" for warning in warnings]
+    return document(config, recorded, described, said)
 
 
 def document(

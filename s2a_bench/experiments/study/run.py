@@ -16,8 +16,8 @@ from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.policy.conformal import CONFIDENCE, PLANS, check, coarse, upper_bound
 
 if TYPE_CHECKING:
-    from s2a_bench.harness.warnings import Doubt
     from s2a_bench.progress import Progress
+    from s2a_bench.store.manifest import RunWarning
 
 Cell: TypeAlias = Callable[[], Sequence[StudyRow]]
 """Independent work of a study: a partial of a module's function, so that another process can run it."""
@@ -45,9 +45,9 @@ class StudyConfig:
             raise UsageError(f"--seed: {self.seed} should be 0 or more")
         check(self.calibration_plans, self.epsilon)
 
-    def doubts(self) -> list[Doubt]:
+    def warnings(self) -> list[RunWarning]:
         """Return what is allowed and worth a warning."""
-        from s2a_bench.harness.warnings import Doubt
+        from s2a_bench.store.manifest import RunWarning
 
         if not coarse(self.calibration_plans, self.epsilon):
             return []
@@ -55,7 +55,7 @@ class StudyConfig:
             f"{self.calibration_plans} calibration plans are few: one lambda may stall up to "
             f"{upper_bound(0, self.calibration_plans, CONFIDENCE):.1%} of its plans"
         )
-        return [Doubt("few-calibration-plans", message, f"take {PLANS} or more")]
+        return [RunWarning("few-calibration-plans", message, f"take {PLANS} or more")]
 
 
 STUDIES: dict[str, str] = {
@@ -95,7 +95,7 @@ def run_study(name: str, config: StudyConfig, output: Path, progress: Progress) 
         "configuration": {"study": name, **asdict(config)},
         "environment": collect(),
         "seeds": {"study": config.seed},
-        "warnings": [doubt.to_manifest() for doubt in config.doubts()],
+        "warnings": [warning.to_manifest() for warning in config.warnings()],
     }
     with RunWriter.create(output, f"study-{name}", manifest, (TABLE,)) as writer:
         progress.opened(writer.path)

@@ -10,7 +10,7 @@ from pathlib import Path
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.throughput.llama_bench import LlamaBench
 from s2a_bench.harness.plan import LatencyConfig
-from s2a_bench.harness.rounds import Task, Turn, run_requests
+from s2a_bench.harness.rounds import Slot, Task, run_requests
 from s2a_bench.harness.session import Session
 from s2a_bench.inference.llama_settings import check_settings
 from s2a_bench.progress import Progress
@@ -57,7 +57,7 @@ def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -
     """
     config.check()
 
-    def others(requests: LatencyConfig, writer: RunWriter, sessions: Sequence[Session]) -> Sequence[Turn]:
+    def others(requests: LatencyConfig, writer: RunWriter, sessions: Sequence[Session]) -> Sequence[Slot]:
         if config.reference is None:
             return []
         return [LlamaBench(config.reference, requests, writer, lambda: max(session.prompt_n for session in sessions))]

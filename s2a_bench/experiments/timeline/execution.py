@@ -15,7 +15,6 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.run import finite
 from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows
-from s2a_bench.harness.warnings import Doubt
 from s2a_bench.plan import Gap
 from s2a_bench.policy import Plans, PlanShape, Policy, Schedule
 from s2a_bench.policy.evaluate import TOLERANCE_S
@@ -25,6 +24,7 @@ from s2a_bench.runtime.events import AbortAsked, Event, LiveInbox
 from s2a_bench.runtime.executor import Executor
 from s2a_bench.runtime.record import Record, SkillRun
 from s2a_bench.stats import summarise
+from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
 
 SWITCH_S: Final = 0.0005
@@ -108,8 +108,8 @@ def keep(
     request_id: str,
     policies: Sequence[Policy],
     records: Sequence[Record],
-) -> list[Doubt]:
-    """Write what happened as rows, as far as skills ran, and return what there is to doubt.
+) -> list[RunWarning]:
+    """Write what happened as rows, as far as skills ran, and return the warnings.
 
     A rate of 0 says that too few tokens came to know it; then there are no rows.
     """
@@ -134,7 +134,7 @@ def keep(
             writer.append(
                 SKILLS, skill_rows(cell, plans, schedule, [request_id], first_plan=plan, texts=texts, due_s=due_s)
             )
-    return list(_doubts(setting, plan, records))
+    return list(_warnings(setting, plan, records))
 
 
 def jitter_facts(records: Sequence[Record]) -> dict[str, float | int]:
@@ -182,7 +182,7 @@ def _facts(record: Record) -> dict[str, Any]:
     }
 
 
-def _doubts(setting: Setting, plan: int, records: Sequence[Record]) -> Iterator[Doubt]:
+def _warnings(setting: Setting, plan: int, records: Sequence[Record]) -> Iterator[RunWarning]:
     """Tell of a plan that was not completed; once where all policies met the same."""
     ends: dict[tuple[str, str], list[Record]] = {}
     for record in records:
@@ -190,7 +190,7 @@ def _doubts(setting: Setting, plan: int, records: Sequence[Record]) -> Iterator[
             ends.setdefault((record.outcome or "unfinished", record.why), []).append(record)
     for (outcome, why), same in ends.items():
         ran = ", ".join(f"{record.policy} {len(record.ran)}" for record in same)
-        yield Doubt(
+        yield RunWarning(
             f"plan-{outcome}",
             f"{setting.name}, plan {plan + 1}: {why}; the robots held after {ran} of {setting.n_skills} skills",
             "their numbers are about the skills that ran; see 'executions' in manifest.json",

@@ -13,10 +13,9 @@ from s2a_bench.experiments.timeline.execution import Scene, SideBySide, View, ji
 from s2a_bench.experiments.timeline.plans import Board
 from s2a_bench.experiments.timeline.policies import draw, learn
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.experiments.timeline.run import board_facts, calibration_doubts, finite
+from s2a_bench.experiments.timeline.run import board_facts, calibration_warnings, finite
 from s2a_bench.experiments.timeline.to_rows import KEPT_PLANS, Setting
 from s2a_bench.experiments.timeline.traces import recordings
-from s2a_bench.harness.warnings import Doubt
 from s2a_bench.machine import environment
 from s2a_bench.plan import Call, Durations, Skill
 from s2a_bench.policy import Plans
@@ -25,6 +24,7 @@ from s2a_bench.runtime.events import Requested, SkillCame, StreamEnded, TokenCam
 from s2a_bench.runtime.executor import SILENCE_S
 from s2a_bench.runtime.record import Record
 from s2a_bench.runtime.timed import TimedRobot
+from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import TOKENS, TokenRow
 from s2a_bench.store.run import RunWriter
 
@@ -62,7 +62,7 @@ class _SoFar:
     """What is said of the whole run at its end, however it ends."""
 
     records: list[Record] = field(default_factory=list)
-    doubts: list[Doubt] = field(default_factory=list)
+    warnings: list[RunWarning] = field(default_factory=list)
     calibrations: dict[str, Any] = field(default_factory=dict)
 
 
@@ -93,11 +93,11 @@ def run_real_time(config: TimelineConfig, output: Path, view: View) -> Path:
             for board, setting in work:
                 _run_setting(config, board, setting, answers, writer, view, so_far)
         finally:
-            doubts = [*so_far.doubts, *calibration_doubts(so_far.calibrations)]
+            warnings = [*so_far.warnings, *calibration_warnings(so_far.calibrations)]
             writer.update(
                 calibrations=so_far.calibrations,
                 start_jitter=jitter_facts(so_far.records),
-                warnings=[doubt.to_manifest() for doubt in doubts],
+                warnings=[warning.to_manifest() for warning in warnings],
             )
         return writer.path
 
@@ -136,7 +136,7 @@ def _run_setting(
             request_id = setting.request_id(plan)
             if plan < KEPT_PLANS:
                 writer.append(TOKENS, _token_rows(setting, request_id, executors.records[0]))
-            so_far.doubts += keep(writer, setting, plan, request_id, policies, executors.records)
+            so_far.warnings += keep(writer, setting, plan, request_id, policies, executors.records)
         view.advance()
 
 

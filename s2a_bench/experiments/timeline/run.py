@@ -14,9 +14,9 @@ from s2a_bench.experiments.timeline.policies import draw, learn, plans_of
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows, token_rows
 from s2a_bench.experiments.timeline.traces import recordings
-from s2a_bench.harness.warnings import Doubt
 from s2a_bench.machine import environment
 from s2a_bench.policy.conformal import Calibration
+from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import RunWriter
 
@@ -54,8 +54,8 @@ def run_timeline(config: TimelineConfig, output: Path, progress: Progress) -> Pa
                 calibrations[setting.name] = asdict(calibration) | {"caution": finite(calibration.caution)}
             if config.random:
                 progress.advance()
-        doubts = calibration_doubts(calibrations)
-        writer.update(calibrations=calibrations, warnings=[doubt.to_manifest() for doubt in doubts])
+        warnings = calibration_warnings(calibrations)
+        writer.update(calibrations=calibrations, warnings=[warning.to_manifest() for warning in warnings])
         return writer.path
 
 
@@ -85,13 +85,13 @@ def board_facts(board: Board) -> dict[str, Any]:
     return plain
 
 
-def calibration_doubts(calibrations: dict[str, Any]) -> list[Doubt]:
+def calibration_warnings(calibrations: dict[str, Any]) -> list[RunWarning]:
     """Say where stream-to-act could not be calibrated well."""
     waits = [name for name, found in calibrations.items() if found["caution"] is None]
     if not waits:
         return []
     return [
-        Doubt(
+        RunWarning(
             "calibration-waits",
             f"stream-to-act waits for the whole plan in {', '.join(waits)}: no smaller lambda kept stalls rare enough",
             "allow more stalls with --epsilon, or calibrate on more plans with --calibration-plans",

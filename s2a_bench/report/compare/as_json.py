@@ -11,14 +11,16 @@ from s2a_bench.stats.batches import BATCHES
 
 if TYPE_CHECKING:
     from s2a_bench.report.compare.comparison import ComparedRuns, Comparison
-    from s2a_bench.report.compare.doubts import Doubt
     from s2a_bench.report.compare.gates import Judgement
     from s2a_bench.stats import Ratio
+    from s2a_bench.store.manifest import RunWarning
 
 SCHEMA = "s2a-bench-compare/1"
 
 
-def compare_to_json(compared: ComparedRuns, judgements: Sequence[Judgement], doubts: Sequence[Doubt]) -> dict[str, Any]:
+def compare_json(
+    compared: ComparedRuns, judgements: Sequence[Judgement], warnings: Sequence[RunWarning]
+) -> dict[str, Any]:
     """Return the object; shares are fractions, values have the unit of their metric."""
     return {
         "schema": SCHEMA,
@@ -49,7 +51,7 @@ def compare_to_json(compared: ComparedRuns, judgements: Sequence[Judgement], dou
             for one in judgements
         ],
         "differences": [asdict(one) for one in compared.differences],
-        "warnings": [asdict(one) for one in doubts],
+        "warnings": [asdict(one) for one in warnings],
     }
 
 

@@ -41,7 +41,7 @@ class Chapter:
     run: Run
     content: Content
     command: str
-    doubts: Sequence[str] = ()
+    caveats: Sequence[str] = ()
     attached: Mapping[str, str] = field(default_factory=dict)
 
     @property

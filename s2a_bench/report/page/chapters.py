@@ -75,15 +75,15 @@ def _of_machine(found: Difference) -> bool:
 def _chapter(run: Run, title: str, against_paper: bool, **more: Any) -> Chapter:
     """Make a run's chapter; one that did not end may lack what its command's tables need."""
     manifest = run.manifest
-    doubts = list(_unfinished(manifest))
+    caveats = list(_unfinished(manifest))
     try:
         content = content_of(run, against_paper=against_paper)
     except (KeyError, IndexError, TypeError, ValueError, StoreError) as error:
-        if not doubts:
+        if not caveats:
             raise StoreError(f"{run.path}: its rows and its manifest do not fit: {error!r}") from error
         content = Content(summary=("What there is of this run is not enough for its tables; its CSV files hold it.",))
     command = more.pop("command", repeat_command(manifest))
-    return Chapter(_slug(run.path.name), title, run, content, command, doubts, **more)
+    return Chapter(_slug(run.path.name), title, run, content, command, caveats, **more)
 
 
 def _slug(name: str) -> str:
@@ -107,16 +107,16 @@ def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
     runs = list(sweep.runs())
     copy = sweep.path / "sweep.toml"
     attached = {copy.name: copy.read_text(encoding="utf-8")} if copy.is_file() else {}
-    doubts = list(_unfinished(manifest))
+    caveats = list(_unfinished(manifest))
     pools, single = pooled(sweep, runs)
     if len(single) > MOST_CHAPTERS:
-        doubts.append(
+        caveats.append(
             f"{len(single)} cells were run: the first {MOST_CHAPTERS} have a chapter each, all are in the overview; "
             "give the folders of others to s2a-bench report to see them."
         )
     command = repeat_command(manifest)
     content = overview(sweep, runs)
-    yield Chapter(_slug(sweep.path.name), title_of(manifest), head, content, command, doubts, attached)
+    yield Chapter(_slug(sweep.path.name), title_of(manifest), head, content, command, caveats, attached)
     for place, run in enumerate(pools, 1):
         what = f"{run.manifest['command']}s of the sweep" + (f", part {place}" if len(pools) > 1 else "")
         yield _chapter(run, what, against_paper, command=command)

@@ -52,7 +52,7 @@ class Report:
 
     chapters: Sequence[Chapter]
     judged: Sequence[Judged]
-    doubts: Sequence[str]
+    caveats: Sequence[str]
 
 
 def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
@@ -69,7 +69,7 @@ def write_report(report: Report, outputs: Outputs) -> list[Path]:
             drawn[chapter.name] = draw(chapter.name, chapter.content.figures, pdf=outputs.latex is not None)
     texts: dict[Path, str | bytes] = {}
     if outputs.page:
-        texts[outputs.page] = render(report.chapters, drawn, report.judged, report.doubts)
+        texts[outputs.page] = render(report.chapters, drawn, report.judged, report.caveats)
     if outputs.latex:
         texts |= {outputs.latex / name: text for name, text in _latex(report, drawn)}
     if outputs.csv:
@@ -135,12 +135,12 @@ def _csv(report: Report) -> Iterator[tuple[str, str]]:
 
 def _markdown(report: Report) -> str:
     """Return everything but the figures as one Markdown text."""
-    parts = [_MARK, *(f"> {doubt}" for doubt in report.doubts)]
+    parts = [_MARK, *(f"> {caveat}" for caveat in report.caveats)]
     if report.judged:
         parts += [f"## The paper's claims\n\n{tally(report.judged)}.", to_markdown(claim_table(report.judged))]
     for chapter in report.chapters:
         parts.append(f"## {chapter.title}")
-        parts += [f"> {doubt}" for doubt in chapter.doubts]
+        parts += [f"> {caveat}" for caveat in chapter.caveats]
         parts.append("\n".join(f"- {text}" for text in chapter.content.summary))
         parts.append(f"```sh\n{chapter.command}\n```")
         parts += [to_markdown(table) for table in chapter.content.tables.values()]

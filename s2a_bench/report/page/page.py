@@ -28,7 +28,7 @@ def render(
     chapters: Sequence[Chapter],
     figures: dict[str, dict[str, Drawn]],
     judged: Sequence[Judged],
-    doubts: Sequence[str],
+    caveats: Sequence[str],
 ) -> str:
     """Return the page; ``figures`` are those of each chapter by its name. Every text of a run is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -55,7 +55,7 @@ def render(
         chapters=shown,
         judged=judged,
         tally=tally(judged),
-        doubts=doubts,
+        caveats=caveats,
     )
 
 
@@ -88,7 +88,7 @@ def _view(chapter: Chapter, figures: dict[str, Drawn]) -> dict[str, Any]:
         "started": when(manifest),
         "labels": list(labels_of([*content.tables.values()])),
         "summary": content.summary,
-        "doubts": chapter.doubts,
+        "caveats": chapter.caveats,
         "warnings": manifest.get("warnings", []),
         "tables": main,
         "more": [table for name, table in content.tables.items() if name not in content.main],

@@ -108,7 +108,7 @@ def chunk(request_id: str, delta: dict[str, str], finish_reason: str | None = No
     return {"id": request_id, "object": "chat.completion.chunk", "model": "s2a", "choices": choices, **extra}
 
 
-def remote_to_json(remote: Remote) -> dict[str, Any]:
+def remote_json(remote: Remote) -> dict[str, Any]:
     """Turn a server's marks into what the last event carries."""
     return asdict(remote)
 

@@ -214,7 +214,7 @@ def _respond(
                 }
             ],
             "usage": _usage(trace, len(whole)),
-            "s2a": own.remote_to_json(trace.to_remote()),
+            "s2a": own.remote_json(trace.to_remote()),
         }
     )
 
@@ -269,7 +269,7 @@ def _events(request: Request, tokens: Iterator[Token], trace: Trace, codec: own.
         return
     finish = own.chunk(request.id, {}, _finish_reason(request, count))
     yield b"data: " + codec.dumps(finish) + b"\n\n"
-    remote = own.remote_to_json(trace.to_remote())
+    remote = own.remote_json(trace.to_remote())
     last = own.chunk(request.id, {}, usage=_usage(trace, count), s2a=remote)
     yield b"data: " + codec.dumps(last) + b"\n\ndata: [DONE]\n\n"
 

@@ -10,7 +10,7 @@ from scipy.stats import binomtest
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments.model_validity.rows import VALIDITY, ValidityRow
-from s2a_bench.experiments.model_validity.view import Share, arms_of, validity_tables, validity_to_json
+from s2a_bench.experiments.model_validity.view import Share, arms_of, validity_json, validity_tables
 from s2a_bench.store.run import Run, RunWriter, read_run
 
 PAPER = {
@@ -80,11 +80,11 @@ def test_the_tables_show_both_and_say_what_is_dummy_and_cut(tmp_path: Path) -> N
 def test_a_real_model_is_not_called_a_dummy(tmp_path: Path) -> None:
     run = run_of(tmp_path, *ROWS)
     assert "DUMMY" not in " ".join(validity_tables(run)["validity"].notes)
-    assert {cell["dummy"] for cell in validity_to_json(run)["cells"]} == {False}
+    assert {cell["dummy"] for cell in validity_json(run)["cells"]} == {False}
 
 
 def test_an_arm_without_a_line_has_no_share_in_json(tmp_path: Path) -> None:
-    (cell,) = validity_to_json(run_of(tmp_path, row(grammar=False, lines=0, skills=0)))["cells"]
+    (cell,) = validity_json(run_of(tmp_path, row(grammar=False, lines=0, skills=0)))["cells"]
     assert "share" not in cell
     assert (cell["as_ordered"], cell["as_ordered_share"]) == (0, 0.0)
 

@@ -17,7 +17,7 @@ from matplotlib.patches import Rectangle
 
 from s2a_bench.experiments.paper import paper_throughput
 from s2a_bench.experiments.throughput.rows import REFERENCE, ReferenceRow
-from s2a_bench.experiments.throughput.view.as_json import throughput_to_json
+from s2a_bench.experiments.throughput.view.as_json import throughput_json
 from s2a_bench.experiments.throughput.view.cells import BIN, Speed, ratios_of, speeds_of
 from s2a_bench.experiments.throughput.view.figures import (
     PAPER_LABEL,
@@ -114,7 +114,7 @@ def test_a_server_that_tells_nothing_has_the_clients_rate_and_no_zeros(make: Mak
     for absent in ("prompt_ms", "image_ms", "prompt_eval_ms", "prefill_tokens_per_s", "tokens_per_joule"):
         assert speed.values(absent).size == 0
     assert "the server does not tell T_eval" in " ".join(speed_table(run).notes)
-    (cell,) = throughput_to_json(run)["cells"]
+    (cell,) = throughput_json(run)["cells"]
     assert cell["t_eval"] == "client"
     assert not {"prompt_ms", "image_ms", "tokens_per_joule"} & set(cell)
 
@@ -131,7 +131,7 @@ def test_warm_ups_are_in_no_number(make: Make) -> None:
     run = make({"in-process": [10] * 3}, n=2, reference=[1.0, 80.0, 90.0])
     assert only(run).cell.n == 2
     assert only(run).cell.itl_ms().size == 6
-    reference = throughput_to_json(run)["reference"]
+    reference = throughput_json(run)["reference"]
     assert reference["decode_tokens_per_s"]["n"] == 2
     assert reference["decode_tokens_per_s"]["mean"] == pytest.approx(85.0)
     assert reference["depths"] == [42]
@@ -181,7 +181,7 @@ def test_the_json_is_strict_and_valid(make: Make) -> None:
     told = {"in-process": {**facts, "energy_j": 3.0}}
     gaps = {"in-process": [10.0] * 69, "http/as-deployed": [11.0] * 69}
     run = make(gaps, facts=told, reference=[9.0, 99.0, 98.0, 97.0], reference_command=["x"])
-    whole = json.loads(json.dumps(throughput_to_json(run), allow_nan=False))
+    whole = json.loads(json.dumps(throughput_json(run), allow_nan=False))
     jsonschema.validate(whole, SCHEMA, cls=jsonschema.Draft202012Validator)
     cell = whole["cells"][0]
     assert cell["tokens_per_s"]["mean"] == pytest.approx(100.0)

@@ -15,7 +15,7 @@ from matplotlib.patches import Rectangle
 
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows, token_rows
-from s2a_bench.experiments.timeline.view.as_json import timelines_to_json
+from s2a_bench.experiments.timeline.view.as_json import timelines_json
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.chrome_trace import to_trace, write_trace
 from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours, write_timeline_figures
@@ -266,7 +266,7 @@ def test_csv_keeps_every_digit_and_leaves_out_what_is_absent(computed: Run) -> N
 
 
 def test_json_has_no_key_for_what_a_live_run_does_not_know(live: Run) -> None:
-    cells = timelines_to_json(live)["cells"]
+    cells = timelines_json(live)["cells"]
     assert all("prompt_s" not in cell and "caution" not in cell for cell in cells)
     assert [cell["emulated"] for cell in cells] == [False] * 3
     assert [cell["mode"] for cell in cells] == ["live"] * 3

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
 
-def to_json(run: Run) -> dict[str, Any]:
+def latency_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
     cells = cells_of(run)
     found = ratios(cells, seed_of(run))

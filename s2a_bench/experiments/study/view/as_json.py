@@ -18,7 +18,7 @@ JUDGED = "targets"
 """The study that has limits to keep."""
 
 
-def study_to_json(run: Run) -> dict[str, Any]:
+def study_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints, as docs/schema/s2a-bench-1.json describes it."""
     rows = run.table(STUDIES)
     online = rows[rows["policy"] == ONLINE]

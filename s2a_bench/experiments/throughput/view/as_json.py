@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
 
-def throughput_to_json(run: Run) -> dict[str, Any]:
+def throughput_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
     speeds = speeds_of(run)
     ratios = [ratio_entry(RATIO_METRIC, of, to, ratio) for of, to, ratio in ratios_of(run, speeds)]

@@ -17,11 +17,12 @@ from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.plan import plan_cells
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Measured, Place, Session
-from s2a_bench.harness.warnings import Doubt, before_run
+from s2a_bench.harness.warnings import before_run
 from s2a_bench.inference.models import resolve
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.progress import Progress
 from s2a_bench.runtime.feed import PlanFeed
+from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, open_client
@@ -31,7 +32,7 @@ LATE = 1.05
 """An answer that takes so many times what the pace allows was not paced, but slow."""
 
 
-class Tap:
+class Tee:
     """A client whose tokens are also told to whoever executes the plan."""
 
     def __init__(self, client: Client) -> None:
@@ -86,7 +87,7 @@ class Link:
     """As `word` returned it."""
     writer: RunWriter
     progress: Progress
-    doubts: list[Doubt] = field(default_factory=list)
+    warnings: list[RunWarning] = field(default_factory=list)
     blocks: Iterator[int] = field(default_factory=count)
     facts: dict[str, Any] = field(default_factory=dict)
     """What the engine says about itself."""
@@ -100,7 +101,7 @@ class Link:
         requests = self.config.requests
         (transport,) = requests.transports
         uses_dds = transport == "ros"
-        self.doubts += before_run(requests.width, requests.height, uses_dds=uses_dds)
+        self.warnings += before_run(requests.width, requests.height, uses_dds=uses_dds)
         self.progress.stage(f"starting the {transport} server")
         self.servers = ServerSet(requests, stack, self.writer.path)
         facts = self.servers.start()
@@ -108,7 +109,7 @@ class Link:
         (self.cell,) = plan_cells(requests, self.servers.addresses)
         with self.servers.death_explained(transport):
             client = open_client(self.cell.route, self.servers.alive(transport))
-        self.tap = stack.enter_context(closing(Tap(client)))
+        self.tee = stack.enter_context(closing(Tee(client)))
         self.feed = RequestFeed(source, preencoded=requests.payload == "jpeg-preencoded")
         self.rate = requests.engine.pace or None
         self.writer.update(
@@ -157,8 +158,8 @@ class Link:
             max_tokens=ask.max_tokens,
             seed=requests.seed + plan,
         )
-        self.tap.plan = feed
-        session = Session(self.cell, self.tap, self.feed, asked)
+        self.tee.plan = feed
+        session = Session(self.cell, self.tee, self.feed, asked)
         measured = session.measure(Place(next(self.blocks), 0, warmup=feed is None))
         if feed is not None:  # the executors' times: the harness sees a token some microseconds later
             tokens = [replace(row, client_ns=at_ns) for row, at_ns in zip(measured.tokens, feed.token_ns, strict=False)]
@@ -175,7 +176,7 @@ class Link:
         return measured
 
     def saw(self, token_ns: Sequence[int]) -> None:
-        """Learn the rate from an answer if nobody set it, and doubt the pace where the model was slower."""
+        """Learn the rate from an answer if nobody set it, and warn where the model was slower."""
         if len(token_ns) < 2:  # noqa: PLR2004 - no gap
             return
         came = (len(token_ns) - 1) / (token_ns[-1] - token_ns[0]) * 1e9
@@ -183,7 +184,9 @@ class Link:
         pace = self.config.requests.engine.pace
         if pace and came * LATE < pace:
             what = f"{came:.3g} tokens/s came, not the {pace:g} of --pace: the model is slower"
-            self.doubts.append(Doubt("pace-missed", what, "stop what else runs, try --threads 1, or a lower --pace"))
+            self.warnings.append(
+                RunWarning("pace-missed", what, "stop what else runs, try --threads 1, or a lower --pace")
+            )
 
     def require_answers(self) -> None:
         """Raise TransportError where no plan came as it should."""

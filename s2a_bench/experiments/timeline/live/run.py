@@ -126,7 +126,7 @@ class _Live:
         token_ns = max((record.token_ns for record in records), key=len)
         self.link.saw(token_ns)
         setting = self._setting(ask, self.link.rate or 0.0)
-        self.link.doubts += keep(self.link.writer, setting, plan, request_id, policies, records)
+        self.link.warnings += keep(self.link.writer, setting, plan, request_id, policies, records)
 
     def _setting(self, ask: Ask, rate: float) -> Setting:
         return Setting(
@@ -151,5 +151,5 @@ class _Live:
     def conclude(self) -> None:
         """Write what is said of the whole run."""
         self.link.writer.update(
-            start_jitter=jitter_facts(self.records), warnings=[doubt.to_manifest() for doubt in self.link.doubts]
+            start_jitter=jitter_facts(self.records), warnings=[warning.to_manifest() for warning in self.link.warnings]
         )

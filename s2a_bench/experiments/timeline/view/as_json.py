@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 _ABOUT = ("cell", "policy", "tokens_per_s", "prompt_s", "tokens_per_skill", "n_skills", "t_nom_s", "mode", "emulated")
 
 
-def timelines_to_json(run: Run) -> dict[str, Any]:
+def timelines_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints, as docs/schema/s2a-bench-1.json describes it."""
     executed = {name: run.manifest[name] for name in ("live", "start_jitter") if run.manifest.get(name)}
     return frame(run, [_cell(cell) for cell in timelines_of(run)], [], **executed)

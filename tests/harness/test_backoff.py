@@ -6,8 +6,8 @@ import pytest
 
 from s2a_bench.clock import VirtualClock
 from s2a_bench.frames import open_source
+from s2a_bench.harness.backoff import Backoff
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.patience import Patience
 from s2a_bench.harness.plan import Cell, LatencyConfig
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.transport import Route, open_client
@@ -18,7 +18,7 @@ from tests.servers.speakers import Cloud
 @pytest.mark.parametrize(("asked_s", "waited_s"), [(0.0, 0), (1.5, 1.5), (60.0, 60), (3600.0, 60)])
 def test_the_wait_is_what_was_asked_up_to_a_minute(asked_s: float, waited_s: float) -> None:
     clock, said = VirtualClock(5), []
-    Patience(clock, said.append).wait("http/as-deployed", asked_s)
+    Backoff(clock, said.append).wait("http/as-deployed", asked_s)
     assert clock.now_ns() - 5 == waited_s * 1e9
     assert said == ([f"waiting {waited_s:g} s, as the server of http/as-deployed asks"] if asked_s else [])
 

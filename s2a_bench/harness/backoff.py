@@ -10,7 +10,7 @@ LONGEST_S = 60.0
 """The longest wait; a server that wants more refuses again after it, and soon ends the run that way."""
 
 
-class Patience:
+class Backoff:
     """Waits between samples, never inside one."""
 
     def __init__(self, clock: Clock, say: Callable[[str], None]) -> None:
