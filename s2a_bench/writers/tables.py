@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from s2a_bench.stats import Ratio, Summary
 
 
@@ -13,9 +15,34 @@ ABSENT = "\N{EN DASH}"
 """Stands where a cell does not have a stage or a ratio."""
 
 
+EMULATED, DUMMY, ECHO = "emulated", "dummy weights", "echo engine"
+PAPERS, ASSUMED, DRAWN = "paper's claim", "assumption", "drawn, not measured"
+"""Labels that several experiments give to their runs."""
+
+
+class Note(str):
+    """A note below a table. Its labels mark the run wherever runs are listed; a plain string is a note without any."""
+
+    __slots__ = ("labels",)
+    labels: tuple[str, ...]
+
+    def __new__(cls, text: str, *labels: str) -> Self:
+        """Label a text."""
+        note = super().__new__(cls, text)
+        note.labels = labels
+        return note
+
+    def sentence(self) -> Note:
+        """Return it as a sentence: a capital first, a full stop last."""
+        return Note(f"{self[0].upper()}{self[1:]}.", *self.labels)
+
+
 @dataclass(frozen=True, slots=True)
 class TextTable:
-    """One table: ``left`` columns of names, then columns of numbers; ``rules`` are the rows that a line precedes."""
+    """One table: ``left`` columns of names, then columns of numbers; ``rules`` are the rows that a line precedes.
+
+    ``notes`` are strings, or `Note` where they bear labels.
+    """
 
     title: str
     header: tuple[str, ...]

@@ -12,7 +12,7 @@ from s2a_bench.errors import StoreError
 from s2a_bench.experiments.model_validity.rows import VALIDITY
 from s2a_bench.policy.conformal import upper_bound
 from s2a_bench.writers.as_json import frame
-from s2a_bench.writers.tables import ABSENT, TextTable
+from s2a_bench.writers.tables import ABSENT, DUMMY, Note, TextTable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -171,7 +171,8 @@ def _notes(run: Run, arms: list[Arm]) -> Iterator[str]:
     yield "[]: 95 % Clopper-Pearson; for lines as if they were independent, which those of one answer are not."
     yield f"The first {run.manifest['configuration']['n_skills']} lines of an answer count. One prompt, no picture."
     if run.manifest["model"]["dummy"]:
-        yield "DUMMY WEIGHTS: without a grammar this is what chance gives; it says nothing about any real model."
+        chance = "DUMMY WEIGHTS: without a grammar this is what chance gives; it says nothing about any real model."
+        yield Note(chance, DUMMY)
     free = [arm for arm in arms if not arm.grammar]
     if cut := sum(arm.cut for arm in free):
         answers = sum(arm.answers for arm in free)

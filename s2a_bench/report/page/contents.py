@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.experiments import EXPERIMENTS
@@ -15,6 +15,7 @@ from s2a_bench.report.page.sentences import (
     throughput_sentences,
     timeline_sentences,
 )
+from s2a_bench.writers.tables import Note
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
@@ -101,21 +102,10 @@ CONTENTS: Final[dict[str, Callable[[Run, bool], Content]]] = {
 """Command, or its first word (study of study-drift), -> what its run shows."""
 
 
-LABELS: Final = {
-    "EMULATED": "emulated",
-    "dummy weights": "dummy weights",
-    "the paper's": "paper's claim",
-    "assumption": "assumption",
-    "are drawn": "drawn, not measured",
-    "echo engine": "echo engine",
-}
-"""Words of the tables' notes -> the label that the run carries on the page."""
-
-
-def labels_of(tables: Sequence[TextTable]) -> Iterator[str]:
-    """Yield the labels that a run carries, since its tables do."""
-    text = " ".join(note for table in tables for note in table.notes).lower()
-    yield from (label for word, label in LABELS.items() if word.lower() in text)
+def labels_of(tables: Iterable[TextTable]) -> list[str]:
+    """Return the labels that a run carries, since the notes of its tables do."""
+    notes = [note for table in tables for note in table.notes if isinstance(note, Note)]
+    return list(dict.fromkeys(label for note in notes for label in note.labels))
 
 
 def _plain(rows: object) -> Iterator[tuple[object, ...]]:

@@ -67,7 +67,7 @@ def measured_table(runs: Runs) -> TextTable | None:
     if not rows:
         return None
     header = ("settings", "cell", "what", "host", "n", "errors", "mean ± sd", "median", "p99")
-    notes = sorted({f"{note[0].upper()}{note[1:]}." for _, run in runs if (note := engine_note(run, cells_of(run)))})
+    notes = sorted({note.sentence() for _, run in runs if (note := engine_note(run, cells_of(run)))})
     return TextTable("Measured cells side by side", header, rows, 4, notes=tuple(notes))
 
 

@@ -7,6 +7,7 @@ from s2a_bench.experiments.latency.view.cells import cells_of, engine_note, grou
 from s2a_bench.stats import summary_of
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run
+from s2a_bench.writers.tables import Note
 
 MakeRun = Callable[..., Run]
 HAND = {
@@ -116,16 +117,17 @@ def test_a_black_box_has_no_ratio_without_inference(make_run: MakeRun, black_box
 
 
 def test_what_did_not_really_answer_is_said(make_run: MakeRun) -> None:
-    def note(**facts: Any) -> str:
+    def note(**facts: Any) -> Note:
         run = make_run(HAND, n=1, **facts)
         return engine_note(run, cells_of(run))
 
-    assert note() == "echo engine"
+    assert (note(), note().labels) == ("echo engine", ("echo engine",))
     assert note(engine="replay") == "EMULATED: replayed profile"
     played = {"profile": "agx", "gaps": "trace", "origin": "measured", "dummy": True}
     assert note(engine="replay", manifest={"model": played}) == (
         "EMULATED: replayed profile agx (trace gaps, recorded with dummy weights)"
     )
+    assert note(engine="replay", manifest={"model": played}).sentence().labels == ("emulated", "dummy weights")
     played |= {"gaps": "constant", "origin": "paper", "dummy": False}
     assert note(engine="replay", manifest={"model": played}) == (
         "EMULATED: replayed profile agx (constant gaps, the paper's rate)"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.writers.as_json import frame
 from s2a_bench.writers.csv_text import csv_text
-from s2a_bench.writers.tables import ABSENT, TextTable, number
+from s2a_bench.writers.tables import ABSENT, EMULATED, PAPERS, Note, TextTable, number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -134,5 +134,6 @@ def _notes(run: Run) -> tuple[str, ...]:
     else:
         notes.append(f"Formula and trial agree at {points - disagreements(run)} of {points} points.")
     if any(board["origin"] == "paper" for board in run.manifest["boards"]):
-        notes.append("EMULATED: the boards' rates are the paper's (table II); nothing was measured here.")
+        rates = "EMULATED: the boards' rates are the paper's (table II); nothing was measured here."
+        notes.append(Note(rates, EMULATED, PAPERS))
     return tuple(notes)

@@ -15,6 +15,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 )
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.words import SAID, law
+from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
@@ -47,28 +48,29 @@ def origin_notes(run: Run) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def tokens_line(run: Run) -> str:
+def tokens_line(run: Run) -> Note:
     """Say in one line where the tokens come from."""
     if (live := run.manifest.get("live")) is None:
-        return f"EMULATED tokens, {run.manifest['boards'][0]['tokens_per_s']:g}/s."
+        return Note(f"EMULATED tokens, {run.manifest['boards'][0]['tokens_per_s']:g}/s.", EMULATED)
     kind = "EMULATED (replayed)" if live["emulated"] else "LIVE"
     pace = live.get("paced_tokens_per_s")
     paced = f", paced to {pace:g} tokens/s (the rate is set)" if pace else ""
-    return f"{kind} tokens over {live['transport']}{paced}; car simulated."
+    line = f"{kind} tokens over {live['transport']}{paced}; car simulated."
+    return Note(line, *([EMULATED] if live["emulated"] else []))
 
 
 def _live_notes(run: Run) -> list[str]:
     """Say what is real of a run on a model's tokens, and what is not."""
     live = run.manifest["live"]
     rate = rollouts_of(run, "point")["tokens_per_s"].iloc[0]
-    notes = [tokens_line(run)]
+    line = tokens_line(run)
     if "paced_tokens_per_s" not in live:
-        notes = [f"{notes[0]} {rate:g} tokens/s came."]
-    notes.append("Open loop: one request at t = 0 about the rendered scene; the road does not change the answer.")
+        line = Note(f"{line} {rate:g} tokens/s came.", *line.labels)
+    road = "Open loop: one request at t = 0 about the rendered scene; the road does not change the answer."
     driven = "the set-points driven are those of the scenario."
-    dummy = f"Dummy weights: what the plan says means nothing; {driven}"
-    notes.append(dummy if live.get("dummy") else f"What the plan says is not driven; {driven}")
-    return notes
+    if live.get("dummy"):
+        return [line, road, Note(f"Dummy weights: what the plan says means nothing; {driven}", DUMMY)]
+    return [line, road, f"What the plan says is not driven; {driven}"]
 
 
 def _emulated_notes(run: Run) -> list[str]:
@@ -76,9 +78,10 @@ def _emulated_notes(run: Run) -> list[str]:
     board = run.manifest["boards"][0]
     rates = {"paper": "the paper's rate (table II)", "measured": "a measured rate", "given": "a rate as given"}
     rate = f"{rates[board['origin']]}, {board['tokens_per_s']:g}/s"
-    notes = [f"EMULATED: no model answered; tokens come evenly at {rate}."]
+    papers = [PAPERS] if board["origin"] == "paper" else []
+    notes: list[str] = [Note(f"EMULATED: no model answered; tokens come evenly at {rate}.", EMULATED, *papers)]
     if board["prompt_origin"] == "assumed":
-        notes.append(f"c = {board['prompt_s']:g} s before decoding is an assumption of ours.")
+        notes.append(Note(f"c = {board['prompt_s']:g} s before decoding is an assumption of ours.", ASSUMED))
     return notes
 
 

@@ -21,7 +21,7 @@ from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.words import ORDERING, SAID, law, operating_point
 from s2a_bench.writers.as_json import frame
 from s2a_bench.writers.csv_text import csv_text
-from s2a_bench.writers.tables import ABSENT, TextTable, number
+from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, number
 
 if TYPE_CHECKING:
     from s2a_bench.experiments import Metric
@@ -133,7 +133,7 @@ def _study(run: Run, study: str, gap: str) -> dict[str, Any]:
 
 def _ordering_notes() -> tuple[str, ...]:
     return (
-        ORDERING,
+        Note(ORDERING, PAPERS),
         "Worse, better: than stream-to-act, by an impact more than 0.5 m/s faster or slower; behind: from there alone.",
     )
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import ratio_of_blocks
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT, STAGES
+from s2a_bench.writers.tables import DUMMY, ECHO, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
     import numpy as np
@@ -139,26 +140,27 @@ def seed_of(run: Run) -> int:
     return int(run.manifest.get("seeds", {}).get("bootstrap") or 0)
 
 
-def engine_note(run: Run, cells: list[Cell]) -> str:
+def engine_note(run: Run, cells: list[Cell]) -> Note:
     """Say what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
     engines = {cell.about["engine"] for cell in cells}
     notes = []
     if "echo" in engines:
-        notes.append("echo engine")
+        notes.append(Note("echo engine", ECHO))
     if "replay" in engines:
         notes.append(_emulated(run.manifest.get("model") or {}))
     if "llama" in engines and (run.manifest.get("model") or {}).get("dummy"):
-        notes.append("dummy weights")
-    return ", ".join(notes)
+        notes.append(Note("dummy weights", DUMMY))
+    return Note(", ".join(notes), *(label for note in notes for label in note.labels))
 
 
-def _emulated(model: dict[str, Any]) -> str:
+def _emulated(model: dict[str, Any]) -> Note:
     """Say which board was played, how, and where its rate is from."""
     note = f"EMULATED: replayed profile {model.get('profile', '')}".rstrip()
-    said = [f"{model['gaps']} gaps"] if "gaps" in model else []
-    said += ["the paper's rate"] if model.get("origin") == "paper" else []
-    said += ["recorded with dummy weights"] if model.get("dummy") else []
-    return f"{note} ({', '.join(said)})" if said else note
+    said = [Note(f"{model['gaps']} gaps")] if "gaps" in model else []
+    said += [Note("the paper's rate", PAPERS)] if model.get("origin") == "paper" else []
+    said += [Note("recorded with dummy weights", DUMMY)] if model.get("dummy") else []
+    labels = (label for more in said for label in more.labels)
+    return Note(f"{note} ({', '.join(said)})" if said else note, EMULATED, *labels)
 
 
 def groups_present(cells: list[Cell]) -> list[str]:

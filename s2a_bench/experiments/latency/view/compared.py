@@ -31,7 +31,7 @@ def subject_of(cell: Cell, rows: Callable[[str], Rows]) -> Subject:
 def origin_of(run: Run) -> list[str]:
     """Say what did not really answer the requests of a run."""
     note = engine_note(run, cells_of(run))
-    return [f"{note[0].upper()}{note[1:]}."] if note else []
+    return [note.sentence()] if note else []
 
 
 def token_rows(cell: Cell, name: str) -> Rows | None:

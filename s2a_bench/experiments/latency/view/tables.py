@@ -152,4 +152,4 @@ def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
 def _engine_notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
     """Say what did not really answer, as a sentence."""
     note = engine_note(run, cells)
-    return (f"{note[0].upper()}{note[1:]}.",) if note else ()
+    return (note.sentence(),) if note else ()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments.study.rows import STUDIES
 from s2a_bench.policy.conformal import upper_bound
-from s2a_bench.writers.tables import ABSENT, TextTable
+from s2a_bench.writers.tables import ABSENT, DRAWN, Note, TextTable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,7 +89,7 @@ def _targets(rows: pd.DataFrame) -> Iterator[TextTable]:
     lines: list[tuple[str, ...]] = [
         (each.what, f"{each.value:.2%}", f"{each.limit:.0%}", "met" if each.met else "MISSED") for each in judged
     ]
-    note = f"{len(online)} settings, {int(online['plans'].sum()):,} plans. {_DRAWN}"
+    note = Note(f"{len(online)} settings, {int(online['plans'].sum()):,} plans. {_DRAWN}", DRAWN)
     yield TextTable(f"Targets of {ONLINE}", ("", "reached", "wanted", ""), lines, 1, notes=(note,))
     columns = {
         "P(stall)": "p_any_stall",
@@ -132,7 +132,7 @@ def _frontier(rows: pd.DataFrame) -> Iterator[TextTable]:
         )
         for _, points in rows.groupby([*WORLD, "family", "policy"], sort=False)
     ]
-    notes = (f"Start regret over S0 where that share of the plans stalls. {_DRAWN}",)
+    notes = (Note(f"Start regret over S0 where that share of the plans stalls. {_DRAWN}", DRAWN),)
     yield TextTable("Frontier: what rare stalls cost", header, lines, 7, notes=notes)
 
 
@@ -151,7 +151,7 @@ def _drift(rows: pd.DataFrame) -> Iterator[TextTable]:
     ]
     notes = (
         "P(any stall) in one stretch of plans after the other; the drift begins with the third of eight.",
-        f"late start: mean start regret over S0. {_DRAWN}",
+        Note(f"late start: mean start regret over S0. {_DRAWN}", DRAWN),
     )
     yield TextTable("Drift", header, lines, 6, notes=notes)
 
@@ -164,7 +164,9 @@ def _misfit(rows: pd.DataFrame) -> Iterator[TextTable]:
         (*_world(row), str(row["condition"]), _caution(row), *(f"{row[name]:.1%}" for name in names))
         for _, row in rows.iterrows()
     ]
-    yield TextTable("Wrong beliefs", header, lines, 6, notes=(f"Calibrated with the right ones. {_DRAWN}",))
+    yield TextTable(
+        "Wrong beliefs", header, lines, 6, notes=(Note(f"Calibrated with the right ones. {_DRAWN}", DRAWN),)
+    )
 
 
 _TABLES: Final[dict[str, Callable[[pd.DataFrame], Iterator[TextTable]]]] = {

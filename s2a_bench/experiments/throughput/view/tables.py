@@ -147,7 +147,7 @@ def _notes(run: Run, speeds: list[Speed]) -> tuple[str, ...]:
         facts.append(f"sampling of our engine: {sampling}")
     notes.append(f"{', '.join(facts)}.")
     if note := engine_note(run, [speed.cell for speed in speeds]):
-        notes.append(f"{note[0].upper()}{note[1:]}.")
+        notes.append(note.sentence())
     if depths := reference_depths(run):
         notes.append(
             f"{LLAMA_BENCH} decodes behind {', '.join(map(str, depths))} tokens, as our requests do; "

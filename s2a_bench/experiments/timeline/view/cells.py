@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.stats import summary_of
 from s2a_bench.store.requests import TOKENS
+from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -144,16 +145,19 @@ def origin_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
         }
         whose = [rates[origin] for origin in dict.fromkeys(board["origin"] for board in boards)]
         virtual = all(cell.about("mode") == "virtual" for cell in cells)
-        notes.append(
+        emulated = (
             f"EMULATED{' in virtual time' if virtual else ', executed in real time'}: no model answered; tokens come "
             f"at {' and '.join(whose) or 'given rates'}, {_jitter(run)}."
         )
+        papers = [PAPERS] if any(board["origin"] == "paper" for board in boards) else []
+        notes.append(Note(emulated, EMULATED, *papers))
     notes += _live_notes(run)
     if assumed := [board for board in boards if board["prompt_origin"] == "assumed"]:
         listed = ", ".join(f"{board['prompt_s']:g}" for board in assumed)
-        notes.append(
+        shift = (
             f"c = {listed} s before decoding is an assumption of ours: it shifts all policies of a board by as much."
         )
+        notes.append(Note(shift, ASSUMED))
     return tuple(notes)
 
 
@@ -163,7 +167,7 @@ def _jitter(run: Run) -> str:
     return {"none": "evenly", "profile": "with the profiles' jitter"}.get(jitter, f"with jitter {jitter}")
 
 
-def _live_notes(run: Run) -> list[str]:
+def _live_notes(run: Run) -> list[Note]:
     """Say what is real in a live run, and what is not."""
     live = run.manifest.get("live")
     if not live:
@@ -177,7 +181,8 @@ def _live_notes(run: Run) -> list[str]:
     whose = "tokens of a server that runs already" if live["engine"] == "unknown" else "real tokens"
     tokens = "EMULATED tokens" if live["emulated"] else f"LIVE: {whose}"
     how = f"parsed and executed as they arrive, {grammar}; {robot}"
-    return [f"{tokens} over {live['transport']}{paced}, {how}.{dummy}"]
+    labels = [*([EMULATED] if live["emulated"] else []), *([DUMMY] if dummy else [])]
+    return [Note(f"{tokens} over {live['transport']}{paced}, {how}.{dummy}", *labels)]
 
 
 def jitter_notes(run: Run) -> tuple[str, ...]:
