@@ -1,4 +1,4 @@
-"""What every middleware's actions promise: subclass `ActionContract` and say how to join a domain.
+"""What every middleware's actions promise: subclass `ActionSuite` and say how to join a domain.
 
 Client and server are driven by turns on the test's own thread: both pull.
 """
@@ -84,7 +84,7 @@ def text_of(client: ActionClient, got: Feedback) -> str:
     return str(client.unpack_feedback(got.packed).partial_response.text)
 
 
-class ActionContract:
+class ActionSuite:
     """Run by every implementation."""
 
     @pytest.fixture

@@ -1,6 +1,6 @@
 """What every FrameSource promises: one suite, run by each implementation with itself as the subject.
 
-A test module takes part by subclassing `FrameSourceContract` as a class named ``Test...`` and overriding the
+A test module takes part by subclassing `FrameSourceSuite` as a class named ``Test...`` and overriding the
 fixture ``make_source``.
 """
 
@@ -21,7 +21,7 @@ CHANNELS = {"yuv422_yuy2": (2,), "bgr8": (3,), "rgb8": (3,), "mono8": ()}
 SIZES = [(64, 48), (98, 30)]
 
 
-class FrameSourceContract:
+class FrameSourceSuite:
     @pytest.fixture
     def make_source(self) -> MakeSource:
         raise NotImplementedError

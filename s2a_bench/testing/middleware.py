@@ -1,4 +1,4 @@
-"""What every middleware promises: subclass `MiddlewareContract` and say how to join a domain."""
+"""What every middleware promises: subclass `MiddlewareSuite` and say how to join a domain."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def wait_matched(publisher: Publisher, subscription: Subscription) -> None:
         subscription.take(0.01)
 
 
-class MiddlewareContract:
+class MiddlewareSuite:
     """Run by every implementation."""
 
     @pytest.fixture

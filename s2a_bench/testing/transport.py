@@ -1,4 +1,4 @@
-"""What every transport promises, as one suite: subclass `TransportContract` and say how to connect."""
+"""What every transport promises, as one suite: subclass `TransportSuite` and say how to connect."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def ask(client: Client, request: Request) -> tuple[list[Token], Trace]:
     return list(client.request(request, trace)), trace
 
 
-class TransportContract:
+class TransportSuite:
     """Run by every transport and variant. Override `connect`; say what its wire does not carry."""
 
     lossless = True

@@ -17,7 +17,7 @@ from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.frames import open_source
 from s2a_bench.frames.bag import COMPRESSED_IMAGE, IMAGE, Recording
 from s2a_bench.frames.convert import yuyv_to_bgr
-from s2a_bench.testing.frame_source import FrameSourceContract, MakeSource
+from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 SHAPES = {"yuv422_yuy2": (48, 64, 2), "bgr8": (48, 64, 3), "rgb8": (48, 64, 3), "mono8": (48, 64)}
@@ -75,14 +75,14 @@ def opened() -> Iterator[Open]:
         yield opened
 
 
-class TestContract(FrameSourceContract):
+class TestContract(FrameSourceSuite):
     @pytest.fixture(params=list(SHAPES))
     def make_source(self, request: pytest.FixtureRequest, tmp_path: Path) -> MakeSource:
         where = str(record(tmp_path / "bag", camera(request.param)))
         return lambda width, height: Recording(where, width, height)
 
 
-class TestCompressedContract(FrameSourceContract):
+class TestCompressedContract(FrameSourceSuite):
     @pytest.fixture
     def make_source(self, tmp_path: Path) -> MakeSource:
         messages = [("/c", COMPRESSED_IMAGE, compressed(cv2.imencode(".png", p)[1])) for p in pictures("bgr8")]

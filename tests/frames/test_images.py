@@ -11,7 +11,7 @@ from s2a_bench.errors import SourceError
 from s2a_bench.frames import images
 from s2a_bench.frames.convert import encode_jpeg, encode_png
 from s2a_bench.frames.images import ImageFolder
-from s2a_bench.testing.frame_source import FrameSourceContract, MakeSource
+from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-class TestContract(FrameSourceContract):
+class TestContract(FrameSourceSuite):
     @pytest.fixture
     def make_source(self, folder: Path) -> MakeSource:
         return lambda width, height: ImageFolder(str(folder), width, height)

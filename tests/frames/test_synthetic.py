@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from s2a_bench.errors import UsageError
 from s2a_bench.frames.convert import decode_image, encode_jpeg, to_bgr
 from s2a_bench.frames.synthetic import SyntheticCamera
-from s2a_bench.testing.frame_source import FrameSourceContract, MakeSource
+from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 from s2a_bench.types import Frame
 
 
-class TestContract(FrameSourceContract):
+class TestContract(FrameSourceSuite):
     @pytest.fixture
     def make_source(self) -> MakeSource:
         return lambda width, height: SyntheticCamera("", width, height)

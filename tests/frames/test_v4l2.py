@@ -16,7 +16,7 @@ from s2a_bench.clock import VirtualClock, now_ns
 from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.frames import v4l2
 from s2a_bench.frames.v4l2 import CAN_CAPTURE, CAPABILITY, HAS_DEVICE_CAPS, V4L2Camera
-from s2a_bench.testing.frame_source import FrameSourceContract, MakeSource
+from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 
 MS = 1_000_000
 YUYV, MJPG = (cv2.VideoWriter.fourcc(*code) for code in ("YUYV", "MJPG"))
@@ -83,7 +83,7 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> Driver:
     return driver
 
 
-class TestContract(FrameSourceContract):
+class TestContract(FrameSourceSuite):
     @pytest.fixture
     def make_source(self, driver: Driver) -> MakeSource:
         def make(width: int, height: int) -> V4L2Camera:

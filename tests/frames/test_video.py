@@ -11,7 +11,7 @@ import pytest
 
 from s2a_bench.errors import SourceError
 from s2a_bench.frames.video import VideoFile
-from s2a_bench.testing.frame_source import FrameSourceContract, MakeSource
+from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 
 GREYS = [40, 80, 120, 160]
 
@@ -27,7 +27,7 @@ def clip(tmp_path: Path) -> str:
     return path
 
 
-class TestContract(FrameSourceContract):
+class TestContract(FrameSourceSuite):
     @pytest.fixture
     def make_source(self, clip: str) -> MakeSource:
         return lambda width, height: VideoFile(clip, width, height)

@@ -17,7 +17,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import Accepted, Feedback, Middleware, Rejected, Result, llama, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.testing.action import NAME, ActionContract, event, offer, receive, send, start, text_of
+from s2a_bench.testing.action import NAME, ActionSuite, event, offer, receive, send, start, text_of
 from s2a_bench.testing.middleware import Join
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
@@ -44,7 +44,7 @@ def join(dds_domain: int) -> Iterator[Join]:
         yield join
 
 
-class TestCycloneActions(ActionContract):
+class TestCycloneActions(ActionSuite):
     @pytest.fixture
     def join(self, join: Join) -> Join:
         return join

@@ -10,12 +10,12 @@ import pytest
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import MIDDLEWARES, Middleware, QoS, open_middleware
 from s2a_bench.ros.messages import type_hash
-from s2a_bench.testing.middleware import Join, MiddlewareContract
+from s2a_bench.testing.middleware import Join, MiddlewareSuite
 
 cyclonedds = pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
 
-class TestCyclone(MiddlewareContract):
+class TestCyclone(MiddlewareSuite):
     @pytest.fixture
     def join(self, dds_domain: int) -> Iterator[Join]:
         with ExitStack() as stack:

@@ -8,8 +8,8 @@ from contextlib import ExitStack
 import pytest
 
 from s2a_bench.ros import Middleware, open_middleware
-from s2a_bench.testing.action import ActionContract
-from s2a_bench.testing.middleware import Join, MiddlewareContract
+from s2a_bench.testing.action import ActionSuite
+from s2a_bench.testing.middleware import Join, MiddlewareSuite
 
 pytest.importorskip("rclpy", reason="rclpy comes with ROS 2, not from PyPI")
 
@@ -26,13 +26,13 @@ def rclpy_join(dds_domain: int) -> Iterator[Join]:
         yield join
 
 
-class TestRclpy(MiddlewareContract):
+class TestRclpy(MiddlewareSuite):
     @pytest.fixture
     def join(self, rclpy_join: Join) -> Join:
         return rclpy_join
 
 
-class TestRclpyActions(ActionContract):
+class TestRclpyActions(ActionSuite):
     @pytest.fixture
     def join(self, rclpy_join: Join) -> Join:
         pytest.importorskip("llama_msgs.action", reason="the workspace has no llama_msgs")

@@ -29,8 +29,8 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Result, default_middleware, llama, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Goals, Status
-from s2a_bench.testing.action import NAME, ActionContract
-from s2a_bench.testing.middleware import Join, MiddlewareContract
+from s2a_bench.testing.action import NAME, ActionSuite
+from s2a_bench.testing.middleware import Join, MiddlewareSuite
 from s2a_bench.types import Frame
 
 GRAPH: list[Node] = []
@@ -339,13 +339,13 @@ def rclpy_join() -> Iterator[Join]:
     assert GRAPH == []
 
 
-class TestRclpyGlue(MiddlewareContract):
+class TestRclpyGlue(MiddlewareSuite):
     @pytest.fixture
     def join(self, rclpy_join: Join) -> Join:
         return rclpy_join
 
 
-class TestRclpyActionGlue(ActionContract):
+class TestRclpyActionGlue(ActionSuite):
     @pytest.fixture
     def join(self, rclpy_join: Join) -> Join:
         return rclpy_join

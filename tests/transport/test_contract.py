@@ -9,7 +9,7 @@ from threading import Thread
 
 import pytest
 
-from s2a_bench.testing.transport import Connect, TransportContract
+from s2a_bench.testing.transport import Connect, TransportSuite
 from s2a_bench.transport import Client, Handler, Route, open_client, open_server
 
 
@@ -30,7 +30,7 @@ def connector(route: Route) -> Iterator[Connect]:
         yield connect
 
 
-class TestLoopback(TransportContract):
+class TestLoopback(TransportSuite):
     @pytest.fixture
     def connect(self) -> Iterator[Connect]:
         yield from connector(Route("loopback"))
@@ -38,14 +38,14 @@ class TestLoopback(TransportContract):
 
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort", "binary"])
 @pytest.mark.parametrize("payload", ["raw", "png"])
-class TestHttp(TransportContract):
+class TestHttp(TransportSuite):
     @pytest.fixture
     def connect(self, variant: str, payload: str) -> Iterator[Connect]:
         yield from connector(Route("http", variant, payload=payload))
 
 
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort", "binary"])
-class TestHttpJpeg(TransportContract):
+class TestHttpJpeg(TransportSuite):
     lossless = False
 
     @pytest.fixture
@@ -54,19 +54,19 @@ class TestHttpJpeg(TransportContract):
 
 
 @pytest.mark.parametrize("connection", ["per-request", "client-per-request"])
-class TestHttpConnections(TransportContract):
+class TestHttpConnections(TransportSuite):
     @pytest.fixture
     def connect(self, connection: str) -> Iterator[Connect]:
         yield from connector(Route("http", "best-effort", payload="raw", connection=connection))
 
 
-class TestRosTopic(TransportContract):
+class TestRosTopic(TransportSuite):
     @pytest.fixture
     def connect(self, dds_domain: int) -> Iterator[Connect]:
         yield from connector(Route("ros", "topic", domain_id=dds_domain))
 
 
-class TestRosAction(TransportContract):
+class TestRosAction(TransportSuite):
     carries_id_and_limit = False  # llama_msgs goals have neither
 
     @pytest.fixture

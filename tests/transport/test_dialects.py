@@ -12,7 +12,7 @@ import pytest
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import decode_image, encode_png, to_bgr
-from s2a_bench.testing.transport import Connect, Recorder, TransportContract, ask, yuyv_frame
+from s2a_bench.testing.transport import Connect, Recorder, TransportSuite, ask, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Route, open_client
 from s2a_bench.transport.http.dialects import DIALECTS
@@ -57,7 +57,7 @@ def speaker(request: pytest.FixtureRequest) -> Speaker:
     return request.param  # type: ignore[no-any-return]
 
 
-class TestContract(TransportContract):
+class TestContract(TransportSuite):
     """The transports' contract, as far as a foreign server carries it: no ids, no marks, no raw pixels."""
 
     lossless = False
