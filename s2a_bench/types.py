@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-Pixels: TypeAlias = NDArray[np.uint8]
+Pixels: TypeAlias = "NDArray[np.uint8]"
 
 Encoding: TypeAlias = Literal["yuv422_yuy2", "bgr8", "rgb8", "mono8", "jpeg", "png"]
 """Pixel formats by their ROS names (``sensor_msgs/image_encodings.hpp``), and the two compressed ones."""

@@ -12,6 +12,8 @@ from s2a_bench.cli.options import file_text, listed, size_of, text_or_file
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError, UsageError
+from s2a_bench.frames import SOURCES
+from s2a_bench.inference import ENGINES
 
 if TYPE_CHECKING:
     from s2a_bench.cli.progress import RunProgress
@@ -22,7 +24,7 @@ FULL = {"runs": 50, "warmup": 5, "max_tokens": 32}
 
 def latency(
     transport: Annotated[str, typer.Option(help="http, ros, loopback; several with commas")] = "http,ros",
-    source: Annotated[str, typer.Option(help="synthetic, video:FILE, images:DIR, bag:FILE, v4l2:DEVICE")] = "synthetic",
+    source: Annotated[str, typer.Option(help=f"{', '.join(SOURCES)}, as video:FILE")] = "synthetic",
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the frames")] = "640x480",
     payload: Annotated[str, typer.Option(help="HTTP picture: jpeg, jpeg-preencoded, png, raw")] = "jpeg",
     http: Annotated[
@@ -54,7 +56,8 @@ def latency(
     namespace: Annotated[str, typer.Option(help="ROS namespace of the topics")] = "/s2a_bench",
     connection: Annotated[str, typer.Option(help="HTTP: keep-alive, per-request, client-per-request")] = "keep-alive",
     engine: Annotated[
-        str, typer.Option(help="llama (a real model), echo (no model: transport alone), replay (a --profile: EMULATED)")
+        str,
+        typer.Option(help=f"{', '.join(ENGINES)}; echo leaves the transport alone, replay plays --profile (EMULATED)"),
     ] = "llama",
     profile: Annotated[str, typer.Option(help="replay: the board to play, a name of 'profile list' or a path")] = "",
     gaps: Annotated[str, typer.Option(help="replay: trace, parametric, constant [default: trace if recorded]")] = "",

@@ -13,6 +13,7 @@ import typer
 from s2a_bench.cli.options import size_of, text_or_file
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import UsageError
+from s2a_bench.frames import SOURCES
 
 if TYPE_CHECKING:
     from s2a_bench.boards.profile import Profile
@@ -34,7 +35,7 @@ def capture(
     threads: Annotated[int, typer.Option(min=0, help="CPU threads of the model; 0: all")] = 0,
     gpu_layers: Annotated[int, typer.Option(min=-1, help="model layers on the GPU; -1: all")] = 0,
     context: Annotated[int, typer.Option(min=256, help="context length in tokens")] = 4096,
-    source: Annotated[str, typer.Option(help="synthetic, video:FILE, images:DIR, bag:FILE, v4l2:DEVICE")] = "synthetic",
+    source: Annotated[str, typer.Option(help=f"{', '.join(SOURCES)}, as video:FILE")] = "synthetic",
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the frames")] = "640x480",
     requests: Annotated[int, typer.Option(help="requests that count, each about a new frame")] = 20,
     warmup: Annotated[int, typer.Option(help="requests before them, kept in the file and left out")] = 3,

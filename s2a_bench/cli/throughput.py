@@ -12,6 +12,8 @@ from s2a_bench.cli.options import file_text, listed, size_of, text_or_file
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError, UsageError
+from s2a_bench.frames import SOURCES
+from s2a_bench.inference import ENGINES
 
 if TYPE_CHECKING:
     from s2a_bench.cli.progress import RunProgress
@@ -25,7 +27,7 @@ WHERE = {"in-process": "loopback", "http": "http", "ros": "ros"}
 
 def throughput(
     transport: Annotated[str, typer.Option(help="in-process, http, ros; several with commas")] = "in-process",
-    source: Annotated[str, typer.Option(help="synthetic, video:FILE, images:DIR, bag:FILE, v4l2:DEVICE")] = "synthetic",
+    source: Annotated[str, typer.Option(help=f"{', '.join(SOURCES)}, as video:FILE")] = "synthetic",
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the frames")] = "640x480",
     payload: Annotated[str, typer.Option(help="HTTP picture: jpeg, jpeg-preencoded, png, raw")] = "jpeg",
     http: Annotated[str, typer.Option(help="as-deployed, best-effort, binary; several with commas")] = "as-deployed",
@@ -47,7 +49,7 @@ def throughput(
     middleware: Annotated[
         str, typer.Option(help="cyclonedds, rclpy [default: rclpy in a sourced ROS 2 environment]")
     ] = "",
-    engine: Annotated[str, typer.Option(help="llama (a real model), replay (a --profile: EMULATED)")] = "llama",
+    engine: Annotated[str, typer.Option(help=f"{', '.join(ENGINES)}; replay plays a --profile: EMULATED")] = "llama",
     profile: Annotated[str, typer.Option(help="replay: the board to play, a name of 'profile list' or a path")] = "",
     gaps: Annotated[str, typer.Option(help="replay: trace, parametric, constant [default: trace if recorded]")] = "",
     model: Annotated[Path | None, typer.Option(help="GGUF model [default: the tiny dummy]")] = None,

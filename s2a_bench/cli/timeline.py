@@ -12,6 +12,8 @@ from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
 from s2a_bench.cli.timeline_live import given_live, live_config, refuse_with_live, refuse_without_live
 from s2a_bench.errors import S2AError, UsageError
+from s2a_bench.inference import ENGINES
+from s2a_bench.runtime import ROBOTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -86,9 +88,9 @@ def timeline(
     ] = None,
     task: Annotated[str | None, typer.Option(help="--live: what the robot should do, text or @FILE")] = None,
     robot: Annotated[
-        str | None, typer.Option(help="--live: timed (waits), ros (action goals), or an entry point [default: timed]")
+        str | None, typer.Option(help=f"--live: {', '.join(ROBOTS)}; timed only waits [default: timed]")
     ] = None,
-    engine: Annotated[str | None, typer.Option(help="--live: llama, replay (EMULATED) [default: llama]")] = None,
+    engine: Annotated[str | None, typer.Option(help=f"--live: {', '.join(ENGINES)} [default: llama]")] = None,
     model: Annotated[str | None, typer.Option(help="--live: GGUF model [default: the tiny dummy]")] = None,
     mmproj: Annotated[str | None, typer.Option(help="--live: GGUF vision tower that goes with --model")] = None,
     threads: Annotated[int | None, typer.Option(min=0, help="--live: CPU threads of the model [default: all]")] = None,

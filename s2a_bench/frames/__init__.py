@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pkgutil import resolve_name
-from typing import Protocol
+from typing import Final, Protocol
 
 from s2a_bench.errors import UsageError
+from s2a_bench.registry import Registry
 from s2a_bench.types import Encoding, Frame
 
 
@@ -26,33 +26,47 @@ class FrameSource(Protocol):
         ...
 
 
-SOURCES: dict[str, str] = {
-    "synthetic": "s2a_bench.frames.synthetic:SyntheticCamera",
-    "video": "s2a_bench.frames.video:VideoFile",
-    "images": "s2a_bench.frames.images:ImageFolder",
-    "v4l2": "s2a_bench.frames.v4l2:V4L2Camera",
-    "bag": "s2a_bench.frames.bag:Recording",
-}
-"""Scheme of ``--source scheme[:where]`` -> class, built as ``Class(where, width, height, fps=..., seed=...)``."""
+class SourceKind(Protocol):
+    """What opens sources of one kind: usually the class itself."""
+
+    where: str
+    """What to write after the name and a colon, as ``FILE``; empty where nothing is."""
+
+    def __call__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> FrameSource:
+        """Open ``where``; raises UsageError for a size it cannot have, SourceError where it cannot deliver."""
+        ...
+
+
+SOURCES: Final[Registry[SourceKind]] = Registry(
+    "frame_sources",
+    "source",
+    {
+        "synthetic": "s2a_bench.frames.synthetic:SyntheticCamera",
+        "video": "s2a_bench.frames.video:VideoFile",
+        "images": "s2a_bench.frames.images:ImageFolder",
+        "v4l2": "s2a_bench.frames.v4l2:V4L2Camera",
+        "bag": "s2a_bench.frames.bag:Recording",
+    },
+)
+"""What opens each kind of source."""
 
 
 def open_source(spec: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> FrameSource:
-    """Open what ``--source`` names, delivering frames of ``width`` x ``height`` pixels.
+    """Open ``name[:where]``, delivering frames of ``width`` x ``height`` pixels.
 
-    Raises UsageError for an unknown scheme and SourceError when it cannot deliver.
+    Raises UsageError for an unknown name or a ``where`` missing or too many, SourceError when it cannot deliver.
     """
-    scheme, _, where = spec.partition(":")
-    if scheme not in SOURCES:
-        raise UsageError(f"--source: '{spec}' is none of synthetic, video:FILE, images:DIR, v4l2:DEVICE, bag:FILE")
-    if bool(where) == (scheme == "synthetic"):
-        raise UsageError(f"--source: '{spec}' should be " + (f"{scheme}:PATH" if not where else "plain 'synthetic'"))
-    source: FrameSource = resolve_name(SOURCES[scheme])(where, width, height, fps=fps, seed=seed)
-    return source
+    name, _, where = spec.partition(":")
+    kind = SOURCES[name]
+    if bool(where) != bool(kind.where):
+        wanted = f"{name}:{kind.where}" if kind.where else f"plain '{name}'"
+        raise UsageError(f"`source`: '{spec}' should be {wanted}")
+    return kind(where, width, height, fps=fps, seed=seed)
 
 
 def check_size(width: int, height: int, *, smallest: int = 1, even: bool = False) -> None:
     """Raise UsageError unless a source can have this size; ``even`` is for YUYV, which holds pixels in pairs."""
     if width < smallest or height < smallest:
-        raise UsageError(f"--size: {width}x{height} should be {smallest}x{smallest} or more")
+        raise UsageError(f"`size`: {width}x{height} should be {smallest}x{smallest} or more")
     if even and width % 2:
-        raise UsageError(f"--size: {width}x{height} should have an even width, YUYV holds pixels in pairs")
+        raise UsageError(f"`size`: {width}x{height} should have an even width, YUYV holds pixels in pairs")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
@@ -35,12 +35,14 @@ class Recording:
     damaged, or without such a topic.
     """
 
+    where: ClassVar[str] = "FILE[?topic=/NAME]"
+
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
         """Open the recording and look at its first picture."""
         check_size(width, height)
         self._path, key, topic = where.partition(TOPIC_KEY)
         if key and not topic.startswith("/"):
-            raise UsageError(f"--source: 'bag:{where}' should end with the absolute name of a topic, {TOPIC_KEY}/name")
+            raise UsageError(f"`source`: 'bag:{where}' should end with the absolute name of a topic, {TOPIC_KEY}/name")
         self.name = f"bag:{where}"
         self.width, self.height = width, height
         self._types = get_typestore(Stores.ROS2_JAZZY)  # Humble's images are the same
@@ -61,17 +63,17 @@ class Recording:
         """Return the next picture, after the last one the first; SourceError once closed."""
         stamp_ns = now_ns()
         if self._reader is None:
-            raise SourceError(f"--source: {self.name} was closed, it has no more frames")
+            raise SourceError(f"`source`: {self.name} was closed, it has no more frames")
         message, self._ahead = self._ahead or self._next(), None
         if self._delivered(message) != self.encoding:
             raise SourceError(
-                f"--source: {self.name} changes from {self.encoding} at {self.width}x{self.height} to "
+                f"`source`: {self.name} changes from {self.encoding} at {self.width}x{self.height} to "
                 f"{message.encoding} at {message.width}x{message.height}; a source has one format, cut the recording"
             )
         try:
             data = self._pixels(message)
         except ValueError as error:
-            raise SourceError(f"--source: {self._path}: picture {self._index} cannot be read: {error}") from error
+            raise SourceError(f"`source`: {self._path}: picture {self._index} cannot be read: {error}") from error
         frame = Frame(self._index, stamp_ns, self.width, self.height, self.encoding, data)
         self._index += 1
         return frame
@@ -97,8 +99,8 @@ class Recording:
             if found is not None:
                 return self._types.deserialize_cdr(found[2], self._connection.msgtype)
         except Exception as error:  # rosbags raises whatever its parsing of a damaged file runs into
-            raise SourceError(f"--source: {_unreadable(self._path, error)}") from error
-        raise SourceError(f"--source: {self._path} holds no picture on {self._connection.topic}; record some")
+            raise SourceError(f"`source`: {_unreadable(self._path, error)}") from error
+        raise SourceError(f"`source`: {self._path} holds no picture on {self._connection.topic}; record some")
 
     def _delivered(self, message: Any) -> Encoding:
         """Say in which encoding this source delivers such a message."""
@@ -106,7 +108,7 @@ class Recording:
             return "bgr8"
         if message.encoding not in CHANNELS:
             raise SourceError(
-                f"--source: {self._path}: {self._connection.topic} has encoding '{message.encoding}', which is "
+                f"`source`: {self._path}: {self._connection.topic} has encoding '{message.encoding}', which is "
                 f"none of {', '.join(CHANNELS)}"
             )
         if message.encoding == "yuv422_yuy2" and (message.width, message.height) != (self.width, self.height):
@@ -134,12 +136,12 @@ class Recording:
 def _open(path: str) -> Any:
     """Open a recording with rosbags, every way of failing made one line."""
     if not Path(path).exists():
-        raise SourceError(f"--source: no recording at {path}")
+        raise SourceError(f"`source`: no recording at {path}")
     try:
         reader = Reader(path)
         reader.open()
     except Exception as error:  # rosbags raises whatever its parsing of a damaged file runs into
-        raise SourceError(f"--source: {_unreadable(path, error)}") from error
+        raise SourceError(f"`source`: {_unreadable(path, error)}") from error
     return reader
 
 
@@ -151,10 +153,10 @@ def _connection(connections: list[Any], path: str, topic: str) -> Any:
         return chosen[0]
     names = sorted({connection.topic for connection in images})
     if names:
-        raise SourceError(f"--source: {path} has no image topic {topic}; it has {', '.join(names)}")
+        raise SourceError(f"`source`: {path} has no image topic {topic}; it has {', '.join(names)}")
     types = sorted({connection.msgtype for connection in connections})
     raise SourceError(
-        f"--source: {path} has no topic of type {IMAGE} or {COMPRESSED_IMAGE}, only {', '.join(types) or 'none at all'}"
+        f"`source`: {path} has no topic of type {IMAGE} or {COMPRESSED_IMAGE}, only {', '.join(types) or 'none at all'}"
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError
@@ -26,6 +26,7 @@ class ImageFolder:
     Raises SourceError for a folder that is missing, empty, too large to hold decoded, or has an unreadable picture.
     """
 
+    where: ClassVar[str] = "FOLDER"
     encoding: Encoding = "bgr8"
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
@@ -33,14 +34,14 @@ class ImageFolder:
         check_size(width, height)
         folder = Path(where)
         if not folder.is_dir():
-            raise SourceError(f"--source: no folder at {where}")
+            raise SourceError(f"`source`: no folder at {where}")
         paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
         if not paths:
-            raise SourceError(f"--source: no pictures in {where}; it takes {', '.join(sorted(SUFFIXES))}")
+            raise SourceError(f"`source`: no pictures in {where}; it takes {', '.join(sorted(SUFFIXES))}")
         if len(paths) > (most := LIMIT_BYTES // (width * height * 3)):
             raise SourceError(
-                f"--source: {where} holds {len(paths)} pictures; decoded to {width}x{height}, {most} fit into "
-                f"{LIMIT_BYTES >> 20} MiB: point at a folder of fewer, or give a smaller --size"
+                f"`source`: {where} holds {len(paths)} pictures; decoded to {width}x{height}, {most} fit into "
+                f"{LIMIT_BYTES >> 20} MiB: point at a folder of fewer, or give a smaller `size`"
             )
         self.name = f"images:{where}"
         self.width, self.height = width, height
@@ -51,7 +52,7 @@ class ImageFolder:
         """Copy the next picture, after the last one the first; SourceError once closed."""
         stamp_ns = now_ns()
         if not self._pictures:
-            raise SourceError(f"--source: {self.name} was closed, it has no more frames")
+            raise SourceError(f"`source`: {self.name} was closed, it has no more frames")
         data = self._pictures[self._index % len(self._pictures)].copy()
         frame = Frame(self._index, stamp_ns, self.width, self.height, self.encoding, data)
         self._index += 1
@@ -67,4 +68,4 @@ def _load(path: Path) -> Pixels:
     try:
         return bgr_to_rgb(decode_image(path.read_bytes()))
     except (OSError, ValueError) as error:
-        raise SourceError(f"--source: cannot read {path}: {error}") from error
+        raise SourceError(f"`source`: cannot read {path}: {error}") from error

@@ -7,7 +7,7 @@ a Lissajous curve. So capture costs one copy, as from a driver's buffer, and wha
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -34,13 +34,14 @@ class SyntheticCamera:
     Raises UsageError for an odd or tiny size.
     """
 
+    where: ClassVar[str] = ""
     encoding: Encoding = "yuv422_yuy2"
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:
         """Render the scene; ``where`` is empty, since there is nothing to open."""
         check_size(width, height, smallest=16, even=True)
         if not fps > 0:
-            raise UsageError(f"--fps: {fps} should be above 0")
+            raise UsageError(f"`fps`: {fps} should be above 0")
         self.name = f"synthetic:{where}" if where else "synthetic"
         self.width, self.height, self.fps = width, height, fps
         # a quarter of the frame each way is room enough to move, and soon rendered
@@ -52,7 +53,7 @@ class SyntheticCamera:
         """Copy the next window out of the scene and stamp the frame's index on it; SourceError once closed."""
         stamp_ns = now_ns()
         if self._scene is None:
-            raise SourceError("--source: the synthetic camera was closed, it has no more frames")
+            raise SourceError("`source`: the synthetic camera was closed, it has no more frames")
         index = self._index
         x, y = self._corner(index / self.fps)
         data = self._scene[y : y + self.height, x : x + self.width].copy()

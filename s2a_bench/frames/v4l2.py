@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import cv2
 
@@ -38,6 +38,7 @@ class V4L2Camera:
     Raises UsageError for an odd width, SourceError when the device cannot be used or offers no such frames.
     """
 
+    where: ClassVar[str] = "DEVICE"
     encoding: Encoding = "yuv422_yuy2"
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
@@ -59,13 +60,13 @@ class V4L2Camera:
     def read(self) -> Frame:
         """Wait for the next frame; SourceError when the camera stops delivering, or once closed."""
         if not self._capture.isOpened():
-            raise SourceError(f"--source: {self.name} was closed, it has no more frames")
+            raise SourceError(f"`source`: {self.name} was closed, it has no more frames")
         stamp_ns = self._grab()
         done, picture = self._capture.retrieve()
         if not done or picture.nbytes != self.width * self.height * 2:
             raise SourceError(
-                f"--source: {self._path} delivered {picture.nbytes if done else 'no'} bytes where "
-                f"{self.width}x{self.height} YUYV has {self.width * self.height * 2}; try another cable, port or --size"
+                f"`source`: {self._path} delivered {picture.nbytes if done else 'no'} bytes where "
+                f"{self.width}x{self.height} YUYV has {self.width * self.height * 2}; try another cable, port or `size`"
             )
         data = cast("Pixels", picture).reshape(self.height, self.width, 2)
         frame = Frame(self._index, stamp_ns, self.width, self.height, self.encoding, data)
@@ -79,7 +80,7 @@ class V4L2Camera:
     def _configure(self, capture: cv2.VideoCapture, fps: float) -> None:
         """Ask for YUYV of our size and see whether that is what the camera gives."""
         if not capture.isOpened():
-            raise SourceError(f"--source: cannot start {self._path}; `fuser -v {self._path}` shows who else uses it")
+            raise SourceError(f"`source`: cannot start {self._path}; `fuser -v {self._path}` shows who else uses it")
         yuyv = cv2.VideoWriter.fourcc(*"YUYV")
         capture.set(cv2.CAP_PROP_FOURCC, yuyv)
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.width)
@@ -91,8 +92,8 @@ class V4L2Camera:
         if (code, *size) != (yuyv, self.width, self.height):
             gives = code.to_bytes(4, "little", signed=code < 0).decode("ascii", "replace").strip("\0 ")
             raise SourceError(
-                f"--source: {self._path} gives {gives} {size[0]}x{size[1]}, not YUYV {self.width}x{self.height}; "
-                f"`v4l2-ctl -d {self._path} --list-formats-ext` lists what it offers: choose a --size from there"
+                f"`source`: {self._path} gives {gives} {size[0]}x{size[1]}, not YUYV {self.width}x{self.height}; "
+                f"`v4l2-ctl -d {self._path} --list-formats-ext` lists what it offers: choose a `size` from there"
             )
 
     def _grab(self) -> int:
@@ -100,7 +101,7 @@ class V4L2Camera:
         for _ in range(QUEUE):
             asked_ns = now_ns()
             if not self._capture.grab():
-                raise SourceError(f"--source: {self._path} delivers no frames; is it still plugged in?")
+                raise SourceError(f"`source`: {self._path} delivers no frames; is it still plugged in?")
             arrived_ns = now_ns()
             driver_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
             # a driver that stamps with another clock is decades off, one that does not stamp says 0
@@ -117,22 +118,22 @@ def _check_device(path: str) -> None:
     try:
         device = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     except FileNotFoundError:
-        raise SourceError(f"--source: no camera at {path}; `ls /dev/video*` shows those there are") from None
+        raise SourceError(f"`source`: no camera at {path}; `ls /dev/video*` shows those there are") from None
     except PermissionError:
         raise SourceError(
-            f"--source: no permission to open {path}; `sudo usermod -aG video $USER` gives it from the next login on"
+            f"`source`: no permission to open {path}; `sudo usermod -aG video $USER` gives it from the next login on"
         ) from None
     except OSError as error:
-        raise SourceError(f"--source: cannot open {path}: {error.strerror}") from error
+        raise SourceError(f"`source`: cannot open {path}: {error.strerror}") from error
     try:
         answer = fcntl.ioctl(device, VIDIOC_QUERYCAP, bytes(CAPABILITY.size))
     except OSError:
-        raise SourceError(f"--source: {path} is no camera; `ls /dev/video*` shows those there are") from None
+        raise SourceError(f"`source`: {path} is no camera; `ls /dev/video*` shows those there are") from None
     finally:
         os.close(device)
     *_, all_caps, device_caps = CAPABILITY.unpack(answer)
     if not (device_caps if all_caps & HAS_DEVICE_CAPS else all_caps) & CAN_CAPTURE:
         raise SourceError(
-            f"--source: {path} captures no pictures, though its camera may under another number; "
+            f"`source`: {path} captures no pictures, though its camera may under another number; "
             "`v4l2-ctl --list-devices` shows them"
         )

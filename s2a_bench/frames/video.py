@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import cv2
 
@@ -25,13 +25,14 @@ class VideoFile:
     Raises SourceError for a file that is missing or no video.
     """
 
+    where: ClassVar[str] = "FILE"
     encoding: Encoding = "bgr8"
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
         """Open the file ``where``."""
         check_size(width, height)
         if not Path(where).is_file():
-            raise SourceError(f"--source: no video file at {where}")
+            raise SourceError(f"`source`: no video file at {where}")
         self.name = f"video:{where}"
         self.width, self.height = width, height
         self._path = where
@@ -42,7 +43,7 @@ class VideoFile:
         """Decode the next frame, after the last one the first; SourceError once closed."""
         stamp_ns = now_ns()
         if self._capture is None:
-            raise SourceError(f"--source: {self.name} was closed, it has no more frames")
+            raise SourceError(f"`source`: {self.name} was closed, it has no more frames")
         done, picture = self._capture.read()
         if not done:
             # opened afresh, because seeking to frame 0 fails for some codecs
@@ -51,7 +52,7 @@ class VideoFile:
             done, picture = self._capture.read()
         if not done:
             raise SourceError(
-                f"--source: {self._path} holds no frame that OpenCV can decode; try `ffprobe {self._path}`"
+                f"`source`: {self._path} holds no frame that OpenCV can decode; try `ffprobe {self._path}`"
             )
         data = resize(cast("Pixels", picture), self.width, self.height)
         frame = Frame(self._index, stamp_ns, self.width, self.height, self.encoding, data)
@@ -68,5 +69,5 @@ class VideoFile:
         """Open the file with FFmpeg alone: OpenCV's other back ends only add noise to the failure."""
         capture = cv2.VideoCapture(self._path, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
         if not capture.isOpened():
-            raise SourceError(f"--source: {self._path} is no video that OpenCV can read; try `ffprobe {self._path}`")
+            raise SourceError(f"`source`: {self._path} is no video that OpenCV can read; try `ffprobe {self._path}`")
         return capture

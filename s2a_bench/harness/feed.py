@@ -133,7 +133,7 @@ class Camera:
             if self._failure is not None:
                 raise self._failure
             if not came or self._newest is None:
-                raise SourceError(f"--source: the camera delivered nothing for {timeout_s:.0f} s")
+                raise SourceError(f"`source`: the camera delivered nothing for {timeout_s:.0f} s")
             return self._newest[0].index
 
     def newest(self) -> tuple[StreamedFrame, Frame] | None:

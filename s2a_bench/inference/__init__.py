@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from pkgutil import resolve_name
-from typing import Protocol
+from typing import Final, Protocol
 
-from s2a_bench.errors import UsageError
+from s2a_bench.registry import Registry
 from s2a_bench.types import Request, Token
 
 
@@ -68,19 +67,21 @@ class EngineConfig:
     """Tokens/s that answers are held back to; 0: as fast as they come."""
 
 
-ENGINES: dict[str, str] = {
-    "llama": "s2a_bench.inference.one_thread:llama",
-    "echo": "s2a_bench.inference.echo:EchoEngine",
-    "replay": "s2a_bench.inference.replay:ReplayEngine",
-}
-"""Value of ``--engine`` -> what builds it, called with the config."""
+ENGINES: Final[Registry[Callable[[EngineConfig], Engine]]] = Registry(
+    "engines",
+    "engine",
+    {
+        "llama": "s2a_bench.inference.one_thread:llama",
+        "echo": "s2a_bench.inference.echo:EchoEngine",
+        "replay": "s2a_bench.inference.replay:ReplayEngine",
+    },
+)
+"""What builds each engine from its configuration."""
 
 
 def open_engine(config: EngineConfig) -> Engine:
     """Start the engine that ``config`` names; raises UsageError for an unknown name, EngineError otherwise."""
-    if config.name not in ENGINES:
-        raise UsageError(f"--engine: '{config.name}' is none of {', '.join(ENGINES)}")
-    engine: Engine = resolve_name(ENGINES[config.name])(config)
+    engine = ENGINES[config.name](config)
     if config.pace:
         from s2a_bench.inference.paced import PacedEngine
 

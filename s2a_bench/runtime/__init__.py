@@ -15,12 +15,10 @@ docs/executor.md says what happens when, and how a robot is plugged in.
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.metadata import entry_points
-from pkgutil import resolve_name
-from typing import Protocol, TypeAlias
+from typing import Final, Protocol, TypeAlias
 
-from s2a_bench.errors import UsageError
 from s2a_bench.plan import Call, Gap, SkillSet
+from s2a_bench.registry import Registry
 
 Report: TypeAlias = Callable[[str], None]
 """Called once, from any thread, when a skill has ended by itself: with nothing, or with what went wrong."""
@@ -61,27 +59,7 @@ class Robot(Protocol):
         ...
 
 
-ENTRY_POINTS = "s2a_bench.robots"
-"""The entry-point group under which other packages offer robots."""
-
-ROBOTS: dict[str, str] = {
-    "timed": "s2a_bench.runtime.timed:TimedRobot",
-    "ros": "s2a_bench.runtime.actions:open_ros",
-}
-"""Value of ``--robot`` -> what builds it, called with the skill set; entry points add to these."""
-
-
-def find_robot(name: str) -> Callable[[SkillSet], Robot]:
-    """Return what builds a robot; raises UsageError for an unknown name, or one that cannot be loaded."""
-    if name in ROBOTS:
-        found: Callable[[SkillSet], Robot] = resolve_name(ROBOTS[name])
-        return found
-    offered = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
-    if name not in offered:
-        known = ", ".join([*ROBOTS, *offered])
-        raise UsageError(f"--robot: '{name}' is none of {known}; packages add robots as entry points '{ENTRY_POINTS}'")
-    try:
-        found = offered[name].load()
-    except (ImportError, AttributeError) as error:
-        raise UsageError(f"--robot {name}: {offered[name].value} cannot be loaded: {error}") from error
-    return found
+ROBOTS: Final[Registry[Callable[[SkillSet], Robot]]] = Registry(
+    "robots", "robot", {"timed": "s2a_bench.runtime.timed:TimedRobot", "ros": "s2a_bench.runtime.actions:open_ros"}
+)
+"""What builds each robot for a skill set."""

@@ -49,7 +49,7 @@ class ActionRobot:
         self._gaps = middleware.publisher(f"{namespace}/gap", "std_msgs/msg/String", QoS(depth=1))
         if not self._client.wait_for_server(server_timeout_s):
             raise TransportError(
-                f"--robot ros: no server of the action {name} ({EXECUTE_SKILL}) appeared in {server_timeout_s:g} s; "
+                f"`robot`: ros: no server of the action {name} ({EXECUTE_SKILL}) appeared in {server_timeout_s:g} s; "
                 "start the robot's node first, with the same ROS_DOMAIN_ID"
             )
         self._reports: dict[bytes, Report] = {}

@@ -91,7 +91,7 @@ class CallableRobot:
         ``hold`` fills the time without a skill: stop, coast, hold or cruise. It runs on the executor's thread.
         """
         if missing := [skill.name for skill in skills.skills if skill.name not in actions]:
-            raise UsageError(f"--robot: no function for the skills {', '.join(missing)} of '{skills.name}'")
+            raise UsageError(f"`robot`: no function for the skills {', '.join(missing)} of '{skills.name}'")
         self._actions = actions
         self._fill = hold
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from s2a_bench.plan import Call, Gap, SkillSet
 from s2a_bench.runtime import Report, Running
 
 
 class TimedRobot:
     """Stands in for a robot wherever only the times matter: timelines, tests, demonstrations."""
+
+    several: ClassVar[bool] = True
+    """Any number may run side by side: nothing moves."""
 
     def __init__(self, skills: SkillSet | None = None) -> None:
         """Take any skills."""

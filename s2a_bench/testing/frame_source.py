@@ -44,6 +44,9 @@ class FrameSourceSuite:
             assert frame.data.flags.c_contiguous
         source.close()
 
+    def test_its_kind_says_what_to_write_after_its_name(self, source: FrameSource) -> None:
+        assert isinstance(type(source).where, str)  # type: ignore[attr-defined]  # of SourceKind
+
     def test_it_has_a_name(self, source: FrameSource) -> None:
         assert source.name
 
@@ -85,10 +88,10 @@ class FrameSourceSuite:
     def test_reading_after_close_says_so(self, source: FrameSource) -> None:
         source.read()
         source.close()
-        with pytest.raises(SourceError, match=r"^--source: .*closed"):
+        with pytest.raises(SourceError, match=r"^`source`: .*closed"):
             source.read()
 
     @pytest.mark.parametrize("size", [(0, 48), (64, 0), (-2, 48)])
     def test_a_size_without_pixels_is_refused(self, make_source: MakeSource, size: tuple[int, int]) -> None:
-        with pytest.raises(UsageError, match="--size"):
+        with pytest.raises(UsageError, match="`size`"):
             make_source(*size)

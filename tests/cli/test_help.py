@@ -84,8 +84,8 @@ def test_the_version_is_printed() -> None:
         (["latency", "--against", "rivals"], "--against: 'rivals' should be paper"),
         (["latency", "--prompt", "@/no/such/file"], "--prompt: cannot read /no/such/file"),
         (["latency", "--grammar", "/no/such/file"], "--grammar: cannot read /no/such/file"),
-        (["latency", "--source", "webcam"], "--source: 'webcam' is none of synthetic, video:FILE"),
-        (["latency", "--source", "video"], "--source: 'video' should be video:PATH"),
+        (["latency", "--source", "webcam"], "--source: 'webcam' is none of synthetic, video"),
+        (["latency", "--source", "video"], "--source: 'video' should be video:FILE"),
         (["latency", "--llama-server", "/no/such/program"], "--llama-server: /no/such/program is no program"),
     ],
 )

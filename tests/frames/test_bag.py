@@ -140,7 +140,7 @@ def test_the_first_image_topic_is_read_unless_another_is_named(tmp_path: Path, o
     )
     assert opened(path).encoding == "mono8"
     assert opened(f"{path}?topic=/right").encoding == "bgr8"
-    with pytest.raises(SourceError, match=r"^--source: .* has no image topic /s; it has /left, /right$"):
+    with pytest.raises(SourceError, match=r"^`source`: .* has no image topic /s; it has /left, /right$"):
         opened(f"{path}?topic=/s")
     with pytest.raises(UsageError, match=r"\?topic=/name"):
         opened(f"{path}?topic=left")
@@ -160,7 +160,7 @@ def test_an_image_topic_without_messages_is_no_endless_loop(tmp_path: Path, open
 
 
 def test_a_missing_recording_is_named(tmp_path: Path, opened: Open) -> None:
-    with pytest.raises(SourceError, match=r"^--source: no recording at .*none\.mcap$"):
+    with pytest.raises(SourceError, match=r"^`source`: no recording at .*none\.mcap$"):
         opened(tmp_path / "none.mcap")
 
 
@@ -169,12 +169,12 @@ def test_a_missing_recording_is_named(tmp_path: Path, opened: Open) -> None:
 def test_a_file_that_is_none_is_named(tmp_path: Path, name: str, content: bytes, opened: Open) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(SourceError, match=rf"^--source: .*{name} (is no recording|has no topic)"):
+    with pytest.raises(SourceError, match=rf"^`source`: .*{name} (is no recording|has no topic)"):
         opened(path)
 
 
 def test_a_folder_that_is_none_is_named(tmp_path: Path, opened: Open) -> None:
-    with pytest.raises(SourceError, match=r"^--source: .* is no recording"):
+    with pytest.raises(SourceError, match=r"^`source`: .* is no recording"):
         opened(tmp_path)
 
 
@@ -191,7 +191,7 @@ def test_a_picture_that_does_not_fit_its_message_is_refused(
 ) -> None:
     message = image(pictures("bgr8")[0], "bgr8", **fields)
     source = opened(record(tmp_path / "bag", [("/c", IMAGE, message)]))
-    with pytest.raises(SourceError, match=r"^--source: .*picture 0 cannot be read: .* bgr8 in 9216 bytes"):
+    with pytest.raises(SourceError, match=r"^`source`: .*picture 0 cannot be read: .* bgr8 in 9216 bytes"):
         source.read()
 
 

@@ -46,18 +46,18 @@ def test_channels_are_blue_green_red(tmp_path: Path) -> None:
 
 def test_a_folder_without_pictures_says_what_it_takes(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(SourceError, match=r"^--source: no pictures in .*\.jpg"):
+    with pytest.raises(SourceError, match=r"^`source`: no pictures in .*\.jpg"):
         ImageFolder(str(tmp_path), 64, 48)
 
 
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"^--source: no folder at .*nowhere"):
+    with pytest.raises(SourceError, match=r"^`source`: no folder at .*nowhere"):
         ImageFolder(str(tmp_path / "nowhere"), 64, 48)
 
 
 def test_an_unreadable_picture_is_named_at_once(folder: Path) -> None:
     (folder / "d.jpg").write_bytes(b"no picture")
-    with pytest.raises(SourceError, match=r"^--source: cannot read .*d\.jpg: the 10 bytes are no picture"):
+    with pytest.raises(SourceError, match=r"^`source`: cannot read .*d\.jpg: the 10 bytes are no picture"):
         ImageFolder(str(folder), 64, 48)
 
 

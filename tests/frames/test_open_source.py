@@ -25,13 +25,13 @@ def test_an_unknown_scheme_lists_those_there_are(spec: str) -> None:
     with pytest.raises(UsageError) as caught:
         open_source(spec, 64, 48)
     message = str(caught.value)
-    assert message.startswith(f"--source: '{spec}'")
+    assert message.startswith(f"`source`: '{spec.partition(':')[0]}'")
     assert all(scheme in message for scheme in SOURCES)
 
 
-@pytest.mark.parametrize("scheme", ["video", "images", "v4l2", "bag"])
-def test_a_scheme_without_its_path_is_refused(scheme: str) -> None:
-    with pytest.raises(UsageError, match=f"--source: '{scheme}' should be {scheme}:PATH"):
+@pytest.mark.parametrize(("scheme", "where"), [("video", "FILE"), ("images", "FOLDER"), ("v4l2", "DEVICE")])
+def test_a_scheme_without_its_path_is_refused(scheme: str, where: str) -> None:
+    with pytest.raises(UsageError, match=f"`source`: '{scheme}' should be {scheme}:{where}"):
         open_source(scheme, 64, 48)
 
 
@@ -45,7 +45,7 @@ def test_a_path_that_is_missing_is_named(scheme: str, tmp_path: Path) -> None:
     path = tmp_path / "with:colon"
     with pytest.raises(SourceError) as caught:
         open_source(f"{scheme}:{path}", 64, 48)
-    assert str(caught.value).startswith("--source: ")
+    assert str(caught.value).startswith("`source`: ")
     assert str(path) in str(caught.value)
 
 

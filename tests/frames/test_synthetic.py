@@ -124,7 +124,7 @@ def test_chroma_lies_in_pairs_of_u_and_v() -> None:
 
 @pytest.mark.parametrize("size", [(641, 480), (14, 16), (16, 15)])
 def test_odd_and_tiny_sizes_are_refused(size: tuple[int, int]) -> None:
-    with pytest.raises(UsageError, match=f"--size: {size[0]}x{size[1]} should"):
+    with pytest.raises(UsageError, match=f"`size`: {size[0]}x{size[1]} should"):
         SyntheticCamera("", *size)
 
 
@@ -135,5 +135,5 @@ def test_small_and_long_sizes_work(size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("fps", [0.0, -1.0, float("nan")])
 def test_a_rate_that_is_none_is_refused(fps: float) -> None:
-    with pytest.raises(UsageError, match="--fps"):
+    with pytest.raises(UsageError, match="`fps`"):
         SyntheticCamera("", 64, 48, fps=fps)

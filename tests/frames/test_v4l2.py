@@ -123,7 +123,7 @@ def test_flat_data_gets_its_shape(driver: Driver) -> None:
 
 def test_a_busy_device_is_named(driver: Driver) -> None:
     driver.busy = True
-    with pytest.raises(SourceError, match=r"^--source: cannot start /dev/video0; `fuser"):
+    with pytest.raises(SourceError, match=r"^`source`: cannot start /dev/video0; `fuser"):
         V4L2Camera("0", 64, 48)
 
 
@@ -155,7 +155,7 @@ def test_a_short_frame_is_an_error(driver: Driver) -> None:
 
 
 def test_an_odd_width_is_refused() -> None:
-    with pytest.raises(UsageError, match="--size: 65x48"):
+    with pytest.raises(UsageError, match="`size`: 65x48"):
         V4L2Camera("0", 65, 48)
 
 
@@ -213,7 +213,7 @@ def test_a_frame_that_had_to_be_waited_for_is_fresh_whatever_its_stamp(
 
 
 def test_a_missing_device_is_named_without_noise(capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SourceError, match=r"^--source: no camera at /dev/video99; `ls /dev/video"):
+    with pytest.raises(SourceError, match=r"^`source`: no camera at /dev/video99; `ls /dev/video"):
         V4L2Camera("/dev/video99", 64, 48)
     assert capfd.readouterr() == ("", "")
 
@@ -222,7 +222,7 @@ def test_what_is_no_camera_is_named_without_noise(tmp_path: Path, capfd: pytest.
     file = tmp_path / "file"
     file.touch()
     for path in ("/dev/null", str(file)):
-        with pytest.raises(SourceError, match=f"^--source: {path} is no camera"):
+        with pytest.raises(SourceError, match=f"^`source`: {path} is no camera"):
             V4L2Camera(path, 64, 48)
     with pytest.raises(SourceError, match="Is a directory"):
         V4L2Camera(str(tmp_path), 64, 48)

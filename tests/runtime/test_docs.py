@@ -12,7 +12,7 @@ from s2a_bench.cli.timeline_live import DEFAULTS
 from s2a_bench.clock import VirtualClock, now_ns
 from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.plan import load_skills
-from s2a_bench.runtime import ENTRY_POINTS, events
+from s2a_bench.runtime import ROBOTS, events
 from s2a_bench.runtime.callables import Motion
 from s2a_bench.runtime.events import ScriptedInbox
 
@@ -31,7 +31,7 @@ def test_the_example_package_makes_a_robot(capsys: pytest.CaptureFixture[str]) -
     stopped.abort()
     names["pick"](stopped)
     assert capsys.readouterr().out.splitlines()[-1] == "stopping"
-    assert f'[project.entry-points."{ENTRY_POINTS}"]' in PAGE
+    assert f'[project.entry-points."{ROBOTS.group}"]' in PAGE
 
 
 def test_the_example_program_carries_a_plan_out(

@@ -12,14 +12,13 @@ from types import ModuleType
 
 import pytest
 
-from s2a_bench import runtime
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.plan import Call, Gap, SkillSet, load_skills, parse_skills
 from s2a_bench.policy import PlanShape, Timing, policy
 from s2a_bench.ros import ActionServer, Middleware, ServerGoal, open_middleware
 from s2a_bench.ros.messages import default
-from s2a_bench.runtime import ROBOTS, Robot, find_robot
+from s2a_bench.runtime import ROBOTS, Robot
 from s2a_bench.runtime.actions import EXECUTE_SKILL, ActionRobot
 from s2a_bench.runtime.callables import Action, CallableRobot, Motion
 from s2a_bench.runtime.events import AbortAsked, LiveInbox, Requested, SkillCame, StreamEnded
@@ -133,7 +132,7 @@ class TestFunctions:
 
     def test_a_skill_without_a_function_is_refused(self) -> None:
         actions: dict[str, Action] = {"go_to": lambda _: None, "pick": lambda _: None}
-        with pytest.raises(UsageError, match="--robot: no function for the skills open, close, place of 'household'"):
+        with pytest.raises(UsageError, match="`robot`: no function for the skills open, close, place of 'household'"):
             CallableRobot(load_skills("household"), actions)
 
 
@@ -143,11 +142,8 @@ class TestPlugIns:
         """A package that offers a robot."""
         module = ModuleType("somebodys_robot")
         monkeypatch.setitem(sys.modules, "somebodys_robot", module)
-        points = [
-            EntryPoint("arm", "somebodys_robot:arm", runtime.ENTRY_POINTS),
-            EntryPoint("gone", "somebodys_robot:leg", runtime.ENTRY_POINTS),
-        ]
-        monkeypatch.setattr(runtime, "entry_points", lambda group: points if group == runtime.ENTRY_POINTS else [])
+        point = EntryPoint("arm", "somebodys_robot:arm", ROBOTS.group)
+        monkeypatch.setitem(vars(ROBOTS), "_offered", {"arm": point})
         return module
 
     def test_a_robot_of_another_package_is_found_by_its_name(self, offer: ModuleType) -> None:
@@ -157,22 +153,17 @@ class TestPlugIns:
             return CallableRobot(skills, {"wave": lambda _: None}, waved.append)
 
         offer.arm = arm  # type: ignore[attr-defined]
-        record = execute(find_robot("arm")(QUICK), [CUP])
+        record = execute(ROBOTS["arm"](QUICK), [CUP])
         assert (record.outcome, waved[-1]) == ("completed", "coast")
 
     def test_one_that_cannot_be_loaded_says_which(self, offer: ModuleType) -> None:
         del offer
-        with pytest.raises(UsageError, match="--robot gone: somebodys_robot:leg cannot be loaded"):
-            find_robot("gone")
+        with pytest.raises(UsageError, match="`robot`: 'arm' of the package somebodys_robot:arm does not load"):
+            ROBOTS["arm"]
 
-    def test_an_unknown_one_names_all_there_are(self, offer: ModuleType) -> None:
-        del offer
-        with pytest.raises(UsageError, match="'kuka' is none of timed, ros, arm, gone"):
-            find_robot("kuka")
-
-    @pytest.mark.parametrize("name", list(ROBOTS))
+    @pytest.mark.parametrize("name", ["timed", "ros"])
     def test_ours_are_found(self, name: str) -> None:
-        assert callable(find_robot(name))
+        assert callable(ROBOTS[name])
 
 
 class TestRosActions:
@@ -284,5 +275,5 @@ class TestRosActions:
     def test_a_robot_that_is_not_there_is_missed(self, dds_domain: int, stack: ExitStack) -> None:
         middleware = open_middleware("cyclonedds", domain_id=dds_domain)
         stack.callback(middleware.close)
-        with pytest.raises(TransportError, match="--robot ros: no server of the action /nowhere/execute_skill"):
+        with pytest.raises(TransportError, match="`robot`: ros: no server of the action /nowhere/execute_skill"):
             ActionRobot(middleware, "/nowhere", server_timeout_s=0.2)

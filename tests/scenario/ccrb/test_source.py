@@ -31,5 +31,5 @@ def test_the_cars_stand_at_their_gaps() -> None:
 
 
 def test_a_tiny_size_is_refused() -> None:
-    with pytest.raises(UsageError, match="--size: 8x8 should be 16x16 or more"):
+    with pytest.raises(UsageError, match="`size`: 8x8 should be 16x16 or more"):
         RoadSource(Cars(), 8, 8)

@@ -13,7 +13,7 @@ from s2a_bench.harness.ranges import LEAST_T_NOM_S, require
 from s2a_bench.plan import Durations, SkillSet, load_skills
 from s2a_bench.policy import PlanShape, Timing
 from s2a_bench.policy import policy as policy_of
-from s2a_bench.runtime import find_robot
+from s2a_bench.runtime import ROBOTS
 
 FASTEST: Final = 10_000.0
 """Tokens/s; a pace beyond it sets nothing."""
@@ -95,9 +95,9 @@ class LiveConfig:
             if not values:
                 raise UsageError(f"{flag}: name at least one")
         self._check_engine()
-        find_robot(self.robot)
-        if self.robot != "timed" and len(self.policies) > 1:
-            raise UsageError(f"--robot {self.robot}: one robot follows one policy; choose it with --policy")
+        robot = ROBOTS[self.robot]
+        if len(self.policies) > 1 and not getattr(robot, "several", False):
+            raise UsageError(f"`robot`: {self.robot} follows one policy at a time; choose it with `policy`")
 
     def _check_engine(self) -> None:
         engine = self.requests.engine

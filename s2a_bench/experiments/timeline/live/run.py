@@ -25,7 +25,7 @@ from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
 from s2a_bench.plan import Parser
 from s2a_bench.policy import Policy
 from s2a_bench.policy.estimator import GapPrior
-from s2a_bench.runtime import Robot, find_robot
+from s2a_bench.runtime import ROBOTS, Robot
 from s2a_bench.runtime.events import StreamBroke
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.runtime.record import Record
@@ -81,7 +81,7 @@ class _Live:
 
     def connect(self, stack: ExitStack, source: FrameSource) -> None:
         """Open the robots, then the way to the model."""
-        build = find_robot(self.config.robot)  # first, as a model may take long to load
+        build = ROBOTS[self.config.robot]  # first, as a model may take long to load
         self.robots: list[Robot] = [
             stack.enter_context(closing(build(self.config.skill_set))) for _ in self.config.policies
         ]
