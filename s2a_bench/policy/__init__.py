@@ -1,8 +1,9 @@
 """When to act: a policy answers when each skill of a plan starts and how long it runs. Pure: time comes in as numbers.
 
-Two forms of every policy give the same result: `Policy.schedule` on arrays, for studies of millions of plans, and
-`Policy.stepper`, an object that is told what has happened so far, for a robot. The words are those of
-docs/policies.md: N skills, M plans, times in seconds from the request.
+A policy is a class with a name and a `Policy.stepper`, an object that is told what has happened so far, for a robot.
+`Policy.schedule` decides for plans whose arrivals are known; it drives the stepper unless a policy has arrays for it,
+for studies of millions of plans: both give the same result. The words are those of docs/policies.md: N skills, M plans,
+times in seconds from the request.
 """
 
 from __future__ import annotations
@@ -107,20 +108,22 @@ class Schedule:
 
 
 class Policy(Protocol):
-    """A rule for acting."""
+    """A rule for acting; a subclass of this one gets `schedule` from its stepper."""
 
     @property
     def name(self) -> str:
         """Return its name, as in POLICIES."""
         ...
 
-    def schedule(self, plans: Plans) -> Schedule:
-        """Decide for many plans at once."""
-        ...
-
     def stepper(self, shape: PlanShape) -> Stepper:
         """Follow one plan as it arrives."""
         ...
+
+    def schedule(self, plans: Plans) -> Schedule:
+        """Decide for many plans at once; step by step they need ``shape``, raises ValueError without."""
+        from s2a_bench.policy.stepping import schedule
+
+        return schedule(self, plans)
 
 
 POLICIES: dict[str, str] = {

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import groupby
+from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from s2a_bench.policy import POLICIES, Plans, PlanShape, Policy, Start, Stepper, Timing
+from s2a_bench.policy import POLICIES, Plans, PlanShape, Policy, Timing, stepping
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import least_end, safe_start
+from s2a_bench.policy.stepping import Stream, follow, step
 
 EXACT = 1e-9
 """Seconds within which two ways to add up the same times agree."""
@@ -65,101 +62,6 @@ seeded = st.builds(
 )
 
 
-@dataclass
-class Stream:
-    """A stream as it arrives; it ends with the last thing that comes."""
-
-    token_s: Sequence[float]
-    arrival_s: Sequence[float]
-    timings: Sequence[Timing]
-
-    def instants(self) -> list[tuple[float, list[tuple[int, int]]]]:
-        """List when something comes, and what: tokens, then fragments, then the end."""
-        events = [(at, 0, 0) for at in self.token_s] + [(at, 1, i) for i, at in enumerate(self.arrival_s)]
-        events.append((max(events)[0], 2, 0))
-        grouped = groupby(sorted(events), key=lambda event: event[0])
-        return [(at_s, [(kind, which) for _, kind, which in group]) for at_s, group in grouped]
-
-
-class Robot:
-    """Carries a stepper's decisions out in virtual time, without delays of its own."""
-
-    def __init__(self, stepper: Stepper, stream: Stream, n_skills: int) -> None:
-        self.stepper, self.stream, self.n_skills = stepper, stream, n_skills
-        self.running: Start | None = None
-        self.starts: list[float] = []
-        self.durations: list[float] = []
-        self.arrived, self.ended = 0, False
-
-    def hear(self, now_s: float, events: list[tuple[int, int]]) -> None:
-        """Tell the stepper what happened."""
-        for kind, which in events:
-            if kind == 0:
-                self.stepper.token(now_s)
-            elif kind == 1:
-                self.stepper.fragment(now_s, self.stream.timings[which])
-                self.arrived += 1
-            else:
-                self.stepper.end(now_s)
-                self.ended = True
-
-    def act(self, now_s: float) -> float:
-        """End and start what is due, and say when to act next if nothing happens before."""
-        while True:
-            wake_s = self.ask(now_s) if self.running is None else self.starts[-1] + self.length_s(self.running)
-            if wake_s > now_s:
-                return wake_s
-            if self.running is not None:
-                self.durations.append(now_s - self.starts[-1])
-                self.running = None
-
-    def ask(self, now_s: float) -> float:
-        """Ask the stepper, and start a skill where it says so."""
-        answer = self.stepper.decide(now_s)
-        if not isinstance(answer, Start):
-            assert answer > now_s, "asked to be asked in the past"
-            return answer
-        assert self.arrived > len(self.starts), "started a skill that has not arrived"
-        assert 0 <= answer.duration_s <= answer.latest_s + EXACT
-        self.running = answer
-        self.starts.append(now_s)
-        return now_s + self.length_s(answer)
-
-    def length_s(self, running: Start) -> float:
-        """Say how long the skill runs, as things stand now."""
-        next_is_here = self.arrived > len(self.starts)
-        none_follows = self.ended or len(self.starts) == self.n_skills
-        return running.duration_s if next_is_here or none_follows else max(running.latest_s, running.duration_s)
-
-
-def follow(stepper: Stepper, stream: Stream, n_skills: int) -> tuple[list[float], list[float]]:
-    """Run a stepper on a stream and return starts and durations."""
-    robot = Robot(stepper, stream, n_skills)
-    wake_s = robot.act(0.0)
-    for at_s, events in stream.instants():
-        while wake_s < at_s:
-            wake_s = robot.act(wake_s)
-        robot.hear(at_s, events)
-        wake_s = robot.act(at_s)
-    while wake_s < math.inf:
-        wake_s = robot.act(wake_s)
-    return robot.starts, robot.durations
-
-
-def step(policy: Policy, plans: Plans, *, missing: int = 0) -> tuple[list[float], list[float]]:
-    """Follow one plan of shape (N, 1); ``missing`` skills more are expected than come."""
-    assert plans.shape is not None
-    assert plans.token_s is not None
-    first_s = float(safe_start(plans.arrival_s, plans.nominal_s)[0])
-    n_skills = plans.shape.n_skills + missing
-    timings = [
-        Timing(float(nominal), float(least), float(most))
-        for nominal, least, most in zip(plans.nominal_s[:, 0], plans.least_s[:, 0], plans.most_s[:, 0], strict=True)
-    ]
-    stream = Stream(plans.token_s[:, 0].tolist(), plans.arrival_s[:, 0].tolist(), timings)
-    return follow(policy.stepper(replace(plans.shape, n_skills=n_skills, safe_start_s=first_s)), stream, n_skills)
-
-
 class PolicySuite:
     """What every policy does."""
 
@@ -169,11 +71,9 @@ class PolicySuite:
     @shared
     @given(plans=seeded)
     def test_the_stepper_and_the_arrays_agree(self, policy: Policy, plans: Plans) -> None:
-        schedule = policy.schedule(plans)
-        for column in range(plans.arrival_s.shape[1]):
-            starts, durations = step(policy, one(plans, column))
-            assert starts == pytest.approx(schedule.start_s[:, column].tolist(), abs=EXACT)
-            assert durations == pytest.approx(schedule.duration_s[:, column].tolist(), abs=EXACT)
+        schedule, stepped = policy.schedule(plans), stepping.schedule(policy, plans)
+        np.testing.assert_allclose(stepped.start_s, schedule.start_s, rtol=0, atol=EXACT)
+        np.testing.assert_allclose(stepped.duration_s, schedule.duration_s, rtol=0, atol=EXACT)
 
     @shared
     @given(plans=seeded)
@@ -232,9 +132,9 @@ class PolicySuite:
 
     def test_following_a_plan_leaves_nothing_behind_for_the_next(self, policy: Policy) -> None:
         plans = draw(2, 6, 3, 1.3, 2)
-        first = step(policy, one(plans, 0))
-        step(policy, one(plans, 1))
-        assert step(policy, one(plans, 0)) == first
+        first = step(policy, plans, 0)
+        step(policy, plans, 1)
+        assert step(policy, plans, 0) == first
 
     @shared
     @given(plans=seeded)
@@ -254,7 +154,7 @@ class PolicySuite:
     @shared
     @given(plans=seeded)
     def test_a_stream_that_breaks_off_is_carried_out_as_far_as_it_came(self, policy: Policy, plans: Plans) -> None:
-        starts, durations = step(policy, one(plans, 0), missing=3)
+        starts, durations = step(policy, plans, missing=3)
         assert len(starts) == len(durations) == len(plans.arrival_s)
         assert np.isfinite(starts).all()
         assert np.isfinite(durations).all()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -10,8 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
-from s2a_bench.policy import Plans, PlanShape, Start, Timing, policy
-from s2a_bench.testing.policy import EXACT, step
+from s2a_bench.policy import Plans, PlanShape, Policy, Start, Stepper, Timing, policy, stepping
+from s2a_bench.policy.naive import Queue
+from s2a_bench.policy.schedule import work_conserving
+from s2a_bench.policy.stepping import Stream, follow
+from s2a_bench.policy.wait_then_act import WaitingStepper
+from s2a_bench.testing.policy import EXACT, draw
 
 SKILL = Timing(1.0, 0.8, 1.5)
 
@@ -64,7 +70,58 @@ def test_ties_between_arrivals_and_ends_are_decided_alike_in_both_forms(
     arrival_s = np.cumsum([float(gap) for gap, _ in skills])[:, np.newaxis]
     nominal_s = np.array([[float(duration)] for _, duration in skills])
     plans = Plans(arrival_s, nominal_s, nominal_s, nominal_s, arrival_s, PlanShape(len(skills), 1, SKILL))
-    starts, durations = step(policy(name), plans)
-    schedule = policy(name).schedule(plans)
-    assert starts == pytest.approx(schedule.start_s[:, 0].tolist(), abs=EXACT)
-    assert durations == pytest.approx(schedule.duration_s[:, 0].tolist(), abs=EXACT)
+    stepped, schedule = stepping.schedule(policy(name), plans), policy(name).schedule(plans)
+    np.testing.assert_allclose(stepped.start_s, schedule.start_s, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(stepped.duration_s, schedule.duration_s, rtol=0, atol=EXACT)
+
+
+@dataclass(frozen=True)
+class AfterTwo(Policy):
+    """A policy of one class: it starts with the second skill, or when no other comes."""
+
+    name: ClassVar[str] = "after-two"
+
+    def stepper(self, shape: PlanShape) -> Stepper:
+        return WaitingStepper(min(2, shape.n_skills))
+
+
+def test_a_policy_with_a_stepper_alone_decides_for_many_plans() -> None:
+    plans = draw(5, 6, 2, 1.3, 20)
+    schedule = AfterTwo().schedule(plans)
+    started = work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[1])
+    np.testing.assert_allclose(schedule.start_s, started, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(schedule.duration_s, plans.nominal_s, rtol=0, atol=EXACT)
+
+
+def test_plans_without_a_shape_cannot_be_stepped_through() -> None:
+    with pytest.raises(ValueError, match="after-two is asked step by step: plans need shape"):
+        AfterTwo().schedule(replace(draw(5, 6, 2, 1.3, 1), shape=None))
+
+
+@dataclass
+class Wrong(Queue):
+    """Answers the same whatever happens."""
+
+    answer: Start | float = 0.0
+
+    def decide(self, now_s: float) -> Start | float:  # noqa: ARG002
+        return self.answer
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (0.0, "asked at 0.0 s wants to be asked again at 0.0 s"),
+        (math.nan, "wants to be asked again at nan s"),
+        (Start(1.0, 1.0), "starts skill 1 at 0.0 s, before it has arrived"),
+    ],
+)
+def test_what_no_robot_can_do_is_refused(answer: Start | float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        follow(Wrong(answer=answer), Stream([], [1.0], [SKILL]), 1)
+
+
+def test_a_stepper_that_gives_up_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(AfterTwo, "stepper", lambda _self, _shape: Wrong(answer=math.inf))
+    with pytest.raises(ValueError, match="after-two ended with 0 of 3 skills"):
+        AfterTwo().schedule(draw(5, 3, 2, 1.3, 1))

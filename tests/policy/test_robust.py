@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
-from s2a_bench.policy import Plans, PlanShape, Timing
+from s2a_bench.policy import Plans, PlanShape, Timing, stepping
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.robust import RobustStart
 from s2a_bench.policy.schedule import safe_start
-from s2a_bench.testing.policy import EXACT, draw, one, step
+from s2a_bench.testing.policy import EXACT, draw
 
 BOUND = 1.3
 
@@ -42,11 +42,9 @@ def test_it_never_stalls_when_gaps_keep_the_bound(seed: int, n_skills: int, shar
 def test_with_a_bound_its_steps_and_arrays_agree(seed: int, n_skills: int) -> None:
     plans = draw(seed, n_skills, 2, 1.2, 2)
     policy = RobustStart(BOUND)
-    schedule = policy.schedule(plans)
-    for column in range(2):
-        starts, durations = step(policy, one(plans, column))
-        np.testing.assert_allclose(starts, schedule.start_s[:, column], rtol=0, atol=EXACT)
-        np.testing.assert_allclose(durations, plans.nominal_s[:, column], rtol=0, atol=EXACT)
+    stepped = stepping.schedule(policy, plans)
+    np.testing.assert_allclose(stepped.start_s, policy.schedule(plans).start_s, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(stepped.duration_s, plans.nominal_s, rtol=0, atol=EXACT)
 
 
 def test_no_earlier_start_is_safe_when_every_gap_is_the_bound() -> None:

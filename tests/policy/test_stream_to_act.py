@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from s2a_bench.policy import Plans, PlanShape, Schedule, Start, Timing
+from s2a_bench.policy import Plans, PlanShape, Start, Timing, stepping
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.policy.stream_to_act import MeanStart, OnlineStepper, QuantileStart, StreamToAct
-from s2a_bench.testing.policy import EXACT, Stream, draw, follow
+from s2a_bench.testing.policy import EXACT, draw
 
 SHAPE = PlanShape(4, 2, Timing(1.0, 0.8, 1.5), expected_cv=0.2)
 PRIOR = GapPrior(0.5, 0.1, 0.2)
@@ -107,19 +107,6 @@ def test_lateness_is_recovered_down_to_the_least_duration_and_not_beyond_schedul
     assert later.duration_s == pytest.approx(0.8)
 
 
-def run(policy: StreamToAct, plans: Plans, column: int) -> Schedule:
-    """Step through one plan."""
-    assert plans.token_s is not None
-    assert plans.shape is not None
-    timings = [
-        Timing(*map(float, row))
-        for row in zip(plans.nominal_s[:, column], plans.least_s[:, column], plans.most_s[:, column], strict=True)
-    ]
-    stream = Stream(plans.token_s[:, column].tolist(), plans.arrival_s[:, column].tolist(), timings)
-    starts, durations = follow(policy.stepper(plans.shape), stream, plans.shape.n_skills)
-    return Schedule(np.array(starts), np.array(durations))
-
-
 @settings(deadline=None, max_examples=150)
 @given(
     kind=KINDS,
@@ -160,10 +147,9 @@ def test_steps_and_arrays_agree_whatever_is_believed_and_however_fragments_lag(
         shape=PlanShape(n_skills + more, believed_tokens, Timing(1.1, 0.9, 1.4), expected_cv),
     )
     schedule = kind(prior, caution).schedule(plans)
-    for column in range(3):
-        stepped = run(kind(prior, caution), plans, column)
-        np.testing.assert_allclose(stepped.start_s, schedule.start_s[:, column], rtol=0, atol=EXACT)
-        np.testing.assert_allclose(stepped.duration_s, schedule.duration_s[:, column], rtol=0, atol=EXACT)
+    stepped = stepping.schedule(kind(prior, caution), plans)
+    np.testing.assert_allclose(stepped.start_s, schedule.start_s, rtol=0, atol=EXACT)
+    np.testing.assert_allclose(stepped.duration_s, schedule.duration_s, rtol=0, atol=EXACT)
 
 
 @settings(deadline=None, max_examples=60)
