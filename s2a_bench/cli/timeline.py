@@ -13,6 +13,7 @@ from s2a_bench.cli.output import print_json
 from s2a_bench.cli.timeline_live import given_live, live_config, refuse_with_live, refuse_without_live
 from s2a_bench.errors import S2AError, UsageError
 from s2a_bench.inference import ENGINES
+from s2a_bench.policy import POLICIES
 from s2a_bench.runtime import ROBOTS
 
 if TYPE_CHECKING:
@@ -30,8 +31,7 @@ def timeline(
     policy: Annotated[
         str,
         typer.Option(
-            help="naive, wait-then-act, stream-to-act (online); for study s2a-clairvoyant, s2a-mean, s2a-quantile, "
-            "s2a-robust; several with commas"
+            help=f"{', '.join(POLICIES)}, with parameters as in NAME?parameter=value&other=value; several with commas"
         ),
     ] = "naive,wait-then-act,stream-to-act",
     profile: Annotated[

@@ -8,11 +8,11 @@ times in seconds from the request.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
 
-from s2a_bench.errors import UsageError
+from s2a_bench.registry import Registry
 
 if TYPE_CHECKING:
     import numpy as np
@@ -126,21 +126,32 @@ class Policy(Protocol):
         return schedule(self, plans)
 
 
-POLICIES: dict[str, str] = {
-    "naive": "s2a_bench.policy.naive:Naive",
-    "wait-then-act": "s2a_bench.policy.wait_then_act:WaitThenAct",
-    "stream-to-act": "s2a_bench.policy.stream_to_act:StreamToAct",
-    "s2a-clairvoyant": "s2a_bench.policy.clairvoyant:Clairvoyant",
-    "s2a-mean": "s2a_bench.policy.stream_to_act:MeanStart",
-    "s2a-quantile": "s2a_bench.policy.stream_to_act:QuantileStart",
-    "s2a-robust": "s2a_bench.policy.robust:RobustStart",
-}
-"""Value of ``--policy`` -> what builds it with its defaults; the names starting with s2a- are for study."""
+POLICIES: Final[Registry[Callable[..., Policy]]] = Registry(
+    "policies",
+    "policy",
+    {
+        "naive": "s2a_bench.policy.naive:Naive",
+        "wait-then-act": "s2a_bench.policy.wait_then_act:WaitThenAct",
+        "stream-to-act": "s2a_bench.policy.stream_to_act:StreamToAct",
+        "s2a-clairvoyant": "s2a_bench.policy.clairvoyant:Clairvoyant",
+        "s2a-mean": "s2a_bench.policy.stream_to_act:MeanStart",
+        "s2a-quantile": "s2a_bench.policy.stream_to_act:QuantileStart",
+        "s2a-robust": "s2a_bench.policy.robust:RobustStart",
+    },
+)
+"""What builds each policy from its parameters, which all have defaults; names starting with s2a- are for study."""
 
 
-def policy(name: str) -> Policy:
-    """Build a policy with its defaults; raises UsageError for an unknown name."""
-    if name not in POLICIES:
-        raise UsageError(f"--policy: '{name}' is none of {', '.join(POLICIES)}")
-    built: Policy = resolve_name(POLICIES[name])()
-    return built
+def policy(written: str) -> Policy:
+    """Build the policy ``name[?parameter=value&...]``; raises UsageError for an unknown name, parameter or value."""
+    from s2a_bench.policy.parameters import build
+
+    return build(POLICIES[written.partition("?")[0]], written)
+
+
+def policies(written: Iterable[str]) -> dict[str, Policy]:
+    """Build each policy once, by its canonical name: parameters in their order, those at their default left out."""
+    from s2a_bench.policy.parameters import canonical
+
+    built = ((each.partition("?")[0], policy(each)) for each in written)
+    return {canonical(name, each): each for name, each in built}

@@ -29,7 +29,7 @@ class Clairvoyant:
         """Follow one plan as it arrives; raises UsageError where ``shape`` does not tell S0."""
         if shape.safe_start_s is None:
             raise UsageError(
-                "--policy: s2a-clairvoyant needs to know when every skill will arrive, so it runs on recorded or "
+                "`policy`: s2a-clairvoyant needs to know when every skill will arrive, so it runs on recorded or "
                 "modelled arrivals only; stream-to-act is what a robot can run"
             )
         return ClairvoyantStepper(shape.safe_start_s)

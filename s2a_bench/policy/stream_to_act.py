@@ -22,7 +22,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, TypeAlias
+
+from pydantic import Field
 
 from s2a_bench.policy import Plans, PlanShape, Schedule, Start, Timing
 from s2a_bench.policy.estimator import VAGUE, GapPrior
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 
 CAUTION = 2.33
 """lambda until it is calibrated: the normal distribution's 99 % quantile."""
+Caution: TypeAlias = Annotated[float, Field(ge=0)]
+"""lambda; infinity waits for the whole plan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,18 +47,22 @@ class StreamToAct:
     """Whether skills may be stretched, held on and compressed."""
 
     prior: GapPrior = VAGUE
-    caution: float = CAUTION
-    """lambda, 0 or more; infinity waits for the whole plan."""
+    caution: Caution | None = None
+    """None: calibrated where a run has plans to do that on, else `CAUTION`."""
 
     def schedule(self, plans: Plans) -> Schedule:
         """Decide for many plans at once; they need ``token_s`` and ``shape``."""
         from s2a_bench.policy.online import schedule
 
-        return schedule(self.prior, self.caution, plans, elastic=self.elastic)
+        return schedule(self.prior, self._lambda, plans, elastic=self.elastic)
 
     def stepper(self, shape: PlanShape) -> Stepper:
         """Follow one plan as it arrives."""
-        return OnlineStepper(self.prior, self.caution, shape, self.elastic)
+        return OnlineStepper(self.prior, self._lambda, shape, self.elastic)
+
+    @property
+    def _lambda(self) -> float:
+        return CAUTION if self.caution is None else self.caution
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +72,7 @@ class MeanStart(StreamToAct):
     name: ClassVar[str] = "s2a-mean"
     elastic: ClassVar[bool] = False
 
-    caution: float = 0.0
+    caution: Caution | None = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +81,8 @@ class QuantileStart(StreamToAct):
 
     name: ClassVar[str] = "s2a-quantile"
     elastic: ClassVar[bool] = False
+
+    caution: Caution | None = CAUTION
 
 
 @dataclass(slots=True)

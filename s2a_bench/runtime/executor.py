@@ -61,9 +61,13 @@ class Executor:
         gap: Gap = "hold",
         silence_s: float = SILENCE_S,
         patience_s: float = PATIENCE_S,
+        name: str = "",
     ) -> None:
-        """Follow the stream that ``inbox`` tells of, whose clock is ``clock``; ``gap`` is how to wait at first."""
-        self.record = Record(policy.name)
+        """Follow the stream that ``inbox`` tells of, whose clock is ``clock``; ``gap`` is how to wait at first.
+
+        ``name`` is what the record calls the policy, its own name otherwise.
+        """
+        self.record = Record(name or policy.name)
         self._stepper = policy.stepper(shape)
         self._announced = shape.n_skills
         self._robot, self._inbox, self._clock = robot, inbox, clock

@@ -309,7 +309,7 @@ def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
     ("fields", "message"),
     [
         ({"policies": ()}, "--policy: name at least one"),
-        ({"policies": ("eager",)}, "--policy: 'eager' is none of"),
+        ({"policies": ("eager",)}, "`policy`: 'eager' is none of"),
         ({"policies": ("s2a-clairvoyant",)}, "s2a-clairvoyant needs to know when every skill will arrive"),
         ({"skills": "juggling"}, "--skills: 'juggling' is none of"),
         ({"n_skills": (0,)}, "--n-skills: 0 should be 1 or more"),

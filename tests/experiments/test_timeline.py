@@ -25,7 +25,9 @@ from s2a_bench.experiments.timeline.traces import recordings
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.conformal import Calibration
+from s2a_bench.policy.robust import RobustStart
 from s2a_bench.policy.schedule import safe_start
+from s2a_bench.policy.stream_to_act import StreamToAct
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
 
@@ -121,7 +123,7 @@ def test_online_without_jitter_starts_at_the_safe_start_exactly(
     )
     ((board, setting),) = settings(config)
     _, plans = draw(config, board, setting, 1, "plans")
-    schedule = learn(config, board, setting).prepare("stream-to-act").schedule(plans)
+    schedule = learn(config, board, setting).prepare(StreamToAct()).schedule(plans)
     safe_s = safe_start(plans.arrival_s, plans.nominal_s)
     assert schedule.start_s[0] == pytest.approx(safe_s, rel=1e-9, abs=1e-9)
     end_s = schedule.start_s[-1] + schedule.duration_s[-1]
@@ -135,7 +137,7 @@ def test_a_declared_gap_bound_frees_the_robust_rule_from_waiting() -> None:
         )
         ((board, setting),) = settings(config)
         _, plans = draw(config, board, setting, 1, "plans")
-        start_s = learn(config, board, setting).prepare("s2a-robust").schedule(plans).start_s[0, 0]
+        start_s = learn(config, board, setting).prepare(RobustStart()).schedule(plans).start_s[0, 0]
         assert start_s == pytest.approx(10.5 if late else 3.5)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UsageError
+from s2a_bench.inference import ENGINES
 from s2a_bench.options import Options, option
 from s2a_bench.scenario.ccrb.options import SKILL_SET
 
@@ -24,7 +25,7 @@ class Asked(Options):
     pace: float | None = option(
         None, "--live: hold the answer back to so many tokens/s [default: the model's own]", gt=0, allow_inf_nan=False
     )
-    engine: str | None = option(None, "--live: llama, replay (EMULATED) [default: llama]")
+    engine: str | None = option(None, f"--live: {', '.join(ENGINES)} [default: llama]")
     model: Path | None = option(None, "--live: GGUF model [default: the tiny dummy]")
     mmproj: Path | None = option(None, "--live: GGUF vision tower that goes with --model")
     threads: int | None = option(None, "--live: CPU threads of the model [default: all]", ge=0)

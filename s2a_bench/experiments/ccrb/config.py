@@ -11,6 +11,7 @@ from pydantic import Field
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.ccrb.asked import Asked, live_config
 from s2a_bench.options import Names, Numbers, Options, one_of, option
+from s2a_bench.policy import POLICIES
 from s2a_bench.scenario import SIMULATORS
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 
@@ -31,7 +32,7 @@ class CcrbConfig(Options):
 
     policies: Names = option(
         ("naive", "wait-then-act", "stream-to-act"),
-        "naive, wait-then-act, stream-to-act, and those for study; several with commas",
+        f"{', '.join(POLICIES)}, with parameters as in NAME?parameter=value&other=value; several with commas",
         flag="policy",
     )
     profile: str = option("jetson-agx-orin", "the board: a name of 'profile list', or a path")

@@ -118,5 +118,5 @@ def _hear(config: CcrbConfig, ask: Ask, link: Link, prior: GapPrior | None) -> P
         column(feed.token_ns),
         shape,
     )
-    policies = {name: prepare_policy(name, prior) for name in config.policies}
+    policies = {name: prepare_policy(policy, prior) for name, policy in config.timeline.chosen.items()}
     return complete(config, setting, request_id, plans, policies)

@@ -35,7 +35,7 @@ def prepare(config: CcrbConfig) -> Prepared:
     board, setting = next(settings(config.timeline))
     known = learn(config.timeline, board, setting)
     _, plans = draw(config.timeline, board, setting, 1, "plans")
-    policies = {name: known.prepare(name) for name in config.policies}
+    policies = {name: known.prepare(policy) for name, policy in config.timeline.chosen.items()}
     return complete(config, setting, setting.request_id(0), plans, policies)
 
 

@@ -14,8 +14,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.plans import NO_JITTER, Board, board_of_profile, board_of_rate
 from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.harness.ranges import LEAST_T_NOM_S, require
-from s2a_bench.policy import PlanShape, Timing
-from s2a_bench.policy import policy as policy_of
+from s2a_bench.policy import PlanShape, Policy, Timing, policies
 from s2a_bench.policy.conformal import EPSILON
 from s2a_bench.policy.conformal import PLANS as CALIBRATION_PLANS
 from s2a_bench.policy.conformal import check as check_calibration
@@ -65,6 +64,11 @@ class TimelineConfig:
         found = [board_of_profile(load_profile(name), self.jitter, self.prompt_s) for name in self.profiles]
         return found + [board_of_rate(rate, self.jitter, self.prompt_s) for rate in self.rates]
 
+    @cached_property
+    def chosen(self) -> dict[str, Policy]:
+        """Build the policies, by their canonical names; raises UsageError."""
+        return policies(self.policies)
+
     @property
     def random(self) -> bool:
         """Tell whether one plan differs from the next."""
@@ -77,8 +81,7 @@ class TimelineConfig:
 
     def check(self) -> None:
         """Refuse what makes no sense; raises UsageError naming the flag."""
-        for name in self.policies:
-            policy_of(name)
+        _ = self.chosen
         for flag, values in (("--policy", self.policies), ("--profile or --rate", (*self.profiles, *self.rates))):
             if not values:
                 raise UsageError(f"{flag}: name at least one")
@@ -97,7 +100,7 @@ class TimelineConfig:
             raise UsageError("--calibrate: the recorded machine is one board; name it with one --profile or --rate")
         if self.plans_a_cell > 1 and not self.random:
             raise UsageError("--plans: without --jitter or --t-nom-cv all plans are the same; leave it out")
-        skills = sum(setting.n_skills for _, setting in settings(self)) * len(self.policies) * self.plans_a_cell
+        skills = sum(setting.n_skills for _, setting in settings(self)) * len(self.chosen) * self.plans_a_cell
         if skills > MOST_SKILLS:
             raise UsageError(f"--plans: {skills} skills are more than the {MOST_SKILLS} of one run; ask for fewer")
         tokens = max(self.n_skills) * max(self.tokens_per_skill)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -54,14 +54,14 @@ class SideBySide:
     """One executor a policy, all told the same. Use as a context manager; leaving it early aborts them."""
 
     def __init__(
-        self, policies: Sequence[Policy], shape: PlanShape, gap: Gap, robots: Sequence[Robot], silence_s: float
+        self, policies: Mapping[str, Policy], shape: PlanShape, gap: Gap, robots: Sequence[Robot], silence_s: float
     ) -> None:
-        """Prepare; one robot a policy."""
+        """Prepare; policies by the names they are recorded under, one robot each."""
         self._inboxes = [LiveInbox() for _ in policies]
         clock = SystemClock()
         self._executors = [
-            Executor(policy, shape, robot, inbox, clock, gap=gap, silence_s=silence_s)
-            for policy, robot, inbox in zip(policies, robots, self._inboxes, strict=True)
+            Executor(policy, shape, robot, inbox, clock, gap=gap, silence_s=silence_s, name=name)
+            for (name, policy), robot, inbox in zip(policies.items(), robots, self._inboxes, strict=True)
         ]
         self._pool = ThreadPoolExecutor(len(policies), "executor")
         self._futures: list[Future[Record]] = []
@@ -106,14 +106,14 @@ def keep(
     setting: Setting,
     plan: int,
     request_id: str,
-    policies: Sequence[Policy],
+    policies: Mapping[str, Policy],
     records: Sequence[Record],
 ) -> list[RunWarning]:
     """Write what happened as rows, as far as skills ran, and return the warnings.
 
     A rate of 0 says that too few tokens came to know it; then there are no rows.
     """
-    for policy, record in zip(policies, records, strict=True):
+    for record in records:
         cell = f"{setting.name}/{record.policy}"
         writer.update(executions={f"{cell}/{plan}": _facts(record)})
         if record.ran and record.requested_ns is not None and setting.tokens_per_s > 0:
@@ -126,7 +126,7 @@ def keep(
                 [request_id],
                 first_plan=plan,
                 requested_ns=[record.requested_ns],
-                caution=finite(getattr(policy, "caution", None)),
+                caution=finite(getattr(policies[record.policy], "caution", None)),
                 tolerance_s=TOLERANCE_S,
             )
             texts = [[str(skill.call) for skill in record.ran]]

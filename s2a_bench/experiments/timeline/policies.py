@@ -13,11 +13,10 @@ from s2a_bench.experiments.timeline.config import TimelineConfig
 from s2a_bench.experiments.timeline.plans import Board
 from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.policy import Policy
-from s2a_bench.policy import policy as policy_of
 from s2a_bench.policy.conformal import Calibration, calibrate
 from s2a_bench.policy.estimator import LEAST_CV, GapPrior
 from s2a_bench.policy.robust import RobustStart
-from s2a_bench.policy.stream_to_act import StreamToAct
+from s2a_bench.policy.stream_to_act import CAUTION, StreamToAct
 
 if TYPE_CHECKING:
     from s2a_bench.policy import Floats, Plans
@@ -34,16 +33,14 @@ class Knowledge:
     gap_bound_s: float | None
     """What s2a-robust is told."""
 
-    def prepare(self, name: str) -> Policy:
-        """Build a policy: the simpler online rules get the prior, s2a-robust its bound."""
-        built = policy_of(name)
-        if name == self.online.name:
-            return self.online
-        if isinstance(built, StreamToAct):
-            return replace(built, prior=self.online.prior)
-        if isinstance(built, RobustStart) and self.gap_bound_s is not None:
-            return replace(built, gap_bound_s=self.gap_bound_s)
-        return built
+    def prepare(self, policy: Policy) -> Policy:
+        """Tell a policy what it was not told yet: online rules the prior and lambda, s2a-robust its bound."""
+        if isinstance(policy, StreamToAct):
+            caution = self.online.caution if policy.caution is None else policy.caution
+            return replace(policy, prior=self.online.prior, caution=caution)
+        if isinstance(policy, RobustStart) and self.gap_bound_s is not None and math.isinf(policy.gap_bound_s):
+            return replace(policy, gap_bound_s=self.gap_bound_s)
+        return policy
 
 
 def learn(config: TimelineConfig, board: Board, setting: Setting, answers: Sequence[Floats] = ()) -> Knowledge:
@@ -55,13 +52,13 @@ def learn(config: TimelineConfig, board: Board, setting: Setting, answers: Seque
     if answers:
         plans = plans_of(config, setting, answers)
         prior = GapPrior.fit(plans.token_s)  # type: ignore[arg-type]  # recorded plans have tokens
-    elif config.random and any(isinstance(policy_of(name), StreamToAct) for name in config.policies):
+    elif config.random and any(isinstance(policy, StreamToAct) for policy in config.chosen.values()):
         count = max(setting.n_skills * setting.tokens_per_skill, 3)  # a spread needs two gaps
         rng = generator(config.seed, "timeline", "prior", setting)
         prior = GapPrior.fit(board.tokens(count, rng, config.calibration_plans))
         _, plans = draw(config, board, setting, config.calibration_plans, "calibration")
     else:
-        return Knowledge(StreamToAct(GapPrior(1 / board.tokens_per_s, LEAST_CV, LEAST_CV)), None, bound_s)
+        return Knowledge(StreamToAct(GapPrior(1 / board.tokens_per_s, LEAST_CV, LEAST_CV), CAUTION), None, bound_s)
     policy = StreamToAct(prior)
     calibration = calibrate(policy, plans, config.epsilon)
     return Knowledge(replace(policy, caution=calibration.caution), calibration, bound_s)

@@ -117,7 +117,7 @@ def _run_setting(
     if known.calibration is not None:
         caution = finite(known.calibration.caution)
         so_far.calibrations[setting.name] = asdict(known.calibration) | {"caution": caution}
-    policies = [known.prepare(name) for name in config.policies]
+    policies = {name: known.prepare(policy) for name, policy in config.chosen.items()}
     token_s, plans = draw(config, board, setting, config.plans_a_cell, "plans")
     for plan in range(config.plans_a_cell):
         cut = slice(plan, plan + 1)

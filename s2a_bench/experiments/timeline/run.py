@@ -67,8 +67,8 @@ def _compute(
     token_s, plans = draw(config, board, setting, config.plans_a_cell, "plans")
     request_ids = [setting.request_id(plan) for plan in range(config.plans_a_cell)]
     writer.append(TOKENS, token_rows(setting.name, token_s, request_ids))
-    for name in config.policies:
-        policy = known.prepare(name)
+    for name, chosen in config.chosen.items():
+        policy = known.prepare(chosen)
         schedule = policy.schedule(plans)
         rows = timeline_rows(
             setting, name, plans, schedule, request_ids, caution=finite(getattr(policy, "caution", None))

@@ -13,9 +13,8 @@ from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.plan import Format, SkillSet, choose_format, grammar, paper_format, prompt
 from s2a_bench.policy import PlanShape, Policy, Timing
-from s2a_bench.policy import policy as policy_of
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
-from s2a_bench.policy.stream_to_act import StreamToAct
+from s2a_bench.policy.stream_to_act import CAUTION, StreamToAct
 
 if TYPE_CHECKING:
     from s2a_bench.policy import Floats
@@ -94,7 +93,8 @@ def _spread_s(gaps_s: Floats) -> float:
     return max(float(gaps_s.std(ddof=1)), of_blocks)
 
 
-def prepare(name: str, prior: GapPrior | None) -> Policy:
-    """Build a policy; online ones get the prior."""
-    built = policy_of(name)
-    return replace(built, prior=prior) if isinstance(built, StreamToAct) and prior is not None else built
+def prepare(policy: Policy, prior: GapPrior | None) -> Policy:
+    """Tell an online policy the prior, and lambda where it was not given: nothing is calibrated here."""
+    if not isinstance(policy, StreamToAct):
+        return policy
+    return replace(policy, prior=prior or policy.prior, caution=CAUTION if policy.caution is None else policy.caution)

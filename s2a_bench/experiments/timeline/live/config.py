@@ -11,8 +11,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.harness.ranges import LEAST_T_NOM_S, require
 from s2a_bench.plan import Durations, SkillSet, load_skills
-from s2a_bench.policy import PlanShape, Timing
-from s2a_bench.policy import policy as policy_of
+from s2a_bench.policy import PlanShape, Policy, Timing, policies
 from s2a_bench.runtime import ROBOTS
 
 FASTEST: Final = 10_000.0
@@ -48,6 +47,11 @@ class LiveConfig:
         """Load the skills; raises UsageError."""
         return load_skills(self.skills)
 
+    @cached_property
+    def chosen(self) -> dict[str, Policy]:
+        """Build the policies, by their canonical names; raises UsageError."""
+        return policies(self.policies)
+
     @property
     def foreign(self) -> bool:
         """Tell whether somebody else's server answers, whose tokenizer is not at hand."""
@@ -81,8 +85,8 @@ class LiveConfig:
         )
         if cells != 1:
             raise UsageError("--transport: --live follows one stream; name one, as ros, ros/action or http/binary")
-        for name in self.policies:
-            policy_of(name).stepper(PlanShape(1, 1, Timing(1.0, 1.0, 1.0)))
+        for policy in self.chosen.values():
+            policy.stepper(PlanShape(1, 1, Timing(1.0, 1.0, 1.0)))
         if not self.policies:
             raise UsageError("--policy: name at least one")
         require("--tokens-per-skill", self.tokens_per_skill, 1)
@@ -96,7 +100,7 @@ class LiveConfig:
                 raise UsageError(f"{flag}: name at least one")
         self._check_engine()
         robot = ROBOTS[self.robot]
-        if len(self.policies) > 1 and not getattr(robot, "several", False):
+        if len(self.chosen) > 1 and not getattr(robot, "several", False):
             raise UsageError(f"`robot`: {self.robot} follows one policy at a time; choose it with `policy`")
 
     def _check_engine(self) -> None:

@@ -6,7 +6,7 @@ set, and said to be; nothing is emulated unless the engine is the replay of a pr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -83,7 +83,7 @@ class _Live:
         """Open the robots, then the way to the model."""
         build = ROBOTS[self.config.robot]  # first, as a model may take long to load
         self.robots: list[Robot] = [
-            stack.enter_context(closing(build(self.config.skill_set))) for _ in self.config.policies
+            stack.enter_context(closing(build(self.config.skill_set))) for _ in self.config.chosen
         ]
         self.link.connect(stack, source, self.config.robot)
 
@@ -99,7 +99,7 @@ class _Live:
 
     def _execute(self, ask: Ask, plan: int, prior: GapPrior | None) -> None:
         """Ask for one plan and let every policy execute it as it arrives."""
-        policies = [prepare(name, prior) for name in self.config.policies]
+        policies = {name: prepare(policy, prior) for name, policy in self.config.chosen.items()}
         rate = self.link.rate
         span_s = ask.n_skills * (ask.tokens_per_skill / rate if rate else 0.0) + ask.n_skills * ask.t_nom_s
         self.view.stage(f"{self.link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
@@ -121,7 +121,9 @@ class _Live:
             self.records += side_by_side.records
             self._keep(ask, plan, request_id, policies, side_by_side.records)
 
-    def _keep(self, ask: Ask, plan: int, request_id: str, policies: Sequence[Policy], records: list[Record]) -> None:
+    def _keep(
+        self, ask: Ask, plan: int, request_id: str, policies: Mapping[str, Policy], records: list[Record]
+    ) -> None:
         """Keep what the policies made of one plan."""
         token_ns = max((record.token_ns for record in records), key=len)
         self.link.saw(token_ns)

@@ -1,0 +1,66 @@
+"""A policy's parameters as its users write them: ``name?parameter=value&other=value``.
+
+They are the fields of the policy's dataclass with a plain default, a number or a text; their annotations, pydantic's
+``Field`` included, say what they may be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import Field, fields, is_dataclass
+from typing import Any, get_type_hints
+
+from s2a_bench.errors import UsageError
+from s2a_bench.policy import Policy
+
+
+def build(made_by: Callable[..., Policy], written: str) -> Policy:
+    """Build ``name?parameter=value&...``; raises UsageError naming the policy, the parameter, and those there are."""
+    name, _, given = written.partition("?")
+    if not given:
+        return made_by()
+    types = _types(made_by)
+    known = f"its parameters are {', '.join(types)}" if types else "it has no parameters"
+    values: dict[str, Any] = {}
+    for pair in given.split("&"):
+        parameter, _, text = pair.partition("=")
+        if parameter not in types or parameter in values:
+            wrong = "is given twice" if parameter in values else "is no parameter"
+            raise UsageError(f"`policy`: {name}: '{parameter}' {wrong}; {known}")
+        values[parameter] = _value(types[parameter], text, f"`policy`: {name}: {parameter} = '{text}'", known)
+    try:
+        return made_by(**values)
+    except UsageError as error:
+        raise UsageError(f"`policy`: {name}: {error}; {known}") from error
+
+
+def canonical(name: str, policy: Policy) -> str:
+    """Write a policy with its parameters in the order of their names, those at their default left out."""
+    given = {}
+    for field in _parameters(type(policy)):
+        value = getattr(policy, field.name)
+        if value != field.default:
+            given[field.name] = f"{value:.12g}" if isinstance(value, float) else str(value)
+    return name + "?" * bool(given) + "&".join(f"{parameter}={text}" for parameter, text in sorted(given.items()))
+
+
+def _value(type_: Any, text: str, what: str, known: str) -> Any:
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        return TypeAdapter(type_).validate_strings(text)
+    except ValidationError as error:
+        wrong = error.errors()[0]["msg"]
+        raise UsageError(f"{what}: {wrong[0].lower()}{wrong[1:]}; {known}") from error
+
+
+def _types(made_by: Callable[..., Policy]) -> dict[str, Any]:
+    """Return each parameter's type, as annotated."""
+    parameters = _parameters(made_by)
+    hints = get_type_hints(made_by, include_extras=True) if parameters else {}
+    return {field.name: hints[field.name] for field in parameters}
+
+
+def _parameters(made_by: Any) -> list[Field[Any]]:
+    found = fields(made_by) if is_dataclass(made_by) else ()
+    return [field for field in found if isinstance(field.default, bool | int | float | str | None)]

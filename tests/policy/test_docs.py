@@ -1,0 +1,45 @@
+"""The example of docs/policies.md is a policy like ours."""
+
+from __future__ import annotations
+
+import re
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from s2a_bench.policy import POLICIES, Policy, policies
+from s2a_bench.policy import policy as build
+from s2a_bench.testing.policy import PolicySuite
+
+PAGE = (Path(__file__).parent.parent.parent / "docs" / "policies.md").read_text()
+
+
+@pytest.fixture(autouse=True)
+def offer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Offer the example as its package would."""
+    (program,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    module = ModuleType("my_policies")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    exec(program, vars(module))  # noqa: S102 - our own page
+    ((name, where),) = re.findall(rf'entry-points."{POLICIES.group}"\]\n(\w+) = "(\S+)"', PAGE)
+    monkeypatch.setitem(vars(POLICIES), "_offered", {name: EntryPoint(name, where, POLICIES.group)})
+
+
+@pytest.mark.parametrize("written", ["ahead", "ahead?skills=4"])
+class TestTheExample(PolicySuite):
+    @pytest.fixture
+    def policy(self, written: str) -> Policy:
+        return build(written)
+
+
+def test_the_table_names_every_parameter() -> None:
+    rows = re.findall(r"^\| ([a-z0-9, -]+) \| `(\w+)` \|", PAGE, re.MULTILINE)
+    documented = {(name, parameter) for names, parameter in rows for name in names.split(", ")}
+    assert documented == {(name, "caution") for name in ("stream-to-act", "s2a-mean", "s2a-quantile")} | {
+        ("s2a-robust", "gap_bound_s")
+    }
+    for name, parameter in documented:
+        assert list(policies([f"{name}?{parameter}=7"])) == [f"{name}?{parameter}=7"]
