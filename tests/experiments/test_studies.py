@@ -229,8 +229,8 @@ def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest
     assert progress.done == len(cells_of(name, config))
     run = read_run(folder)
     assert run.manifest["configuration"]["study"] == name
-    assert set(run.table(STUDIES)["study"]) == {name}
-    assert (run.table(STUDIES)["plans"] > 0).all()
+    assert set(run.table(TABLE)["study"]) == {name}
+    assert (run.table(TABLE)["plans"] > 0).all()
     tables = study_tables(run)
     assert all(len(row) == len(table.header) for table in tables for row in table.rows)
     assert all("nan" not in entry.lower() for table in tables for row in table.rows for entry in row)
@@ -238,7 +238,7 @@ def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest
     assert [path.name for path in write_study_figure(run)] == [f"{name}.png", f"{name}.pdf"]
     told = study_json(run)
     jsonschema.validate(told, json.loads(SCHEMA.read_text()))
-    assert len(told["cells"]) == len(run.table(STUDIES))
+    assert len(told["cells"]) == len(run.table(TABLE))
     assert [each["what"] for each in told.get("targets", [])] == (TARGETS if name == "targets" else [])
 
 
