@@ -24,3 +24,27 @@ class Progress(Protocol):
     def advance(self) -> None:
         """Say that one more sample is done."""
         ...
+
+
+class NullProgress:
+    """Shows nothing, and keeps what it was told last."""
+
+    folder: Path | None = None
+    text = ""
+    expected = done = 0
+
+    def opened(self, folder: Path) -> None:
+        """Keep the folder."""
+        self.folder = folder
+
+    def stage(self, text: str) -> None:
+        """Keep the text."""
+        self.text = text
+
+    def expect(self, samples: int) -> None:
+        """Keep the number."""
+        self.expected = samples
+
+    def advance(self) -> None:
+        """Count."""
+        self.done += 1

@@ -1,4 +1,4 @@
-"""What every middleware's actions promise: subclass `ActionSuite` and say how to join a domain.
+"""What every middleware's actions promise, as one suite.
 
 Client and server are driven by turns on the test's own thread: both pull.
 """
@@ -85,7 +85,10 @@ def text_of(client: ActionClient, got: Feedback) -> str:
 
 
 class ActionSuite:
-    """Run by every implementation."""
+    """What every middleware's action clients and servers do.
+
+    Fixture: ``join``, which opens one more participant of the same domain and closes all when the test ends.
+    """
 
     @pytest.fixture
     def join(self) -> Join:

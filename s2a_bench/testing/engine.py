@@ -1,4 +1,4 @@
-"""The engine's contract as one suite: subclass it, and give a fixture `engine`."""
+"""What every engine promises, as one suite."""
 
 from __future__ import annotations
 
@@ -24,7 +24,11 @@ def ask(
 
 
 class EngineSuite:
-    """What every engine does."""
+    """What every engine does.
+
+    Fixtures: ``engine``, which may live as long as the class, and ``fresh_engine``, an engine of its own for one test,
+    which closes it.
+    """
 
     def test_tokens_are_counted_from_0(self, engine: Engine) -> None:
         tokens = ask(engine)

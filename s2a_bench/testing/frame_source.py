@@ -1,8 +1,4 @@
-"""What every FrameSource promises: one suite, run by each implementation with itself as the subject.
-
-A test module takes part by subclassing `FrameSourceSuite` as a class named ``Test...`` and overriding the
-fixture ``make_source``.
-"""
+"""What every frame source promises, as one suite."""
 
 from __future__ import annotations
 
@@ -22,6 +18,12 @@ SIZES = [(64, 48), (98, 30)]
 
 
 class FrameSourceSuite:
+    """What every frame source does.
+
+    Fixture: ``make_source``, called with width and height, opens a new source of frames that are not all alike; it
+    raises UsageError for a size without pixels.
+    """
+
     @pytest.fixture
     def make_source(self) -> MakeSource:
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""What every middleware promises: subclass `MiddlewareSuite` and say how to join a domain."""
+"""What every middleware promises, as one suite."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ def wait_matched(publisher: Publisher, subscription: Subscription) -> None:
 
 
 class MiddlewareSuite:
-    """Run by every implementation."""
+    """What every middleware does.
+
+    Fixture: ``join``, which opens one more participant of the same domain and closes all when the test ends.
+    """
 
     @pytest.fixture
     def join(self) -> Join:

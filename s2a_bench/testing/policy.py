@@ -1,4 +1,4 @@
-"""The policy's contract as one suite: subclass it, and give a fixture `policy`."""
+"""What every policy promises, as one suite."""
 
 from __future__ import annotations
 
@@ -63,7 +63,10 @@ seeded = st.builds(
 
 
 class PolicySuite:
-    """What every policy does."""
+    """What every policy does: its arrays, where it has some, and its stepper give the same result.
+
+    Fixture: ``policy``, whose name is found in `POLICIES`.
+    """
 
     def test_its_name_is_the_one_it_is_found_by(self, policy: Policy) -> None:
         assert policy.name in POLICIES

@@ -1,4 +1,4 @@
-"""The simulator's contract as one suite: subclass it, and give a fixture `world` (one roll-out at a time)."""
+"""What every simulator promises, as one suite."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ def run(world: Simulator, seconds: float, wanted: Command) -> State:
 
 
 class SimulatorSuite:
-    """What every simulator does; ``EXACT`` is how far it may be off, in m and m/s, after some seconds."""
+    """What every simulator does; ``EXACT`` is how far it may be off, in m and m/s, after some seconds.
+
+    Fixture: ``world``, whose name is found in `SIMULATORS`, for one roll-out at a time.
+    """
 
     EXACT = 0.1
 

@@ -11,23 +11,15 @@ import pytest
 
 from s2a_bench.experiments.timeline.config import TimelineConfig
 from s2a_bench.experiments.timeline.run import run_timeline
+from s2a_bench.testing import NullProgress
 
 ROOT = Path(__file__).parent.parent.parent
-
-
-class Quiet:
-    """Progress that nobody looks at."""
-
-    def opened(self, folder: Path) -> None: ...
-    def stage(self, text: str) -> None: ...
-    def expect(self, samples: int) -> None: ...
-    def advance(self) -> None: ...
 
 
 @pytest.fixture(scope="module")
 def timeline(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
-    return run_timeline(config, tmp_path_factory.mktemp("timeline"), Quiet())
+    return run_timeline(config, tmp_path_factory.mktemp("timeline"), NullProgress())
 
 
 def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -29,6 +29,7 @@ from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.policy.stream_to_act import StreamToAct
 from s2a_bench.store.run import read_run
+from s2a_bench.testing import NullProgress
 
 SCHEMA = Path(__file__).parents[2] / "docs" / "schema" / "s2a-bench-1.json"
 TARGETS = [
@@ -48,25 +49,6 @@ HARDEST = (
     World(0.58, 3.0, 6, 8, 1.0),
 )
 """Settings with rho from .83 to 10.3 where stalls were most frequent."""
-
-
-class Quiet:
-    """Progress that nobody watches."""
-
-    folder: Path | None = None
-    done = 0
-
-    def opened(self, folder: Path) -> None:
-        self.folder = folder
-
-    def stage(self, text: str) -> None:
-        pass
-
-    def expect(self, samples: int) -> None:
-        pass
-
-    def advance(self) -> None:
-        self.done += 1
 
 
 def frame(rows: list[StudyRow]):  # noqa: ANN201 - pandas is imported late, as in the package
@@ -222,7 +204,7 @@ def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest
     for module in (study_targets, study_jitter, study_drift, study_misfit):
         monkeypatch.setattr(module, "WORLDS", HARDEST[:1])
     monkeypatch.setattr(study_drift, "REFIT", 32)
-    progress = Quiet()
+    progress = NullProgress()
     config = StudyConfig(plans=64, calibration_plans=100)
     folder = run_study(name, config, tmp_path, progress)
     assert folder == progress.folder
@@ -256,7 +238,7 @@ def test_wrong_use_is_told_before_anything_is_written(
     name: str, config: StudyConfig, message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(UsageError, match=message):
-        run_study(name, config, tmp_path, Quiet())
+        run_study(name, config, tmp_path, NullProgress())
     assert list(tmp_path.iterdir()) == []
 
 

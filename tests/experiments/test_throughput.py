@@ -22,25 +22,10 @@ from s2a_bench.harness.rounds import run_blocks
 from s2a_bench.harness.session import Place
 from s2a_bench.inference import EngineConfig
 from s2a_bench.store.run import RunWriter, read_run
+from s2a_bench.testing import NullProgress
 from tests.llama_bench_stand_in import install
 
 REQUESTS = LatencyConfig(transports=("loopback",), max_tokens=16)
-
-
-class Silent:
-    """Progress that nobody watches."""
-
-    expected = done = 0
-
-    def opened(self, folder: Path) -> None: ...
-
-    def stage(self, text: str) -> None: ...
-
-    def expect(self, samples: int) -> None:
-        self.expected = samples
-
-    def advance(self) -> None:
-        self.done += 1
 
 
 @pytest.mark.parametrize(
@@ -88,7 +73,7 @@ def test_every_block_gives_everyone_one_turn_and_the_others_are_last_at_first(
     seen: list[tuple[str, Place]] = []
     turns = [lambda place, name=f"turn{i}": seen.append((name, place)) for i in range(n_turns)]
     others = [lambda place, name=f"other{i}": seen.append((name, place)) for i in range(n_others)]
-    progress = Silent()
+    progress = NullProgress()
     run_blocks(turns, others, replace(REQUESTS, warmup=warmup, runs=runs, seed=seed), progress)
     everyone = {f"turn{i}" for i in range(n_turns)} | {f"other{i}" for i in range(n_others)}
     assert progress.expected == progress.done == len(everyone) * (warmup + runs)
@@ -103,7 +88,7 @@ def test_every_block_gives_everyone_one_turn_and_the_others_are_last_at_first(
 def test_the_order_changes_from_block_to_block() -> None:
     seen: list[str] = []
     turns = [lambda _place, name=name: seen.append(name) for name in "abc"]
-    run_blocks(turns, [], replace(REQUESTS, warmup=0, runs=12), Silent())
+    run_blocks(turns, [], replace(REQUESTS, warmup=0, runs=12), NullProgress())
     assert len({"".join(seen[at : at + 3]) for at in range(0, 36, 3)}) > 2
 
 

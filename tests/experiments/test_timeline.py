@@ -30,22 +30,14 @@ from s2a_bench.policy.schedule import safe_start
 from s2a_bench.policy.stream_to_act import StreamToAct
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.testing import NullProgress
 
 ORIN = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
 JITTERY = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,), jitter="profile", plans=300)
 
 
-class Quiet:
-    """Progress that nobody looks at."""
-
-    def opened(self, folder: Path) -> None: ...
-    def stage(self, text: str) -> None: ...
-    def expect(self, samples: int) -> None: ...
-    def advance(self) -> None: ...
-
-
 def ran(config: TimelineConfig, output: Path) -> Run:
-    return read_run(run_timeline(config, output, Quiet()))
+    return read_run(run_timeline(config, output, NullProgress()))
 
 
 def test_every_policy_meets_the_same_arrivals(tmp_path: Path) -> None:
@@ -274,7 +266,7 @@ def test_too_few_or_too_short_answers_are_refused_before_there_is_a_folder(tmp_p
             profiles=(), rates=(5.0,), tokens_per_skill=(3,), n_skills=(skills,), calibrate=folder, epsilon=0.005
         )
         with pytest.raises(UsageError, match=f"{answers} of 120 answers have the {3 * skills} tokens"):
-            run_timeline(config, tmp_path / "run", Quiet())
+            run_timeline(config, tmp_path / "run", NullProgress())
     assert not (tmp_path / "run").exists()
 
 

@@ -22,6 +22,7 @@ from s2a_bench.report.claims.claim import CONFIRMED, NO_RUN, REFUTED, UNTESTABLE
 from s2a_bench.report.claims.verdicts import Judged, claim_table, judge_claims
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.testing import NullProgress
 
 MakeRun = Callable[..., Run]
 MakeRow = Callable[..., SampleRow]
@@ -33,15 +34,6 @@ EVEN: dict[str, dict[str, float]] = {
 }
 
 
-class Quiet:
-    """Progress that nobody looks at."""
-
-    def opened(self, folder: Path) -> None: ...
-    def stage(self, text: str) -> None: ...
-    def expect(self, samples: int) -> None: ...
-    def advance(self) -> None: ...
-
-
 def claim_of(text: str, *runs: Run) -> Judged:
     (found,) = [judged for judged in judge_claims(runs) if text in judged.claim.text]
     return found
@@ -49,13 +41,13 @@ def claim_of(text: str, *runs: Run) -> Judged:
 
 @pytest.fixture(scope="module")
 def timelines(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return read_run(run_timeline(TimelineConfig(), tmp_path_factory.mktemp("timeline"), Quiet()))
+    return read_run(run_timeline(TimelineConfig(), tmp_path_factory.mktemp("timeline"), NullProgress()))
 
 
 @pytest.fixture(scope="module")
 def ccrb(tmp_path_factory: pytest.TempPathFactory) -> Run:
     config = CcrbConfig(phase=True, phase_points=(7, 5))
-    return read_run(run_ccrb(config, tmp_path_factory.mktemp("ccrb"), Quiet()))
+    return read_run(run_ccrb(config, tmp_path_factory.mktemp("ccrb"), NullProgress()))
 
 
 def test_without_runs_each_claim_says_what_to_run() -> None:
@@ -216,12 +208,12 @@ def test_what_the_paper_says_beyond_that_is_not_confirmed(timelines: Run) -> Non
 
 
 def test_s0_is_minimal_where_nothing_can_be_stretched(tmp_path: Path) -> None:
-    run = read_run(run_timeline(TimelineConfig(t_max=1.0), tmp_path, Quiet()))
+    run = read_run(run_timeline(TimelineConfig(t_max=1.0), tmp_path, NullProgress()))
     assert claim_of("S0 is minimal", run).verdict == NO_RUN
 
 
 def test_timelines_at_other_rates_say_nothing_of_the_papers_boards(tmp_path: Path) -> None:
-    run = read_run(run_timeline(TimelineConfig(profiles=(), rates=(9.0,)), tmp_path, Quiet()))
+    run = read_run(run_timeline(TimelineConfig(profiles=(), rates=(9.0,)), tmp_path, NullProgress()))
     assert claim_of("AGX Orin: naive", run).verdict == NO_RUN
     assert claim_of("no significant latency penalty", run).verdict == CONFIRMED
 
@@ -242,17 +234,17 @@ def test_a_stall_of_stream_to_act_refutes_its_claim(timelines: Run) -> None:
 
 
 def test_the_boundary_has_a_safe_side_and_one_that_is_not_always_unsafe(tmp_path: Path) -> None:
-    run = read_run(run_boundary(BoundaryConfig(), tmp_path, Quiet()))
+    run = read_run(run_boundary(BoundaryConfig(), tmp_path, NullProgress()))
     assert claim_of("suffices", run).verdict == CONFIRMED
     below = claim_of("Below R", run)
     assert below.verdict == REFUTED
     assert "the line is R = L/T_nom" in below.evidence[0]
     jitter = BoundaryConfig(jitter="lognormal:cv=0.2", plans=50, points=10)
-    assert claim_of("Below R", read_run(run_boundary(jitter, tmp_path, Quiet()))).verdict == UNTESTABLE
+    assert claim_of("Below R", read_run(run_boundary(jitter, tmp_path, NullProgress()))).verdict == UNTESTABLE
 
 
 def test_where_skills_cannot_end_early_the_papers_line_is_right(tmp_path: Path) -> None:
-    run = read_run(run_boundary(BoundaryConfig(t_min=1.0), tmp_path, Quiet()))
+    run = read_run(run_boundary(BoundaryConfig(t_min=1.0), tmp_path, NullProgress()))
     assert claim_of("Below R", run).verdict == CONFIRMED
 
 

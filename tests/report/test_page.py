@@ -29,6 +29,7 @@ from s2a_bench.report.page.plots import inline
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run, RunWriter, read_run
 from s2a_bench.store.sweep import CELLS, CellRow
+from s2a_bench.testing import NullProgress
 from s2a_bench.writers.latex import PREAMBLE, document, escape, to_siunitx
 from s2a_bench.writers.tables import ABSENT, TextTable
 
@@ -37,15 +38,6 @@ MakeRow = Callable[..., SampleRow]
 HOSTILE = "<script>alert('x')</script>&\"%_$#{}\\"
 VOID = {"meta", "br", "hr", "img", "input", "link"}
 POLICIES = ("naive", "wait-then-act", "stream-to-act")
-
-
-class Quiet:
-    """Progress that nobody looks at."""
-
-    def opened(self, folder: Path) -> None: ...
-    def stage(self, text: str) -> None: ...
-    def expect(self, samples: int) -> None: ...
-    def advance(self) -> None: ...
 
 
 class Page(HTMLParser):
@@ -87,7 +79,7 @@ class Page(HTMLParser):
 
 
 def timeline(folder: Path, **settings: Any) -> Path:
-    return run_timeline(TimelineConfig(**settings), folder, Quiet())
+    return run_timeline(TimelineConfig(**settings), folder, NullProgress())
 
 
 @pytest.fixture(scope="module")

@@ -25,6 +25,7 @@ from s2a_bench.sweep.machine import difference
 from s2a_bench.sweep.plan import Plan, plan_sweep
 from s2a_bench.sweep.run import SweepRun, check_resume, only_one, start_sweep
 from s2a_bench.sweep.timing import expect
+from s2a_bench.testing import NullProgress
 
 values = st.lists(st.integers(0, 9), min_size=1, max_size=4, unique=True)
 axes = st.dictionaries(st.sampled_from("abc"), values, max_size=3)
@@ -263,23 +264,6 @@ class Fake:
         pass
 
 
-class Quiet:
-    """Progress that counts."""
-
-    def __init__(self) -> None:
-        self.expected = self.done = 0
-
-    def opened(self, folder: Path) -> None: ...
-
-    def stage(self, text: str) -> None: ...
-
-    def expect(self, samples: int) -> None:
-        self.expected = samples
-
-    def advance(self) -> None:
-        self.done += 1
-
-
 PLAN = plan_of({"rate": 1}, {"rate": 2}, {"rate": 3, "live": True}, repeats=2)
 
 
@@ -292,8 +276,8 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 
 def sit(
     folder: Path, workers: Fake, *, plan: Plan = PLAN, retry: bool = False, clock: VirtualClock | None = None
-) -> Quiet:
-    progress = Quiet()
+) -> NullProgress:
+    progress = NullProgress()
     with RunWriter.reopen(folder, [CELLS]) as writer:
         run = SweepRun(writer, plan, progress, clock)
         run.work(run.pending(retry_failed=retry), workers)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,28 +16,20 @@ from s2a_bench.experiments.boundary.view import show
 from s2a_bench.experiments.boundary.view.figure import build_boundary
 from s2a_bench.experiments.boundary.view.tables import board_table, boundary_csv, disagreements, line_table
 from s2a_bench.store.run import Run, read_run
+from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import save
 from s2a_bench.writers.style import paper_column
 
 
-class Quiet:
-    """Progress that nobody looks at."""
-
-    def opened(self, folder: Path) -> None: ...
-    def stage(self, text: str) -> None: ...
-    def expect(self, samples: int) -> None: ...
-    def advance(self) -> None: ...
-
-
 @pytest.fixture(scope="module")
 def even(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return read_run(run_boundary(BoundaryConfig(), tmp_path_factory.mktemp("even"), Quiet()))
+    return read_run(run_boundary(BoundaryConfig(), tmp_path_factory.mktemp("even"), NullProgress()))
 
 
 @pytest.fixture(scope="module")
 def jittery(tmp_path_factory: pytest.TempPathFactory) -> Run:
     config = BoundaryConfig(jitter="lognormal:cv=0.2", plans=200, points=30)
-    return read_run(run_boundary(config, tmp_path_factory.mktemp("jittery"), Quiet()))
+    return read_run(run_boundary(config, tmp_path_factory.mktemp("jittery"), NullProgress()))
 
 
 def drawn(run: Run) -> Figure:
