@@ -1,4 +1,4 @@
-"""A program that answers like llama.cpp's ``llama-bench -o json`` (build 0c1e570, 2026) without any model.
+"""A stand-in of llama.cpp's llama-bench: a program that answers like ``llama-bench -o json`` (0c1e570): no model.
 
 Run as a script it takes llama-bench's long flags, refuses unknown ones as llama-bench does, and "decodes" at
 ``S2A_STAND_IN_RATE`` tokens a second; ``S2A_STAND_IN_FAULT`` is one of crash, illegal (it dies by an

@@ -1,0 +1,296 @@
+"""A stand-in of the part of rclpy that the glue around it uses, inside this process. It is not rclpy.
+
+It has the calls that the glue makes, with rclpy's signatures, its type checks on messages, one kind of each message
+taken at a time, done callbacks and waitables run by the executor, and the order of steps in rclpy's action server. Its
+generated classes and its CDR are rosbags'. So it cannot show: DDS, discovery and QoS; rclpy's serialiser and the fields
+of real generated classes; threads inside rclpy, its locks, teardown and time spent; exceptions of rcl; a Humble that
+differs from Jazzy. For these tests/ros/test_rclpy.py runs the same suites on the real one.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections import defaultdict, deque
+from collections.abc import Callable
+from enum import Enum
+from functools import cache
+from queue import SimpleQueue
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.action import Goals, Status
+
+GRAPH: list[Node] = []
+Verdict = Enum("Verdict", ["REJECT", "ACCEPT"])
+
+
+@cache
+def generated(type_name: str, version: str = "6.0") -> Any:
+    """What rosidl generates for a message: made without arguments, then assigned to."""
+
+    def build(self: Any, **fields: Any) -> None:
+        vars(self).update(vars(ros.default(type_name, version)) | fields)
+
+    fields = {name: "" for name, _ in ros.typestore(version).fielddefs[type_name][1]}
+    methods = {"__init__": build, "get_fields_and_field_types": classmethod(lambda _: dict(fields)), "version": version}
+    return type(type_name, (ros.typestore(version).types[type_name],), methods)
+
+
+def service(type_name: str) -> Any:
+    return SimpleNamespace(Request=generated(type_name + "_Request"), Response=generated(type_name + "_Response"))
+
+
+@cache
+def action(type_name: str, version: str = "6.0") -> Any:
+    parts = {part: generated(f"{type_name}_{part}", version) for part in ("Goal", "Result", "Feedback")}
+    services = {name + "Service": service(f"{type_name}_{name}") for name in ("SendGoal", "GetResult")}
+    return SimpleNamespace(
+        **parts, Impl=SimpleNamespace(**services, FeedbackMessage=generated(type_name + "_FeedbackMessage"))
+    )
+
+
+def serialize_message(message: Any) -> bytes:
+    return bytes(ros.serialise(message, message.__msgtype__, getattr(message, "version", "6.0")))
+
+
+def deserialize_message(cdr: bytes, cls: Any) -> Any:
+    assert isinstance(cdr, bytes)
+    message = cls()
+    vars(message).update(vars(ros.deserialise(memoryview(cdr), cls.__msgtype__, cls.version)))
+    return message
+
+
+class Future:
+    def __init__(self, executor: Executor) -> None:
+        self.executor, self.callbacks, self.value = executor, [], []
+        self.done = lambda: bool(self.value)
+        self.result = lambda: self.value[0]
+
+    def add_done_callback(self, callback: Callable[[Any], None]) -> None:
+        self.callbacks.append(callback)
+        if self.value:
+            self.executor.create_task(callback, self)
+
+    def set_result(self, value: Any) -> None:
+        self.value.append(value)
+        for callback in self.callbacks:
+            self.executor.create_task(callback, self)
+
+
+class Executor:
+    def __init__(self, context: Any) -> None:
+        self.tasks: SimpleQueue[Any] = SimpleQueue()
+        self.context = context
+
+    def add_node(self, node: Node) -> None:
+        node.executor = self
+
+    def create_task(self, function: Any, *arguments: Any) -> None:
+        self.tasks.put((function, arguments))
+
+    def spin_once(self) -> None:
+        function, arguments = self.tasks.get()
+        coroutine = function(*arguments)
+        if inspect.iscoroutine(coroutine):
+            with pytest.raises(StopIteration):  # nothing here ever suspends
+                coroutine.send(None)
+
+    def shutdown(self) -> None:
+        self.tasks = SimpleQueue()
+
+
+class Node:
+    def __init__(self, name: str, context: Any, namespace: str, **_: bool) -> None:
+        assert "/" not in name
+        assert namespace.startswith("/")
+        self.domain, self.executor = context.domain, Executor(context)
+        self.topics: dict[str, list[Any]] = defaultdict(list)
+        self.subscribed: dict[str, list[Any]] = defaultdict(list)
+        self.waitables: list[Any] = []
+        GRAPH.append(self)
+
+    def destroy_node(self) -> None:
+        GRAPH.remove(self)
+
+    def peers(self) -> list[Node]:
+        return [node for node in GRAPH if node.domain == self.domain]
+
+    def servers(self, name: str) -> list[Any]:
+        every = [(node, end) for node in self.peers() for end in node.waitables]
+        return [(node, end) for node, end in every if isinstance(end, ActionServer) and end.name == name]
+
+    def deliver(self, end: Any, kind: str, data: Any) -> None:
+        async def handle() -> None:
+            await end.execute(end.take_data())
+
+        end.ready[kind].append(data)
+        self.executor.create_task(handle)
+
+    def create_publisher(self, _cls: Any, topic: str, _qos: Any) -> Any:
+        def receivers() -> list[tuple[Node, Any]]:
+            return [(node, receive) for node in self.peers() for receive in node.subscribed[topic]]
+
+        def publish(message: bytes) -> None:
+            assert isinstance(message, bytes)  # rclpy: of the class, or bytes
+            for node, receive in receivers():
+                node.executor.create_task(receive, message)
+
+        self.topics[topic].append(publish)
+        return SimpleNamespace(publish=publish, get_subscription_count=lambda: len(receivers()), topic_name=topic)
+
+    def create_subscription(self, _cls: Any, topic: str, callback: Any, _qos: Any, *, raw: bool) -> None:
+        assert raw
+        self.subscribed[topic].append(callback)
+
+    def count_publishers(self, topic: str) -> int:
+        return sum(len(node.topics[topic]) for node in self.peers())
+
+    def create_client(self, _service: Any, name: str) -> Any:
+        server = name.removesuffix("/_action/cancel_goal")
+
+        def call_async(request: Any) -> Future:
+            future = Future(self.executor)
+            for node, end in self.servers(server):
+                node.deliver(end, "cancel", (future.set_result, request))
+            return future
+
+        return SimpleNamespace(call_async=call_async, service_is_ready=lambda: bool(self.servers(server)))
+
+
+class Waitable:
+    def __init__(self, node: Node, kind: Any, name: str) -> None:
+        self.node, self.action, self.name = node, kind, name
+        self.ready: dict[str, deque[Any]] = defaultdict(deque)
+        node.waitables.append(self)
+
+    def take_data(self) -> dict[str, Any]:
+        return {kind: queue.popleft() for kind, queue in self.ready.items() if queue}
+
+    def destroy(self) -> None:
+        self.node.waitables.remove(self)
+
+
+class ActionClient(Waitable):
+    def __init__(self, node: Node, kind: Any, name: str, *, feedback_sub_qos_profile: Any) -> None:
+        assert feedback_sub_qos_profile
+        super().__init__(node, kind, name)
+        self.server_is_ready = lambda: bool(node.servers(name))
+
+    def ask(self, kind: str, request: Any) -> Future:
+        future = Future(self.node.executor)
+        for node, end in self.node.servers(self.name):
+            reply = lambda value: self.node.deliver(self, kind, (future, value))  # noqa: E731
+            node.deliver(end, kind, ((self, reply), request))
+        return future
+
+    def send_goal_async(self, goal: Any, feedback_callback: Any = None, goal_uuid: Any = None) -> Future:
+        assert isinstance(goal, self.action.Goal)
+        assert feedback_callback is None
+        return self.ask("goal", self.action.Impl.SendGoalService.Request(goal_id=goal_uuid, goal=goal))
+
+    async def execute(self, taken_data: dict[str, Any]) -> None:
+        for future, response in taken_data.values():
+            future.set_result(response)
+
+
+class ClientGoalHandle:
+    def __init__(self, client: ActionClient, goal_id: Any, _response: Any) -> None:
+        request = client.action.Impl.GetResultService.Request(goal_id=goal_id)
+        self.get_result_async = lambda: client.ask("result", request)
+
+
+class ServerGoalHandle:
+    def __init__(self, server: ActionServer, goal_id: Any) -> None:
+        self.server, self.goal_id, self.result = server, goal_id, Future(server.node.executor)
+        self.id = bytes(goal_id.uuid)
+        for name, end in (("succeed", Status.SUCCEEDED), ("abort", Status.ABORTED), ("canceled", Status.CANCELED)):
+            setattr(self, name, lambda end=end: server.goals.end(self.id, end, None, now_ns()))
+
+    status = property(lambda self: self.server.goals.status(self.id))
+    is_cancel_requested = property(lambda self: self.status == Status.CANCELING)
+
+    def execute(self, execute_callback: Any = None) -> None:
+        self.server.goals.move(self.id, Status.EXECUTING)
+        self.server.notify_execute(self, execute_callback)
+
+    def publish_feedback(self, feedback: Any) -> None:
+        assert isinstance(feedback, self.server.action.Feedback)
+        for node in self.server.node.peers():
+            for end in node.waitables:
+                if isinstance(end, ActionClient) and end.name == self.server.name:
+                    message = self.server.action.Impl.FeedbackMessage(goal_id=self.goal_id, feedback=feedback)
+                    node.deliver(end, "feedback", message)
+
+
+class ActionServer(Waitable):
+    def __init__(self, node: Node, kind: Any, name: str, *, result_timeout: float, **callbacks: Any) -> None:
+        super().__init__(node, kind, name)
+        self.goals, self.callbacks = Goals(int(result_timeout * 1e9)), callbacks
+        self._goal_handles: dict[bytes, ServerGoalHandle] = {}
+
+    async def execute(self, taken_data: dict[str, Any]) -> None:
+        self.goals.expire(now_ns())
+        self._goal_handles = {key: handle for key, handle in self._goal_handles.items() if self.goals.find(key)}
+        for kind, (header, request) in taken_data.items():
+            getattr(self, "on_" + kind)(header, request)
+
+    def on_goal(self, header: Any, request: Any) -> None:
+        key = bytes(request.goal_id.uuid)
+        accepted = key not in self._goal_handles and self.callbacks["goal_callback"](request.goal) is Verdict.ACCEPT
+        if accepted:
+            self.goals.offer(key)
+            self.goals.accept(key, now_ns())
+            self._goal_handles[key] = ServerGoalHandle(self, request.goal_id)
+        header[1](SimpleNamespace(accepted=accepted))
+
+    def on_cancel(self, reply: Any, request: Any) -> None:
+        code, goals = self.goals.cancel(bytes(request.goal_info.goal_id.uuid), 0)
+        infos = [SimpleNamespace(goal_id=SimpleNamespace(uuid=goal.id)) for goal in goals]
+        reply(SimpleNamespace(return_code=int(code), goals_canceling=infos))
+
+    def on_result(self, header: Any, request: Any) -> None:
+        handle = self._goal_handles.get(bytes(request.goal_id.uuid))
+        response = self.action.Impl.GetResultService.Response
+        if handle is None:
+            header[1](response(status=0))
+        else:
+            handle.result.add_done_callback(
+                lambda done: header[1](response(status=int(handle.status), result=done.result()))
+            )
+
+    def notify_execute(self, handle: ServerGoalHandle, execute_callback: Any) -> None:
+        self.node.executor.create_task(lambda: handle.result.set_result(execute_callback(handle)))
+
+
+def modules() -> dict[str, dict[str, Any]]:
+    """The modules the glue imports, with what it takes from them."""
+    profile = SimpleNamespace(KEEP_ALL=1, KEEP_LAST=2, RELIABLE=3, BEST_EFFORT=4)
+    return {
+        "rclpy": {
+            "init": lambda *, args, context, domain_id: args or setattr(context, "domain", domain_id),
+            "create_node": Node,
+            "get_rmw_implementation_identifier": lambda: "rmw_stand_in",
+        },
+        "rclpy.context": {"Context": type("Context", (), {"try_shutdown": lambda _: None})},
+        "rclpy.executors": {
+            "SingleThreadedExecutor": Executor,
+            "ExternalShutdownException": type("ExternalShutdownException", (Exception,), {}),
+        },
+        "rclpy.qos": {"HistoryPolicy": profile, "ReliabilityPolicy": profile, "QoSProfile": SimpleNamespace},
+        "rclpy.serialization": {"serialize_message": serialize_message, "deserialize_message": deserialize_message},
+        "rclpy.action": {
+            "ActionClient": ActionClient,
+            "ActionServer": ActionServer,
+            "GoalResponse": Verdict,
+            "CancelResponse": Verdict,
+        },
+        "rclpy.action.client": {"ClientGoalHandle": ClientGoalHandle},
+    }
+
+
+INTERFACES: dict[str, Callable[[str], Any]] = {"msg": generated, "srv": service, "action": action}
+PACKAGES = ("action_msgs", "builtin_interfaces", "llama_msgs", "s2a_msgs", "sensor_msgs", "std_msgs")
