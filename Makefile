@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-policy bench-ray test check check-platforms setup clean
+.PHONY: bench bench-policy bench-ray test test-all check check-platforms setup clean
 
 # The main job: a real model first, then the transports alone (no model), with JPEG and with raw pixels.
 bench: setup
@@ -24,6 +24,10 @@ bench-ray: setup
 	$(BIN)/python -m benchmarks.sweep_scaling
 
 test: setup
+	$(BIN)/python -m pytest -m "not slow"
+	@echo "slow tests were left out: make test-all runs them too"
+
+test-all: setup
 	$(BIN)/python -m pytest
 
 check: setup

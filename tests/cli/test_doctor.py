@@ -44,6 +44,7 @@ def s2a_bench(*arguments: str, code: int = 0, **environ: str) -> subprocess.Comp
     return done
 
 
+@pytest.mark.slow
 def test_every_line_is_one_check_with_its_level() -> None:
     *lines, counts = s2a_bench("doctor", ROS_DOMAIN_ID="7").stdout.splitlines()
     seen = [line.split()[1] for line in lines]
@@ -66,6 +67,7 @@ def test_json_is_one_object_that_the_schema_describes() -> None:
     }
 
 
+@pytest.mark.slow
 def test_an_error_is_exit_code_one_with_the_way_out() -> None:
     done = s2a_bench("doctor", code=1, ROS_DOMAIN_ID="300")
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("error")]

@@ -69,6 +69,7 @@ def test_blocks_hold_every_cell_once_in_changing_order(tmp_path: Path) -> None:
     assert len(samples) == 9 * 4
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_order_and_frames(tmp_path: Path) -> None:
     for name in ("a", "b"):
         run(*SMALL, "--transport", "http", "--seed", "5", output=tmp_path / name)
@@ -93,6 +94,7 @@ def test_every_token_has_its_two_times(tmp_path: Path) -> None:
     assert (kept.tokens["client_ns"] > kept.tokens["engine_ns"]).all()
 
 
+@pytest.mark.slow
 def test_json_is_the_only_thing_on_standard_output(tmp_path: Path) -> None:
     done = run(*SMALL, "--transport", "http,ros,loopback", "--json", output=tmp_path)
     whole: dict[str, Any] = json.loads(done.stdout)
@@ -104,6 +106,7 @@ def test_json_is_the_only_thing_on_standard_output(tmp_path: Path) -> None:
     assert ("ros/topic", "loopback") in compared
 
 
+@pytest.mark.slow
 def test_stream_mode_knows_the_age_of_the_frame(tmp_path: Path) -> None:
     done = run(*SMALL, "--transport", "http,ros", "--mode", "stream", "--fps", "60", output=tmp_path)
     assert "Frame path" in done.stdout

@@ -80,6 +80,7 @@ def test_in_process_http_and_ros_stand_beside_llama_bench(tmp_path: Path) -> Non
     assert kept.samples["frame_index"].nunique() > 1
 
 
+@pytest.mark.slow
 def test_the_engines_settings_reach_it_and_the_terminal_shows_all(tmp_path: Path) -> None:
     settings = ["--batch", "64", "--context", "1024", "--kv-type", "q8_0", "--flash-attention", "on"]
     done = run(*SMALL, *settings, "--against", "paper", output=tmp_path)
@@ -97,6 +98,7 @@ def test_the_engines_settings_reach_it_and_the_terminal_shows_all(tmp_path: Path
     assert not (kept.path / "reference.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_replayed_profile_is_labelled_emulated(tmp_path: Path) -> None:
     done = run(*SMALL, "--max-tokens", "3", "--engine", "replay", "--profile", "rtx-4080", "--json", output=tmp_path)
     (cell,) = valid(done.stdout)["cells"]

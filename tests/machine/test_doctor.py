@@ -434,6 +434,7 @@ def test_only_the_doctor_makes_the_smoke_test() -> None:
     assert "llama-build" not in BEFORE_RUN
 
 
+@pytest.mark.slow
 def test_every_check_exists_and_uses_its_own_code(make: Make) -> None:
     found = examine(replace(Machine(), output=make({}).output))
     assert {finding.code for finding in found} <= CHECKS.keys()

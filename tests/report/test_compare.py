@@ -109,6 +109,7 @@ def test_a_comparison_of_the_same_thing_finds_nothing_in_at_least_95_of_100_repe
     assert clean >= 95
 
 
+@pytest.mark.slow
 def test_a_slowdown_of_ten_per_cent_is_found_in_every_cell(launch: Launch) -> None:
     found = [compared(launch(repeat, n=200), launch(100 + repeat, n=200, factor=1.1)) for repeat in range(10)]
     words = [word for each in found for word in verdicts(each)]

@@ -125,6 +125,7 @@ def sweep_of(folder: Path, runs: list[tuple[dict[str, Any], Path]], *, cells: in
     return writer.path
 
 
+@pytest.mark.slow
 def test_nothing_is_fetched(computed: Path, make_run: MakeRun) -> None:
     text = page_of(computed, make_run().path, against_paper=True)
     page = Page(text)
@@ -138,6 +139,7 @@ def test_nothing_is_fetched(computed: Path, make_run: MakeRun) -> None:
     assert all(found.startswith("#") for found in re.findall(r"url\(([^)]*)\)", text))
 
 
+@pytest.mark.slow
 def test_ids_are_its_own_and_references_find_them(computed: Path, make_run: MakeRun) -> None:
     page = Page(page_of(computed, make_run().path, make_run().path))
     ids = Counter(page.values("id"))
@@ -263,6 +265,7 @@ def test_timelines_of_other_settings_are_kept_apart(tmp_path: Path) -> None:
     assert len(read_chapters([sweep_of(tmp_path / "sweeps", runs)], against_paper=False)) == 3
 
 
+@pytest.mark.slow
 def test_measured_cells_stand_side_by_side_and_are_not_pooled(tmp_path: Path, make_run: MakeRun) -> None:
     runs = [({"runs": n}, make_run(n=n).path) for n in range(2, MOST_CHAPTERS + 4)]
     folder = sweep_of(tmp_path / "sweeps", [*runs, ({"runs": 99}, tmp_path / "no-such")])
@@ -319,6 +322,7 @@ def test_rows_that_their_manifest_does_not_fit_are_an_error_where_the_run_claims
         read_chapters([odd], against_paper=False)
 
 
+@pytest.mark.slow
 def test_runs_of_unlike_machines_are_told_apart(make_run: MakeRun) -> None:
     runs = [make_run(n=2, manifest={"environment": {"cpu": cpu, "cores": 2}}).path for cpu in ("A", "B", "A")]
     report = make_report(read_chapters(runs, against_paper=False), against_paper=False)

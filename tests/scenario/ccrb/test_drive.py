@@ -117,6 +117,7 @@ def test_idm_turns_the_rear_outcome_round() -> None:
     assert not naive.rear_impact_mps[0] > stream.rear_impact_mps[0] - 0.5
 
 
+@pytest.mark.slow
 @laws
 def test_a_drive_that_ends_when_all_is_decided_has_the_outcome_of_a_long_one(follower: str) -> None:
     for seed in (11, 12):
@@ -192,6 +193,7 @@ def go(cars: Cars, many: Schedule, *, record: bool = False) -> Driven:
     return drive(simulator("longitudinal"), cars, braking_plan(cars, 5, 0.8), many, record=record)
 
 
+@pytest.mark.slow
 @seeds
 @laws
 def test_physics_holds_in_any_scenario(seed: int, follower: str) -> None:
@@ -213,6 +215,7 @@ def test_physics_holds_in_any_scenario(seed: int, follower: str) -> None:
     assert not (outcomes.impact_mps <= 0.5).any()
 
 
+@pytest.mark.slow
 @seeds
 def test_more_room_ahead_never_makes_the_front_worse(seed: int) -> None:
     cars, many = draw(seed, "careful", reflex=False)  # with the reflex the ego itself drives otherwise
@@ -221,6 +224,7 @@ def test_more_room_ahead_never_makes_the_front_worse(seed: int) -> None:
     assert ((far.code & 1) <= (near.code & 1)).all()
 
 
+@pytest.mark.slow
 @seeds
 def test_the_ego_does_not_look_behind(seed: int) -> None:
     cars, many = draw(seed, "careful", reflex=False)
