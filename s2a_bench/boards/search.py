@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from s2a_bench.boards.file import read_profile
@@ -14,9 +15,8 @@ SHIPPED = Path(__file__).parent.parent / "profiles"
 
 def search_path() -> list[Path]:
     """Return the folders that are searched for a name, the first first."""
-    from platformdirs import user_config_path
-
-    return [Path("profiles"), user_config_path("s2a-bench") / "profiles", SHIPPED]
+    config = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    return [Path("profiles"), config / "s2a-bench" / "profiles", SHIPPED]
 
 
 def profile_files() -> dict[str, Path]:

@@ -35,9 +35,7 @@ def cache_folder() -> Path:
     """Return the user's cache folder of s2a-bench; the variable S2A_BENCH_CACHE replaces it."""
     if chosen := os.environ.get(CACHE_VARIABLE):
         return Path(chosen)
-    from platformdirs import user_cache_path
-
-    return user_cache_path("s2a-bench")
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "s2a-bench"
 
 
 def dummy_folder(size: Size) -> Path:

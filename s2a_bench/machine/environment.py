@@ -25,7 +25,6 @@ PACKAGES = (
     "nvidia-ml-py",
     "opencv-python-headless",
     "orjson",
-    "psutil",
     "pybase64",
     "pydantic",
     "rosbags",

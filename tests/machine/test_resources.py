@@ -300,8 +300,26 @@ def test_the_cpu_clock_of_another_process_counts_its_threads() -> None:
 def test_memory_is_that_of_the_processes() -> None:
     values = Memory([os.getpid()]).read()
     assert values["client_rss_bytes"] == pytest.approx(values["server_rss_bytes"], rel=0.05)
-    assert 0 <= values["cpu_busy"] <= 1
     assert values["memory_available_bytes"] > 0
+
+
+def test_memory_and_load_are_read_from_proc(tmp_path: Path) -> None:
+    for process, pages in (("self", 500), ("42", 700)):
+        (tmp_path / process).mkdir()
+        (tmp_path / process / "statm").write_text(f"9000 {pages} 300 1 0 200 0\n")
+    (tmp_path / "meminfo").write_text("MemTotal:  2000 kB\nMemFree:  10 kB\nMemAvailable:  1000 kB\n")
+    (tmp_path / "stat").write_text("cpu  100 0 50 800 50 0 0 0 7 0\ncpu0 1 2 3\n")
+    reader = Memory([42, 43], tmp_path)
+    assert "cpu_busy" not in reader.read()  # no time has passed
+    (tmp_path / "stat").write_text("cpu  120 5 60 850 60 1 2 2 9 0\n")
+    assert reader.read() == {
+        "client_rss_bytes": 500 * os.sysconf("SC_PAGE_SIZE"),
+        "server_rss_bytes": 700 * os.sysconf("SC_PAGE_SIZE"),
+        "memory_available_bytes": 1000 << 10,
+        "cpu_busy": 0.4,
+    }
+    with pytest.raises(Unreadable, match="no-proc"):
+        Memory([], tmp_path / "no-proc")
 
 
 def test_a_counters_rise_between_edges_is_exact() -> None:

@@ -6,10 +6,12 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-
-import psutil
+from pathlib import Path
 
 from s2a_bench.machine.resources import Unreadable
+
+PROC = Path("/proc")
+PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 def cpu_clock(pid: int) -> int:
@@ -47,37 +49,57 @@ class CpuTimes:
 
 
 class Memory:
-    """Resident memory, and how busy all CPUs are, through psutil."""
+    """Resident memory, and how busy all CPUs are, as /proc says."""
 
     cheap = False
-    about = f"psutil {psutil.__version__}"
 
-    def __init__(self, pids: Sequence[int]) -> None:
-        """Look the processes up; raises Unreadable where there is no /proc to read."""
+    def __init__(self, pids: Sequence[int], root: Path = PROC) -> None:
+        """Read everything once; raises Unreadable where there is no /proc to read."""
+        self.about = str(root)
+        self._root = root
+        self._pids = [pid for pid in pids if (root / str(pid)).is_dir()]
         try:
-            self._client = psutil.Process()
-            psutil.cpu_percent()  # the first call has nothing to compare with
-        except (psutil.Error, OSError) as error:
-            raise Unreadable(f"psutil: {error}") from error
-        self._servers = []
-        for pid in pids:
-            with suppress(psutil.Error):
-                self._servers.append(psutil.Process(pid))
+            self._rss("self")
+            self._available()
+            self._times = self._cpu_times()  # the first reading has nothing else to compare with
+        except (OSError, LookupError, ValueError) as error:
+            raise Unreadable(f"{root}: {error}") from error
 
     def read(self) -> Mapping[str, float]:
         """Return bytes, and the share of all CPUs that was busy since the last reading, from 0 to 1."""
         values: dict[str, float] = {}
         sources: dict[str, Callable[[], float]] = {
-            "client_rss_bytes": lambda: self._client.memory_info().rss,
-            "memory_available_bytes": lambda: psutil.virtual_memory().available,
-            "cpu_busy": lambda: psutil.cpu_percent() / 100,
+            "client_rss_bytes": lambda: self._rss("self"),
+            "memory_available_bytes": self._available,
+            "cpu_busy": self._busy,
         }
-        if self._servers:
-            sources["server_rss_bytes"] = lambda: sum(server.memory_info().rss for server in self._servers)
+        if self._pids:
+            sources["server_rss_bytes"] = lambda: sum(self._rss(str(pid)) for pid in self._pids)
         for name, source in sources.items():
-            with suppress(psutil.Error, OSError):
+            with suppress(OSError, LookupError, ValueError, ZeroDivisionError):
                 values[name] = source()
         return values
 
     def close(self) -> None:
         """Nothing is held."""
+
+    def _rss(self, process: str) -> int:
+        """Return a process's resident bytes: the second number of statm, in pages (proc(5))."""
+        return int((self._root / process / "statm").read_text().split()[1]) * PAGE_BYTES
+
+    def _available(self) -> int:
+        """Return what programs could still have without swapping."""
+        lines = (self._root / "meminfo").read_text().splitlines()
+        (line,) = (line for line in lines if line.startswith("MemAvailable:"))
+        return int(line.split()[1]) << 10
+
+    def _cpu_times(self) -> tuple[int, int]:
+        """Return the ticks of all CPUs so far: busy, and all. Guests' are in the user's already."""
+        user, nice, system, idle, iowait, *interrupts = map(int, (self._root / "stat").read_text().split()[1:9])
+        busy = user + nice + system + sum(interrupts)
+        return busy, busy + idle + iowait
+
+    def _busy(self) -> float:
+        before, self._times = self._times, self._cpu_times()
+        share = (self._times[0] - before[0]) / (self._times[1] - before[1])
+        return min(share, 1.0)  # iowait may fall, says proc(5), and the sum with it
