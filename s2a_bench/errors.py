@@ -4,6 +4,7 @@ A field of a configuration stands in backquotes, as `runs`: the command line sho
 
 S2AError
 ├── UsageError           a flag's value, or a combination of flags, makes no sense (exit code 2)
+├── MissingExtra         a library that this needs is not installed
 ├── SourceError          a camera, video or image folder cannot deliver frames
 ├── EngineError          an engine cannot start or answer
 │   └── ModelError       a model file is missing, damaged or of the wrong kind
@@ -30,6 +31,10 @@ class UsageError(S2AError):
     """A flag's value, or a combination of flags, makes no sense."""
 
     exit_code = 2
+
+
+class MissingExtra(S2AError):
+    """A library that this needs is not installed, or does not load."""
 
 
 class SourceError(S2AError):

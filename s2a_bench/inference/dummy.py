@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
+from s2a_bench import extras
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference.dummy_vocab import Vocab, make_vocab
 from s2a_bench.inference.dummy_weights import Kind, Tensor
@@ -140,12 +141,13 @@ def _write(
 ) -> None:
     """Write one file: gguf-py writes header and keys, the tensors are streamed behind them."""
     import numpy as np
-    from gguf import GGMLQuantizationType, GGUFWriter
+
+    gguf = extras.require("gguf", "model")
 
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     os.close(handle)
     temporary = Path(name)
-    writer = GGUFWriter(temporary, architecture)
+    writer: GGUFWriter = gguf.GGUFWriter(temporary, architecture)
     try:
         keys(writer)
         for tensor in tensors:
@@ -154,7 +156,7 @@ def _write(
                 tensor.shape,
                 np.dtype(np.float32),
                 tensor.nbytes,
-                raw_dtype=GGMLQuantizationType[tensor.kind.upper()],
+                raw_dtype=gguf.GGMLQuantizationType[tensor.kind.upper()],
             )
         writer.write_header_to_file()
         writer.write_kv_data_to_file()

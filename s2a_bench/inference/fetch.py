@@ -18,6 +18,7 @@ from logging import ERROR, getLogger
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from s2a_bench import extras
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference.fetch_errors import no_hub, one_line
 from s2a_bench.inference.fetch_names import HUB_MODELS
@@ -78,13 +79,11 @@ def wanted(what: str, quant: str | None, mmproj: str | None) -> Wanted:
     if what in HUB_MODELS:
         known = HUB_MODELS[what]
         return Wanted(known.repository, (known.model_file(quant or known.quant), mmproj or known.mmproj))
-    from huggingface_hub.errors import HFValidationError
-    from huggingface_hub.utils import validate_repo_id  # type: ignore[attr-defined]
-
+    utils = extras.require("huggingface_hub.utils", "model")
     repository, _, file = what.partition(":")
     try:
-        validate_repo_id(repository)
-    except HFValidationError:
+        utils.validate_repo_id(repository)
+    except utils.HFValidationError:
         file = ""
     if not file or "/" not in repository:
         raise UsageError(f"model fetch: '{what}' is neither {', '.join(HUB_MODELS)} nor ORG/REPO:FILE")
@@ -98,10 +97,8 @@ def fetch(want: Wanted, progress: Progress | None = None) -> Fetched:
 
     Raises ModelError, one line, for whatever is in the way: no network, no such file, gated, disk full, wrong content.
     """
-    from huggingface_hub import constants
-    from huggingface_hub.utils import disable_progress_bars  # type: ignore[attr-defined]
-
-    disable_progress_bars()
+    constants = extras.require("huggingface_hub.constants", "model")
+    extras.require("huggingface_hub.utils", "model").disable_progress_bars()
     getLogger("huggingface_hub").setLevel(ERROR)  # it tells of each retry with the whole, signed address
     with one_line(want.repository, want.in_words):
         commit, files = _listing(want)
@@ -112,10 +109,10 @@ def fetch(want: Wanted, progress: Progress | None = None) -> Fetched:
 
 def _listing(want: Wanted) -> tuple[str, tuple[HubFile, ...]]:
     """Ask the hub for its commit and the files' sizes and checksums; a file's case is forgiven."""
-    from huggingface_hub import HfApi, constants
-
+    hub = extras.require("huggingface_hub", "model")
+    timeout_s = extras.require("huggingface_hub.constants", "model").HF_HUB_ETAG_TIMEOUT
     try:
-        info = HfApi().model_info(want.repository, files_metadata=True, timeout=constants.HF_HUB_ETAG_TIMEOUT)
+        info = hub.HfApi().model_info(want.repository, files_metadata=True, timeout=timeout_s)
         siblings = {sibling.rfilename: sibling for sibling in info.siblings or ()}
     except (ValueError, LookupError, TypeError, AttributeError) as error:  # no JSON, or not a hub's
         raise no_hub(want.repository, want.in_words) from error
@@ -136,11 +133,10 @@ def _hub_file(repository: str, name: str, siblings: dict[str, Any]) -> HubFile:
 
 def _blob(repository: str, file: HubFile) -> Path:
     """Return where the hub's cache keeps a content (its documented layout)."""
-    from huggingface_hub import constants
-    from huggingface_hub.file_download import repo_folder_name
-
-    folder = repo_folder_name(repo_id=repository, repo_type="model")
-    return Path(constants.HF_HUB_CACHE).expanduser() / folder / "blobs" / file.sha256
+    download = extras.require("huggingface_hub.file_download", "model")
+    cache: str = extras.require("huggingface_hub.constants", "model").HF_HUB_CACHE
+    folder: str = download.repo_folder_name(repo_id=repository, repo_type="model")
+    return Path(cache).expanduser() / folder / "blobs" / file.sha256
 
 
 def _part(blob: Path) -> Path:
@@ -165,15 +161,14 @@ def _check_space(repository: str, files: tuple[HubFile, ...]) -> None:
 
 
 def _fetch_file(repository: str, commit: str, file: HubFile, progress: Progress | None) -> FetchedFile:
-    from huggingface_hub import hf_hub_download
-
+    hub = extras.require("huggingface_hub", "model")
     blob, resumed_at = _blob(repository, file), file.nbytes
     if not blob.is_file():
         blob.parent.mkdir(parents=True, exist_ok=True)
         resumed_at = _download(repository, commit, file, blob, progress)
     if progress is not None:
         progress(file.name, file.nbytes, file.nbytes)
-    path = Path(hf_hub_download(repository, file.name))  # finds the blob there and links it
+    path = Path(hub.hf_hub_download(repository, file.name))  # finds the blob there and links it
     if sha256(path) != file.sha256:
         raise ModelError(f"{path.resolve()}: does not have the hub's SHA-256 {file.sha256}; delete it and fetch again")
     return FetchedFile(path, file.nbytes, file.sha256, resumed_at)
@@ -194,10 +189,9 @@ class _Part(io.BufferedWriter):
 
 def _download(repository: str, commit: str, file: HubFile, blob: Path, progress: Progress | None) -> int:
     """Append what is missing, check all of it, and make it the blob; return how much was there before."""
-    from huggingface_hub import hf_hub_url
-    from huggingface_hub.file_download import http_get
-    from huggingface_hub.utils import build_hf_headers  # type: ignore[attr-defined]
-
+    hub = extras.require("huggingface_hub", "model")
+    http_get = extras.require("huggingface_hub.file_download", "model").http_get
+    headers = extras.require("huggingface_hub.utils", "model").build_hf_headers()
     part = _part(blob)
     with _Part(part, lambda done: progress(file.name, done, file.nbytes) if progress else None) as content:
         try:
@@ -211,8 +205,8 @@ def _download(repository: str, commit: str, file: HubFile, blob: Path, progress:
             content.truncate()
         there = content.tell()
         # the resolve address, not where it leads: a signed address runs out while a large file is under way
-        url = hf_hub_url(repository, file.name, revision=commit)
-        http_get(url, content, resume_size=there, headers=build_hf_headers(), expected_size=file.nbytes)
+        url = hub.hf_hub_url(repository, file.name, revision=commit)
+        http_get(url, content, resume_size=there, headers=headers, expected_size=file.nbytes)
         content.flush()
         found = digest(part)
         if found != file.sha256:

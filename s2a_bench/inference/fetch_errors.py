@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from s2a_bench import extras
 from s2a_bench.errors import ModelError
 
 _REFUSED = (401, 403, 404)
@@ -14,9 +15,7 @@ _REFUSED = (401, 403, 404)
 
 
 def _endpoint() -> str:
-    from huggingface_hub import constants
-
-    return str(constants.ENDPOINT)
+    return str(extras.require("huggingface_hub.constants", "model").ENDPOINT)
 
 
 def _offline(repository: str, by_hand: str, _error: Any) -> str:
@@ -65,8 +64,7 @@ def _by_hand(files: str) -> str:
 @contextmanager
 def one_line(repository: str, files: str) -> Iterator[None]:
     """Turn what the hub library raises into a ModelError of one line; ``files`` are those to fetch by hand."""
-    from huggingface_hub import errors
-
+    errors = extras.require("huggingface_hub.errors", "model")
     # the hub library has changed its HTTP client twice, so the client's base error cannot be named by import
     client_error: Any = errors.HfHubHTTPError.__mro__[1]
     table: tuple[tuple[Any, Callable[[str, str, Any], str]], ...] = (

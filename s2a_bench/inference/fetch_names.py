@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from s2a_bench import extras
 from s2a_bench.errors import ModelError
 
 
@@ -43,10 +44,9 @@ def fetched(name: str, flag: str) -> tuple[Path, Path]:
 
     Raises ModelError where it is not fetched yet, or where several quantisations are there.
     """
-    from huggingface_hub import try_to_load_from_cache
-
+    hub = extras.require("huggingface_hub", "model")
     known = HUB_MODELS[name]
-    mmproj = try_to_load_from_cache(known.repository, known.mmproj)
+    mmproj = hub.try_to_load_from_cache(known.repository, known.mmproj)
     folder = Path(mmproj).parent if isinstance(mmproj, str) else None
     models = [path for path in sorted(folder.glob(known.model_file("*"))) if path.is_file()] if folder else []
     if not models or not isinstance(mmproj, str):

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
+from s2a_bench import extras
 from s2a_bench.errors import ModelError
 
 MAGIC = b"GGUF"
@@ -155,8 +156,7 @@ def _parse(path: Path, data: mmap.mmap, flag: str) -> GgufHeader:
 
 def _tensors(cursor: _Cursor, count: int) -> tuple[tuple[TensorInfo, ...], int]:
     """Return the tensors, and the offset within the data at which the last of them ends."""
-    from gguf.constants import GGML_QUANT_SIZES
-
+    sizes = extras.require("gguf.constants", "model").GGML_QUANT_SIZES
     tensors, last = [], 0
     for _ in range(count):
         name, n_dims = cursor.string(), cursor.integer("<I")
@@ -164,7 +164,7 @@ def _tensors(cursor: _Cursor, count: int) -> tuple[tuple[TensorInfo, ...], int]:
             raise ValueError(n_dims)
         shape = tuple(cursor.integer("<Q") for _ in range(n_dims))
         kind = cursor.integer("<I")
-        block, block_bytes = GGML_QUANT_SIZES[kind]
+        block, block_bytes = sizes[kind]
         nbytes = math.prod(shape) // block * block_bytes
         tensors.append(TensorInfo(name, shape, kind, nbytes))
         last = max(last, cursor.integer("<Q") + nbytes)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from s2a_bench import extras
 from s2a_bench.inference.gguf_file import GgufHeader, TensorInfo, Value, read_array, read_header
 
 _CONTROL = 3
@@ -116,16 +117,13 @@ def _plain(value: Value) -> Value:
 
 def _file_type(number: Value | None) -> str | None:
     """Name the mixture of types that the converter or ``llama-quantize`` was asked for."""
-    from gguf.constants import LlamaFileType
-
-    names = {int(kind): kind.name.removeprefix("MOSTLY_").removeprefix("ALL_") for kind in LlamaFileType}
+    kinds = extras.require("gguf.constants", "model").LlamaFileType
+    names = {int(kind): kind.name.removeprefix("MOSTLY_").removeprefix("ALL_") for kind in kinds}
     return names.get(int(number)) if isinstance(number, int) else None
 
 
 def _type_name(kind: int) -> str:
-    from gguf.constants import GGMLQuantizationType
-
-    return str(GGMLQuantizationType(kind).name)
+    return str(extras.require("gguf.constants", "model").GGMLQuantizationType(kind).name)
 
 
 def _types(tensors: Sequence[TensorInfo]) -> tuple[TypeShare, ...]:

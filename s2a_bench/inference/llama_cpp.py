@@ -9,10 +9,9 @@ from collections.abc import Iterator
 from importlib.metadata import version
 from typing import Any
 
-import llama_cpp
 import numpy as np
-from llama_cpp.llama_chat_format import MiniCPMv26ChatHandler
 
+from s2a_bench import extras
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, ModelError
 from s2a_bench.inference import EngineConfig, llama_log
@@ -22,11 +21,14 @@ from s2a_bench.inference.llama_settings import FLASH_ATTENTION, KV_TYPES, SAMPLI
 from s2a_bench.inference.models import ModelFiles, load_headers, sha256
 from s2a_bench.types import Frame, Request, Token
 
+llama_cpp = extras.require("llama_cpp", "llama")
+chat_format = extras.require("llama_cpp.llama_chat_format", "llama")
+
 _URL = "s2a-bench:image/{:04d}/"
 _MS_NS = 1_000_000
 
 
-class _Prefilled(llama_cpp.Llama):  # type: ignore[misc]  # the library has no types
+class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the library has no types
     """A Llama that stops where the library's handler would start to generate, and keeps the evaluated prompt."""
 
     prompt: list[int]
@@ -63,7 +65,7 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc]  # the library has no t
         return iter(())
 
 
-class _PixelHandler(MiniCPMv26ChatHandler):  # type: ignore[misc]  # the library has no types
+class _PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, name-defined]  # the library has no types
     """The library's handler, except that a picture is an RGB array and not the bytes of a JPEG."""
 
     def __init__(self, mmproj: str, *, use_gpu: bool) -> None:

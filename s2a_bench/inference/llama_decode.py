@@ -10,10 +10,13 @@ import ctypes
 from collections.abc import Iterator
 from typing import Any, Protocol
 
-import llama_cpp
 import numpy as np
-from llama_cpp import llama_cpp as bindings
 from numpy.typing import NDArray
+
+from s2a_bench import extras
+
+llama_cpp = extras.require("llama_cpp", "llama")
+bindings = llama_cpp.llama_cpp
 
 _logits_address = bindings._lib["llama_get_logits_ith"]  # noqa: SLF001 a function object of our own: a plain address
 _logits_address.argtypes = [ctypes.c_void_p, ctypes.c_int32]

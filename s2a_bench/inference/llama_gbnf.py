@@ -15,10 +15,12 @@ import tempfile
 import weakref
 from typing import Any
 
-import llama_cpp
 import numpy as np
 
+from s2a_bench import extras
 from s2a_bench.inference import llama_log
+
+llama_cpp = extras.require("llama_cpp", "llama")
 
 _STDERR = 2
 

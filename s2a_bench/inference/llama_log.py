@@ -8,8 +8,10 @@ import re
 from collections import deque
 from typing import Any
 
-import llama_cpp
-from llama_cpp import mtmd_cpp
+from s2a_bench import extras
+
+llama_cpp = extras.require("llama_cpp", "llama")
+mtmd_cpp = extras.require("llama_cpp.mtmd_cpp", "llama")
 
 VARIABLE = "S2A_BENCH_LLAMA_LOG"
 """Set to 1, llama.cpp writes to stderr as usual."""

@@ -6,12 +6,13 @@ import ctypes
 import weakref
 from pathlib import Path
 
-import llama_cpp
-
+from s2a_bench import extras
 from s2a_bench.errors import ModelError
 from s2a_bench.inference import llama_log
 from s2a_bench.inference.gguf_file import read_header
 from s2a_bench.inference.models import tiny_dummy
+
+llama_cpp = extras.require("llama_cpp", "llama")
 
 
 class Tokenizer:

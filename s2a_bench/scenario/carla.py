@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
+from s2a_bench import extras
 from s2a_bench.errors import SimulatorError, UsageError
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES, Command, State
 
@@ -43,14 +44,7 @@ class Carla:
         self.step_s = step_s
         self._cars: dict[int, Any] = {}
         self._speed = np.zeros(3)
-        try:
-            import carla
-        except ImportError as error:
-            raise SimulatorError(
-                "`simulator` carla: the package carla is not installed; pip install 's2a-bench[carla]' "
-                "(x86-64, Python 3.10 to 3.12)"
-            ) from error
-        self._carla: Any = carla
+        carla = self._carla = extras.require("carla", "carla")
         name, _, port = host.partition(":")
         if port and not port.isdecimal():
             raise UsageError(f"`host`: '{host}' should be HOST or HOST:PORT")

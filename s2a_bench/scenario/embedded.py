@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from s2a_bench import extras
 from s2a_bench.scenario import EGO, LEAD, REAR, STEP_S, Command, State
 from s2a_bench.scenario.roads import LENGTHS, MIDDLE_M, build_road, centre, lane_index
 
@@ -29,14 +30,13 @@ class Embedded:
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         """Begin anew on an empty road."""
-        from highway_env.vehicle.controller import ControlledVehicle
-        from highway_env.vehicle.kinematics import Vehicle
-
+        controlled = extras.require("highway_env.vehicle.controller", "ccrb").ControlledVehicle
+        free = extras.require("highway_env.vehicle.kinematics", "ccrb").Vehicle
         road = build_road()
         self._cars = {}
         for car in (LEAD, EGO, REAR):
-            kind = ControlledVehicle if car == EGO else Vehicle
-            at = centre(car, float(position_m[car, 0]), 0.0, Vehicle.LENGTH)
+            kind = controlled if car == EGO else free
+            at = centre(car, float(position_m[car, 0]), 0.0, free.LENGTH)
             self._cars[car] = kind(road, at, heading=0.0, speed=float(speed_mps[car, 0]))
             road.vehicles.append(self._cars[car])
         return self._state()

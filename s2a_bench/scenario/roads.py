@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
+from s2a_bench import extras
 from s2a_bench.scenario import EGO, LEAD, REAR
 
 if TYPE_CHECKING:
@@ -21,13 +22,14 @@ LENGTHS: Final = {LEAD: 1.0, EGO: 0.0, REAR: -1.0}
 
 
 def build_road() -> Any:
-    """Make a straight road of two lanes; raises ImportError without highway-env."""
+    """Make a straight road of two lanes; raises MissingExtra without highway-env."""
     # A fixed source of randomness: nothing on this road draws from it, but without one it would be seeded anew.
     import numpy as np
-    from highway_env.road.road import Road, RoadNetwork
 
-    network = RoadNetwork.straight_road_network(len(LANES), start=-BEHIND_M, length=ROAD_M + BEHIND_M, speed_limit=50.0)
-    return Road(network, np_random=np.random.RandomState(0), record_history=False)
+    made_of = extras.require("highway_env.road.road", "ccrb")
+    straight = made_of.RoadNetwork.straight_road_network
+    network = straight(len(LANES), start=-BEHIND_M, length=ROAD_M + BEHIND_M, speed_limit=50.0)
+    return made_of.Road(network, np_random=np.random.RandomState(0), record_history=False)
 
 
 def centre(car: int, position_m: float, lateral_m: float, length_m: float) -> Floats:

@@ -13,11 +13,11 @@ import socket
 import tarfile
 from collections.abc import Mapping
 from concurrent.futures import Future
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, TypeAlias
 
+from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.machine.environment import collect
 from s2a_bench.store.manifest import utc_now
@@ -25,7 +25,6 @@ from s2a_bench.sweep import Cell, Outcome
 from s2a_bench.sweep.perform import perform
 from s2a_bench.sweep.plan import Plan
 
-INSTALL: Final = "--ray needs Ray, which is not installed here: .venv/bin/pip install -e '.[ray]' -c constraints.txt"
 LOCAL: Final = "local"
 TRIES: Final = 5
 """How often a cell is run again because its node or process was lost."""
@@ -42,10 +41,8 @@ class OnRay:
     """A cluster that runs there, or one of this machine's cores made for the sweep."""
 
     def __init__(self, entry: str, address: str, plan: Plan, jobs: int) -> None:
-        """Connect; raises UsageError where Ray is not installed, does not answer, or no node has a board."""
-        connect(address, jobs)
-        import ray
-
+        """Connect; raises MissingExtra without Ray, UsageError where it does not answer or no node has a board."""
+        ray = self._ray = connect(address, jobs)
         self._entry = entry
         self._refs: set[Any] = set()
         resources = ray.cluster_resources()
@@ -68,11 +65,9 @@ class OnRay:
 
     def collect(self, future: Future[Packed], folder: Path) -> Outcome:
         """Unpack a cell's run folder and return how it went."""
-        from ray.exceptions import RayError
-
         try:
             outcome, data = future.result()
-        except RayError as error:
+        except self._ray.exceptions.RayError as error:
             return Outcome(f"Ray gave it up: {str(error).splitlines()[0]}", 0.0, utc_now(), collect())
         with tarfile.open(fileobj=io.BytesIO(data)) as archive:
             archive.extractall(folder, filter="data")
@@ -83,24 +78,19 @@ class OnRay:
 
     def __exit__(self, *_: object) -> None:
         """Cancel what is under way and leave the cluster."""
-        import ray
-
         for ref in list(self._refs):
-            ray.cancel(ref, force=True)
-        ray.shutdown()
+            self._ray.cancel(ref, force=True)
+        self._ray.shutdown()
 
 
-def connect(address: str, jobs: int) -> None:
-    """Join the cluster at an address, or make one of ``jobs`` cores for "local"; raises UsageError."""
-    if find_spec("ray") is None:
-        raise UsageError(INSTALL)
+def connect(address: str, jobs: int) -> Any:
+    """Join the cluster at an address, or make one of ``jobs`` cores for "local", and return Ray; raises S2AError."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is told to anybody
-    import ray
-
+    ray = extras.require("ray", "ray")
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address == LOCAL:
         ray.init(num_cpus=jobs, include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, address=LOCAL, **quiet)
-        return
+        return ray
     try:
         host, colon, port = address.rpartition(":")
         if colon and port.isdecimal():  # Ray itself would try for minutes
@@ -108,6 +98,7 @@ def connect(address: str, jobs: int) -> None:
         ray.init(address=address, **quiet)
     except (OSError, ValueError, RuntimeError) as error:
         raise UsageError(f"--ray: no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
+    return ray
 
 
 def _check(plan: Plan, resources: Mapping[str, float]) -> None:

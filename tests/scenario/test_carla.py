@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from s2a_bench.errors import SimulatorError, UsageError
+from s2a_bench.errors import MissingExtra, SimulatorError, UsageError
 from s2a_bench.policy import Schedule
 from s2a_bench.scenario.carla import Carla
 from s2a_bench.scenario.ccrb.cars import Cars, braking_plan
@@ -24,7 +24,7 @@ def connect(monkeypatch: pytest.MonkeyPatch, world: World | None, host: str = "l
 
 def test_without_the_package_the_way_to_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "carla", None)
-    with pytest.raises(SimulatorError, match=r"pip install 's2a-bench\[carla\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install 's2a-bench\[carla\]'"):
         Carla()
 
 

@@ -12,10 +12,11 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from s2a_bench import extras
 
 if TYPE_CHECKING:
     from s2a_bench.frames.v4l2_formats import CameraInfo
@@ -52,7 +53,7 @@ def _run(command: Sequence[str]) -> str | None:
 
 def _finds(package: str) -> bool:
     """Tell whether a package could be imported, without importing it."""
-    return find_spec(package) is not None
+    return extras.installed(package)
 
 
 def _cameras() -> list[CameraInfo]:

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from s2a_bench import extras
+from s2a_bench.errors import MissingExtra
 from s2a_bench.machine.doctor import Finding, Machine
 
 GIB = 1 << 30
@@ -18,9 +20,12 @@ FULL_POWER = "MAXN"
 
 @contextmanager
 def nvml() -> Iterator[tuple[Any, list[Any]]]:
-    """Open NVML and hand out the module and the GPUs; no GPUs where there is no driver."""
-    import pynvml
-
+    """Open NVML and hand out the module and the GPUs; no GPUs where there is no driver, or no nvidia-ml-py."""
+    try:
+        pynvml = extras.require("pynvml", "nvidia")
+    except MissingExtra:
+        yield None, []
+        return
     try:
         pynvml.nvmlInit()
     except pynvml.NVMLError:
@@ -74,6 +79,8 @@ def gpu(machine: Machine) -> Finding:
             return _cards(lib, gpus)
     if is_jetson(machine):
         return Finding("gpu", "state", "the board's own, which shares its memory")
+    if has_nvidia(machine) and not extras.installed("pynvml"):
+        return Finding("gpu", "advice", "an NVIDIA GPU that is not watched", extras.how_to_install("nvidia"))
     for path in machine.read_all("sys/bus/pci/devices/*/vendor").items():
         folder = path[0].rpartition("/")[0]
         if path[1] == NVIDIA_VENDOR and (machine.read(f"{folder}/class") or "").startswith(DISPLAY_CLASS):

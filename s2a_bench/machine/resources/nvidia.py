@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
+from s2a_bench import extras
+from s2a_bench.errors import MissingExtra
 from s2a_bench.machine.resources import Unreadable
 
 Query = Callable[[Any], float]
@@ -17,10 +19,11 @@ class Nvml:
     cheap = False
 
     def __init__(self, pids: Sequence[int] = ()) -> None:  # noqa: ARG002 - a GPU's figures are the whole GPU's
-        """Load the driver's library and ask each GPU what it can tell; raises Unreadable without a driver or GPU."""
-        import pynvml
-
-        self._nvml = pynvml
+        """Load the driver's library and ask each GPU what it can tell; raises Unreadable without it or a GPU."""
+        try:
+            pynvml = self._nvml = extras.require("pynvml", "nvidia")
+        except MissingExtra as error:
+            raise Unreadable(str(error)) from error
         self._failed = pynvml.NVMLError
         try:
             pynvml.nvmlInit()

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.errors import SimulatorError, UsageError
+from s2a_bench import extras
+from s2a_bench.errors import UsageError
 from s2a_bench.policy import Schedule
 from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, LEAD_JERK_MPS3, Cars, DrivingPlan
 from s2a_bench.scenario.ccrb.follower import MOST_MPS2
@@ -37,16 +38,11 @@ AFTER_S: Final = 20.0
 def write_openscenario(path: Path, asked: CcrbOptions, schedules: Mapping[str, Schedule]) -> list[Path]:
     """Write ``PATH`` as one file a policy, STEM-POLICY.xosc, and STEM.xodr; return what was written.
 
-    Takes the first roll-out. Raises UsageError for a path that cannot be written, SimulatorError without the package.
+    Takes the first roll-out. Raises UsageError for a path that cannot be written, MissingExtra without the package.
     """
     if path.suffix != ".xosc":
         raise UsageError(f"`openscenario`: {path} should end in .xosc")
-    try:
-        from scenariogeneration import xodr
-    except ImportError as error:
-        raise SimulatorError(
-            "`openscenario`: the package scenariogeneration is not installed; pip install 's2a-bench[scenario]'"
-        ) from error
+    xodr = extras.require("scenariogeneration", "scenario").xodr
     road = path.with_suffix(".xodr")
     drive = xodr.OpenDrive(path.stem)
     drive.add_road(xodr.create_road(xodr.Line(ROAD_M), 0, left_lanes=0, right_lanes=2, lane_width=4))
@@ -66,17 +62,15 @@ def write_openscenario(path: Path, asked: CcrbOptions, schedules: Mapping[str, S
 
 def problems(path: Path) -> list[str]:
     """Check a file against the standard's schema; return what is wrong with it, nothing where all is well."""
-    import schemas
-    import xmlschema
-
+    xmlschema = extras.require("xmlschema", "scenario")
+    schemas = extras.require("schemas", "scenario")
     schema = xmlschema.XMLSchema(str(Path(schemas.__path__[0]) / SCHEMA))
     return [str(error.reason) for error in schema.iter_errors(str(path))]
 
 
 def _scenario(name: str, cars: Cars, plan: DrivingPlan, schedule: Schedule, road: str) -> Any:
     """Put the parts of one file together."""
-    from scenariogeneration import xosc
-
+    xosc = extras.require("scenariogeneration", "scenario").xosc
     entities = xosc.Entities()
     init = xosc.Init()
     speed = float(np.asarray(cars.speed_mps))
@@ -116,8 +110,7 @@ def _scenario(name: str, cars: Cars, plan: DrivingPlan, schedule: Schedule, road
 
 def _ego_actions(cars: Cars, plan: DrivingPlan, schedule: Schedule) -> Iterator[tuple[str, float, Any]]:
     """List what the ego does and when: its skills, and the gap behaviour between them."""
-    from scenariogeneration import xosc
-
+    xosc = extras.require("scenariogeneration", "scenario").xosc
     start, duration = schedule.start_s[:, 0], np.broadcast_to(schedule.duration_s, schedule.start_s.shape)[:, 0]
     for index, lane in enumerate(plan.lane):
         before, target = (float(plan.set_point_mps[index + place, 0]) for place in (0, 1))
@@ -150,8 +143,7 @@ def _between(gap: Gap, decel: float, first: float) -> Any:
 
 def _speed(target: float, *, rate: float | None = None, time: float | None = None) -> Any:
     """Return a speed action: at once, at a rate in m/s^2, or within a time in s."""
-    from scenariogeneration import xosc
-
+    xosc = extras.require("scenariogeneration", "scenario").xosc
     if rate is not None:
         dynamics = xosc.TransitionDynamics(xosc.DynamicsShapes.linear, xosc.DynamicsDimension.rate, rate)
     elif time is not None:
@@ -163,8 +155,7 @@ def _speed(target: float, *, rate: float | None = None, time: float | None = Non
 
 def _group(car: str, actions: list[tuple[str, float, Any]]) -> Any:
     """Return a car's maneuver: each action at its time, the newest one wins."""
-    from scenariogeneration import xosc
-
+    xosc = extras.require("scenariogeneration", "scenario").xosc
     maneuver = xosc.Maneuver(f"{car}-maneuver")
     for name, at_s, action in actions:
         event = xosc.Event(f"{car}-{name}", xosc.Priority.overwrite)
@@ -179,16 +170,14 @@ def _group(car: str, actions: list[tuple[str, float, Any]]) -> Any:
 
 def _at(name: str, at_s: float, kind: str = "start") -> Any:
     """Return a trigger by simulation time."""
-    from scenariogeneration import xosc
-
+    xosc = extras.require("scenariogeneration", "scenario").xosc
     condition = xosc.SimulationTimeCondition(at_s, xosc.Rule.greaterThan)
     return xosc.ValueTrigger(name, 0, xosc.ConditionEdge.none, condition, triggeringpoint=kind)
 
 
 def _vehicle(name: str) -> Any:
     """Return a car whose middle is its origin."""
-    from scenariogeneration import xosc
-
+    xosc = extras.require("scenariogeneration", "scenario").xosc
     box = xosc.BoundingBox(WIDTH_M, LENGTH_M, 1.5, 0, 0, 0.75)
     front, rear = xosc.Axle(0.5, 0.8, 1.7, 1.4, 0.4), xosc.Axle(0, 0.8, 1.7, -1.4, 0.4)
     return xosc.Vehicle(name, xosc.VehicleCategory.car, box, front, rear, 70, 10, 10)

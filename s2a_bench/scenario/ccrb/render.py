@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from s2a_bench import extras
 from s2a_bench.scenario import EGO, LEAD, REAR
 from s2a_bench.scenario.roads import LANE_WIDTH_M, MIDDLE_M, build_road, centre
 
@@ -30,18 +31,17 @@ class TopView:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-        import pygame
-        from highway_env.road.graphics import RoadGraphics, WorldSurface
-        from highway_env.vehicle.kinematics import Vehicle
-
+        pygame = extras.require("pygame", "ccrb")
+        graphics = extras.require("highway_env.road.graphics", "ccrb")
+        vehicles = extras.require("highway_env.vehicle.kinematics", "ccrb")
         self._pixels_of = pygame.surfarray.array3d
-        self._draw: Any = RoadGraphics
-        self._surface: Any = WorldSurface((width, height), 0, pygame.Surface((width, height)))
+        self._draw: Any = graphics.RoadGraphics
+        self._surface: Any = graphics.WorldSurface((width, height), 0, pygame.Surface((width, height)))
         self._surface.scaling = PIXELS_A_M
         self._road = build_road()
         self._cars: dict[int, Any] = {}
         for car, colour in COLOURS.items():
-            vehicle = Vehicle(self._road, centre(car, 0.0, 0.0, Vehicle.LENGTH))
+            vehicle = vehicles.Vehicle(self._road, centre(car, 0.0, 0.0, vehicles.Vehicle.LENGTH))
             vehicle.color = colour
             self._cars[car] = vehicle
             self._road.vehicles.append(vehicle)

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("scenariogeneration", reason="no wheel of pyclothoids on this platform")
 
-from s2a_bench.errors import SimulatorError, UsageError
+from s2a_bench.errors import MissingExtra, UsageError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.plans import prepare
 from s2a_bench.plan.skillset import GAPS
@@ -73,5 +73,5 @@ def test_other_endings_are_refused(tmp_path: Path) -> None:
 def test_without_the_package_the_way_to_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ready = prepare(CcrbConfig())
     monkeypatch.setitem(sys.modules, "scenariogeneration", None)
-    with pytest.raises(SimulatorError, match=r"pip install 's2a-bench\[scenario\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install 's2a-bench\[scenario\]'"):
         write_openscenario(tmp_path / "ccrb.xosc", CcrbOptions(), ready.schedules)

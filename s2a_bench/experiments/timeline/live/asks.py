@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from s2a_bench.experiments.timeline.live.config import LiveConfig
-from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.plan import Format, SkillSet, choose_format, grammar, paper_format, prompt
 from s2a_bench.policy import PlanShape, Policy, Timing
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
@@ -54,7 +53,11 @@ class Ask:
 
 def asks_of(config: LiveConfig, model: Path | None) -> list[Ask]:
     """Word every setting for the tokenizer of ``model``; raises UsageError where there is no such format."""
-    tokenize = None if config.paper_format else Tokenizer(model)
+    tokenize = None
+    if not config.paper_format:
+        from s2a_bench.inference.tokenizer import Tokenizer
+
+        tokenize = Tokenizer(model)
     found = []
     for tokens, n_skills, t_nom_s in config.settings():
         skills = config.skills_lasting(t_nom_s)

@@ -9,15 +9,17 @@ import json
 import re
 from typing import Any
 
-import json_numpy
 import numpy as np
 
+from s2a_bench import extras
 from s2a_bench.frames.convert import bgr_to_rgb, to_bgr, yuyv_to_rgb
 from s2a_bench.trace import Trace
 from s2a_bench.transport.http.dialects import Event, Picture
 from s2a_bench.transport.http.dialects.common import Chat, endpoint, refuse_grammar
 from s2a_bench.transport.http.dialects.framing import WholeBody
 from s2a_bench.types import Frame, Pixels, Request
+
+json_numpy = extras.require("json_numpy", "openvla")
 
 FAILED = "error"
 """The whole body of a failure, with status 200 (``vla-scripts/deploy.py``)."""

@@ -1,0 +1,53 @@
+"""Optional libraries: which extra of this package brings each, and the one line where it is missing.
+
+No optional library is imported by a statement: ``gguf = extras.require("gguf", "model")``.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, Final
+
+from s2a_bench.errors import MissingExtra
+
+EXTRAS: Final = {
+    "model": "GGUF model files",
+    "llama": "the llama engine",
+    "ccrb": "the embedded simulator and pictures of the road",
+    "scenario": "OpenSCENARIO files",
+    "nvidia": "load, memory and power of NVIDIA GPUs",
+    "openvla": "the openvla dialect",
+    "ray": "sweeps on a Ray cluster",
+    "carla": "the carla simulator",
+}
+"""Extra -> what it is for."""
+BY_HAND: Final = ("ray", "carla")
+"""Extras that `make setup` leaves out."""
+
+
+def installed(module: str) -> bool:
+    """Whether a top-level module could be imported, without importing it."""
+    return sys.modules[module] is not None if module in sys.modules else find_spec(module) is not None
+
+
+def need(module: str, extra: str) -> None:
+    """Raise MissingExtra where a top-level module is not installed, without importing it."""
+    if not installed(module):
+        raise MissingExtra(f"{EXTRAS[extra]}: the package {module} is not installed; {how_to_install(extra)}")
+
+
+def require(module: str, extra: str) -> Any:
+    """Import and return a module, as ``gguf.constants``; raises MissingExtra where it is missing or does not load."""
+    need(module.partition(".")[0], extra)
+    try:
+        return import_module(module)
+    except (ImportError, OSError, RuntimeError) as error:
+        raise MissingExtra(f"{EXTRAS[extra]}: {module} does not load ({error}); {how_to_install(extra)}") from error
+
+
+def how_to_install(*extras: str) -> str:
+    """Return the command that installs extras."""
+    checkout = "" if set(extras) & set(BY_HAND) else " (in a checkout: make setup)"
+    return f"pip install 's2a-bench[{','.join(extras)}]'{checkout}"
