@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 
 from packaging.requirements import Requirement
 
-from s2a_bench import __version__
+from s2a_bench import __version__, extras
 from s2a_bench.machine.doctor import Finding, Machine
 
 CUDA_BUILD = (
@@ -30,24 +30,48 @@ def python(machine: Machine) -> Finding:
 
 
 def packages(machine: Machine) -> Finding:  # noqa: ARG001 - the packages of this interpreter
-    """Compare the packages that are installed with those that are needed here."""
-    wrong = []
+    """Compare the packages that are installed with those that are needed here, and say which extras are there."""
     try:
         stated = [Requirement(text) for text in requires("s2a-bench") or ()]
     except PackageNotFoundError:
         stated = []
-    needed = [each for each in stated if not each.marker or each.marker.evaluate({"extra": ""})]
-    for requirement in needed:
-        try:
-            found = version(requirement.name)
-        except PackageNotFoundError:
-            wrong.append(f"{requirement.name} is missing")
-            continue
-        if not requirement.specifier.contains(found, prereleases=True):
-            wrong.append(f"{requirement.name} is {found}, not {requirement.specifier}")
-    if wrong:
+    needed = [each for each in stated if _applies(each)]
+    missing = []
+    for extra in extras.EXTRAS:
+        added = [each for each in stated if _applies(each, extra) and not _applies(each)]
+        if all(_installed(each.name) for each in added):
+            needed += added
+        else:
+            missing.append(extra)
+    if wrong := [problem for each in needed if (problem := _problem(each))]:
         return Finding("packages", "error", "; ".join(wrong), "make setup")
-    return Finding("packages", "state", f"{len(needed)} requirements, all met")
+    message = f"{len(needed)} requirements, all met"
+    if not missing:
+        return Finding("packages", "state", message)
+    without = ", ".join(f"{extra} ({extras.EXTRAS[extra]})" for extra in missing)
+    return Finding("packages", "state", f"{message}; without the extras {without}", extras.how_to_install(*missing))
+
+
+def _applies(requirement: Requirement, extra: str = "") -> bool:
+    """Whether a package is needed on this platform with an extra, or with none."""
+    return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
+
+
+def _installed(package: str) -> str:
+    """Return a package's version; "" where it is not there."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def _problem(requirement: Requirement) -> str:
+    """Return what is wrong with a package that is needed, "" if nothing is."""
+    found = _installed(requirement.name)
+    if not found:
+        return f"{requirement.name} is missing"
+    fits = requirement.specifier.contains(found, prereleases=True)
+    return "" if fits else f"{requirement.name} is {found}, not {requirement.specifier}"
 
 
 def compiler(machine: Machine) -> Finding:
@@ -65,20 +89,18 @@ def compiler(machine: Machine) -> Finding:
     return Finding("compiler", "state", first + (f"; CUDA {cuda[1]}" if cuda else "; no nvcc"))
 
 
-def llama_build(machine: Machine) -> Finding:
+def llama_build(machine: Machine) -> Finding | None:
     """Say what llama-cpp-python was built for, whether GPU or AMX lie idle because of it, and whether it works."""
     from s2a_bench.machine.doctor.gpu import has_nvidia
 
+    if not machine.finds("llama_cpp"):
+        return None
     seen = machine.smoke_test()
     if seen.message:
         return Finding("llama-build", "error", seen.message, "make clean setup")
+    llama_cpp = extras.require("llama_cpp", "llama")
+    from s2a_bench.inference.llama_log import silence
 
-    try:
-        import llama_cpp
-
-        from s2a_bench.inference.llama_log import silence
-    except (ImportError, OSError, RuntimeError) as error:
-        return Finding("llama-build", "error", f"llama-cpp-python does not load: {error}", "make setup")
     silence()
     llama_cpp.llama_backend_init()
     text = llama_cpp.llama_print_system_info().decode(errors="replace")
