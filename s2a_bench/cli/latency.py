@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -57,8 +59,11 @@ def latency(
     connection: Annotated[str, typer.Option(help="HTTP: keep-alive, per-request, client-per-request")] = "keep-alive",
     engine: Annotated[
         str,
-        typer.Option(help=f"{', '.join(ENGINES)}; echo leaves the transport alone, replay plays --profile (EMULATED)"),
-    ] = "llama",
+        typer.Option(
+            help=f"{', '.join(ENGINES)}; echo leaves the transport alone, replay plays --profile (EMULATED) "
+            "[default: llama where installed, else echo]"
+        ),
+    ] = "",
     profile: Annotated[str, typer.Option(help="replay: the board to play, a name of 'profile list' or a path")] = "",
     gaps: Annotated[str, typer.Option(help="replay: trace, parametric, constant [default: trace if recorded]")] = "",
     model: Annotated[Path | None, typer.Option(help="GGUF model [default: the tiny dummy]")] = None,
@@ -94,7 +99,7 @@ def latency(
     from s2a_bench.cli.progress import RunProgress
     from s2a_bench.experiments.latency.run import run_latency
     from s2a_bench.harness.plan import DEFAULT_PROMPT, LatencyConfig
-    from s2a_bench.inference import EngineConfig
+    from s2a_bench.inference import EngineConfig, default_engine
     from s2a_bench.ros.config import domain_id
 
     if against not in {"", "paper"}:
@@ -126,7 +131,7 @@ def latency(
         dds_tuning=dds_tuning,
         domain_id=domain_id(os.environ),
         namespace=namespace,
-        engine=EngineConfig(engine, model, mmproj, threads, gpu_layers, context, profile=profile, gaps=gaps),
+        engine=EngineConfig(engine or "llama", model, mmproj, threads, gpu_layers, context, profile=profile, gaps=gaps),
         runs=few["runs"] if runs is None else runs,
         warmup=few["warmup"] if warmup is None else warmup,
         mode=mode,
@@ -138,6 +143,9 @@ def latency(
         timeout_s=timeout,
         sample_resources_hz=sample_resources,
     )
+    if not engine and config.own_engine and not llama_server:
+        chosen = default_engine(partial(typer.echo, err=True))
+        config = replace(config, engine=replace(config.engine, name=chosen))
     config.check()
     with RunProgress() as progress:
         try:

@@ -84,6 +84,12 @@ class LatencyConfig:
         return bool(self.url or self.llama_server)
 
     @property
+    def own_engine(self) -> bool:
+        """Whether an engine of ours answers over any transport."""
+        foreign = {"http": self.black_box, "ros": bool(self.action)}
+        return not all(foreign.get(transport, False) for transport in self.transports)
+
+    @property
     def http_variants(self) -> tuple[str, ...]:
         """Return the variants to measure."""
         speaks = HTTP_VARIANTS[:2] if self.black_box else HTTP_VARIANTS

@@ -9,6 +9,7 @@ from pathlib import Path
 from random import Random
 from typing import Any, TypeAlias
 
+from s2a_bench import extras
 from s2a_bench.clock import SystemClock
 from s2a_bench.errors import TransportError
 from s2a_bench.frames import FrameSource, open_source
@@ -19,6 +20,7 @@ from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.harness.warnings import Counters, SampleGuard, before_run
+from s2a_bench.inference import need_engine
 from s2a_bench.inference.models import resolve
 from s2a_bench.machine import environment
 from s2a_bench.machine.doctor import Machine
@@ -56,6 +58,10 @@ def run_requests(task: Task, config: LatencyConfig, output: Path, progress: Prog
 
     Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
     """
+    if config.own_engine:
+        need_engine(config.engine.name)
+    if config.llama_server:
+        extras.need("gguf", "model")
     limit_threads()
     malloc_tuned = config.dds_tuning == "tuned" and keep_large_blocks()
     with ExitStack() as stack:
@@ -63,7 +69,7 @@ def run_requests(task: Task, config: LatencyConfig, output: Path, progress: Prog
         manifest = _manifest(task, config, malloc_tuned=malloc_tuned)
         writer = stack.enter_context(RunWriter.create(output, task.command, manifest))
         progress.opened(writer.path)
-        if config.engine.name == "llama":
+        if config.engine.name == "llama" and extras.installed("gguf"):  # else nobody here reads the files
             config = _with_model(config, progress)
         _measure(task, config, sources, writer, progress)
         return writer.path

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
+from s2a_bench import extras
 from s2a_bench.registry import Registry
 from s2a_bench.types import Request, Token
 
@@ -77,6 +78,21 @@ ENGINES: Final[Registry[Callable[[EngineConfig], Engine]]] = Registry(
     },
 )
 """What builds each engine from its configuration."""
+
+
+def default_engine(say: Callable[[str], None]) -> str:
+    """Return llama where it is installed, else echo, and ``say`` so."""
+    if extras.installed("llama_cpp"):
+        return "llama"
+    say(f"no llama-cpp-python here, so the echo engine answers, without a model; {extras.how_to_install('llama')}")
+    return "echo"
+
+
+def need_engine(name: str) -> None:
+    """Raise MissingExtra where what an engine needs is not installed."""
+    if name == "llama":
+        extras.need("llama_cpp", "llama")
+        extras.need("gguf", "llama")
 
 
 def open_engine(config: EngineConfig) -> Engine:

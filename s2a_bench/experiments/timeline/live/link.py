@@ -18,6 +18,7 @@ from s2a_bench.harness.plan import plan_cells
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.harness.warnings import before_run
+from s2a_bench.inference import need_engine
 from s2a_bench.inference.models import resolve
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.progress import Progress
@@ -71,6 +72,7 @@ def word(config: LiveConfig, progress: Progress) -> tuple[LiveConfig, list[Ask]]
     """Find the model's files and word what it is asked, with the room that it needs; raises S2AError."""
     requests = config.requests
     if not config.paper_format:
+        need_engine("llama")
         progress.stage("reading the model's headers" if requests.engine.model else "the tiny dummy model")
         model, mmproj = resolve(requests.engine)
         requests = replace(requests, engine=replace(requests.engine, model=model, mmproj=mmproj))
