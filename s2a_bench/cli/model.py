@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from s2a_bench import extras
 from s2a_bench.cli.model_validity import validity
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
@@ -59,6 +60,8 @@ def fetch(
     from s2a_bench.inference.fetch import wanted
     from s2a_bench.inference.gguf_file import read_header
 
+    for module in ("huggingface_hub", "gguf"):
+        extras.need(module, "model")
     want = wanted(what, quant, mmproj)
     with _bytes_bar() as bar:
         tasks: dict[str, TaskID] = {}

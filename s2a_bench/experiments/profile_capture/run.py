@@ -21,7 +21,7 @@ from s2a_bench.frames import open_source
 from s2a_bench.frames.convert import bgr_to_rgb, to_bgr
 from s2a_bench.harness.plan import DEFAULT_PROMPT
 from s2a_bench.harness.warnings import Counters, before_run
-from s2a_bench.inference import Engine, EngineConfig
+from s2a_bench.inference import Engine, EngineConfig, need_engine
 from s2a_bench.machine import environment
 from s2a_bench.machine.board import board_facts
 from s2a_bench.machine.tuning import limit_threads
@@ -127,6 +127,7 @@ def capture(config: CaptureConfig, stage: Callable[[str], None], advance: Callab
     Raises EngineError where the model's answers are too short to time.
     """
     config.check()
+    need_engine(config.engine.name)
     limit_threads()
     warnings = before_run(config.width, config.height, uses_dds=False)
     with ExitStack() as stack:

@@ -1,0 +1,60 @@
+"""What is not imported: heavy libraries before they are needed, and optional ones but through one function."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import s2a_bench
+
+HEAVY = ("numpy", "cv2", "pandas", "matplotlib", "pydantic", "llama_cpp", "cyclonedds")
+OPTIONAL = {
+    *("gguf", "huggingface_hub", "llama_cpp", "highway_env", "gymnasium", "pygame", "scenariogeneration", "schemas"),
+    *("xmlschema", "pynvml", "json_numpy", "ray", "carla"),
+}
+TYPES = "TYPE_CHECKING"
+
+
+def imported(code: str) -> list[str]:
+    """Run code in a fresh Python; return the heavy packages that it imported."""
+    told = f"import sys\n{code}\nprint([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True, timeout=120)
+    names: list[str] = ast.literal_eval(done.stderr)
+    return names
+
+
+def test_the_package_itself_imports_nothing_heavy() -> None:
+    assert imported("import s2a_bench") == []
+
+
+def test_help_imports_nothing_heavy() -> None:
+    run = "sys.argv = ['s2a-bench', '--help']\nfrom s2a_bench.cli import main\n"
+    run += "try:\n    main()\nexcept SystemExit:\n    pass"
+    assert imported(run) == []
+
+
+def statements(tree: ast.AST) -> Iterator[ast.stmt]:
+    """Yield the import statements that are carried out."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            yield node
+        elif not (isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == TYPES):
+            yield from statements(node)
+
+
+def modules(statement: ast.stmt) -> set[str]:
+    if isinstance(statement, ast.ImportFrom):
+        return {(statement.module or "").partition(".")[0]} if not statement.level else set()
+    assert isinstance(statement, ast.Import)
+    return {alias.name.partition(".")[0] for alias in statement.names}
+
+
+@pytest.mark.parametrize("path", sorted(Path(s2a_bench.__file__).parent.rglob("*.py")), ids=str)
+def test_no_module_imports_an_optional_library_by_a_statement(path: Path) -> None:
+    for statement in statements(ast.parse(path.read_text())):
+        assert not modules(statement) & OPTIONAL, f"line {statement.lineno}: see s2a_bench/extras.py"

@@ -1,0 +1,200 @@
+"""Without the extras: the core measures, and what needs one says in one line which."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from s2a_bench import extras
+from s2a_bench.errors import MissingExtra
+from s2a_bench.inference import default_engine
+from s2a_bench.machine.doctor import Machine, software
+from s2a_bench.machine.resources import Unreadable
+from s2a_bench.machine.resources.nvidia import Nvml
+from tests.cli.test_imports import OPTIONAL
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+SETUP = " (in a checkout: make setup)"
+
+
+def without(modules: set[str], folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command where some modules cannot be found, by its server processes neither."""
+    site = folder / "site"
+    site.mkdir(exist_ok=True)
+    (site / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({modules}))\n")
+    return subprocess.run(
+        [sys.executable, "-m", "s2a_bench", *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": f"{site}:{ROOT}", "S2A_BENCH_CACHE": str(folder / "cache")},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+
+
+BLACK_BOX = ("latency", "--transport", "http", "--url", "http://127.0.0.1:9")
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "arguments"),
+    [
+        ("llama_cpp", "llama", ("latency", "--engine", "llama")),
+        ("llama_cpp", "llama", ("throughput",)),
+        ("llama_cpp", "llama", ("timeline", "--live")),
+        ("llama_cpp", "llama", ("ccrb", "--live")),
+        ("llama_cpp", "llama", ("model", "validity")),
+        ("llama_cpp", "llama", ("profile", "capture", "x")),
+        ("llama_cpp", "llama", ("serve", "http")),
+        ("llama_cpp", "llama", ("serve", "ros")),
+        ("gguf", "llama", ("latency", "--engine", "llama")),
+        ("gguf", "model", ("model", "dummy")),
+        ("huggingface_hub", "model", ("model", "fetch", "minicpm-v-2.6")),
+        ("highway_env", "ccrb", ("ccrb", "--simulator", "embedded")),
+        ("highway_env", "ccrb", ("ccrb", "--animation")),
+        ("scenariogeneration", "scenario", ("ccrb", "--openscenario", "a.xosc")),
+        ("carla", "carla", ("ccrb", "--simulator", "carla")),
+        ("json_numpy", "openvla", (*BLACK_BOX, "--dialect", "openvla", "--payload", "raw")),
+        ("ray", "ray", ("sweep", "paper", "--ray", "local")),
+    ],
+)
+def test_a_missing_library_is_one_line_with_the_command_and_leaves_nothing(
+    module: str, extra: str, arguments: tuple[str, ...], tmp_path: Path
+) -> None:
+    done = without({module}, tmp_path, *arguments)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    hint = "" if extra in extras.BY_HAND else SETUP
+    ending = f": the package {module} is not installed; pip install 's2a-bench[{extra}]'{hint}"
+    assert line == f"error: {extras.EXTRAS[extra]}{ending}"
+    assert not (tmp_path / "results").exists()
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Measure once without any extra."""
+    folder = tmp_path_factory.mktemp("bare")
+    few = ("--runs", "3", "--warmup", "1", "--max-tokens", "4", "--size", "64x48")
+    done = without(OPTIONAL, folder, "latency", "--transport", "loopback,http", *few)
+    assert done.returncode == 0, done.stderr
+    assert "Echo engine" in done.stdout
+    (said,) = (line for line in done.stderr.splitlines() if "pip install" in line)
+    assert said.endswith(f"the echo engine answers, without a model; pip install 's2a-bench[llama]'{SETUP}")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("latency", "--engine", "echo", "--transport", "loopback,http", "--runs", "3"),
+        ("timeline",),
+        ("boundary",),
+        ("ccrb",),
+        ("doctor",),
+        ("report", "RUN"),
+        ("compare", "RUN", "RUN"),
+        ("profile", "list"),
+        *((command, "--help") for command in ("latency", "throughput", "timeline", "boundary", "study", "ccrb")),
+        *((command, "--help") for command in ("sweep", "compare", "report", "doctor", "model", "profile", "serve")),
+        ("--help",),
+    ],
+    ids=" ".join,
+)
+def test_the_core_needs_no_extra(arguments: tuple[str, ...], bare: Path, tmp_path: Path) -> None:
+    (run,) = (bare / "results").iterdir()
+    done = without(OPTIONAL, tmp_path, *(str(run) if word == "RUN" else word for word in arguments))
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_black_box_needs_no_extra(tmp_path: Path) -> None:
+    done = without(OPTIONAL, tmp_path, *BLACK_BOX)
+    assert "nothing answers at http://127.0.0.1:9" in done.stderr
+    assert "pip install" not in done.stderr
+
+
+def test_llama_answers_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    assert default_engine(said.append) == "llama"
+    assert said == []
+    monkeypatch.setitem(sys.modules, "llama_cpp", None)
+    assert default_engine(said.append) == "echo"
+    assert len(said) == 1
+
+
+def test_a_library_that_does_not_load_is_one_line_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "broken_library.py").write_text("raise OSError('libcuda.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(MissingExtra, match=r"broken_library does not load \(libcuda.so.1: .*\[llama\]"):
+        extras.require("broken_library", "llama")
+
+
+def test_without_nvml_a_gpu_is_not_watched_and_the_reason_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pynvml", None)
+    with pytest.raises(Unreadable, match=r"pynvml is not installed; pip install 's2a-bench\[nvidia\]'"):
+        Nvml()
+
+
+def test_the_core_has_22_requirements_at_most() -> None:
+    assert len(PROJECT["dependencies"]) <= 22
+
+
+def test_every_extra_is_described_and_in_all() -> None:
+    offered = PROJECT["optional-dependencies"]
+    assert offered.keys() == {*extras.EXTRAS, "all", "dev"}
+    (everything,) = (Requirement(text).extras for text in offered["all"])
+    assert everything | {"model"} == set(extras.EXTRAS)
+    (made,) = (Requirement(text).extras for text in offered["dev"] if text.startswith("s2a-bench"))
+    assert made == everything - set(extras.BY_HAND)
+
+
+@pytest.mark.parametrize(
+    ("there", "level", "message", "fix"),
+    [
+        ({"numpy": "2", "gguf": "1", "ray": "2"}, "state", "3 requirements, all met", ""),
+        (
+            {"numpy": "2", "gguf": "1"},
+            "state",
+            "2 requirements, all met; without the extras ray (sweeps on a Ray cluster)",
+            "pip install 's2a-bench[ray]'",
+        ),
+        ({"numpy": "2", "gguf": "0.1", "ray": "2"}, "error", "gguf is 0.1, not >=1", "make setup"),
+        ({"gguf": "1", "ray": "2"}, "error", "numpy is missing", "make setup"),
+    ],
+)
+def test_the_doctor_knows_which_extras_are_there(
+    there: dict[str, str], level: str, message: str, fix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stated = ["numpy>=1", 'gguf>=1; extra == "model"', 'ray>=2; extra == "ray"', 'tomli; python_version < "3"']
+
+    def version(name: str) -> str:
+        if name not in there:
+            raise PackageNotFoundError(name)
+        return there[name]
+
+    monkeypatch.setattr(software, "requires", lambda _name: stated)
+    monkeypatch.setattr(software, "version", version)
+    found = software.packages(Machine())
+    assert (found.level, found.message, found.fix) == (level, message, fix)
+
+
+def test_no_message_names_an_extra_that_there_is_not() -> None:
+    for path in (ROOT / "s2a_bench").rglob("*.py"):
+        for names in re.findall(r"s2a-bench\[([a-z,]+)\]", path.read_text()):
+            assert set(names.split(",")) <= extras.EXTRAS.keys(), path
