@@ -12,6 +12,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires
@@ -29,6 +30,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 CONSTRAINTS = ROOT / "constraints.txt"
+OURS = "s2a-bench"
 COMPILED = "llama-cpp-python"
 NO_WHEEL = ("empy",)
 """Published as source only; pure Python, so that a wheel made here is everybody's. colcon-core needs it."""
@@ -84,12 +86,13 @@ class Target:
         return flags + [word for tag in tags for word in ("--platform", tag)]
 
 
+BOARD = ("llama", "ccrb", "nvidia", "openvla", "scenario", "ray")
 TARGETS = (
     Target("3.10", "x86_64", 35, "Ubuntu 22.04, Humble", ("dev", "ray")),
     Target("3.11", "x86_64", 36, "Debian 12", ("dev", "ray")),
     Target("3.12", "x86_64", 39, "Ubuntu 24.04, Jazzy", ("dev", "ray")),
-    Target("3.10", "aarch64", 35, "JetPack 6", ("ray",)),
-    Target("3.12", "aarch64", 39, "Jazzy in a container", ("ray",)),
+    Target("3.10", "aarch64", 35, "JetPack 6", BOARD),
+    Target("3.12", "aarch64", 39, "Jazzy in a container", BOARD),
 )
 
 
@@ -97,7 +100,7 @@ def requirements(target: Target) -> list[str]:
     """List what pyproject.toml asks for on a platform, and what the compiled package needs in its place."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = [Requirement(text) for text in project["dependencies"]]
-    asked += [Requirement(text) for extra in target.extras for text in project["optional-dependencies"][extra]]
+    asked += added(project["optional-dependencies"], target.extras)
     try:
         needed = [Requirement(text) for text in requires(COMPILED) or ()]
     except PackageNotFoundError:
@@ -110,6 +113,16 @@ def requirements(target: Target) -> list[str]:
     for requirement in wanted:
         requirement.marker = None
     return [str(requirement) for requirement in wanted]
+
+
+def added(offered: dict[str, list[str]], names: Iterable[str]) -> Iterator[Requirement]:
+    """Yield what extras add to the core, those that an extra takes from another included."""
+    for name in names:
+        for requirement in map(Requirement, offered[name]):
+            if requirement.name == OURS:
+                yield from added(offered, sorted(requirement.extras))
+            else:
+                yield requirement
 
 
 def pins(target: Target, text: str) -> dict[str, str]:

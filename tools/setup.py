@@ -256,7 +256,7 @@ def pip(*arguments: str, watch: bool = False, environment: dict[str, str] | None
 
 
 def install() -> None:
-    """Make the environment, compile llama-cpp-python, install the rest; only what is missing."""
+    """Make the environment, compile llama-cpp-python, install the rest (`dev` has all but Ray and CARLA)."""
     check_machine()
     if not has_pip():
         print(f"making {VENV}", flush=True)

@@ -43,6 +43,14 @@ def test_the_compiled_package_is_replaced_by_what_it_needs() -> None:
     assert {"diskcache", "jinja2"} <= needed
 
 
+def test_extras_that_take_from_others_bring_what_those_have() -> None:
+    for target in check.TARGETS:
+        needed = names(check.requirements(target))
+        assert {"gguf", "huggingface-hub", "highway-env", "nvidia-ml-py", "json-numpy", "ray"} <= needed
+        assert ("scenariogeneration" in needed) == (target.machine == "x86_64")
+        assert "s2a-bench" not in needed
+
+
 def test_pins_follow_their_markers() -> None:
     text = (
         "# comment\n\nnumpy==2.4.6; python_version >= '3.11'\nnumpy==2.2.6; python_version < '3.11'\nRuamel_YAML==1\n"
