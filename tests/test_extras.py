@@ -100,10 +100,10 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("latency", "--engine", "echo", "--transport", "loopback,http", "--runs", "3"),
-        ("timeline",),
-        ("boundary",),
-        ("ccrb",),
+        ("latency", "--engine", "echo", "--transport", "loopback,http", "--runs", "3", "--data-only"),
+        ("timeline", "--profile", "rtx-4080", "--tokens-per-skill", "6"),
+        ("boundary", "--data-only"),
+        ("ccrb", "--data-only"),
         ("doctor",),
         ("report", "RUN"),
         ("compare", "RUN", "RUN"),
