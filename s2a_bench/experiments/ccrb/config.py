@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import Field
 
+from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.ccrb.asked import Asked, live_config
 from s2a_bench.options import Names, Numbers, Options, one_of, option
@@ -138,3 +139,8 @@ class CcrbView(Options):
     """What is drawn besides tables and figures."""
 
     animation: bool = option(False, "write the animation (GIF, MP4): half a minute", flag="animation/--no-animation")
+
+    def check(self) -> None:
+        """Raise MissingExtra, before anything is driven, where an animation cannot be drawn."""
+        if self.animation:
+            extras.need("highway_env", "ccrb")
