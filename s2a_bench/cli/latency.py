@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from s2a_bench.cli.options import file_text, listed, size_of, text_or_file
+from s2a_bench.cli.options import engine_config, file_text, listed, size_of, text_or_file
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError, UsageError
@@ -99,7 +99,7 @@ def latency(
     from s2a_bench.cli.progress import RunProgress
     from s2a_bench.experiments.latency.run import run_latency
     from s2a_bench.harness.plan import DEFAULT_PROMPT, LatencyConfig
-    from s2a_bench.inference import EngineConfig, default_engine
+    from s2a_bench.inference import default_engine
     from s2a_bench.ros.config import domain_id
 
     if against not in {"", "paper"}:
@@ -131,7 +131,16 @@ def latency(
         dds_tuning=dds_tuning,
         domain_id=domain_id(os.environ),
         namespace=namespace,
-        engine=EngineConfig(engine or "llama", model, mmproj, threads, gpu_layers, context, profile=profile, gaps=gaps),
+        engine=engine_config(
+            name=engine or "llama",
+            model=model,
+            mmproj=mmproj,
+            threads=threads,
+            gpu_layers=gpu_layers,
+            context=context,
+            profile=profile,
+            gaps=gaps,
+        ),
         runs=few["runs"] if runs is None else runs,
         warmup=few["warmup"] if warmup is None else warmup,
         mode=mode,

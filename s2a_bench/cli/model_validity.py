@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from s2a_bench.cli.options import listed, text_or_file
+from s2a_bench.cli.options import engine_config, listed, text_or_file
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError
@@ -37,10 +37,9 @@ def validity(
     """Count the valid skills in a model's plans, with a grammar and without (the paper's hallucination control)."""
     from s2a_bench.cli.progress import RunProgress
     from s2a_bench.experiments.model_validity.run import ValidityConfig, run_validity
-    from s2a_bench.inference import EngineConfig
 
     config = ValidityConfig(
-        engine=EngineConfig(model=model, mmproj=mmproj, threads=threads, gpu_layers=gpu_layers),
+        engine=engine_config(model=model, mmproj=mmproj, threads=threads, gpu_layers=gpu_layers),
         skills=skills,
         tokens_per_skill=listed(tokens_per_skill),
         n_skills=n_skills,

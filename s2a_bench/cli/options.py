@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from s2a_bench.cli.adapter import flags_of, with_flags
 from s2a_bench.errors import UsageError
+
+if TYPE_CHECKING:
+    from s2a_bench.inference import EngineConfig
 
 WIDTH = 100
 """Columns of the tables where the output is no terminal."""
@@ -50,3 +55,15 @@ def file_text(path: Path, flag: str) -> str:
         return path.read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{flag}: cannot read {path}: {error}") from error
+
+
+def engine_config(**given: Any) -> EngineConfig:
+    """Make the engine's options of a command that declares their flags itself; raises UsageError naming the flag."""
+    from s2a_bench.inference import EngineConfig
+
+    try:
+        return EngineConfig(**given)
+    except UsageError as error:
+        raise UsageError(
+            with_flags(str(error), {flag.path[-1]: flag.name for flag in flags_of(EngineConfig)})
+        ) from error

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from s2a_bench.cli.options import size_of, text_or_file
+from s2a_bench.cli.options import engine_config, size_of, text_or_file
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import UsageError
 from s2a_bench.frames import SOURCES
@@ -51,11 +51,12 @@ def capture(
     from s2a_bench.experiments.profile_capture.run import CaptureConfig, make_room, write_profile
     from s2a_bench.experiments.profile_capture.run import capture as measure
     from s2a_bench.harness.plan import DEFAULT_PROMPT
-    from s2a_bench.inference import EngineConfig
 
     width, height = size_of(size)
     text = DEFAULT_PROMPT if prompt is None else text_or_file(prompt)
-    engine = EngineConfig("llama", model, mmproj, threads, gpu_layers, context)
+    engine = engine_config(
+        name="llama", model=model, mmproj=mmproj, threads=threads, gpu_layers=gpu_layers, context=context
+    )
     config = CaptureConfig(name, engine, source, width, height, requests, warmup, tokens, text, seed)
     config.check()
     path = output / f"{name}.toml"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from s2a_bench.cli.options import engine_config
 from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
@@ -177,17 +178,16 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _engine(settings: dict[str, Any]) -> EngineConfig:
-    from s2a_bench.inference import EngineConfig
     from s2a_bench.inference.replay import check_replay
 
     model, mmproj = (Path(settings[key]) if settings[key] else None for key in ("model", "mmproj"))
-    engine = EngineConfig(
-        settings["engine"],
-        model,
-        mmproj,
-        settings["threads"],
-        settings["gpu-layers"],
-        settings["context"],
+    engine = engine_config(
+        name=settings["engine"],
+        model=model,
+        mmproj=mmproj,
+        threads=settings["threads"],
+        gpu_layers=settings["gpu-layers"],
+        context=settings["context"],
         profile=settings["profile"],
         gaps=settings["gaps"],
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from s2a_bench.cli.options import file_text, listed, size_of, text_or_file
+from s2a_bench.cli.options import engine_config, file_text, listed, size_of, text_or_file
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError, UsageError
@@ -88,7 +88,6 @@ def throughput(
     from s2a_bench.cli.progress import RunProgress
     from s2a_bench.experiments.throughput.run import ThroughputConfig, run_throughput
     from s2a_bench.harness.plan import DEFAULT_PROMPT, LatencyConfig
-    from s2a_bench.inference import EngineConfig
     from s2a_bench.ros.config import domain_id
 
     if against not in {"", "paper"}:
@@ -115,17 +114,17 @@ def throughput(
         llama_server=llama_server,
         middleware=middleware,
         domain_id=domain_id(os.environ),
-        engine=EngineConfig(
-            engine,
-            model,
-            mmproj,
-            threads,
-            gpu_layers,
-            context,
-            batch,
-            kv_type,
-            flash_attention,
-            sampling or ("greedy" if reference else "model"),
+        engine=engine_config(
+            name=engine,
+            model=model,
+            mmproj=mmproj,
+            threads=threads,
+            gpu_layers=gpu_layers,
+            context=context,
+            batch=batch,
+            kv_type=kv_type,
+            flash_attention=flash_attention,
+            sampling=sampling or ("greedy" if reference else "model"),
             profile=profile,
             gaps=gaps,
         ),

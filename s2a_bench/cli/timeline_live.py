@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.cli.options import listed, numbers, size_of, text_or_file, whole_numbers
+from s2a_bench.cli.options import engine_config, listed, numbers, size_of, text_or_file, whole_numbers
 from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
@@ -69,7 +69,6 @@ def live_config(
     """Make the configuration of a live run; raises UsageError naming the flag."""
     from s2a_bench.experiments.timeline.live.config import LiveConfig
     from s2a_bench.harness.plan import LatencyConfig
-    from s2a_bench.inference import EngineConfig
     from s2a_bench.ros.config import domain_id
 
     value = {**DEFAULTS, **given}
@@ -79,12 +78,12 @@ def live_config(
     width, height = size_of(value["size"])
     if value["pace"] < 0 or ("pace" in given and not value["pace"]):
         raise UsageError(f"--pace: {value['pace']:g} should be above 0")
-    engine = EngineConfig(
-        value["engine"],
-        _path(value["model"]),
-        _path(value["mmproj"]),
-        value["threads"],
-        value["gpu-layers"],
+    engine = engine_config(
+        name=value["engine"],
+        model=_path(value["model"]),
+        mmproj=_path(value["mmproj"]),
+        threads=value["threads"],
+        gpu_layers=value["gpu-layers"],
         profile=profile,
         pace=value["pace"],
     )

@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from s2a_bench.errors import UsageError
-from s2a_bench.inference import ENGINES, EngineConfig
+from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import check_replay
 from s2a_bench.ros import MIDDLEWARES
 from s2a_bench.transport import CONNECTIONS, HTTP_VARIANTS, NAMES, PAYLOADS, QOS_PROFILES, ROS_VARIANTS, WIRES, Route
@@ -107,7 +107,6 @@ class LatencyConfig:
         _one_of("--payload", [self.payload], PAYLOADS)
         _one_of("--wire", [self.wire], WIRES)
         _one_of("--connection", [self.connection], CONNECTIONS)
-        _one_of("--engine", [self.engine.name], tuple(ENGINES))
         _one_of("--mode", [self.mode], MODES)
         _one_of("--dds-tuning", [self.dds_tuning], TUNINGS)
         for flag, value, least, most in (
@@ -191,7 +190,12 @@ class LatencyConfig:
 
     def to_manifest(self) -> dict[str, Any]:
         """Return the settings as plain data."""
-        return {**asdict(self), "http": list(self.http_variants), "size": f"{self.width}x{self.height}"}
+        return {
+            **asdict(self),
+            "engine": self.engine.to_manifest(),
+            "http": list(self.http_variants),
+            "size": f"{self.width}x{self.height}",
+        }
 
 
 def _is_url(text: str) -> bool:

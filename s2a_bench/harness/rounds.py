@@ -79,7 +79,7 @@ def _with_model(config: LatencyConfig, progress: Progress) -> LatencyConfig:
     """Find or make the model files, so that every server gets the same."""
     progress.stage("reading the model's headers" if config.engine.model else "the tiny dummy model, made on first use")
     model, mmproj = resolve(config.engine)
-    return replace(config, engine=replace(config.engine, model=model, mmproj=mmproj))
+    return replace(config, engine=config.engine.but(model=model, mmproj=mmproj))
 
 
 def _manifest(task: Task, config: LatencyConfig, *, malloc_tuned: bool) -> dict[str, Any]:

@@ -13,7 +13,6 @@ import signal
 import sys
 from collections.abc import Generator
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from threading import Lock, Thread
 from typing import Any
 
@@ -59,15 +58,15 @@ class ServerJob:
 
     def to_json(self) -> str:
         """Write as one line."""
-        return json.dumps(asdict(self), default=str)
+        return json.dumps(
+            {"route": asdict(self.route), "engine": self.engine.model_dump(mode="json"), "tuned": self.tuned}
+        )
 
     @staticmethod
     def from_json(line: str) -> ServerJob:
         """Read what `to_json` wrote."""
         fields: dict[str, Any] = json.loads(line)
-        engine = fields["engine"]
-        paths = {key: Path(engine[key]) if engine[key] else None for key in ("model", "mmproj")}
-        return ServerJob(Route(**fields["route"]), EngineConfig(**{**engine, **paths}), fields["tuned"])
+        return ServerJob(Route(**fields["route"]), EngineConfig(**fields["engine"]), fields["tuned"])
 
 
 def main() -> int:

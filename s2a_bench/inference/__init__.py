@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Annotated, Final, Protocol
 
 from s2a_bench import extras
+from s2a_bench.errors import UsageError
+from s2a_bench.inference.llama_settings import FLASH_ATTENTION, KV_TYPES, LARGEST, LEAST_BATCH, LEAST_CONTEXT, SAMPLINGS
+from s2a_bench.options import Options, one_of, option
 from s2a_bench.registry import Registry
 from s2a_bench.types import Request, Token
 
@@ -37,35 +39,34 @@ class Engine(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class EngineConfig:
+class EngineConfig(Options):
     """Which engine, on which files, with which settings; plain data, so that a server process can be told."""
 
-    name: str = "llama"
-    model: Path | None = None
-    """GGUF language model; None: the tiny dummy, made on first use."""
-    mmproj: Path | None = None
-    """GGUF vision tower and projector that goes with ``model``."""
-    threads: int = 0
-    """CPU threads; 0: as many as this process may use."""
-    gpu_layers: int = 0
-    """Layers on the GPU; -1: all."""
-    context: int = 4096
-    """Context length in tokens."""
-    batch: int = 512
-    """The most prompt tokens evaluated at once (llama.cpp's ``n_batch`` and ``n_ubatch``)."""
-    kv_type: str = "f16"
-    """Type of the KV cache: f32, f16, q8_0, q4_0."""
-    flash_attention: str = "auto"
-    """auto, on, off."""
-    sampling: str = "model"
-    """model: as its authors recommend; greedy: the likeliest token."""
-    profile: str = ""
-    """replay: name or path of the hardware profile."""
-    gaps: str = ""
-    """replay: trace (the recorded gaps), parametric, constant; empty: the best that the profile has."""
-    pace: float = 0.0
-    """Tokens/s that answers are held back to; 0: as fast as they come."""
+    name: Annotated[str, one_of(lambda: ENGINES)] = option(
+        "llama", "llama (a real model), echo (no model: transport alone), replay (a --profile: EMULATED)", flag="engine"
+    )
+    profile: str = option("", "what --engine replay plays: a name of 'profile list', or a path")
+    gaps: str = option("", "replay: trace, parametric, constant [default: trace if recorded]")
+    model: Path | None = option(None, "GGUF model [default: the tiny dummy]")
+    mmproj: Path | None = option(None, "GGUF vision tower that goes with --model")
+    threads: int = option(0, "CPU threads of the model; 0: all", ge=0, le=LARGEST)
+    gpu_layers: int = option(0, "model layers on the GPU; -1: all", ge=-1, le=LARGEST)
+    context: int = option(4096, "context length in tokens", ge=LEAST_CONTEXT, le=LARGEST)
+    batch: int = option(512, "the most prompt tokens evaluated at once", ge=LEAST_BATCH, le=LARGEST)
+    kv_type: Annotated[str, one_of(lambda: KV_TYPES)] = option("f16", "KV cache: f32, f16, q8_0, q4_0")
+    flash_attention: Annotated[str, one_of(lambda: FLASH_ATTENTION)] = option("auto", "auto, on, off")
+    sampling: Annotated[str, one_of(lambda: SAMPLINGS)] = option(
+        "model", "model (as its authors recommend), greedy (the likeliest token)"
+    )
+    pace: float = option(0.0, "tokens/s that answers are held back to; 0: as fast as they come", ge=0)
+
+    def check(self) -> None:
+        """Refuse a cache that no kernel reads."""
+        if self.kv_type in {"q8_0", "q4_0"} and self.flash_attention == "off":
+            raise UsageError(
+                f"`kv_type` {self.kv_type} needs flash attention, which alone reads a quantised V cache; "
+                "leave out `flash_attention` off"
+            )
 
 
 ENGINES: Final[Registry[Callable[[EngineConfig], Engine]]] = Registry(

@@ -17,7 +17,7 @@ from s2a_bench.errors import EngineError, ModelError
 from s2a_bench.inference import EngineConfig, llama_log
 from s2a_bench.inference.llama_decode import GreedySampler, Sampler, TokenBatch, TokenBytes
 from s2a_bench.inference.llama_gbnf import GrammarSampler, grammar_error
-from s2a_bench.inference.llama_settings import FLASH_ATTENTION, KV_TYPES, SAMPLINGS, check_settings
+from s2a_bench.inference.llama_settings import FLASH_ATTENTION, KV_TYPES, SAMPLINGS
 from s2a_bench.inference.models import ModelFiles, load_headers, sha256
 from s2a_bench.types import Frame, Request, Token
 
@@ -114,7 +114,6 @@ class LlamaCppEngine:
 
     def __init__(self, config: EngineConfig) -> None:
         """Load both files; raises ModelError where llama.cpp refuses one."""
-        check_settings(config)
         self.facts: dict[str, float] = {}
         self._files = load_headers(config)
         self._config = config

@@ -1,13 +1,6 @@
-"""The llama engine's settings by their names on the command line, checked before anything is loaded."""
+"""The llama engine's settings by their names, and the bounds of its numbers."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from s2a_bench.errors import UsageError
-
-if TYPE_CHECKING:
-    from s2a_bench.inference import EngineConfig
 
 KV_TYPES = {"f32": 0, "f16": 1, "q8_0": 8, "q4_0": 2}
 """Type of the KV cache -> ggml's number (``ggml_type``)."""
@@ -23,28 +16,3 @@ SAMPLINGS: dict[str, dict[str, float]] = {
 structured output; ``greedy`` takes the likeliest token."""
 
 LEAST_CONTEXT, LEAST_BATCH, LARGEST = 256, 32, 1 << 20
-_QUANTISED = ("q8_0", "q4_0")
-
-
-def check_settings(config: EngineConfig) -> None:
-    """Raise UsageError, naming the flag, for a value or combination that llama.cpp would refuse."""
-    for flag, value, known in (
-        ("--kv-type", config.kv_type, KV_TYPES),
-        ("--flash-attention", config.flash_attention, FLASH_ATTENTION),
-        ("--sampling", config.sampling, SAMPLINGS),
-    ):
-        if value not in known:
-            raise UsageError(f"{flag}: '{value}' is none of {', '.join(known)}")
-    for flag, number, least in (
-        ("--context", config.context, LEAST_CONTEXT),
-        ("--batch", config.batch, LEAST_BATCH),
-        ("--threads", config.threads, 0),
-        ("--gpu-layers", config.gpu_layers, -1),
-    ):
-        if not least <= number <= LARGEST:
-            raise UsageError(f"{flag}: {number} is not between {least} and {LARGEST}")
-    if config.kv_type in _QUANTISED and config.flash_attention == "off":
-        raise UsageError(
-            f"--kv-type {config.kv_type} needs flash attention, which alone reads a quantised V cache; "
-            "leave out --flash-attention off"
-        )

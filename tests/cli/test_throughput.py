@@ -126,7 +126,7 @@ def test_a_reference_that_fails_ends_the_run_with_one_line_and_keeps_the_samples
         (["--kv-type", "q4_0", "--flash-attention", "off"], "--kv-type q4_0 needs flash attention"),
         (["--flash-attention", "1"], "--flash-attention: '1' is none of auto, on, off"),
         (["--sampling", "hot"], "--sampling: 'hot' is none of model, greedy"),
-        (["--batch", "1"], "--batch: 1 is not between 32 and"),
+        (["--batch", "1"], "--batch: 1 should be greater than or equal to 32"),
         (["--engine", "echo"], "--engine echo computes nothing"),
         (["--max-tokens", "1"], "--max-tokens: a rate needs 2 tokens or more"),
         (["--reference", "/no/such"], "--reference: /no/such is no program that can be run"),

@@ -41,7 +41,7 @@ def recording(gaps: Gaps, seed: int, requests: int, tokens: int = 64) -> list[An
 def replayed_ns(path: Path, gaps: str, requests: int, tokens: int) -> list[list[int]]:
     """Play a profile on a virtual clock and return each request's gaps."""
     clock = VirtualClock()
-    engine = ReplayEngine(EngineConfig("replay", profile=str(path), gaps=gaps), clock)
+    engine = ReplayEngine(EngineConfig(name="replay", profile=str(path), gaps=gaps), clock)
     played = []
     for number in range(requests):
         times = [clock.now_ns() for _ in engine.generate(Request(str(number), "go", max_tokens=tokens))]
@@ -141,7 +141,7 @@ class Asked(EchoEngine):
 
 
 def test_every_request_is_about_another_picture_with_another_seed() -> None:
-    engine = Asked(EngineConfig("echo"))
+    engine = Asked(EngineConfig(name="echo"))
     engine.requests = []
     asked = answers(engine, CaptureConfig("x", width=64, height=48, tokens=5, seed=3))
     timed = [next(asked) for _ in range(4)]

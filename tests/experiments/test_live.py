@@ -84,7 +84,7 @@ def config(fast: str) -> LiveConfig:
         http=("as-deployed",),
         width=64,
         height=48,
-        engine=EngineConfig("replay", profile=fast),
+        engine=EngineConfig(name="replay", profile=fast),
         runs=1,
         warmup=1,
         timeout_s=30.0,
@@ -334,7 +334,7 @@ def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
     ],
 )
 def test_what_makes_no_sense_is_named(config: LiveConfig, fields: dict[str, Any], message: str) -> None:
-    engine = replace(config.requests.engine, **fields.pop("engine", {}))
+    engine = config.requests.engine.but(**fields.pop("engine", {}))
     requests = replace(config.requests, engine=engine, **fields.pop("requests", {}))
     with pytest.raises(UsageError) as error:
         replace(config, requests=requests, **fields).check()

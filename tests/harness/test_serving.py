@@ -88,7 +88,10 @@ def test_a_failure_frees_the_engine() -> None:
     assert next(handle(Request("b", "2"), Trace())).text == "2"
 
 
-@pytest.mark.parametrize("engine", [EngineConfig("echo"), EngineConfig("llama", Path("/m.gguf"), Path("/p.gguf"), 2)])
+@pytest.mark.parametrize(
+    "engine",
+    [EngineConfig(name="echo"), EngineConfig(name="llama", model=Path("/m.gguf"), mmproj=Path("/p.gguf"), threads=2)],
+)
 def test_a_job_survives_its_line(engine: EngineConfig) -> None:
     job = ServerJob(Route("http", "binary", "127.0.0.1:0", payload="raw"), engine, tuned=False)
     assert "\n" not in job.to_json()

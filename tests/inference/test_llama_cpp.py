@@ -149,7 +149,7 @@ def test_pictures_smaller_than_they_say_are_refused(shared: LlamaCppEngine) -> N
 
 
 def test_a_request_longer_than_the_context_says_so(tiny: EngineConfig) -> None:
-    engine = LlamaCppEngine(replace(tiny, context=256))
+    engine = LlamaCppEngine(tiny.but(context=256))
     with pytest.raises(EngineError, match=r"does not fit the context of 256 tokens \(the prompt alone"):
         ask(engine, "word " * 500)
     with pytest.raises(EngineError, match=r"does not fit .* answer of up to 250\); shorten it or raise --context"):
@@ -208,10 +208,10 @@ def test_what_only_llama_cpp_can_tell_is_a_model_error(
     assert tiny.mmproj is not None
     strange = damaged(tiny.model, tmp_path / "model.gguf", b"blk.3.ffn_up.weight", b"blk.3.ffn_xx.weight")
     with pytest.raises(ModelError, match=r"--model .*model.gguf: llama.cpp: .*blk.3.ffn_up.weight"):
-        LlamaCppEngine(replace(tiny, model=strange))
+        LlamaCppEngine(tiny.but(model=strange))
     strange = damaged(tiny.mmproj, tmp_path / "mmproj.gguf", b"resampler.query", b"resampler.xuery")
     with pytest.raises(ModelError, match=r"--mmproj .*mmproj.gguf: llama.cpp: .*resampler.query"):
-        LlamaCppEngine(replace(tiny, mmproj=strange))
+        LlamaCppEngine(tiny.but(mmproj=strange))
     assert capfd.readouterr() == ("", "")
 
 

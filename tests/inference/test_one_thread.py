@@ -19,7 +19,7 @@ from s2a_bench.types import Request, Token
 class TestOneThread(EngineSuite):
     @pytest.fixture
     def engine(self) -> Iterator[Engine]:
-        engine = OneThreadEngine(lambda: EchoEngine(EngineConfig("echo")))
+        engine = OneThreadEngine(lambda: EchoEngine(EngineConfig(name="echo")))
         yield engine
         engine.close()
 
@@ -153,4 +153,4 @@ def test_errors_come_through() -> None:
         list(engine.generate(Request("a", "b", max_tokens=9)))
     engine.close()
     with pytest.raises(ModelError, match="no such file"):
-        open_engine(EngineConfig("llama", model=Path("/no/such.gguf")))
+        open_engine(EngineConfig(name="llama", model=Path("/no/such.gguf")))

@@ -20,7 +20,7 @@ SECOND = 10**9
 class TestPacedEcho(EngineSuite):
     @pytest.fixture
     def engine(self) -> Engine:
-        return PacedEngine(EchoEngine(EngineConfig("echo")), 10.0, VirtualClock())
+        return PacedEngine(EchoEngine(EngineConfig(name="echo")), 10.0, VirtualClock())
 
     @pytest.fixture
     def fresh_engine(self, engine: Engine) -> Engine:
@@ -78,8 +78,8 @@ def test_leaving_early_ends_the_engine_s_answer() -> None:
 
 
 def test_it_says_what_the_rate_is_and_else_what_the_engine_says() -> None:
-    engine = open_engine(EngineConfig("echo", pace=4.8))
-    plain = open_engine(EngineConfig("echo"))
+    engine = open_engine(EngineConfig(name="echo", pace=4.8))
+    plain = open_engine(EngineConfig(name="echo"))
     assert engine.describe() == {**plain.describe(), "paced_tokens_per_s": 4.8}
     assert PacedEngine(Slow(VirtualClock(), []), 1.0).facts == {"predicted_n": 3.0}
 

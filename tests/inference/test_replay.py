@@ -42,7 +42,7 @@ def recorded(tmp_path: Path) -> str:
 
 def replay(profile: str, gaps: str = "") -> tuple[ReplayEngine, VirtualClock]:
     clock = VirtualClock(10**12)
-    return ReplayEngine(EngineConfig("replay", profile=profile, gaps=gaps), clock), clock
+    return ReplayEngine(EngineConfig(name="replay", profile=profile, gaps=gaps), clock), clock
 
 
 def times_ns(engine: ReplayEngine, clock: VirtualClock, tokens: int, **rest: Any) -> list[int]:
@@ -117,7 +117,7 @@ class LateClock(VirtualClock):
 
 def test_late_wake_ups_do_not_add_up() -> None:
     clock = LateClock()
-    engine = ReplayEngine(EngineConfig("replay", profile="rtx-4080", gaps="constant"), clock)
+    engine = ReplayEngine(EngineConfig(name="replay", profile="rtx-4080", gaps="constant"), clock)
     came = times_ns(engine, clock, 200)
     assert came[-1] == pytest.approx((0.05 + 200 / 34.2) * 1e9 + 3e6, abs=1000)
 
@@ -153,10 +153,10 @@ def test_the_text_is_numbered_skill_calls_of_six_tokens() -> None:
 
 
 def test_it_says_that_it_is_emulated_and_of_what(recorded: str) -> None:
-    facts = open_engine(EngineConfig("replay", profile=recorded)).describe()
+    facts = open_engine(EngineConfig(name="replay", profile=recorded)).describe()
     assert facts["emulated"] is True
     assert (facts["profile"], facts["origin"], facts["gaps"], facts["dummy"]) == ("recorded", "measured", "trace", True)
-    facts = open_engine(EngineConfig("replay", profile="rtx-4080")).describe()
+    facts = open_engine(EngineConfig(name="replay", profile="rtx-4080")).describe()
     assert (facts["profile"], facts["origin"], facts["gaps"], facts["dummy"]) == (
         "rtx-4080",
         "paper",
@@ -179,12 +179,21 @@ def test_facts_tell_prompt_and_decoding_time() -> None:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (EngineConfig("replay"), "--engine replay needs --profile NAME"),
-        (EngineConfig("replay", profile="tx1"), "--profile: 'tx1' is none of"),
-        (EngineConfig("replay", profile="rtx-4080", gaps="trace"), "--gaps trace: profile rtx-4080 holds no recording"),
-        (EngineConfig("replay", profile="rtx-4080", gaps="wild"), "--gaps: 'wild' is none of constant, parametric"),
-        (EngineConfig("echo", profile="rtx-4080"), "--profile needs --engine replay; --engine echo answers at its own"),
-        (EngineConfig("llama", gaps="trace"), "--gaps needs --engine replay"),
+        (EngineConfig(name="replay"), "--engine replay needs --profile NAME"),
+        (EngineConfig(name="replay", profile="tx1"), "--profile: 'tx1' is none of"),
+        (
+            EngineConfig(name="replay", profile="rtx-4080", gaps="trace"),
+            "--gaps trace: profile rtx-4080 holds no recording",
+        ),
+        (
+            EngineConfig(name="replay", profile="rtx-4080", gaps="wild"),
+            "--gaps: 'wild' is none of constant, parametric",
+        ),
+        (
+            EngineConfig(name="echo", profile="rtx-4080"),
+            "--profile needs --engine replay; --engine echo answers at its own",
+        ),
+        (EngineConfig(name="llama", gaps="trace"), "--gaps needs --engine replay"),
     ],
 )
 def test_settings_that_do_not_go_together_are_refused(config: EngineConfig, message: str) -> None:

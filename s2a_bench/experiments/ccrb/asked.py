@@ -56,10 +56,10 @@ def live_config(config: CcrbConfig) -> LiveConfig:
         raise UsageError(f"`engine` replay writes {REPLAY_TOKENS} tokens a skill; leave out `tokens_per_skill`")
     transport, _, variant = (asked.transport or "ros").partition("/")
     engine = EngineConfig(
-        asked.engine or "llama",
-        asked.model,
-        asked.mmproj,
-        asked.threads or 0,
+        name=asked.engine or "llama",
+        model=asked.model,
+        mmproj=asked.mmproj,
+        threads=asked.threads or 0,
         profile=config.profile if asked.replayed else "",
         pace=asked.pace or 0.0,
     )

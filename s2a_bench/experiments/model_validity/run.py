@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -102,9 +102,9 @@ def run_validity(config: ValidityConfig, output: Path, progress: Progress) -> Pa
     tokenize = Tokenizer(model)
     asks = [_ask(config, name, skills, tokenize) for name in config.tokens_per_skill]
     longest = max(len(tokenize(ask.prompt)) + ask.max_tokens for ask in asks) + TEMPLATE_TOKENS
-    chosen = replace(config.engine, model=model, mmproj=mmproj, context=max(config.engine.context, longest))
+    chosen = config.engine.but(model=model, mmproj=mmproj, context=max(config.engine.context, longest))
     manifest = {
-        "configuration": {**asdict(config), "engine": asdict(chosen)},
+        "configuration": {**asdict(config), "engine": chosen.to_manifest()},
         "environment": environment.collect(),
         "seeds": {"sampling": config.seed},
         "formats": [ask.to_manifest() for ask in asks],

@@ -12,7 +12,6 @@ from s2a_bench.experiments.throughput.llama_bench import LlamaBench
 from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.harness.rounds import Slot, Task, run_requests
 from s2a_bench.harness.session import Session
-from s2a_bench.inference.llama_settings import check_settings
 from s2a_bench.progress import Progress
 from s2a_bench.store.run import RunWriter
 
@@ -33,7 +32,6 @@ class ThroughputConfig:
         """Raise UsageError, naming the flag, for a value or combination that makes no sense."""
         requests = self.requests
         requests.check()
-        check_settings(requests.engine)
         if requests.max_tokens < 2:  # noqa: PLR2004 - a rate needs two tokens
             raise UsageError("--max-tokens: a rate needs 2 tokens or more")
         if requests.engine.name == "echo":

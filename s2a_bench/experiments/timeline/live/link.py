@@ -75,7 +75,7 @@ def word(config: LiveConfig, progress: Progress) -> tuple[LiveConfig, list[Ask]]
         need_engine("llama")
         progress.stage("reading the model's headers" if requests.engine.model else "the tiny dummy model")
         model, mmproj = resolve(requests.engine)
-        requests = replace(requests, engine=replace(requests.engine, model=model, mmproj=mmproj))
+        requests = replace(requests, engine=requests.engine.but(model=model, mmproj=mmproj))
     asks = asks_of(config, requests.engine.model)
     requests = replace(requests, max_tokens=max(ask.max_tokens for ask in asks))
     return replace(config, requests=requests), asks
