@@ -6,7 +6,8 @@ A configuration that exists is valid: what makes no sense raises UsageError, whi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -43,7 +44,14 @@ class Options(BaseModel):
 
     def but(self: Made, **changes: Any) -> Made:  # noqa: PYI019 - typing has Self since Python 3.11
         """Return a copy with some fields changed, checked like a new one."""
-        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | changes)
+        return type(self)(**{name: getattr(self, name) for name in self.model_fields_set} | changes)
+
+    def given(self, options: type[Options] | None = None) -> Iterator[str]:
+        """Yield the fields, of ``options`` that this class is derived from if told, that were given a value."""
+        for name in type(self).model_fields:
+            if name in self.model_fields_set and (options is None or name in options.model_fields):
+                value = getattr(self, name)
+                yield from value.given() if isinstance(value, Options) else [name]
 
     def to_manifest(self) -> dict[str, Any]:
         """Return the options as plain data."""
@@ -58,6 +66,11 @@ def option(default: Any, about: str, *, flag: str = "", **bounds: Any) -> Any:
     return Field(default, description=about, json_schema_extra={"flag": flag} if flag else None, **bounds)
 
 
+def group(options: type[Options], *, only: tuple[str, ...] = (), about: str = "") -> Any:
+    """Declare a group of options, of which ``only`` some are flags; ``about`` stands before the help of each."""
+    return Field(default_factory=options, json_schema_extra={"only": list(only), "about": about})
+
+
 def _line(error: ErrorDetails, options: type[Options]) -> str:
     """Return one line for what is wrong with one field."""
     field = str(error["loc"][0]) if error["loc"] else ""
@@ -65,6 +78,8 @@ def _line(error: ErrorDetails, options: type[Options]) -> str:
         return f"`{field}` is none of the options {', '.join(options.model_fields)}"
     if error["type"] == "missing":
         return f"`{field}` is needed"
+    if error["type"] == "too_short":
+        return f"`{field}`: name at least one"
     if error["type"] == "value_error":
         return f"`{field}`: {error['ctx']['error']}"
     said = error["msg"].removeprefix("Input ").removeprefix("Value ")
@@ -92,11 +107,40 @@ def one_of(names: Callable[[], Iterable[str]]) -> AfterValidator:
     return AfterValidator(check)
 
 
-Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
+def _size(value: Any) -> Any:
+    """Read WIDTHxHEIGHT."""
+    if not isinstance(value, str):
+        return value
+    width, cross, height = value.lower().partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal()):
+        raise ValueError(f"'{value}' should look like 640x480")
+    return int(width), int(height)
+
+
+def _text(value: Any) -> Any:
+    """Read the file that @FILE names."""
+    if not isinstance(value, str) or not value.startswith("@"):
+        return value
+    try:
+        return Path(value[1:]).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"cannot read {value[1:]}: {error}") from error
+
+
+SEVERAL = BeforeValidator(_listed)
+"""What makes a tuple of text with commas between its elements, each once."""
+
+Names = Annotated[tuple[str, ...], SEVERAL]
 """Several names; as text with commas between them, each once."""
 
-Numbers = Annotated[tuple[float, ...], BeforeValidator(_listed)]
+Numbers = Annotated[tuple[float, ...], SEVERAL]
 """Several numbers; as text with commas between them, each once."""
 
-WholeNumbers = Annotated[tuple[int, ...], BeforeValidator(_listed)]
+WholeNumbers = Annotated[tuple[int, ...], SEVERAL]
 """Several whole numbers; as text with commas between them, each once."""
+
+Size = Annotated[tuple[int, int], BeforeValidator(_size)]
+"""Width and height; as text 640x480."""
+
+TextOrFile = Annotated[str, BeforeValidator(_text)]
+"""A text, or the content of the file that @FILE names."""

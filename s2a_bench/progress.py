@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 
 class Progress(Protocol):
@@ -48,3 +50,22 @@ class NullProgress:
     def advance(self) -> None:
         """Count."""
         self.done += 1
+
+
+class Picture(Protocol):
+    """What can be watched while it happens."""
+
+    def draw(self, width: int) -> Any:
+        """Return how it looks now, so many columns wide, as rich renders it."""
+        ...
+
+    def lines(self) -> Iterable[str]:
+        """Say what came of it, for where there is no terminal."""
+        ...
+
+
+def watching(progress: Progress, picture: Picture) -> AbstractContextManager[None]:
+    """Show a picture for as long as the context lasts, where ``progress`` has a method ``watch`` for it."""
+    watch = getattr(progress, "watch", None)
+    shown: AbstractContextManager[None] = watch(picture) if watch else nullcontext()
+    return shown

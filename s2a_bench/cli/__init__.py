@@ -24,7 +24,6 @@ from s2a_bench.cli import (
     study,
     sweep,
     throughput,
-    timeline,
 )
 from s2a_bench.cli.adapter import with_flags
 from s2a_bench.errors import S2AError
@@ -75,7 +74,6 @@ app.command("doctor")(doctor.doctor)
 app.command("latency")(latency.latency)
 app.command("throughput")(throughput.throughput)
 app.command("study")(study.study)
-app.command("timeline")(timeline.timeline)
 app.command("sweep")(sweep.sweep)
 app.command("compare")(compare.compare)
 app.command("report")(report.report)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
@@ -49,15 +50,20 @@ class Flag:
         return "__".join(self.path)
 
 
-def flags_of(options: type[Options], path: tuple[str, ...] = ()) -> Iterator[Flag]:
+def flags_of(options: type[Options]) -> Iterator[Flag]:
     """Yield the flags of a configuration, those of a group in its place."""
     for name, field in options.model_fields.items():
+        extra = _extra(field)
         group = _group(field)
         if group is not None:
-            yield from flags_of(group, (*path, name))
-        elif not _extra(field).get("hidden"):
-            flag = str(_extra(field).get("flag") or name.replace("_", "-"))
-            yield Flag(flag, (*path, name), _kind(field.annotation), _about(field))
+            only, about = extra.get("only"), extra.get("about", "")
+            for flag in flags_of(group):
+                if not only or flag.path[0] in only:
+                    yield replace(flag, path=(name, *flag.path), about=f"{about}{flag.about}")
+        else:
+            yield Flag(
+                str(extra.get("flag") or name.replace("_", "-")), (name,), _kind(field.annotation), _about(field)
+            )
 
 
 def command(
@@ -70,23 +76,32 @@ def command(
 
     ``function`` gets one configuration a class, in order, and the values of ``more``, other parameters, by name.
     """
-    flags = [list(flags_of(each)) for each in options]
-    spelled = {flag.path[-1]: flag.name for each in flags for flag in each}
-    parameters = {flag.key: flag.parameter for each in flags for flag in each} | dict(more or {})
+    flags = [flag for each in options for flag in flags_of(each)]
+    parameters = {flag.key: flag.parameter for flag in flags} | dict(more or {})
 
     def run(**given: Any) -> None:
-        try:
-            built = [
-                each(**_nested({flag.path: given.pop(flag.key) for flag in mine}))
-                for each, mine in zip(options, flags, strict=True)
-            ]
-            function(*built, **given)
-        except UsageError as error:
-            raise UsageError(with_flags(str(error), spelled)) from error
+        with flags_named(*options):
+            rest = {name: given[name] for name in more or {}}
+            function(*(build(each, given) for each in options), **rest)
 
     run.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
     run.__doc__ = about
     return run
+
+
+def build(options: type[Options], given: Mapping[str, Any]) -> Options:
+    """Return the configuration that a command's parameters make; raises UsageError naming the field."""
+    return options(**_nested({flag.path: given[flag.key] for flag in flags_of(options)}))
+
+
+@contextmanager
+def flags_named(*options: type[Options]) -> Iterator[None]:
+    """Let errors name the flags of ``options`` in place of their fields."""
+    try:
+        yield
+    except UsageError as error:
+        spelled = {flag.path[-1]: flag.name for each in options for flag in flags_of(each)}
+        raise UsageError(with_flags(str(error), spelled)) from error
 
 
 def with_flags(message: str, spelled: Mapping[str, str] | None = None) -> str:

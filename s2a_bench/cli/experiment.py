@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from s2a_bench.cli.adapter import command
+from s2a_bench.cli.adapter import build, command, flags_named
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError
@@ -35,6 +35,13 @@ def _own(
 def options_of(experiment: Experiment) -> tuple[type[Options], ...]:
     """Return the classes of an experiment's options: what is run, and how it is shown."""
     return tuple(resolve_name(name) for name in (experiment.config, experiment.view_options) if name)
+
+
+def config_of(experiment: Experiment, given: Mapping[str, Any]) -> Options:
+    """Return the configuration that the parameters of its command make; raises UsageError naming the flag."""
+    config = options_of(experiment)[0]
+    with flags_named(config):
+        return build(config, given)
 
 
 def command_of(experiment: Experiment) -> Callable[..., None]:
@@ -96,4 +103,7 @@ def present(run: Run, shown: Shown, progress: RunProgress, *, as_json: bool) -> 
         console.print(lay_out(shown.tables[name]))
     for note in shown.notes:
         console.print(note, markup=False, highlight=False)
+    for name in shown.files:
+        if (run.path / name).exists():
+            console.print(f"{name}: {run.path / name}", highlight=False, markup=False, soft_wrap=True)
     console.print(f"run folder: {run.path}", highlight=False, markup=False, soft_wrap=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.cli.adapter import flags_of, with_flags
+from s2a_bench.cli.adapter import flags_named
 from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
@@ -61,9 +61,5 @@ def engine_config(**given: Any) -> EngineConfig:
     """Make the engine's options of a command that declares their flags itself; raises UsageError naming the flag."""
     from s2a_bench.inference import EngineConfig
 
-    try:
+    with flags_named(EngineConfig):
         return EngineConfig(**given)
-    except UsageError as error:
-        raise UsageError(
-            with_flags(str(error), {flag.path[-1]: flag.name for flag in flags_of(EngineConfig)})
-        ) from error

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
+from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from s2a_bench.clock import now_ns
 
+if TYPE_CHECKING:
+    from s2a_bench.progress import Picture
+
+REFRESHES_HZ = 8
 PLAIN_STEPS = 5
 """Without a terminal, progress is told this often."""
 
@@ -46,6 +54,25 @@ class RunProgress:
     def say(self, line: str) -> None:
         """Print one line, above the bar."""
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    @contextmanager
+    def watch(self, picture: Picture) -> Iterator[None]:
+        """Show a picture while the context lasts; its last state stays on the terminal."""
+        if not self.console.is_terminal:
+            yield
+            for line in picture.lines():
+                self.say(line)
+            return
+        self._bar.stop()  # one live display at a time
+        try:
+            with Live(
+                get_renderable=lambda: picture.draw(self.console.width),
+                console=self.console,
+                refresh_per_second=REFRESHES_HZ,
+            ):
+                yield
+        finally:
+            self._bar.start()
 
     def opened(self, folder: Path) -> None:
         """Remember where the results go."""

@@ -161,6 +161,7 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
     {
         "boundary": "s2a_bench.experiments.boundary:EXPERIMENT",
         "ccrb": "s2a_bench.experiments.ccrb:EXPERIMENT",
+        "timeline": "s2a_bench.experiments.timeline:EXPERIMENT",
     },
 )
 """The experiments by their commands."""

@@ -7,9 +7,6 @@ from collections.abc import Iterable
 
 from s2a_bench.errors import UsageError
 
-LEAST_T_NOM_S = 1e-6
-"""Run folders keep times in whole nanoseconds: a shorter skill would lose its digits."""
-
 
 def require(flag: str, values: Iterable[float], least: float, most: float = math.inf, *, above: bool = False) -> None:
     """Refuse values out of a range, of which ``above`` leaves out the lower end; infinity never is in it."""

@@ -39,11 +39,25 @@ class Engine(Protocol):
         ...
 
 
+ENGINES: Final[Registry[Callable[[EngineConfig], Engine]]] = Registry(
+    "engines",
+    "engine",
+    {
+        "llama": "s2a_bench.inference.one_thread:llama",
+        "echo": "s2a_bench.inference.echo:EchoEngine",
+        "replay": "s2a_bench.inference.replay:ReplayEngine",
+    },
+)
+"""What builds each engine from its configuration."""
+
+
 class EngineConfig(Options):
     """Which engine, on which files, with which settings; plain data, so that a server process can be told."""
 
     name: Annotated[str, one_of(lambda: ENGINES)] = option(
-        "llama", "llama (a real model), echo (no model: transport alone), replay (a --profile: EMULATED)", flag="engine"
+        "llama",
+        f"{', '.join(ENGINES)}; echo leaves the transport alone, replay plays --profile (EMULATED)",
+        flag="engine",
     )
     profile: str = option("", "what --engine replay plays: a name of 'profile list', or a path")
     gaps: str = option("", "replay: trace, parametric, constant [default: trace if recorded]")
@@ -58,7 +72,9 @@ class EngineConfig(Options):
     sampling: Annotated[str, one_of(lambda: SAMPLINGS)] = option(
         "model", "model (as its authors recommend), greedy (the likeliest token)"
     )
-    pace: float = option(0.0, "tokens/s that answers are held back to; 0: as fast as they come", ge=0)
+    pace: float | None = option(
+        None, "hold the answer back to so many tokens/s [default: the model's own]", gt=0, le=10_000
+    )
 
     def check(self) -> None:
         """Refuse a cache that no kernel reads."""
@@ -67,18 +83,6 @@ class EngineConfig(Options):
                 f"`kv_type` {self.kv_type} needs flash attention, which alone reads a quantised V cache; "
                 "leave out `flash_attention` off"
             )
-
-
-ENGINES: Final[Registry[Callable[[EngineConfig], Engine]]] = Registry(
-    "engines",
-    "engine",
-    {
-        "llama": "s2a_bench.inference.one_thread:llama",
-        "echo": "s2a_bench.inference.echo:EchoEngine",
-        "replay": "s2a_bench.inference.replay:ReplayEngine",
-    },
-)
-"""What builds each engine from its configuration."""
 
 
 def default_engine(say: Callable[[str], None]) -> str:

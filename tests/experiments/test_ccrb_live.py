@@ -22,6 +22,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import token_times_s
 from s2a_bench.experiments.ccrb.view.sentences import origin_notes
 from s2a_bench.experiments.ccrb.view.tables import ccrb_json
 from s2a_bench.experiments.timeline.rows import SKILLS
+from s2a_bench.inference import EngineConfig
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.requests import SAMPLES, TOKENS
 from s2a_bench.store.run import Run, read_run
@@ -31,7 +32,7 @@ from s2a_bench.types import Request, Token
 
 SCHEMA = json.loads((Path(__file__).parent.parent.parent / "docs" / "schema" / "s2a-bench-1.json").read_text())
 N, L, T_NS = 3, 6, 800_000_000
-REPLAYED = Asked(live=True, transport="loopback", engine="replay")
+REPLAYED = Asked(live=True, transport="loopback", engine=EngineConfig(name="replay"))
 FACTS = {"title": "A board", "origin": "measured", "tokens_per_s": 120.0, "prompt_s": 0.05}
 
 
@@ -52,7 +53,10 @@ def fast(tmp_path: Path) -> str:
 @pytest.fixture(scope="module")
 def paced(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The tiny dummy model, held back to 40 tokens a second."""
-    return drive(Asked(live=True, transport="loopback", threads=1, pace=40.0), tmp_path_factory.mktemp("runs"))
+    return drive(
+        Asked(live=True, transport="loopback", engine=EngineConfig(threads=1, pace=40.0)),
+        tmp_path_factory.mktemp("runs"),
+    )
 
 
 def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: Run) -> None:

@@ -6,7 +6,6 @@ import json
 import signal
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +16,15 @@ import pytest
 from s2a_bench.boards.file import to_toml
 from s2a_bench.errors import EngineError, ServerDied, SourceError, TransportError, UsageError
 from s2a_bench.experiments.timeline.config import TimelineConfig
-from s2a_bench.experiments.timeline.execution import Scene
 from s2a_bench.experiments.timeline.live.asks import asks_of, prior_of
-from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.experiments.timeline.live.run import run_live
 from s2a_bench.experiments.timeline.real_time import run_real_time
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.view.as_json import timelines_json
 from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_of
-from s2a_bench.experiments.timeline.view.figures import write_timeline_figures
+from s2a_bench.experiments.timeline.view.figures import timeline_figures
+from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
 from s2a_bench.store.run import Run, read_run
@@ -56,7 +53,7 @@ class Watched:
 
     def advance(self) -> None: ...
 
-    def show(self, scene: Scene) -> AbstractContextManager[None]:
+    def watch(self, scene: Scene) -> AbstractContextManager[None]:
         self.scenes.append(scene)
         return nullcontext()
 
@@ -77,22 +74,20 @@ def fast(tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def config(fast: str) -> LiveConfig:
+def config(fast: str) -> TimelineConfig:
     """Eight household skills of 30 ms each, written by a replay: naive has to wait for every one of them."""
-    requests = LatencyConfig(
-        transports=("loopback",),
-        http=("as-deployed",),
-        width=64,
-        height=48,
-        engine=EngineConfig(name="replay", profile=fast),
-        runs=1,
-        warmup=1,
+    return TimelineConfig(
+        live=True,
+        transport="loopback",
+        engine=EngineConfig(name="replay"),
+        profiles=(fast,),
+        size=(64, 48),
         timeout_s=30.0,
+        t_nom_s=(0.03,),
     )
-    return LiveConfig(requests=requests, t_nom_s=(0.03,))
 
 
-def live(config: LiveConfig, output: Path) -> tuple[Run, Watched]:
+def live(config: TimelineConfig, output: Path) -> tuple[Run, Watched]:
     view = Watched()
     return read_run(run_live(config, output / "runs", view)), view
 
@@ -115,22 +110,22 @@ def check(run: Run, transport: str) -> None:
         assert len(cell.token_s) == 48
         np.testing.assert_allclose(cell.skills["arrival_ns"] / 1e9, cell.token_s[5::6], rtol=0, atol=1e-9)
         assert cell.skills["text"].str.fullmatch(r"\w+\(\w+(, \w+)?\)").all()
-    assert naive.mean("start") <= online.mean("start") <= wait.mean("start")  # type: ignore[operator]
-    assert wait.mean("start") >= wait.mean("last_arrival")  # type: ignore[operator]
+    assert naive.mean("start_s") <= online.mean("start_s") <= wait.mean("start_s")  # type: ignore[operator]
+    assert wait.mean("start_s") >= wait.mean("last_arrival_s")  # type: ignore[operator]
     assert list(naive.skills["text"]) == list(wait.skills["text"]) == list(online.skills["text"])
     assert run.manifest["live"]["transport"] == transport
     assert run.manifest["start_jitter"]["starts"] == 24
     jsonschema.validate(timelines_json(run), SCHEMA)
 
 
-def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: LiveConfig, tmp_path: Path) -> None:
+def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: TimelineConfig, tmp_path: Path) -> None:
     run, view = live(config, tmp_path)
     check(run, "loopback")
     assert run.manifest["live"]["emulated"] is True
     assert [len(scene.records) for scene in view.scenes] == [3]
     (note,) = origin_notes(run, timelines_of(run))
     assert note.startswith("EMULATED tokens over loopback, parsed and executed as they arrive")
-    assert {path.name for path in write_timeline_figures(run)} == {"timeline.png", "timeline.pdf"}
+    assert list(timeline_figures(run)) == ["timeline"]
     assert run.samples["warmup"].tolist() == [True, False]
     assert run.manifest["prior"]["mean_s"] == pytest.approx(1 / 120, rel=0.5)
 
@@ -138,22 +133,23 @@ def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: Li
 @pytest.mark.slow
 @pytest.mark.parametrize("ros", ["topic", "action"])
 def test_a_replay_over_dds_is_executed_by_three_policies_at_once(
-    config: LiveConfig, tmp_path: Path, dds_domain: int, ros: str
+    config: TimelineConfig, tmp_path: Path, dds_domain: int, ros: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
-    requests = replace(config.requests, transports=("ros",), ros=(ros,), domain_id=dds_domain)
-    run, _ = live(replace(config, requests=requests), tmp_path)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(dds_domain))
+    run, _ = live(config.but(transport=f"ros/{ros}"), tmp_path)
     check(run, f"ros/{ros}")
 
 
 @pytest.mark.slow
 def test_a_real_model_is_held_to_its_grammar_and_its_pace(
-    config: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
     engine = EngineConfig(threads=1, pace=60.0)
-    requests = replace(config.requests, engine=engine, transports=("http",), timeout_s=120.0)
-    asked = replace(config, requests=requests, t_nom_s=(0.05,), task="Tidy up.", plans=2)
+    asked = config.but(
+        engine=engine, profiles=(), transport="http", timeout_s=120.0, t_nom_s=(0.05,), task="Tidy up.", plans=2
+    )
     view = Watched()
     run = read_run(run_live(asked, tmp_path / "runs", view))
     outcomes = [found["outcome"] for found in run.manifest["executions"].values()]
@@ -175,7 +171,7 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
 
 @pytest.mark.parametrize("tokens", [0, 1, 5, 6, 7, 20, 47])
 def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
-    config: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tokens: int
+    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tokens: int
 ) -> None:
     whole = ReplayEngine.generate
 
@@ -186,7 +182,7 @@ def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
             yield token
 
     monkeypatch.setattr(ReplayEngine, "generate", dies)
-    asked = replace(config, requests=replace(config.requests, warmup=0))
+    asked = config.but(warmup=0)
     view = Watched()
     with pytest.raises(TransportError, match="no request of loopback succeeded"):
         run_live(asked, tmp_path / "runs", view)
@@ -203,7 +199,7 @@ def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
     assert len(run.tokens) == tokens
 
 
-def test_prose_is_not_executed(config: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prose_is_not_executed(config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def prose(self: ReplayEngine, request: Request) -> Iterator[Token]:
         del self, request
         yield from (
@@ -218,7 +214,7 @@ def test_prose_is_not_executed(config: LiveConfig, tmp_path: Path, monkeypatch: 
 
 
 def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
-    config: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = LoopbackClient.request
 
@@ -230,7 +226,7 @@ def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
 
     monkeypatch.setattr(LoopbackClient, "request", dies)
     view = Watched()
-    asked = replace(config, requests=replace(config.requests, warmup=0), t_nom_s=(0.3,))
+    asked = config.but(warmup=0, t_nom_s=(0.3,))
     with pytest.raises(ServerDied, match="pid 7"):
         run_live(asked, tmp_path / "runs", view)
     run = read_run(view.folder)
@@ -242,7 +238,7 @@ def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
 
 
 def test_a_camera_that_breaks_ends_the_run_and_not_the_executors(
-    config: LiveConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = RequestFeed.capture
     frames = iter(range(9))
@@ -260,20 +256,20 @@ def test_a_camera_that_breaks_ends_the_run_and_not_the_executors(
     assert outcomes == {"stream-error"}
 
 
-def test_an_interruption_aborts_the_robots_and_keeps_what_ran(config: LiveConfig, tmp_path: Path) -> None:
+def test_an_interruption_aborts_the_robots_and_keeps_what_ran(config: TimelineConfig, tmp_path: Path) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
     class Impatient(Watched):
-        def show(self, scene: Scene) -> AbstractContextManager[None]:
+        def watch(self, scene: Scene) -> AbstractContextManager[None]:
             signal.setitimer(signal.ITIMER_REAL, 0.5)
-            return super().show(scene)
+            return super().watch(scene)
 
     view = Impatient()
     before = signal.signal(signal.SIGALRM, interrupt)
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_live(replace(config, t_nom_s=(100.0,)), tmp_path / "runs", view)
+            run_live(config.but(t_nom_s=(100.0,)), tmp_path / "runs", view)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
@@ -285,7 +281,7 @@ def test_an_interruption_aborts_the_robots_and_keeps_what_ran(config: LiveConfig
 
 def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
     played = TimelineConfig(
-        profiles=(fast,), tokens_per_skill=(6, 2), t_nom_s=(0.03,), policies=(*THREE, "s2a-clairvoyant")
+        real_time=True, profiles=(fast,), tokens_per_skill=(6, 2), t_nom_s=(0.03,), policies=(*THREE, "s2a-clairvoyant")
     )
     view = Watched()
     run = read_run(run_real_time(played, tmp_path / "runs", view))
@@ -297,8 +293,8 @@ def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
     naive, wait, online, clairvoyant = cells[:4]
     # t_i = .05 + i / 20 s at least: a real clock is never early.
     assert (naive.skills["arrival_ns"].to_numpy() / 1e9 >= 0.05 + np.arange(1, 9) / 20 - 1e-6).all()
-    assert clairvoyant.mean("start") >= 0.05 + 0.4 - 7 * 0.03 - 1e-6  # type: ignore[operator]
-    assert naive.mean("start") < online.mean("start") < wait.mean("start")  # type: ignore[operator]
+    assert clairvoyant.mean("start_s") >= 0.05 + 0.4 - 7 * 0.03 - 1e-6  # type: ignore[operator]
+    assert naive.mean("start_s") < online.mean("start_s") < wait.mean("start_s")  # type: ignore[operator]
     assert run.manifest["configuration"]["time"] == "real-time"
     assert run.manifest["start_jitter"]["starts"] == 64
     assert any("EMULATED, executed in real time" in note for note in origin_notes(run, cells))
@@ -308,36 +304,27 @@ def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"policies": ()}, "--policy: name at least one"),
-        ({"policies": ("eager",)}, "`policy`: 'eager' is none of"),
+        ({"policies": ()}, "`policies`: name at least one"),
+        ({"policies": ("eager",)}, "--policy: 'eager' is none of"),
         ({"policies": ("s2a-clairvoyant",)}, "s2a-clairvoyant needs to know when every skill will arrive"),
         ({"skills": "juggling"}, "--skills: 'juggling' is none of"),
-        ({"n_skills": (0,)}, "--n-skills: 0 should be 1 or more"),
-        ({"plans": 0}, "--plans: 0 should be 1 or more"),
-        ({"t_nom_s": (0.0,)}, "--t-nom: 0 should be 1e-06 or more"),
-        ({"robot": "kuka"}, "`robot`: 'kuka' is none of timed, ros"),
-        ({"robot": "ros"}, "`robot`: ros follows one policy at a time"),
-        ({"tokens_per_skill": (4,)}, "--engine replay writes plans of the household skills in 6 tokens a skill"),
-        ({"skills": "driving"}, "--engine replay writes plans of the household skills in 6 tokens a skill"),
-        ({"requests": {"transports": ("http", "ros")}}, "--transport: --live follows one stream"),
-        ({"requests": {"transports": ("ros",), "ros": ("topic", "action")}}, "--transport: --live follows one stream"),
-        ({"engine": {"name": "echo", "profile": ""}}, "--engine echo writes no plans"),
-        ({"engine": {"pace": 5.0}}, "--pace: --engine replay has its profile's rate"),
-        ({"engine": {"name": "llama", "profile": "", "pace": 1e6}}, "--pace: 1e+06 should be above 0"),
+        ({"plans": 0}, "`plans`: 0 should be greater than or equal to 1"),
+        ({"robot": "kuka"}, "--robot: 'kuka' is none of timed, ros"),
+        ({"robot": "ros"}, "`robot` ros: one robot follows one policy"),
+        ({"tokens_per_skill": (4,)}, "`engine` replay writes plans of the household skills in 6 tokens a skill"),
+        ({"skills": "driving"}, "`engine` replay writes plans of the household skills in 6 tokens a skill"),
+        ({"transport": "http,ros"}, "--transport: 'http,ros' is none of"),
+        ({"engine": EngineConfig(name="echo"), "profiles": ()}, "`engine` echo writes no plans"),
+        ({"engine": EngineConfig(name="replay", pace=5.0)}, "`pace`: `engine` replay has its profile's rate"),
         (
-            {
-                "engine": {"name": "llama", "profile": "", "pace": 5.0},
-                "requests": {"transports": ("http",), "url": "http://x"},
-            },
-            "--pace needs our own server",
+            {"engine": EngineConfig(pace=5.0), "profiles": (), "transport": "http", "url": "http://x"},
+            "`pace` needs our own server",
         ),
     ],
 )
-def test_what_makes_no_sense_is_named(config: LiveConfig, fields: dict[str, Any], message: str) -> None:
-    engine = config.requests.engine.but(**fields.pop("engine", {}))
-    requests = replace(config.requests, engine=engine, **fields.pop("requests", {}))
+def test_what_makes_no_sense_is_named(config: TimelineConfig, fields: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError) as error:
-        replace(config, requests=requests, **fields).check()
+        config.but(**fields)
     assert message in str(error.value)
 
 
@@ -363,8 +350,8 @@ def test_a_prior_knows_bursts_that_single_gaps_hide() -> None:
     assert burst.token_cv > 1.9 * even.token_cv  # four blocks of four: 1.2, 1.2, .4, .4 s
 
 
-def test_skills_keep_their_own_durations_unless_they_are_given(config: LiveConfig) -> None:
-    (own,) = asks_of(replace(config, t_nom_s=()), None)
+def test_skills_keep_their_own_durations_unless_they_are_given(config: TimelineConfig) -> None:
+    (own,) = asks_of(config.but(t_nom_s=()), None)
     times = [call.skill.durations.nominal_s for call in own.skills.calls]
     assert own.t_nom_s == pytest.approx(np.mean(times))
     assert own.shape.expected_cv == pytest.approx(np.std(times) / np.mean(times))
@@ -373,5 +360,5 @@ def test_skills_keep_their_own_durations_unless_they_are_given(config: LiveConfi
     assert given.shape.expected.most_s == pytest.approx(0.045)
     assert "Output exactly 8 of them." in given.prompt
     assert (bool(given.grammar), given.max_tokens) == (True, 48)
-    (free,) = asks_of(replace(config, constrained=False), None)
+    (free,) = asks_of(config.but(no_grammar=True), None)
     assert free.grammar == ""

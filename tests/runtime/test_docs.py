@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
 from s2a_bench.cli.timeline_live import DEFAULTS
+
 from s2a_bench.clock import VirtualClock, now_ns
 from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.plan import load_skills

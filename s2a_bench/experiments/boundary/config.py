@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.timeline.plans import NO_JITTER, gaps_of
+from s2a_bench.experiments.timeline.config import NO_JITTER
 from s2a_bench.options import Names, Numbers, Options, WholeNumbers, option
 
 if TYPE_CHECKING:
@@ -84,6 +84,8 @@ class BoundaryConfig(Options):
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
+        from s2a_bench.experiments.timeline.plans import gaps_of
+
         if len(self.rates) != 2 or not 0 < self.rates[0] < self.rates[1] < float("inf"):  # noqa: PLR2004 - from, to
             raise UsageError("`rates`: should be two tokens/s, the lower first, as 0.3,60")
         for tokens in self.tokens_per_skill:

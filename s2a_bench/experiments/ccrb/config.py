@@ -10,7 +10,7 @@ from pydantic import Field
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.ccrb.asked import Asked, live_config
+from s2a_bench.experiments.ccrb.asked import Asked, live_timeline
 from s2a_bench.options import Names, Numbers, Options, one_of, option
 from s2a_bench.policy import POLICIES
 from s2a_bench.scenario import SIMULATORS
@@ -18,7 +18,6 @@ from s2a_bench.scenario.ccrb.options import CcrbOptions
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.timeline.config import TimelineConfig
-    from s2a_bench.experiments.timeline.live.config import LiveConfig
 
 LONG_S: Final = 600.0
 """Plans that take longer than this are no driving."""
@@ -76,7 +75,7 @@ class CcrbConfig(Options):
         """Return the timeline run whose plans these are: one setting, even tokens."""
         from s2a_bench.experiments.timeline.config import TimelineConfig
 
-        durations, rate = self.scenario.durations, self.asked.pace if self.asked.live else self.rate
+        durations, rate = self.scenario.durations, self.asked.engine.pace if self.asked.live else self.rate
         return TimelineConfig(
             policies=self.policies,
             profiles=() if rate is not None else (self.profile,),
@@ -91,9 +90,9 @@ class CcrbConfig(Options):
         )
 
     @cached_property
-    def request(self) -> LiveConfig:
-        """Return how the model is asked in a live run."""
-        return live_config(self)
+    def request(self) -> TimelineConfig:
+        """Return the live timeline whose plan is driven in a live run."""
+        return live_timeline(self)
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
@@ -122,7 +121,7 @@ class CcrbConfig(Options):
         for name in MODELLED if self.asked.replayed else (*MODELLED, "profile"):
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")
-        self.request.check()
+        _ = self.request
 
     def _check_length(self) -> None:
         """Refuse plans that no drive could wait for."""

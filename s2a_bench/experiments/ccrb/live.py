@@ -45,12 +45,11 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
     Whatever happens, the requests so far are in the folder.
     """
     limit_threads()
-    if config.request.requests.dds_tuning == "tuned":
-        keep_large_blocks()
+    keep_large_blocks()
     with ExitStack() as stack:
         world = stack.enter_context(closing(simulator(config.simulator, **config.world)))
-        live, (ask,) = word(config.request, progress)
-        requests = live.requests
+        live = config.request
+        requests, (ask,) = word(live, progress)
         source = RoadSource(config.scenario.cars, requests.width, requests.height, fps=requests.fps)
         manifest = {
             "configuration": {**config.to_manifest(), "live": {**live.to_manifest(), "source": source.name}},
@@ -61,7 +60,7 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
         writer = stack.enter_context(RunWriter.create(output, "ccrb", manifest, tables))
         progress.opened(writer.path)
         progress.expect(requests.warmup + 1)
-        link = Link(live, writer, progress)
+        link = Link(live, requests, writer, progress)
         try:
             link.connect(stack, source, f"{world.name} simulator")
             prior = link.warm_up(ask)

@@ -1,1 +1,14 @@
-"""When each policy acts, and where it stalls: in virtual time, in real time, or on a model's live stream."""
+"""What each policy makes of streamed skills: computed, played in real time, or live."""
+
+from s2a_bench.experiments import Experiment
+
+EXPERIMENT = Experiment(
+    name="timeline",
+    about="Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live.",
+    config="s2a_bench.experiments.timeline.config:TimelineConfig",
+    run="s2a_bench.experiments.timeline.run:run_timeline",
+    view="s2a_bench.experiments.timeline.view:show",
+    view_options="s2a_bench.experiments.timeline.view:Asked",
+    compared="s2a_bench.experiments.timeline.view.compared:COMPARED",
+    unit="timelines",
+)

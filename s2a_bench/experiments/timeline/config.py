@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from s2a_bench.boards.search import load_profile
+from pydantic import Field
+
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.timeline.plans import NO_JITTER, Board, board_of_profile, board_of_rate
-from s2a_bench.experiments.timeline.to_rows import Setting
-from s2a_bench.harness.ranges import LEAST_T_NOM_S, require
-from s2a_bench.policy import PlanShape, Policy, Timing, policies
-from s2a_bench.policy.conformal import EPSILON
-from s2a_bench.policy.conformal import PLANS as CALIBRATION_PLANS
-from s2a_bench.policy.conformal import check as check_calibration
+from s2a_bench.experiments.timeline.live.config import Live, check_live, requests_of
+from s2a_bench.options import SEVERAL, Names, Options, option
+from s2a_bench.policy import POLICIES as NAMED
 
+if TYPE_CHECKING:
+    from s2a_bench.experiments.timeline.plans import Board
+    from s2a_bench.experiments.timeline.to_rows import Setting
+    from s2a_bench.plan import SkillSet
+    from s2a_bench.policy import PlanShape, Policy
+
+NO_JITTER: Final = "none"
+POLICIES: Final = ("naive", "wait-then-act", "stream-to-act")
+PROFILES: Final = ("rtx-4080", "jetson-agx-orin", "jetson-orin-nano")
+REAL_TIME_PROFILE: Final = "jetson-agx-orin"
+LENGTHS: Final = (6, 4, 2, 1)
+LIVE_LENGTH: Final = 6
 PLANS: Final = 1000
 """Plans a cell where something is random; one where nothing is."""
 MOST_SKILLS: Final = 2_000_000
@@ -27,98 +35,184 @@ MOST_TOKENS: Final = 20_000_000
 """Tokens of a cell: they are held in memory at once."""
 MOST_CV: Final = 3**-0.5
 """Uniform durations of a larger spread could be negative."""
+LEAST_T_NOM_S: Final = 1e-6
+"""Run folders keep times in whole nanoseconds: a shorter skill would lose its digits."""
+
+Counts = Annotated[tuple[Annotated[int, Field(ge=1)], ...], SEVERAL]
+Rates = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...], SEVERAL]
+Seconds = Annotated[tuple[Annotated[float, Field(ge=LEAST_T_NOM_S, allow_inf_nan=False)], ...], SEVERAL]
 
 
-@dataclass(frozen=True)
-class TimelineConfig:
-    """What is compared with what."""
+class Compared(Options):
+    """Options about what is compared, wherever the tokens are from."""
 
-    policies: tuple[str, ...] = ("naive", "wait-then-act", "stream-to-act")
-    profiles: tuple[str, ...] = ("rtx-4080", "jetson-agx-orin", "jetson-orin-nano")
-    rates: tuple[float, ...] = ()
-    """Boards of which only the rate is known, in tokens/s."""
-    prompt_s: float | None = None
-    """c for every board; None: the profiles' own, and 0 for rates."""
-    tokens_per_skill: tuple[int, ...] = (6, 4, 2, 1)
-    n_skills: tuple[int, ...] = (8,)
-    t_nom_s: tuple[float, ...] = (1.0,)
-    t_min: float = 0.8
-    """T_min over T_nom."""
-    t_max: float = 1.5
-    t_nom_cv: float = 0.0
-    """How much T_nom differs from skill to skill, known only when a skill has been parsed."""
-    jitter: str = NO_JITTER
-    plans: int | None = None
-    calibration_plans: int = CALIBRATION_PLANS
-    epsilon: float = EPSILON
-    gap_bound: float | None = None
-    """What s2a-robust is told: the longest gap between skills over L / R; None: there is no bound."""
-    calibrate: Path | None = None
-    """A run folder whose answers prior and lambda are learned from, instead of drawn plans."""
-    seed: int = 0
+    policies: Names = option(
+        POLICIES,
+        f"{', '.join(NAMED)}, with parameters as in NAME?parameter=value&other=value; several with commas",
+        flag="policy",
+        min_length=1,
+    )
+    profiles: Names = option(
+        (),
+        f"boards: names of 'profile list', or paths [default: {','.join(PROFILES)}; --real-time: {REAL_TIME_PROFILE}; "
+        "none with --rate]; with --live what --engine replay plays",
+        flag="profile",
+    )
+    tokens_per_skill: Counts = option(
+        (),
+        "L, the delimiter included; several with commas "
+        f"[default: {','.join(map(str, LENGTHS))}; --live: {LIVE_LENGTH}]",
+    )
+    n_skills: Counts = option((8,), "N, skills a plan; several with commas", min_length=1)
+    t_nom_s: Seconds = option(
+        (), "seconds a skill takes; several with commas [default: 1; --live: the skill set's own]", flag="t-nom"
+    )
+    t_min: float = option(0.8, "least duration of a skill, as a factor of T_nom", gt=0, le=1)
+    t_max: float = option(1.5, "longest duration of a skill, as a factor of T_nom", ge=1, allow_inf_nan=False)
+    plans: int | None = option(None, "plans a cell [default: 1; with jitter 1000]", ge=1)
+    seed: int = option(0, "seed of everything that is drawn", ge=0)
+    real_time: bool = option(False, "play the boards' tokens on the clock and execute while you watch")
+    live: bool = option(False, "execute what a model really answers, as it arrives")
+
+
+class Modelled(Options):
+    """Options about tokens that no model writes."""
+
+    rates: Rates = option((), "boards of which only the tokens/s are known; several with commas", flag="rate")
+    prompt_s: float | None = option(
+        None,
+        "seconds before decoding, c [default: the profile's; with --rate 0]",
+        flag="prompt-time",
+        ge=0,
+        allow_inf_nan=False,
+    )
+    t_nom_cv: float = option(0.0, "how much T_nom differs from skill to skill: sd / mean", ge=0, le=MOST_CV)
+    jitter: str = option(
+        NO_JITTER,
+        "none (tokens come evenly, as in the paper), profile (as the profile says), or a family of gaps, as "
+        "lognormal:cv=0.2",
+    )
+    epsilon: float = option(0.01, "share of plans that may stall: lambda is calibrated for it")
+    calibration_plans: int = option(400, "other plans that prior and lambda are learned from")
+    calibrate: Path | None = option(
+        None, "run folder of latency or throughput: learn prior and lambda from its answers instead"
+    )
+    gap_bound: float | None = option(
+        None,
+        "s2a-robust: the longest gap between skills, over L/R [default: unbounded]",
+        gt=0,
+        allow_inf_nan=False,
+    )
+
+
+class TimelineConfig(Live, Modelled, Compared):
+    """What is compared with what: computed, played in real time, or live."""
+
+    @property
+    def virtual(self) -> bool:
+        """Return True if nothing happens on a clock."""
+        return not (self.live or self.real_time)
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Return the tokens a skill, given or not."""
+        return self.tokens_per_skill or ((LIVE_LENGTH,) if self.live else LENGTHS)
 
     @cached_property
     def boards(self) -> list[Board]:
-        """Find the boards; raises UsageError for a profile, rate or jitter that there is not."""
-        require("--rate", self.rates, 0, above=True)
-        found = [board_of_profile(load_profile(name), self.jitter, self.prompt_s) for name in self.profiles]
+        """Find the boards; raises UsageError for a profile or jitter that there is not."""
+        from s2a_bench.boards.search import load_profile
+        from s2a_bench.experiments.timeline.plans import board_of_profile, board_of_rate
+
+        found = [board_of_profile(load_profile(name), self.jitter, self.prompt_s) for name in self._profiles]
         return found + [board_of_rate(rate, self.jitter, self.prompt_s) for rate in self.rates]
 
     @cached_property
     def chosen(self) -> dict[str, Policy]:
         """Build the policies, by their canonical names; raises UsageError."""
+        from s2a_bench.policy import policies
+
         return policies(self.policies)
 
     @property
+    def _profiles(self) -> tuple[str, ...]:
+        default = () if self.rates else (REAL_TIME_PROFILE,) if self.real_time else PROFILES
+        return self.profiles or default
+
+    @cached_property
+    def skill_set(self) -> SkillSet:
+        """Load the skills that a model is asked for; raises UsageError."""
+        from s2a_bench.plan import load_skills
+
+        return load_skills(self.skills)
+
+    @property
     def random(self) -> bool:
-        """Tell whether one plan differs from the next."""
+        """Whether one plan differs from the next."""
         return self.t_nom_cv > 0 or not all(board.even for board in self.boards)
 
     @property
     def plans_a_cell(self) -> int:
         """Return how many plans each cell has."""
-        return self.plans if self.plans is not None else PLANS if self.random else 1
+        return self.plans if self.plans is not None else PLANS if not self.live and self.random else 1
 
     def check(self) -> None:
-        """Refuse what makes no sense; raises UsageError naming the flag."""
+        """Refuse what makes no sense together; raises UsageError naming the fields."""
+        if self.live:
+            if self.real_time:
+                raise UsageError("`live` and `real_time` are two things: a model answers, or a profile is played")
+            for name in self.given(Modelled):
+                raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")
+            check_live(self)
+            return
+        for name in self.given(Live):
+            raise UsageError(f"`{name}` is about a model that answers; it needs `live`")
+        self._check_modelled()
+
+    def _check_modelled(self) -> None:
+        from s2a_bench.policy.conformal import check as check_calibration
+
         _ = self.chosen
-        for flag, values in (("--policy", self.policies), ("--profile or --rate", (*self.profiles, *self.rates))):
-            if not values:
-                raise UsageError(f"{flag}: name at least one")
-        require("--tokens-per-skill", self.tokens_per_skill, 1)
-        require("--n-skills", self.n_skills, 1)
-        require("--t-nom", self.t_nom_s, LEAST_T_NOM_S)
-        require("--t-min (a factor of T_nom)", [self.t_min], 0, 1, above=True)
-        require("--t-max (a factor of T_nom)", [self.t_max], 1)
-        require("--t-nom-cv", [self.t_nom_cv], 0, MOST_CV)
-        require("--prompt-time", [] if self.prompt_s is None else [self.prompt_s], 0)
-        require("--gap-bound", [] if self.gap_bound is None else [self.gap_bound], 0, above=True)
-        require("--plans", [self.plans_a_cell], 1)
         check_calibration(self.calibration_plans, self.epsilon)
-        require("--seed", [self.seed], 0)
         if self.calibrate is not None and len(self.boards) != 1:
-            raise UsageError("--calibrate: the recorded machine is one board; name it with one --profile or --rate")
-        if self.plans_a_cell > 1 and not self.random:
-            raise UsageError("--plans: without --jitter or --t-nom-cv all plans are the same; leave it out")
-        skills = sum(setting.n_skills for _, setting in settings(self)) * len(self.chosen) * self.plans_a_cell
+            raise UsageError("`calibrate`: the recorded machine is one board; name it with one `profiles` or `rates`")
+        plans = self.plans_a_cell
+        if plans > 1 and not self.random:
+            raise UsageError("`plans`: without `jitter` or `t_nom_cv` all plans are the same; leave it out")
+        skills = sum(setting.n_skills for _, setting in settings(self)) * len(self.chosen) * plans
         if skills > MOST_SKILLS:
-            raise UsageError(f"--plans: {skills} skills are more than the {MOST_SKILLS} of one run; ask for fewer")
-        tokens = max(self.n_skills) * max(self.tokens_per_skill)
-        if (drawn := tokens * max(self.plans_a_cell, self.calibration_plans)) > MOST_TOKENS:
+            raise UsageError(f"`plans`: {skills} skills are more than the {MOST_SKILLS} of one run; ask for fewer")
+        tokens = max(self.n_skills) * max(self.lengths)
+        if (drawn := tokens * max(plans, self.calibration_plans)) > MOST_TOKENS:
             raise UsageError(
-                f"--n-skills, --tokens-per-skill: {tokens} tokens a plan, {drawn} a cell: {MOST_TOKENS} is the most"
+                f"`n_skills`, `tokens_per_skill`: {tokens} tokens a plan, {drawn} a cell: {MOST_TOKENS} is the most"
             )
 
     def shape(self, setting: Setting) -> PlanShape:
         """Return what is known of a plan before its first token."""
+        from s2a_bench.policy import PlanShape, Timing
+
         t_nom_s = setting.t_nom_s
         timing = Timing(t_nom_s, self.t_min * t_nom_s, self.t_max * t_nom_s)
         return PlanShape(setting.n_skills, setting.tokens_per_skill, timing, self.t_nom_cv)
 
+    def to_manifest(self) -> dict[str, Any]:
+        """Return the options that hold in this kind of run, with the values that follow from others."""
+        own = self.model_dump(include=set(Compared.model_fields) - {"profiles", "real_time", "live"})
+        own |= {"tokens_per_skill": self.lengths, "plans": self.plans_a_cell}
+        if self.live:
+            asked = {"skills": self.skills, "task": self.task, "robot": self.robot, "constrained": not self.no_grammar}
+            return {**requests_of(self).to_manifest(), **own, **asked, "time": "live"}
+        own |= self.model_dump(include=set(Modelled.model_fields))
+        own |= {"profiles": self._profiles, "t_nom_s": self.t_nom_s or (1.0,)}
+        return own | ({"time": "real-time"} if self.real_time else {})
+
 
 def settings(config: TimelineConfig) -> Iterator[tuple[Board, Setting]]:
     """List what is compared, board by board."""
+    from s2a_bench.experiments.timeline.to_rows import Setting
+
     for n_skills, t_nom_s, board, tokens in product(
-        config.n_skills, config.t_nom_s, config.boards, config.tokens_per_skill
+        config.n_skills, config.t_nom_s or (1.0,), config.boards, config.lengths
     ):
         yield board, Setting(board.name, board.title, board.tokens_per_s, board.prompt_s, tokens, n_skills, t_nom_s)

@@ -5,20 +5,18 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from contextlib import contextmanager
+from typing import Any, Final
 
 import numpy as np
 
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.experiments.timeline.run import finite
 from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows
+from s2a_bench.experiments.timeline.virtual import finite
 from s2a_bench.plan import Gap
 from s2a_bench.policy import Plans, PlanShape, Policy, Schedule
 from s2a_bench.policy.evaluate import TOLERANCE_S
-from s2a_bench.progress import Progress
 from s2a_bench.runtime import Robot
 from s2a_bench.runtime.events import AbortAsked, Event, LiveInbox
 from s2a_bench.runtime.executor import Executor
@@ -29,25 +27,6 @@ from s2a_bench.store.run import RunWriter
 
 SWITCH_S: Final = 0.0005
 """How soon Python's threads give way to one another: at the usual 5 ms a busy thread would make starts that late."""
-
-
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """What can be watched while it happens: the records grow."""
-
-    title: str
-    records: Sequence[Record]
-    n_skills: int
-    span_s: float
-    """About how long it takes."""
-
-
-class View(Progress, Protocol):
-    """Progress that can also show executions."""
-
-    def show(self, scene: Scene) -> AbstractContextManager[None]:
-        """Show a scene for as long as the context lasts."""
-        ...
 
 
 class SideBySide:

@@ -10,11 +10,11 @@ import numpy as np
 from s2a_bench.boards.gaps import Constant, Gaps, Lognormal, Recorded, from_table
 from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.timeline.config import NO_JITTER
 
 if TYPE_CHECKING:
     from s2a_bench.policy import Floats
 
-NO_JITTER: Final = "none"
 AS_PROFILE: Final = "profile"
 
 
@@ -71,7 +71,7 @@ def board_of_profile(profile: Profile, jitter: str, prompt_s: float | None) -> B
 def board_of_rate(tokens_per_s: float, jitter: str, prompt_s: float | None) -> Board:
     """Make a board of a bare rate; raises UsageError where only a profile could tell its jitter."""
     if jitter == AS_PROFILE:
-        raise UsageError(f"--jitter: {AS_PROFILE} needs a --profile; --rate alone takes a family, as lognormal:cv=0.2")
+        raise UsageError(f"`jitter`: {AS_PROFILE} needs `profiles`; `rates` alone takes a family, as lognormal:cv=0.2")
     return Board(
         name="",
         title=f"{tokens_per_s:g} tokens/s",
@@ -84,7 +84,7 @@ def board_of_rate(tokens_per_s: float, jitter: str, prompt_s: float | None) -> B
 
 
 def gaps_of(jitter: str, mean_s: float) -> Gaps:
-    """Read ``none`` or ``FAMILY:key=value,...`` of `jitter.FAMILIES`; raises UsageError naming ``--jitter``."""
+    """Read ``none`` or ``FAMILY:key=value,...`` of `jitter.FAMILIES`; raises UsageError naming the field."""
     if jitter == NO_JITTER:
         return Constant(mean_s)
     family, _, rest = jitter.partition(":")
@@ -92,12 +92,12 @@ def gaps_of(jitter: str, mean_s: float) -> Gaps:
     for part in filter(None, rest.split(",")):
         key, equals, value = part.partition("=")
         if not equals:
-            raise UsageError(f"--jitter: '{part}' should be key=value, as in lognormal:cv=0.2")
+            raise UsageError(f"`jitter`: '{part}' should be key=value, as in lognormal:cv=0.2")
         table[key.strip()] = _number(key, value)
     try:
         return from_table(table, mean_s)
     except UsageError as error:
-        raise UsageError(f"--jitter {jitter}: {error}") from error
+        raise UsageError(f"`jitter` {jitter}: {error}") from error
 
 
 def _gaps(jitter: str, profile: Profile) -> Gaps:
@@ -117,4 +117,4 @@ def _number(key: str, value: str) -> int | float:
             return kind(value)
         except ValueError:
             continue
-    raise UsageError(f"--jitter: {key}={value} should be a number")
+    raise UsageError(f"`jitter`: {key}={value} should be a number")

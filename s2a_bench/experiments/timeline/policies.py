@@ -71,8 +71,8 @@ def plans_of(config: TimelineConfig, setting: Setting, answers: Sequence[Floats]
     count, tokens = plans.arrival_s.shape[1], setting.n_skills * setting.tokens_per_skill
     if (count + 1) * config.epsilon < 1:
         raise UsageError(
-            f"--calibrate: {count} of {len(answers)} answers have the {tokens} tokens of {setting.name}; "
-            f"--epsilon {config.epsilon:g} needs {math.ceil(1 / config.epsilon) - 1}"
+            f"`calibrate`: {count} of {len(answers)} answers have the {tokens} tokens of {setting.name}; "
+            f"`epsilon` {config.epsilon:g} needs {math.ceil(1 / config.epsilon) - 1}"
         )
     return plans
 

@@ -9,17 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 from s2a_bench.clock import SystemClock
 from s2a_bench.experiments.timeline.config import TimelineConfig, settings
-from s2a_bench.experiments.timeline.execution import Scene, SideBySide, View, jitter_facts, keep, quick_switching
+from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep, quick_switching
 from s2a_bench.experiments.timeline.plans import Board
 from s2a_bench.experiments.timeline.policies import draw, learn
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.experiments.timeline.run import board_facts, calibration_warnings, finite
 from s2a_bench.experiments.timeline.to_rows import KEPT_PLANS, Setting
 from s2a_bench.experiments.timeline.traces import recordings
+from s2a_bench.experiments.timeline.virtual import board_facts, calibration_warnings, finite
+from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.machine import environment
 from s2a_bench.plan import Call, Durations, Skill
 from s2a_bench.policy import Plans
 from s2a_bench.policy.schedule import safe_start
+from s2a_bench.progress import Progress, watching
 from s2a_bench.runtime.events import Requested, SkillCame, StreamEnded, TokenCame
 from s2a_bench.runtime.executor import SILENCE_S
 from s2a_bench.runtime.record import Record
@@ -66,32 +68,26 @@ class _SoFar:
     calibrations: dict[str, Any] = field(default_factory=dict)
 
 
-def run_real_time(config: TimelineConfig, output: Path, view: View) -> Path:
+def run_real_time(config: TimelineConfig, output: Path, progress: Progress) -> Path:
     """Play all timelines, one setting after the other, and return the run folder; raises S2AError.
 
     Nothing is measured of a model: arrivals are emulated, executions are real.
     """
-    config.check()
     answers = recordings(config.calibrate) if config.calibrate else []
     work = [(board, replace(setting, mode=MODE)) for board, setting in settings(config)]
     manifest = {
-        "configuration": {
-            **asdict(config),
-            "plans": config.plans_a_cell,
-            "calibrate": config.calibrate and str(config.calibrate),
-            "time": MODE,
-        },
+        "configuration": config.to_manifest(),
         "environment": environment.collect(),
         "seeds": {"plans": config.seed},
         "boards": [board_facts(board) for board in config.boards],
     }
     with RunWriter.create(output, "timeline", manifest, (TIMELINES, SKILLS, TOKENS)) as writer, quick_switching():
-        view.opened(writer.path)
-        view.expect(len(work) * config.plans_a_cell)
+        progress.opened(writer.path)
+        progress.expect(len(work) * config.plans_a_cell)
         so_far = _SoFar()
         try:
             for board, setting in work:
-                _run_setting(config, board, setting, answers, writer, view, so_far)
+                _run_setting(config, board, setting, answers, writer, progress, so_far)
         finally:
             warnings = [*so_far.warnings, *calibration_warnings(so_far.calibrations)]
             writer.update(
@@ -108,11 +104,11 @@ def _run_setting(
     setting: Setting,
     answers: Sequence[Floats],
     writer: RunWriter,
-    view: View,
+    progress: Progress,
     so_far: _SoFar,
 ) -> None:
     """Play the plans of one setting."""
-    view.stage(f"learning {setting.title}")
+    progress.stage(f"learning {setting.title}")
     known = learn(config, board, setting, answers)
     if known.calibration is not None:
         caution = finite(known.calibration.caution)
@@ -123,13 +119,13 @@ def _run_setting(
         cut = slice(plan, plan + 1)
         one = Plans(plans.arrival_s[:, cut], plans.nominal_s[:, cut], plans.least_s[:, cut], plans.most_s[:, cut])
         play = _Play(token_s[:, plan], one)
-        view.stage(f"{setting.title}, L = {setting.tokens_per_skill}: about {play.span_s:.0f} s")
+        progress.stage(f"{setting.title}, L = {setting.tokens_per_skill}: about {play.span_s:.0f} s")
         known_too = replace(config.shape(setting), safe_start_s=float(safe_start(one.arrival_s, one.nominal_s)[0]))
         robots = [TimedRobot() for _ in policies]
         executors = SideBySide(policies, known_too, "hold", robots, max(SILENCE_S, 2 * play.span_s))
         title = f"{setting.title}, {setting.tokens_per_s:g} tokens/s, L = {setting.tokens_per_skill} (EMULATED)"
         try:
-            with executors, view.show(Scene(title, executors.records, setting.n_skills, play.span_s)):
+            with executors, watching(progress, Scene(title, executors.records, setting.n_skills, play.span_s)):
                 _play(play, setting.tokens_per_skill, executors)
         finally:  # what an interruption leaves is kept too
             so_far.records += executors.records
@@ -137,7 +133,7 @@ def _run_setting(
             if plan < KEPT_PLANS:
                 writer.append(TOKENS, _token_rows(setting, request_id, executors.records[0]))
             so_far.warnings += keep(writer, setting, plan, request_id, policies, executors.records)
-        view.advance()
+        progress.advance()
 
 
 def _play(play: _Play, tokens_per_skill: int, executors: SideBySide) -> None:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, make_dataclass
 from typing import Final
 
+from s2a_bench.experiments.timeline.metrics import METRICS
 from s2a_bench.store.schema import Table, Value
 
 
 @dataclass(frozen=True, slots=True)
-class TimelineRow:
-    """One plan under one policy, with its metrics as `policy.metrics` defines them; times count from the request.
+class PlanRow:
+    """What a row of `TIMELINES` says of its plan besides the metrics.
 
     ``board`` is a profile's name, empty where only a rate was given. ``mode`` says what passed the time: ``virtual``
     (computed), else a clock; ``emulated`` is true where no model answered. ``requested_ns`` is when the clock showed
-    the request: 0 in virtual time. ``safe_start_ns`` is S0, ``last_arrival_ns`` t_N, ``safe_end_ns`` S0 + P_N,
-    ``least_end_ns`` E_lo. ``any_stall`` counts stalls too short for ``stalls``. Motion is null for plans whose skills
-    are not kept.
+    the request, from which all times count: 0 in virtual time.
     """
 
     cell: str
@@ -34,32 +33,20 @@ class TimelineRow:
     request_id: str
     requested_ns: int
     caution: float | None
-    start_ns: int
-    end_ns: int
-    safe_start_ns: int
-    last_arrival_ns: int
-    safe_end_ns: int
-    least_end_ns: int
-    stalls: int
-    any_stall: bool
-    stall_ns: int
-    longest_stall_ns: int
-    stall_ratio: float
-    start_regret: float
-    signed_start_regret: float
-    start_regret_of_wait: float
-    end_regret: float
-    end_regret_of_wait: float
-    end_regret_elastic: float
-    mean_queue_wait_ns: int
-    longest_queue_wait_ns: int
-    mean_action_age_ns: int
-    oldest_action_ns: int
-    speed_distortion: float
-    fluidity: float
-    rms_jerk: float | None = None
-    peak_jerk: float | None = None
-    sparc: float | None = None
+
+
+TimelineRow: Final = make_dataclass(
+    "TimelineRow",
+    [
+        (metric.column, metric.column_type, *([field(default=None)] if metric.optional else []))
+        for metric in METRICS.values()
+    ],
+    bases=(PlanRow,),
+    frozen=True,
+    slots=True,
+    kw_only=True,
+)
+"""One plan under one policy, with a column a metric. Motion is null for plans whose skills are not kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +72,7 @@ class SkillRow:
     due_ns: int | None = None
 
 
-TIMELINES: Final[Table[TimelineRow]] = Table("timelines", TimelineRow)
+TIMELINES: Final[Table[PlanRow]] = Table("timelines", TimelineRow)
 """One row a plan and policy."""
 
 

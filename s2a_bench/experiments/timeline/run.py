@@ -1,104 +1,22 @@
-"""The timeline run in virtual time: every policy on the same arrivals, board by board, granularity by granularity."""
+"""A timeline run: computed in virtual time, played on the clock, or live."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from s2a_bench.boards.gaps import to_table
-from s2a_bench.experiments.timeline.config import TimelineConfig, settings
-from s2a_bench.experiments.timeline.plans import Board
-from s2a_bench.experiments.timeline.policies import draw, learn, plans_of
-from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows, token_rows
-from s2a_bench.experiments.timeline.traces import recordings
-from s2a_bench.machine import environment
-from s2a_bench.policy.conformal import Calibration
-from s2a_bench.store.manifest import RunWarning
-from s2a_bench.store.requests import TOKENS
-from s2a_bench.store.run import RunWriter
+from s2a_bench.experiments.timeline.config import TimelineConfig
 
 if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
     from s2a_bench.progress import Progress
 
 
 def run_timeline(config: TimelineConfig, output: Path, progress: Progress) -> Path:
-    """Compute all timelines and return the run folder; raises S2AError for what a user can mend."""
-    config.check()
-    work = list(settings(config))
-    answers = recordings(config.calibrate) if config.calibrate else []
-    for _, setting in work if answers else ():
-        plans_of(config, setting, answers)  # what is wrong shows before there is a folder
-    manifest = {
-        "configuration": {
-            **asdict(config),
-            "plans": config.plans_a_cell,
-            "calibrate": config.calibrate and str(config.calibrate),
-        },
-        "environment": environment.collect(),
-        "seeds": {"plans": config.seed},
-        "boards": [board_facts(board) for board in config.boards],
-    }
-    with RunWriter.create(output, "timeline", manifest, (TIMELINES, SKILLS, TOKENS)) as writer:
-        progress.opened(writer.path)
-        progress.stage("computing timelines")
-        if config.random:
-            progress.expect(len(work))
-        calibrations: dict[str, Any] = {}
-        for board, setting in work:
-            calibration = _compute(config, board, setting, answers, writer)
-            if calibration is not None:
-                calibrations[setting.name] = asdict(calibration) | {"caution": finite(calibration.caution)}
-            if config.random:
-                progress.advance()
-        warnings = calibration_warnings(calibrations)
-        writer.update(calibrations=calibrations, warnings=[warning.to_manifest() for warning in warnings])
-        return writer.path
-
-
-def _compute(
-    config: TimelineConfig, board: Board, setting: Setting, answers: Sequence[Floats], writer: RunWriter
-) -> Calibration | None:
-    """Draw one setting's plans, let every policy decide them, and keep the rows."""
-    known = learn(config, board, setting, answers)
-    token_s, plans = draw(config, board, setting, config.plans_a_cell, "plans")
-    request_ids = [setting.request_id(plan) for plan in range(config.plans_a_cell)]
-    writer.append(TOKENS, token_rows(setting.name, token_s, request_ids))
-    for name, chosen in config.chosen.items():
-        policy = known.prepare(chosen)
-        schedule = policy.schedule(plans)
-        rows = timeline_rows(
-            setting, name, plans, schedule, request_ids, caution=finite(getattr(policy, "caution", None))
-        )
-        writer.append(TIMELINES, rows)
-        writer.append(SKILLS, skill_rows(rows[0].cell, plans, schedule, request_ids))
-    return known.calibration
-
-
-def board_facts(board: Board) -> dict[str, Any]:
-    """Return a board as plain data; a recording as its family alone."""
-    plain = asdict(board) | {"gaps": to_table(board.gaps)}
-    plain["gaps"].pop("trace", None)
-    return plain
-
-
-def calibration_warnings(calibrations: dict[str, Any]) -> list[RunWarning]:
-    """Say where stream-to-act could not be calibrated well."""
-    waits = [name for name, found in calibrations.items() if found["caution"] is None]
-    if not waits:
-        return []
-    return [
-        RunWarning(
-            "calibration-waits",
-            f"stream-to-act waits for the whole plan in {', '.join(waits)}: no smaller lambda kept stalls rare enough",
-            "allow more stalls with --epsilon, or calibrate on more plans with --calibration-plans",
-        )
-    ]
-
-
-def finite(caution: float | None) -> float | None:
-    """Return lambda, or None where it is infinite: JSON has no infinity."""
-    return None if caution is None or caution == float("inf") else caution
+    """Run all timelines and return the run folder; raises S2AError for what a user can mend."""
+    if config.live:
+        from s2a_bench.experiments.timeline.live.run import run_live as run
+    elif config.real_time:
+        from s2a_bench.experiments.timeline.real_time import run_real_time as run
+    else:
+        from s2a_bench.experiments.timeline.virtual import run_virtual as run
+    return run(config, output, progress)

@@ -12,15 +12,18 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.timeline.rows import SkillRow, TimelineRow
+from s2a_bench.experiments.timeline.metrics import METRICS
+from s2a_bench.experiments.timeline.rows import PlanRow, SkillRow, TimelineRow
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.conformal import TOLERANCE_S
-from s2a_bench.policy.metrics import Metrics, measure, stalls
+from s2a_bench.policy.metrics import measure, stalls
 from s2a_bench.policy.motion import peak_jerk, rms_jerk, sparc, speed_profile
 from s2a_bench.policy.schedule import align, least_end, safe_start
 from s2a_bench.store.requests import TokenRow
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from s2a_bench.policy import Floats
 
 KEPT_PLANS: Final = 10
@@ -33,18 +36,6 @@ SHORTEST_MOTION_S: Final = 1e-9
 """Shorter motions have no jerk and no SPARC: no sample of theirs moves."""
 LONGEST_MOTION_S: Final = 1000.0
 """Longer motions have none of these: their samples would fill the memory."""
-
-_SHARES: Final = (
-    "stall_ratio",
-    "start_regret",
-    "signed_start_regret",
-    "start_regret_of_wait",
-    "end_regret",
-    "end_regret_of_wait",
-    "end_regret_elastic",
-    "speed_distortion",
-    "fluidity",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,24 +78,16 @@ def timeline_rows(
     caution: float | None = None,
     observed_s: float = 0.0,
     tolerance_s: float = TOLERANCE_S,
-) -> list[TimelineRow]:
+) -> list[PlanRow]:
     """Describe M timelines; ``tolerance_s`` is the longest gap that is no stall for ``any_stall`` (1 us unless told).
 
     Motion is computed for plans below `KEPT_PLANS`. ``observed_s`` is when the picture was taken, from the request.
     """
-    arrival_s, nominal_s, least_s = align(plans.arrival_s, plans.nominal_s, plans.least_s)
-    found = measure(plans, schedule, observed_s=observed_s)
-    safe_s = safe_start(arrival_s, nominal_s)
-    moments_s = {
-        "safe_start_ns": safe_s,
-        "last_arrival_ns": arrival_s[-1],
-        "safe_end_ns": safe_s + nominal_s.sum(axis=0),
-        "least_end_ns": least_end(arrival_s, least_s),
-    }
+    found = metrics_of(plans, schedule, observed_s=observed_s, tolerance_s=tolerance_s)
     rows = []
     for place, request_id in enumerate(request_ids):
         plan = first_plan + place
-        motion: dict[str, Any] = _motion(schedule, nominal_s, place) if plan < KEPT_PLANS else {}
+        motion = _motion(schedule, plans.nominal_s, place) if plan < KEPT_PLANS else {}
         rows.append(
             TimelineRow(
                 cell=f"{setting.name}/{policy}",
@@ -122,13 +105,27 @@ def timeline_rows(
                 request_id=request_id,
                 requested_ns=requested_ns[place] if requested_ns else 0,
                 caution=caution,
-                any_stall=bool(found.longest_stall_s[place] > tolerance_s),
-                **_numbers(found, place),
-                **{name: to_ns(values[place]) for name, values in moments_s.items()},
+                **{METRICS[name].column: METRICS[name].stored(values[place]) for name, values in found.items()},
                 **motion,
             )
         )
     return rows
+
+
+def metrics_of(plans: Plans, schedule: Schedule, *, observed_s: float, tolerance_s: float) -> dict[str, NDArray[Any]]:
+    """Return the metrics of M timelines by their names, but for motion: arrays of shape (M,), times in s."""
+    arrival_s, nominal_s, least_s = align(plans.arrival_s, plans.nominal_s, plans.least_s)
+    found = measure(plans, schedule, observed_s=observed_s)
+    safe_s = safe_start(arrival_s, nominal_s)
+    return {
+        **{name: getattr(found, name) for name in METRICS if hasattr(found, name)},
+        "start_s": found.first_action_s,
+        "safe_start_s": safe_s,
+        "last_arrival_s": arrival_s[-1],
+        "safe_end_s": safe_s + nominal_s.sum(axis=0),
+        "least_end_s": least_end(arrival_s, least_s),
+        "p_any_stall": found.longest_stall_s > tolerance_s,
+    }
 
 
 def skill_rows(
@@ -184,16 +181,6 @@ def token_rows(cell: str, token_s: Floats, request_ids: Sequence[str]) -> Iterab
 def to_ns(seconds: float) -> int:
     """Round to nanoseconds."""
     return round(float(seconds) * 1e9)
-
-
-def _numbers(found: Metrics, place: int) -> dict[str, Any]:
-    """Return one timeline's metrics by the names of their columns."""
-    times = ("stall", "longest_stall", "mean_queue_wait", "longest_queue_wait", "mean_action_age", "oldest_action")
-    numbers: dict[str, Any] = {f"{name}_ns": to_ns(getattr(found, f"{name}_s")[place]) for name in times}
-    numbers |= {"start_ns": to_ns(found.first_action_s[place]), "end_ns": to_ns(found.end_s[place])}
-    # Times are exact to a nanosecond, so that what is less of a share is rounding; 0.0 makes -0.0 a zero.
-    numbers |= {name: round(float(getattr(found, name)[place]), 9) + 0.0 for name in _SHARES}
-    return {**numbers, "stalls": int(found.stalls[place])}
 
 
 def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> dict[str, float]:

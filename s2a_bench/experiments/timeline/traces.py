@@ -28,5 +28,5 @@ def recordings(folder: Path) -> list[Floats]:
         if sample["request_id"] in times
     ]
     if not found:
-        raise UsageError(f"--calibrate: {folder} holds no answers; give the run folder of a latency or throughput run")
+        raise UsageError(f"`calibrate`: {folder} holds no answers; give the run folder of a latency or throughput run")
     return found

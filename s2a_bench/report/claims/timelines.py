@@ -100,7 +100,7 @@ def _grows(run: Run) -> Finding | None:
         return None
     said, fine = [], True
     for title, cells in several.items():
-        stalls = [cell.mean("stall") or 0.0 for cell in cells]
+        stalls = [cell.mean("stall_s") or 0.0 for cell in cells]
         fine &= all(after >= before - _VISIBLE_S for before, after in pairwise(stalls))
         said.append(f"{title}: {', '.join(f'{stall:.2f}' for stall in stalls)} s at L = {_lengths(cells)}")
     every = [cell for cells in several.values() for cell in cells]
@@ -176,7 +176,7 @@ def _ends_over(policy: str, run: Run) -> tuple[float, float, str] | None:
 
 
 def _end(cell: Timelines) -> float:
-    return cell.mean("end") or 0.0
+    return cell.mean("end_s") or 0.0
 
 
 def _stalls(cell: Timelines) -> bool:
@@ -186,7 +186,7 @@ def _stalls(cell: Timelines) -> bool:
 
 def _listed(cells: Sequence[Timelines]) -> str:
     """Say how much cells stall."""
-    means = [(cell, cell.mean("stalls") or 0.0, cell.mean("stall") or 0.0) for cell in cells]
+    means = [(cell, cell.mean("stalls") or 0.0, cell.mean("stall_s") or 0.0) for cell in cells]
     return "; ".join(f"{cell.policy} at L = {cell.setting[1]}: {n:g} stalls of {s:.2f} s" for cell, n, s in means)
 
 

@@ -13,7 +13,6 @@ from s2a_bench.report.page.sentences import (
     latency_sentences,
     study_sentences,
     throughput_sentences,
-    timeline_sentences,
 )
 from s2a_bench.writers.tables import Note
 
@@ -53,16 +52,6 @@ def _throughput(run: Run, against_paper: bool) -> Content:
     return Content(throughput_sentences(run), throughput_tables(run), ["throughput"], throughput_csv(run), figures)
 
 
-def _timeline(run: Run, _against_paper: bool) -> Content:
-    from s2a_bench.experiments.timeline.view.cells import timelines_of
-    from s2a_bench.experiments.timeline.view.figures import timeline_figures
-    from s2a_bench.experiments.timeline.view.tables import timeline_csv, timeline_tables
-
-    shown = [cell for cell in timelines_of(run) if len(cell.skills)]
-    tables, csvs = timeline_tables(run), timeline_csv(run)
-    return Content(timeline_sentences(run), tables, ["timelines"], csvs, timeline_figures(run), shown)
-
-
 def _study(run: Run, _against_paper: bool) -> Content:
     from functools import partial
 
@@ -95,7 +84,6 @@ def _other(run: Run, _against_paper: bool) -> Content:
 CONTENTS: Final[dict[str, Callable[[Run, bool], Content]]] = {
     "latency": _latency,
     "throughput": _throughput,
-    "timeline": _timeline,
     "study": _study,
     "model validity": _validity,
 }

@@ -59,7 +59,7 @@ def panels_of(cells: Sequence[Timelines]) -> list[Panel]:
 def _panel(setting: tuple[str, int, int, float], cells: Sequence[Timelines], colours: dict[str, str]) -> Panel:
     title, tokens, n_skills, t_nom_s = setting
     shared = len({cell.about("request_id") for cell in cells}) == 1
-    end_s = max(cell.moment_s("end") for cell in cells) * 1.02
+    end_s = max(cell.moment_s("end_s") for cell in cells) * 1.02
     rate = f"{cells[0].about('tokens_per_s'):g} tokens/s"
     board = title if rate in title else f"{title}, {rate}"
     plans = f"; plan 1 of {cells[0].n}" if cells[0].n > 1 else ""
@@ -98,15 +98,15 @@ def _lane(cell: Timelines, colour: str, *, own_tokens: bool) -> Lane:
             f"{cell.policy}: {name} arrives at {seconds(arrival)} s, runs {seconds(start)} to {seconds(end)} s{stalled}"
         )
         bars.append(Bar("skill", start, end - start, text))
-    stalls, stall_s = int(cell.rows["stalls"].iloc[0]), cell.moment_s("stall")
-    words = f"starts {seconds(cell.moment_s('start'))} s, ends {seconds(cell.moment_s('end'))} s, "
+    stalls, stall_s = int(cell.rows["stalls"].iloc[0]), cell.moment_s("stall_s")
+    words = f"starts {seconds(cell.moment_s('start_s'))} s, ends {seconds(cell.moment_s('end_s'))} s, "
     words += f"{stalls} stalls, {seconds(stall_s)} s" if stall_s else "no stalls"
     return Lane(
         cell.policy,
         colour,
         tuple(bars),
-        cell.moment_s("start"),
-        cell.moment_s("safe_start"),
+        cell.moment_s("start_s"),
+        cell.moment_s("safe_start_s"),
         tuple(cell.token_s) if own_tokens else (),
         _complete_s(cell) if own_tokens else (),
         words,

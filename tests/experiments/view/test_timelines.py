@@ -17,8 +17,8 @@ from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows, token_rows
 from s2a_bench.experiments.timeline.view.as_json import timelines_json
 from s2a_bench.experiments.timeline.view.cells import timelines_of
-from s2a_bench.experiments.timeline.view.chrome_trace import to_trace, write_trace
-from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours, write_timeline_figures
+from s2a_bench.experiments.timeline.view.chrome_trace import TRACE, to_trace, write_trace
+from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours, timeline_figures
 from s2a_bench.experiments.timeline.view.tables import (
     execution_table,
     seconds,
@@ -31,6 +31,7 @@ from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
 from s2a_bench.store.requests import TOKENS, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.writers.figures import save
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import TextTable, to_markdown
 
@@ -165,7 +166,8 @@ def test_requests_of_their_own_have_their_tokens_in_their_lanes(live: Run) -> No
 
 
 def test_figures_are_written_as_png_and_pdf(computed: Run) -> None:
-    assert [path.name for path in write_timeline_figures(computed)] == ["timeline.png", "timeline.pdf"]
+    written = save(computed.path / "figures", timeline_figures(computed))
+    assert [path.name for path in written] == ["timeline.png", "timeline.pdf"]
     assert all(path.stat().st_size > 5000 for path in (computed.path / "figures").iterdir())
 
 
@@ -202,7 +204,8 @@ def check_trace(trace: dict[str, Any]) -> None:
 
 def test_the_trace_is_one_that_viewers_open(computed: Run, live: Run) -> None:
     for run in (computed, live):
-        trace = json.loads(write_trace(run).read_text())
+        write_trace(run, run.path / TRACE)
+        trace = json.loads((run.path / TRACE).read_text())
         assert set(trace) == {"traceEvents", "displayTimeUnit", "otherData"}
         check_trace(trace)
 

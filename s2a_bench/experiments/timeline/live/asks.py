@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from s2a_bench.experiments.timeline.live.config import LiveConfig
+from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.experiments.timeline.live.config import in_paper_format, settings_asked, skills_lasting
 from s2a_bench.plan import Format, SkillSet, choose_format, grammar, paper_format, prompt
 from s2a_bench.policy import PlanShape, Policy, Timing
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
@@ -51,20 +52,20 @@ class Ask:
         return PlanShape(self.n_skills, self.tokens_per_skill, timing, float(nominal_s.std()) / mean_s)
 
 
-def asks_of(config: LiveConfig, model: Path | None) -> list[Ask]:
+def asks_of(config: TimelineConfig, model: Path | None) -> list[Ask]:
     """Word every setting for the tokenizer of ``model``; raises UsageError where there is no such format."""
     tokenize = None
-    if not config.paper_format:
+    if not in_paper_format(config):
         from s2a_bench.inference.tokenizer import Tokenizer
 
         tokenize = Tokenizer(model)
     found = []
-    for tokens, n_skills, t_nom_s in config.settings():
-        skills = config.skills_lasting(t_nom_s)
+    for tokens, n_skills, t_nom_s in settings_asked(config):
+        skills = skills_lasting(config, t_nom_s)
         format_ = paper_format(skills) if tokenize is None else choose_format(skills, tokens, tokenize, n_skills)
         # Token ids mean something to our own server only, which has the same model files.
-        pinned = None if config.foreign else tokenize
-        counted = tokens if tokenize is not None or config.requests.engine.name == "replay" else ROOM
+        pinned = None if config.url else tokenize
+        counted = tokens if tokenize is not None or config.engine.name == "replay" else ROOM
         found.append(
             Ask(
                 skills,
@@ -72,7 +73,7 @@ def asks_of(config: LiveConfig, model: Path | None) -> list[Ask]:
                 tokens,
                 n_skills,
                 prompt(format_, n_skills, config.task),
-                grammar(format_, n_skills, pinned) if config.constrained else "",
+                grammar(format_, n_skills, pinned) if not config.no_grammar else "",
                 n_skills * counted,
             )
         )

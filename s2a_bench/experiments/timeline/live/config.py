@@ -1,127 +1,115 @@
-"""What a live timeline is asked to do: which model, over which transport, writing which plans; and what it refuses."""
+"""What a live timeline is asked besides what is compared: which model, over which transport, and what it refuses."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+import os
+from dataclasses import replace
 from itertools import product
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.plan import LatencyConfig
-from s2a_bench.harness.ranges import LEAST_T_NOM_S, require
-from s2a_bench.plan import Durations, SkillSet, load_skills
-from s2a_bench.policy import PlanShape, Policy, Timing, policies
+from s2a_bench.inference import EngineConfig
+from s2a_bench.options import Options, Size, TextOrFile, group, option
 from s2a_bench.runtime import ROBOTS
 
-FASTEST: Final = 10_000.0
-"""Tokens/s; a pace beyond it sets nothing."""
+if TYPE_CHECKING:
+    from s2a_bench.experiments.timeline.config import TimelineConfig
+    from s2a_bench.harness.plan import LatencyConfig
+    from s2a_bench.plan import SkillSet
+
 REPLAY_TOKENS: Final = 6
 """Tokens a skill of the replay engine, which writes household plans in the paper's format."""
 REPLAY_SKILLS: Final = "household"
 
 
-@dataclass(frozen=True)
-class LiveConfig:
-    """The settings of one ``s2a-bench timeline --live`` run."""
+class Live(Options):
+    """Options about a model that answers."""
 
-    requests: LatencyConfig
-    """How the model is asked: one transport in one variant; prompt, grammar and length follow from the plan."""
-    policies: tuple[str, ...] = ("naive", "wait-then-act", "stream-to-act")
-    skills: str = "household"
-    task: str = ""
-    """What the robot should do, in the user's words."""
-    tokens_per_skill: tuple[int, ...] = (6,)
-    n_skills: tuple[int, ...] = (8,)
-    t_nom_s: tuple[float, ...] = ()
-    """Durations that every skill gets; empty: the skill set's own."""
-    t_min: float = 0.8
-    t_max: float = 1.5
-    plans: int = 1
-    robot: str = "timed"
-    constrained: bool = True
-    """Whether a grammar holds the model to the plan's form and length."""
+    transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, loopback [default: ros]")
+    skills: str = option("household", "--live: household, driving, or a TOML file")
+    task: TextOrFile = option("", "--live: what the robot should do, text or @FILE")
+    robot: str = option("timed", f"--live: {', '.join(ROBOTS)}; timed only waits")
+    engine: EngineConfig = group(
+        EngineConfig, only=("name", "model", "mmproj", "threads", "gpu_layers", "pace"), about="--live: "
+    )
+    source: str = option("synthetic", "--live: the camera")
+    size: Size = option((640, 480), "--live: WIDTHxHEIGHT of the frames [default: 640x480]")
+    url: str = option("", "--live: an HTTP server that runs already (a black box)")
+    dialect: str = option("", "--live: what --url speaks [default: ask]")
+    no_grammar: bool = option(False, "--live: let the model write what it likes")
+    warmup: int = option(1, "--live: answers before, which policies learn the rate from", ge=0)
+    timeout_s: float = option(
+        60.0, "--live: seconds without a token after which the robot holds", flag="timeout", ge=0.1, le=86_400
+    )
 
-    @cached_property
-    def skill_set(self) -> SkillSet:
-        """Load the skills; raises UsageError."""
-        return load_skills(self.skills)
 
-    @cached_property
-    def chosen(self) -> dict[str, Policy]:
-        """Build the policies, by their canonical names; raises UsageError."""
-        return policies(self.policies)
+def requests_of(config: TimelineConfig) -> LatencyConfig:
+    """Return how the model is asked: one transport in one variant; prompt and length follow from the plan."""
+    from s2a_bench.harness.plan import LatencyConfig
+    from s2a_bench.ros.config import domain_id
 
-    @property
-    def foreign(self) -> bool:
-        """Tell whether somebody else's server answers, whose tokenizer is not at hand."""
-        requests = self.requests
-        return bool(requests.url or requests.action or requests.llama_server)
+    transport, _, variant = (config.transport or ("http" if config.url else "ros")).partition("/")
+    width, height = config.size
+    return LatencyConfig(
+        transports=(transport,),
+        http=(variant or "as-deployed",) if transport == "http" else ("as-deployed",),
+        ros=(variant or "topic",) if transport == "ros" else ("topic",),
+        source=config.source,
+        width=width,
+        height=height,
+        url=config.url,
+        dialect=config.dialect,
+        engine=config.engine.but(profile=",".join(config.profiles)) if config.profiles else config.engine,
+        runs=1,
+        warmup=config.warmup,
+        seed=config.seed,
+        timeout_s=config.timeout_s,
+        domain_id=domain_id(os.environ),
+        sample_resources_hz=0,
+    )
 
-    @property
-    def paper_format(self) -> bool:
-        """Tell whether plans are written as in the paper, for want of a tokenizer to choose a format with."""
-        return self.requests.engine.name != "llama" or bool(self.requests.url or self.requests.action)
 
-    def settings(self) -> list[tuple[int, int, float | None]]:
-        """List what is asked for: tokens a skill, skills, and T_nom in s (None: the set's own)."""
-        return list(product(self.tokens_per_skill, self.n_skills, self.t_nom_s or (None,)))
+def check_live(config: TimelineConfig) -> None:
+    """Refuse what no model, robot or policy can do; raises UsageError naming the fields."""
+    from s2a_bench.policy import PlanShape, Timing
 
-    def skills_lasting(self, t_nom_s: float | None) -> SkillSet:
-        """Return the skill set, every skill of which takes ``t_nom_s`` if that is given."""
-        if t_nom_s is None:
-            return self.skill_set
-        times = Durations(self.t_min * t_nom_s, t_nom_s, self.t_max * t_nom_s)
-        return replace(self.skill_set, skills=tuple(replace(skill, durations=times) for skill in self.skill_set.skills))
+    requests_of(config).check()
+    _ = config.skill_set
+    for policy in config.chosen.values():
+        policy.stepper(PlanShape(1, 1, Timing(1.0, 1.0, 1.0)))
+    if len(config.chosen) > 1 and not getattr(ROBOTS[config.robot], "several", False):
+        raise UsageError(f"`robot`: {config.robot} follows one policy at a time; choose it with `policies`")
+    engine = config.engine
+    if engine.pace and config.url:
+        raise UsageError("`pace` needs our own server, which holds its engine back")
+    if engine.name == "echo":
+        raise UsageError("`engine` echo writes no plans; `live` needs llama, or replay")
+    if engine.name == "replay":
+        if engine.pace:
+            raise UsageError("`pace`: `engine` replay has its profile's rate; leave one of them out")
+        if config.skills != REPLAY_SKILLS or config.lengths != (REPLAY_TOKENS,):
+            raise UsageError(
+                f"`engine` replay writes plans of the {REPLAY_SKILLS} skills in {REPLAY_TOKENS} tokens a skill; "
+                "leave out `skills` and `tokens_per_skill`"
+            )
 
-    def check(self) -> None:
-        """Refuse what makes no sense; raises UsageError naming the flag."""
-        requests = self.requests
-        requests.check()
-        _ = self.skill_set
-        cells = len(requests.transports) * max(
-            len(requests.http_variants) if "http" in requests.transports else 1,
-            len(requests.ros) if "ros" in requests.transports else 1,
-        )
-        if cells != 1:
-            raise UsageError("--transport: --live follows one stream; name one, as ros, ros/action or http/binary")
-        for policy in self.chosen.values():
-            policy.stepper(PlanShape(1, 1, Timing(1.0, 1.0, 1.0)))
-        if not self.policies:
-            raise UsageError("--policy: name at least one")
-        require("--tokens-per-skill", self.tokens_per_skill, 1)
-        require("--n-skills", self.n_skills, 1)
-        require("--t-nom", self.t_nom_s, LEAST_T_NOM_S)
-        require("--t-min (a factor of T_nom)", [self.t_min], 0, 1, above=True)
-        require("--t-max (a factor of T_nom)", [self.t_max], 1)
-        require("--plans", [self.plans], 1)
-        for flag, values in (("--tokens-per-skill", self.tokens_per_skill), ("--n-skills", self.n_skills)):
-            if not values:
-                raise UsageError(f"{flag}: name at least one")
-        self._check_engine()
-        robot = ROBOTS[self.robot]
-        if len(self.chosen) > 1 and not getattr(robot, "several", False):
-            raise UsageError(f"`robot`: {self.robot} follows one policy at a time; choose it with `policy`")
 
-    def _check_engine(self) -> None:
-        engine = self.requests.engine
-        pace = engine.pace
-        if pace:
-            require("--pace", [pace], 0, FASTEST, above=True)
-            if self.foreign:
-                raise UsageError("--pace needs our own server, which holds its engine back")
-        if engine.name == "echo":
-            raise UsageError("--engine echo writes no plans; --live needs llama, or replay")
-        if engine.name == "replay":
-            if pace:
-                raise UsageError("--pace: --engine replay has its profile's rate; leave one of them out")
-            if self.skills != REPLAY_SKILLS or self.tokens_per_skill != (REPLAY_TOKENS,):
-                raise UsageError(
-                    f"--engine replay writes plans of the {REPLAY_SKILLS} skills in {REPLAY_TOKENS} tokens a skill; "
-                    "leave out --skills and --tokens-per-skill"
-                )
+def in_paper_format(config: TimelineConfig) -> bool:
+    """Return True if plans are written as in the paper, for want of a tokenizer to choose a format with."""
+    return config.engine.name != "llama" or bool(config.url)
 
-    def to_manifest(self) -> dict[str, Any]:
-        """Return the settings as plain data."""
-        own = {name: value for name, value in asdict(self).items() if name != "requests"}
-        return {**self.requests.to_manifest(), **own, "time": "live"}
+
+def settings_asked(config: TimelineConfig) -> list[tuple[int, int, float | None]]:
+    """List what is asked for: tokens a skill, skills, and T_nom in s (None: the set's own)."""
+    return list(product(config.lengths, config.n_skills, config.t_nom_s or (None,)))
+
+
+def skills_lasting(config: TimelineConfig, t_nom_s: float | None) -> SkillSet:
+    """Return the skill set, every skill of which takes ``t_nom_s`` if that is given."""
+    from s2a_bench.plan import Durations
+
+    if t_nom_s is None:
+        return config.skill_set
+    times = Durations(config.t_min * t_nom_s, t_nom_s, config.t_max * t_nom_s)
+    skills = tuple(replace(skill, durations=times) for skill in config.skill_set.skills)
+    return replace(config.skill_set, skills=skills)

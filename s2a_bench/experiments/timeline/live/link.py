@@ -10,11 +10,12 @@ from typing import Any
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError, TransportError, UsageError
+from s2a_bench.experiments.timeline.config import TimelineConfig
 from s2a_bench.experiments.timeline.live.asks import Ask, asks_of, prior_of
-from s2a_bench.experiments.timeline.live.config import LiveConfig
+from s2a_bench.experiments.timeline.live.config import in_paper_format, requests_of
 from s2a_bench.frames import FrameSource
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.plan import plan_cells
+from s2a_bench.harness.plan import LatencyConfig, plan_cells
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.harness.warnings import before_run
@@ -68,25 +69,25 @@ class Tee:
         self._client.close()
 
 
-def word(config: LiveConfig, progress: Progress) -> tuple[LiveConfig, list[Ask]]:
+def word(config: TimelineConfig, progress: Progress) -> tuple[LatencyConfig, list[Ask]]:
     """Find the model's files and word what it is asked, with the room that it needs; raises S2AError."""
-    requests = config.requests
-    if not config.paper_format:
+    requests = requests_of(config)
+    if not in_paper_format(config):
         need_engine("llama")
         progress.stage("reading the model's headers" if requests.engine.model else "the tiny dummy model")
         model, mmproj = resolve(requests.engine)
         requests = replace(requests, engine=requests.engine.but(model=model, mmproj=mmproj))
     asks = asks_of(config, requests.engine.model)
-    requests = replace(requests, max_tokens=max(ask.max_tokens for ask in asks))
-    return replace(config, requests=requests), asks
+    return replace(requests, max_tokens=max(ask.max_tokens for ask in asks)), asks
 
 
 @dataclass
 class Link:
     """The way to one model, for one run."""
 
-    config: LiveConfig
-    """As `word` returned it."""
+    config: TimelineConfig
+    requests: LatencyConfig
+    """As `word` returned them."""
     writer: RunWriter
     progress: Progress
     warnings: list[RunWarning] = field(default_factory=list)
@@ -100,7 +101,7 @@ class Link:
 
     def connect(self, stack: ExitStack, source: FrameSource, robot: str) -> None:
         """Start the server or find the one that runs, and open a client; ``robot`` is who will act, for the record."""
-        requests = self.config.requests
+        requests = self.requests
         (transport,) = requests.transports
         uses_dds = transport == "ros"
         self.warnings += before_run(requests.width, requests.height, uses_dds=uses_dds)
@@ -113,7 +114,7 @@ class Link:
             client = open_client(self.cell.route, self.servers.alive(transport))
         self.tee = stack.enter_context(closing(Tee(client)))
         self.feed = RequestFeed(source, preencoded=requests.payload == "jpeg-preencoded")
-        self.rate = requests.engine.pace or None
+        self.rate = requests.engine.pace
         self.writer.update(
             servers=facts,
             model=self.facts,
@@ -123,7 +124,7 @@ class Link:
                 "emulated": self.emulated,
                 **({"dummy": self.facts["dummy"]} if "dummy" in self.facts else {}),
                 **({"paced_tokens_per_s": self.rate} if self.rate else {}),
-                "grammar": self.config.constrained,
+                "grammar": not self.config.no_grammar,
                 "skills": self.config.skill_set.name,
                 "robot": robot,
             },
@@ -136,7 +137,7 @@ class Link:
 
     def warm_up(self, ask: Ask) -> GapPrior | None:
         """Ask as often as the configuration wants, and return what policies learn from that."""
-        warmups = self.config.requests.warmup
+        warmups = self.requests.warmup
         arrivals_ns = []
         for _ in range(warmups):
             self.progress.stage("warming up")
@@ -152,7 +153,7 @@ class Link:
 
     def ask(self, ask: Ask, plan: int, feed: PlanFeed | None) -> Measured:
         """Make one request and keep its rows; raises what ends the run."""
-        requests = self.config.requests
+        requests = self.requests
         asked = replace(
             requests,
             prompt=ask.prompt,
@@ -172,7 +173,7 @@ class Link:
         transport = self.cell.route.transport
         self.servers.raise_if_dead(transport, suspect=measured.fatal is not None)
         if isinstance(measured.fatal, UsageError) and "grammar" in str(measured.fatal):
-            raise UsageError(f"{measured.fatal} (here: --no-grammar)") from measured.fatal
+            raise UsageError(f"{measured.fatal} (here: `no_grammar`)") from measured.fatal
         if measured.fatal is not None:
             raise measured.fatal
         return measured
@@ -183,7 +184,7 @@ class Link:
             return
         came = (len(token_ns) - 1) / (token_ns[-1] - token_ns[0]) * 1e9
         self.rate = self.rate or came
-        pace = self.config.requests.engine.pace
+        pace = self.requests.engine.pace
         if pace and came * LATE < pace:
             what = f"{came:.3g} tokens/s came, not the {pace:g} of --pace: the model is slower"
             self.warnings.append(

@@ -13,18 +13,20 @@ from pathlib import Path
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError
-from s2a_bench.experiments.timeline.execution import Scene, SideBySide, View, jitter_facts, keep, quick_switching
+from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep, quick_switching
 from s2a_bench.experiments.timeline.live.asks import Ask, prepare
-from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.experiments.timeline.live.link import Link, word
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.to_rows import Setting
+from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
 from s2a_bench.plan import Parser
 from s2a_bench.policy import Policy
 from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.progress import Progress, watching
 from s2a_bench.runtime import ROBOTS, Robot
 from s2a_bench.runtime.events import StreamBroke
 from s2a_bench.runtime.feed import PlanFeed
@@ -35,18 +37,15 @@ from s2a_bench.store.run import RunWriter
 MODE = "live"
 
 
-def run_live(config: LiveConfig, output: Path, view: View) -> Path:
+def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
     """Ask for plans, execute them, and return the run folder; raises S2AError for what a user can mend.
 
     Whatever happens, the timelines so far are in the folder. KeyboardInterrupt passes through, after the robots hold.
     """
-    config.check()
     limit_threads()
-    if config.requests.dds_tuning == "tuned":
-        keep_large_blocks()
+    keep_large_blocks()
     with ExitStack() as stack:
-        config, asks = word(config, view)
-        requests = config.requests
+        requests, asks = word(config, progress)
         source = open_source(requests.source, requests.width, requests.height, fps=requests.fps, seed=requests.seed)
         stack.callback(source.close)
         manifest = {
@@ -56,9 +55,9 @@ def run_live(config: LiveConfig, output: Path, view: View) -> Path:
         }
         tables = (TIMELINES, SKILLS, SAMPLES, TOKENS)
         writer = stack.enter_context(RunWriter.create(output, "timeline", manifest, tables))
-        view.opened(writer.path)
+        progress.opened(writer.path)
         stack.enter_context(quick_switching())
-        run = _Live(Link(config, writer, view), view)
+        run = _Live(Link(config, requests, writer, progress), progress)
         try:
             run.connect(stack, source)
             run.everything(asks)
@@ -72,7 +71,7 @@ class _Live:
     """One run under way."""
 
     link: Link
-    view: View
+    progress: Progress
     records: list[Record] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -89,12 +88,12 @@ class _Live:
 
     def everything(self, asks: Sequence[Ask]) -> None:
         """Warm up, then ask for all plans."""
-        self.view.expect(self.config.requests.warmup + len(asks) * self.config.plans)
+        self.progress.expect(self.config.warmup + len(asks) * self.config.plans_a_cell)
         prior = self.link.warm_up(asks[0])
         for ask in asks:
-            for plan in range(self.config.plans):
+            for plan in range(self.config.plans_a_cell):
                 self._execute(ask, plan, prior)
-                self.view.advance()
+                self.progress.advance()
         self.link.require_answers()
 
     def _execute(self, ask: Ask, plan: int, prior: GapPrior | None) -> None:
@@ -102,14 +101,14 @@ class _Live:
         policies = {name: prepare(policy, prior) for name, policy in self.config.chosen.items()}
         rate = self.link.rate
         span_s = ask.n_skills * (ask.tokens_per_skill / rate if rate else 0.0) + ask.n_skills * ask.t_nom_s
-        self.view.stage(f"{self.link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
-        timeout_s = self.config.requests.timeout_s
+        self.progress.stage(f"{self.link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
+        timeout_s = self.config.timeout_s
         side_by_side = SideBySide(policies, ask.shape, ask.skills.gap, self.robots, timeout_s)
         feed = PlanFeed(Parser(ask.format), side_by_side.tell)
         title = f"live {self.link.cell.name}, L = {ask.tokens_per_skill}{self._remarks()}"
         request_id = ""
         try:
-            with side_by_side, self.view.show(Scene(title, side_by_side.records, ask.n_skills, span_s)):
+            with side_by_side, watching(self.progress, Scene(title, side_by_side.records, ask.n_skills, span_s)):
                 try:
                     request_id = self.link.ask(ask, plan, feed).sample.request_id
                 except S2AError as error:  # the run ends, but not in the middle of a skill
@@ -145,7 +144,7 @@ class _Live:
 
     def _remarks(self) -> str:
         """Say what is not as it seems."""
-        pace = self.config.requests.engine.pace
+        pace = self.config.engine.pace
         paced = f", paced to {pace:g} tokens/s" if pace else ""
         dummy = ", dummy weights" if self.link.facts.get("dummy") else ""
         return f"{paced}{dummy}{' (EMULATED)' if self.link.emulated else ''}"

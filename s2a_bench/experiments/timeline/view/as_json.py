@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments.timeline.view.cells import NUMBERS, TIMES, Timelines, timelines_of
+from s2a_bench.experiments.timeline.metrics import METRICS
+from s2a_bench.experiments.timeline.view.cells import Timelines, timelines_of
 from s2a_bench.writers.as_json import frame
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def _cell(cell: Timelines) -> dict[str, Any]:
     about["rate_tokens_per_s"] = about.pop("tokens_per_s")
     if about["prompt_s"] is None:
         del about["prompt_s"]
-    means = {f"{name}_s" if name in TIMES else name: cell.mean(name) for name in (*TIMES, *NUMBERS)}
+    means = {name: cell.mean(name) for name in METRICS}
     caution = cell.about("caution")
     return {
         **about,
@@ -33,5 +34,4 @@ def _cell(cell: Timelines) -> dict[str, Any]:
         "plans": cell.n,
         **({} if caution is None else {"caution": caution}),
         **{name: mean for name, mean in means.items() if mean is not None},
-        "p_any_stall": cell.p_any_stall,
     }

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from s2a_bench.experiments.timeline.metrics import METRICS, TIME
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.stats import summary_of
 from s2a_bench.store.requests import TOKENS
@@ -17,39 +18,6 @@ if TYPE_CHECKING:
     from s2a_bench.experiments.latency.view.cells import Floats
     from s2a_bench.stats import Summary
     from s2a_bench.store.run import Run
-
-TIMES = (
-    "start",
-    "end",
-    "stall",
-    "longest_stall",
-    "mean_queue_wait",
-    "longest_queue_wait",
-    "mean_action_age",
-    "oldest_action",
-    "safe_start",
-    "last_arrival",
-    "safe_end",
-    "least_end",
-)
-"""Metrics in time, by their columns less ``_ns``."""
-
-NUMBERS = (
-    "stalls",
-    "stall_ratio",
-    "start_regret",
-    "signed_start_regret",
-    "start_regret_of_wait",
-    "end_regret",
-    "end_regret_of_wait",
-    "end_regret_elastic",
-    "speed_distortion",
-    "fluidity",
-    "rms_jerk",
-    "peak_jerk",
-    "sparc",
-)
-"""The other metrics, by their columns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +53,9 @@ class Timelines:
 
     def values(self, metric: str) -> Floats:
         """Return a metric's values, times in s, one a plan that has it."""
-        if metric in TIMES:
-            return self.rows[f"{metric}_ns"].dropna().to_numpy(dtype="float64") / 1e9
-        return self.rows[metric].dropna().to_numpy(dtype="float64")
+        about = METRICS[metric]
+        values: Floats = self.rows[about.column].dropna().to_numpy(dtype="float64")
+        return values / 1e9 if about.kind == TIME else values
 
     def summary(self, metric: str) -> Summary | None:
         """Summarise a metric; None where no plan has it."""
@@ -101,7 +69,7 @@ class Timelines:
     @property
     def p_any_stall(self) -> float:
         """Return the share of plans that stall at all."""
-        return float(self.rows["any_stall"].astype("float64").mean())
+        return self.mean("p_any_stall") or 0.0
 
     @property
     def token_s(self) -> Floats:
@@ -110,7 +78,7 @@ class Timelines:
 
     def moment_s(self, metric: str) -> float:
         """Return a time of the shown plan in s."""
-        return float(self.rows[f"{metric}_ns"].iloc[0]) / 1e9
+        return float(self.rows[METRICS[metric].column].iloc[0]) / 1e9
 
 
 def timelines_of(run: Run) -> list[Timelines]:

@@ -12,7 +12,7 @@ import json
 from collections.abc import Iterator, Sequence
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, panels, timelines_of
@@ -20,6 +20,7 @@ from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, p
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
+TRACE: Final = "trace.json"
 Event: TypeAlias = dict[str, Any]
 
 
@@ -33,14 +34,12 @@ def to_trace(run: Run) -> dict[str, Any]:
     }
 
 
-def write_trace(run: Run) -> Path:
-    """Write ``trace.json``; raises StoreError."""
-    path = run.path / "trace.json"
+def write_trace(run: Run, path: Path) -> None:
+    """Write the trace; raises StoreError."""
     try:
         path.write_text(json.dumps(to_trace(run), ensure_ascii=False, allow_nan=False), encoding="utf-8")
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror}; the timelines are kept") from error
-    return path
 
 
 def _events(cells: Sequence[Timelines]) -> Iterator[Event]:
@@ -79,8 +78,8 @@ def _tokens(pid: int, tid: int, cell: Timelines) -> Iterator[Event]:
 
 def _skills(pid: int, tid: int, cell: Timelines) -> Iterator[Event]:
     """List waiting, skills and stalls as slices, and S0 as a mark."""
-    yield _instant(pid, tid, "S0", round(cell.moment_s("safe_start") * 1e6))
-    yield from _slice(pid, tid, "waiting", 0, round(cell.moment_s("start") * 1e6), {})
+    yield _instant(pid, tid, "S0", round(cell.moment_s("safe_start_s") * 1e6))
+    yield from _slice(pid, tid, "waiting", 0, round(cell.moment_s("start_s") * 1e6), {})
     for skill in cell.skills.to_dict("records"):
         start_ns, end_ns = skill["start_ns"], skill["end_ns"]
         if skill["stall_ns"]:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.paper import paper_colours
 from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, panels, timelines_of
-from s2a_bench.writers.figures import LINE_CHARS, new_figure, save
+from s2a_bench.writers.figures import LINE_CHARS, new_figure
 from s2a_bench.writers.style import WIDTH_IN
 
 if TYPE_CHECKING:
@@ -78,14 +77,14 @@ def build_timelines(run: Run, cells: Sequence[Timelines]) -> Figure:
 def draw_panel(axes: Axes, cells: Sequence[Timelines], colours: dict[str, str], *, names: bool) -> None:
     """Draw one setting: tokens on top where all policies share them, else above each policy's own skills."""
     shared = len({cell.about("request_id") for cell in cells}) == 1
-    end_s = max(cell.moment_s("end") for cell in cells)
+    end_s = max(cell.moment_s("end_s") for cell in cells)
     if shared:
         _draw_tokens(axes, cells[0], 0.35, -0.35)
     for lane, cell in enumerate(cells, start=1):
         _draw_skills(axes, cell, lane, colours[cell.policy], end_s)
         if not shared:
             _draw_tokens(axes, cell, lane - _LANE / 2, lane - 0.5)
-        safe_s = cell.moment_s("safe_start")
+        safe_s = cell.moment_s("safe_start_s")
         axes.vlines(
             safe_s, 0.5 if shared and lane == 1 else lane - 0.5, lane + 0.5, "black", (0, (2, 1.5)), linewidth=0.9
         )
@@ -109,15 +108,10 @@ def timeline_figures(run: Run) -> dict[str, Callable[[], Figure]]:
     return builders
 
 
-def write_timeline_figures(run: Run) -> list[Path]:
-    """Write ``figures/timeline*.png`` and ``.pdf``."""
-    return save(run.path / "figures", timeline_figures(run))
-
-
 def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: float) -> None:
     """Draw one lane: a line while the robot waits, then skills (what is longer than planned is paler) and stalls."""
     skills = cell.skills.to_dict("records")
-    axes.hlines(lane, 0, cell.moment_s("start"), "#BBBBBB", linewidth=0.8)
+    axes.hlines(lane, 0, cell.moment_s("start_s"), "#BBBBBB", linewidth=0.8)
     ink = "white" if _dark(colour) else "black"
     for skill in skills:
         start, end, stall, nominal = (skill[f"{name}_ns"] / 1e9 for name in ("start", "end", "stall", "nominal"))

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from s2a_bench.experiments.timeline.metrics import COUNT, FLAG, METRICS, SHARE, TIME, TimelineMetric
 from s2a_bench.experiments.timeline.view.cells import (
-    NUMBERS,
-    TIMES,
     Timelines,
     jitter_notes,
     origin_notes,
@@ -21,44 +20,24 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
 _SUMMARY = ("n", "median", "mean", "sd", "p90", "p99")
-_SHARES = {"start_regret", "end_regret", "start_regret_of_wait", "stall_ratio", "end_regret_elastic"}
-"""Shown in percent."""
-
-_EXECUTION = {
-    "start": "start",
-    "end": "end",
-    "stalls": "stalls",
-    "stall": "stalled",
-    "longest_stall": "longest",
-    "start_regret": "late start",
-    "end_regret": "late end",
-}
-_WAITING = {
-    "mean_queue_wait": "queued",
-    "longest_queue_wait": "longest",
-    "mean_action_age": "age",
-    "oldest_action": "oldest",
-    "stall_ratio": "stall ratio",
-    "start_regret_of_wait": "of wait",
-    "end_regret_elastic": "over E_lo",
-}
-_MOTION = {
-    "speed_distortion": "distortion",
-    "fluidity": "fluidity",
-    "rms_jerk": "RMS jerk",
-    "peak_jerk": "peak jerk",
-    "sparc": "SPARC",
-}
+_EXECUTION = ("start_s", "end_s", "stalls", "stall_s", "longest_stall_s", "start_regret", "end_regret")
+_WAITING = (
+    "mean_queue_wait_s",
+    "longest_queue_wait_s",
+    "mean_action_age_s",
+    "oldest_action_s",
+    "stall_ratio",
+    "start_regret_of_wait",
+    "end_regret_elastic",
+)
+_MOTION = ("speed_distortion", "fluidity", "rms_jerk", "peak_jerk", "sparc")
 
 
 def execution_table(run: Run) -> TextTable:
     """Lay out starts, ends, stalls and regrets: means over the plans, in s."""
     cells = timelines_of(run)
     random = any(cell.n > 1 for cell in cells)
-    header, rows, rules = _rows(cells, _EXECUTION)
-    if random:
-        header += ("P(stall)",)
-        rows = [(*row, f"{cell.p_any_stall:.1%}") for row, cell in zip(rows, cells, strict=True)]
+    header, rows, rules = _rows(cells, (*_EXECUTION, *(["p_any_stall"] if random else [])))
     title = f"Timelines{_common(cells)}: times in s{', means' if random else ''}"
     notes = [*origin_notes(run, cells), *_plan_notes(run, cells), *jitter_notes(run)]
     notes.append("stalls: those above 20 ms. late start, late end: regret over S0 and S0 + P_N.")
@@ -117,12 +96,11 @@ def timeline_csv(run: Run) -> dict[str, str]:
     """Return file name -> CSV text in long form, every digit kept, times in s; what is absent has no row."""
     summaries = []
     for cell in timelines_of(run):
-        for metric in (*TIMES, *NUMBERS):
-            if found := cell.summary(metric):
-                name = f"{metric}_s" if metric in TIMES else metric
-                summaries.append((cell.about("cell"), name, *(getattr(found, part) for part in _SUMMARY)))
-        share = cell.p_any_stall
-        summaries.append((cell.about("cell"), "p_any_stall", cell.n, None, share, None, None, None))
+        for name, metric in METRICS.items():
+            if found := cell.summary(name):
+                parts = ("n", "mean") if metric.kind == FLAG else _SUMMARY
+                values = (getattr(found, part) if part in parts else None for part in _SUMMARY)
+                summaries.append((cell.about("cell"), name, *values))
     return {"timelines.csv": csv_text(("cell", "metric", *_SUMMARY), summaries)}
 
 
@@ -132,7 +110,7 @@ def seconds(value: float) -> str:
 
 
 def _rows(
-    cells: Sequence[Timelines], columns: dict[str, str]
+    cells: Sequence[Timelines], metrics: Sequence[str]
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]], frozenset[int]]:
     """Return header, rows and rules: a group of rows a board, L where it begins."""
     rows: list[tuple[str, ...]] = []
@@ -145,21 +123,23 @@ def _rows(
             rules.append(len(rows))
         for place, cell in enumerate(group):
             names = (board if board != last else "", str(tokens) if not place else "", cell.policy)
-            rows.append((*names, *(_entry(cell, metric) for metric in columns)))
+            rows.append((*names, *(_entry(cell, METRICS[name]) for name in metrics)))
             last = board
-    return ("board", "L", "policy", *columns.values()), rows, frozenset(rules[1:])
+    return ("board", "L", "policy", *(METRICS[name].title for name in metrics)), rows, frozenset(rules[1:])
 
 
-def _entry(cell: Timelines, metric: str) -> str:
+def _entry(cell: Timelines, metric: TimelineMetric) -> str:
     """Write a metric's mean."""
-    value = cell.mean(metric)
+    value = cell.mean(metric.name)
     if value is None:
         return ABSENT
-    if metric in TIMES:
+    if metric.kind == TIME:
         return seconds(value)
-    if metric in _SHARES:
+    if metric.kind == FLAG:
+        return f"{value:.1%}"
+    if metric.kind == SHARE:
         return f"{value:.0%}" if abs(value) >= 0.0995 or not value else f"{round(value, 3) + 0.0:.1%}"  # noqa: PLR2004 - two digits
-    if metric == "stalls":
+    if metric.kind == COUNT:
         return f"{value:.0f}" if cell.n == 1 else f"{value:.2f}"
     return number(value)
 

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from s2a_bench.cli.timeline_view import STALL, TimelineView, draw, summary
-from s2a_bench.experiments.timeline.execution import Scene
+from s2a_bench.cli.progress import RunProgress
+from s2a_bench.experiments.timeline.watch import STALL, Scene, draw, summary
+from s2a_bench.progress import watching
 from s2a_bench.runtime.events import AbortAsked, StreamBroke
 from s2a_bench.runtime.record import Record
 from tests.runtime.drive import ns, plan, run
@@ -114,8 +115,8 @@ def test_what_went_wrong_stands_where_the_numbers_would(event: StreamBroke | Abo
 
 
 def test_without_a_terminal_every_policy_gets_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    view = TimelineView()
-    with view, view.show(scene(finished(*THREE))):
+    view = RunProgress()
+    with view, watching(view, scene(finished(*THREE))):
         pass
     said = capsys.readouterr().err.splitlines()
     assert said[0] == "  naive: started at 2.00 s, ended at 9.00 s, 3 stalls of 3.00 s"

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rich.console import Group
-from rich.live import Live
 from rich.text import Text
 
-from s2a_bench.cli.progress import RunProgress
 from s2a_bench.clock import now_ns
 
 if TYPE_CHECKING:
-    from s2a_bench.experiments.timeline.execution import Scene
     from s2a_bench.runtime.record import Record
 
-REFRESHES_HZ = 8
 STATUS = 21
 """Columns to the right of the lanes."""
 LEAST_LANE = 20
@@ -31,27 +26,23 @@ STALL_S = 0.02
 WAITING, SKILL, STALL, TOKEN, COMPLETE, NOW, SAFE = "─█╱·┃│┊"  # noqa: RUF001 - a hatch, not a slash
 
 
-class TimelineView(RunProgress):
-    """Progress of a run, and the timelines that it is executing."""
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What can be watched while it happens: the records grow."""
 
-    @contextmanager
-    def show(self, scene: Scene) -> Iterator[None]:
-        """Show a scene while the context lasts; its last state stays on the terminal."""
-        if not self.console.is_terminal:
-            yield
-            for record in scene.records:
-                self.say(f"  {record.policy}: {summary(record)}")
-            return
-        self._bar.stop()  # one live display at a time
-        try:
-            with Live(
-                get_renderable=lambda: draw(scene, now_ns(), self.console.width),
-                console=self.console,
-                refresh_per_second=REFRESHES_HZ,
-            ):
-                yield
-        finally:
-            self._bar.start()
+    title: str
+    records: Sequence[Record]
+    n_skills: int
+    span_s: float
+    """About how long it takes."""
+
+    def draw(self, width: int) -> Group:
+        """Draw what has happened by now."""
+        return draw(self, now_ns(), width)
+
+    def lines(self) -> Iterator[str]:
+        """Say how each policy's plan went."""
+        return (f"  {record.policy}: {summary(record)}" for record in self.records)
 
 
 def draw(scene: Scene, at_ns: int, width: int) -> Group:

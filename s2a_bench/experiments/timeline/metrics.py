@@ -1,0 +1,134 @@
+"""The metrics of a timeline: the one table that columns, JSON and its schema, CSV, tables and comparison are made of.
+
+A new metric is a row here, and under its name an array of one number a plan in `to_rows.metrics_of`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from s2a_bench.experiments import Better, Metric
+
+TIME, COUNT, FLAG, SHARE, NUMBER = "time", "count", "flag", "share", "number"
+
+
+@dataclass(frozen=True, slots=True)
+class TimelineMetric(Metric):
+    """A metric with its column.
+
+    ``kind`` is `TIME` (kept in whole nanoseconds), `COUNT`, `FLAG` (true or false of a plan: its mean is the share of
+    the plans), `SHARE` (shown in percent) or `NUMBER`. ``about`` says what it is and ``bounds`` between what it lies.
+    A plan may be without an ``optional`` one.
+    """
+
+    kind: str = NUMBER
+    about: str = ""
+    bounds: tuple[float | None, float | None] = (0, None)
+    optional: bool = False
+
+    @property
+    def column(self) -> str:
+        """Name the column that holds it."""
+        if self.kind == TIME:
+            return f"{self.name.removesuffix('_s')}_ns"
+        return self.name.removeprefix("p_") if self.kind == FLAG else self.name
+
+    @property
+    def column_type(self) -> Any:
+        """Return the type of the column."""
+        types: dict[str, Any] = {TIME: int, COUNT: int, FLAG: bool}
+        return types.get(self.kind, float)
+
+    def stored(self, value: float) -> int | float | bool:
+        """Return a value as its column holds it."""
+        if self.kind == TIME:
+            return round(float(value) * 1e9)
+        # Times are exact to a nanosecond, so that what is less of a share is rounding; 0.0 makes -0.0 a zero.
+        plain: int | float | bool = self.column_type(value)
+        return round(plain, 9) + 0.0 if isinstance(plain, float) else plain
+
+    @property
+    def schema(self) -> dict[str, Any]:
+        """Return its entry in the JSON schema."""
+        limits = {"minimum": self.bounds[0], "maximum": self.bounds[1]}
+        about = {"description": self.about} if self.about else {}
+        return {**about, "type": "number", **{key: limit for key, limit in limits.items() if limit is not None}}
+
+
+def _time(name: str, title: str = "", about: str = "", statistic: str = "median") -> TimelineMetric:
+    return TimelineMetric(name, "s", title=title, statistic=statistic, kind=TIME, about=about)
+
+
+def _mean(name: str, title: str = "", about: str = "", better: Better = "lower", **more: Any) -> TimelineMetric:
+    return TimelineMetric(name, "", better, title, "mean", about=about, **more)
+
+
+_UNBOUND: Final = (None, None)
+_SHARE: Final = (0, 1)
+
+METRICS: Final[Mapping[str, TimelineMetric]] = {
+    metric.name: metric
+    for metric in (
+        _time("start_s", "start", "Time to first action, s_1."),
+        _time("end_s", "end", "Completion, e_N."),
+        _time("safe_start_s", about="S0."),
+        _time("last_arrival_s", about="t_N."),
+        _time("safe_end_s", about="S0 + P_N."),
+        _time("least_end_s", about="E_lo."),
+        _mean("stalls", "stalls", "Stalls longer than 20 ms a plan.", kind=COUNT),
+        _mean("p_any_stall", "P(stall)", "Share of the plans that stall at all.", kind=FLAG, bounds=_SHARE),
+        _time("stall_s", "stalled", "All stalls of a plan together.", "mean"),
+        _time("longest_stall_s", "longest", statistic="mean"),
+        _mean(
+            "stall_ratio",
+            "stall ratio",
+            "Stalled share of the time from first action to completion.",
+            kind=SHARE,
+            bounds=_SHARE,
+        ),
+        _mean("start_regret", "late start", "max(0, s_1 - S0) / S0.", kind=SHARE, optional=True),
+        _mean("signed_start_regret", about="(s_1 - S0) / S0.", bounds=_UNBOUND, optional=True),
+        _mean(
+            "start_regret_of_wait",
+            "of wait",
+            "max(0, s_1 - S0) / (t_N - S0); absent where t_N = S0.",
+            kind=SHARE,
+            optional=True,
+        ),
+        _mean("end_regret", "late end", "(e_N - E) / E with E = S0 + P_N.", kind=SHARE, bounds=_UNBOUND),
+        _mean(
+            "end_regret_of_wait", about="(e_N - E) / (t_N - S0); absent where t_N = S0.", bounds=_UNBOUND, optional=True
+        ),
+        _mean(
+            "end_regret_elastic",
+            "over E_lo",
+            "(e_N - E_lo) / E_lo, over the least end that T_min allows.",
+            kind=SHARE,
+            bounds=_UNBOUND,
+        ),
+        _time("mean_queue_wait_s", "queued", "s_i - t_i.", "mean"),
+        _time("longest_queue_wait_s", "longest", statistic="mean"),
+        _time("mean_action_age_s", "age", "s_i - the time of the picture."),
+        _time("oldest_action_s", "oldest"),
+        _mean("speed_distortion", "distortion", "Durations over nominal ones."),
+        _mean("fluidity", "fluidity", "Share of deadlines met (Etalon).", "higher", bounds=_SHARE),
+        _mean(
+            "rms_jerk",
+            "RMS jerk",
+            "Of a model: 1 / s^2 at unit speed; mean over the plans whose skills are kept.",
+            optional=True,
+        ),
+        _mean("peak_jerk", "peak jerk", optional=True),
+        _mean(
+            "sparc",
+            "SPARC",
+            "Spectral arc length: closer to 0 is smoother.",
+            "higher",
+            bounds=(None, 0),
+            optional=True,
+        ),
+    )
+}
+"""The metrics by their names, in the order of their columns."""
