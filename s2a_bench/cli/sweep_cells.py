@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from s2a_bench.cli.experiment import config_of
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments import EXPERIMENTS
 
 if TYPE_CHECKING:
     from s2a_bench.sweep import Command
 
-REAL: dict[str, dict[str, Any] | None] = {
-    "latency": None,
-    "throughput": None,
-    "timeline": {"live": True, "real-time": True},
-    "ccrb": {"simulator": "carla", "live": True},
-    "boundary": {},
-    "study": {},
+VIRTUAL: dict[str, Callable[[Mapping[str, Any]], bool]] = {
+    "latency": lambda _: False,
+    "throughput": lambda _: False,
+    "ccrb": lambda given: not given["live"] and given["simulator"] != "carla",
+    "study": lambda _: True,
 }
-"""Commands that can be swept -> the settings with which they measure; else they compute. None: they always measure."""
+"""Commands by hand that can be swept -> whether one with these parameters computes and measures nothing.
+
+Of an experiment its configuration says so; each can be swept.
+"""
 ENTRY = f"{__name__}:run"
 """Where a worker finds `run`."""
 
@@ -28,7 +31,7 @@ def command_of(name: str, key: str = "command") -> Command:
     """Describe a command; raises UsageError for one that cannot be swept."""
     from s2a_bench.sweep import Command
 
-    known = [each for each in REAL if each in _commands()]
+    known = sorted({*VIRTUAL, *EXPERIMENTS})
     if name not in known:
         raise UsageError(f"{key}: '{name}' is none of {', '.join(known)}")
     flags: dict[str, Any] = {}
@@ -39,7 +42,7 @@ def command_of(name: str, key: str = "command") -> Command:
         long = next(flag for flag in parameter.opts if flag.startswith("--"))
         kind = "value" if not parameter.is_flag else "toggle" if parameter.secondary_opts else "switch"
         flags[long.removeprefix("--")] = kind
-    return Command(name, flags, lambda argv: _check(name, argv), REAL[name])
+    return Command(name, flags, lambda argv: _check(name, argv))
 
 
 def run(argv: Sequence[str]) -> None:
@@ -52,14 +55,15 @@ def run(argv: Sequence[str]) -> None:
         raise UsageError(error.format_message()) from error
 
 
-def _check(name: str, argv: Sequence[str]) -> None:
-    """Parse arguments and run nothing."""
+def _check(name: str, argv: Sequence[str]) -> bool:
+    """Parse arguments and run nothing; return True if the command would compute and measure nothing."""
     from s2a_bench.cli import ParseError
 
     try:
-        _commands()[name].make_context(name, list(argv))
+        given = _commands()[name].make_context(name, list(argv)).params
     except ParseError as error:
         raise UsageError(error.format_message()) from error
+    return VIRTUAL[name](given) if name in VIRTUAL else config_of(EXPERIMENTS[name], given).virtual
 
 
 @cache

@@ -23,11 +23,9 @@ class Command:
     name: str
     flags: Mapping[str, Flag]
     """What can be set, without the dashes."""
-    check: Callable[[Sequence[str]], None]
-    """Parse arguments as the command line does, and run nothing; raises UsageError."""
-    real: Mapping[str, Any] | None
-    """Settings that make a cell measure, as ``live = true`` does; None: every cell does. What does not measure is
-    virtual: computed, so that many may run at once, anywhere."""
+    check: Callable[[Sequence[str]], bool]
+    """Parse arguments as the command line does, and run nothing; raises UsageError. Return True for a cell that is
+    virtual: computed, so that many may run at once, anywhere; False for one that measures."""
 
 
 @dataclass(frozen=True, slots=True)

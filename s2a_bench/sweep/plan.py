@@ -57,13 +57,12 @@ def plan_sweep(file: SweepFile, command: Command, boards: Collection[str] | None
     for repeat, (number, setting) in rounds(here, file.repeats, file.seed):
         argv = _argv(file, command, setting, file.seed + repeat - 1)
         try:
-            command.check(argv[1:])
+            virtual = command.check(argv[1:])
         except UsageError as error:
             raise UsageError(f"{file.path}: {_words(setting)}: {error}") from error
-        real = command.real is None or any(setting.get(key) == value for key, value in command.real.items())
         found = _hash([argv, setting.get(BOARD), [_content(path) for path in _files(setting)]])
         plain = {key: _text(value) if isinstance(value, list) else value for key, value in setting.items()}
-        cells.append(Cell(number, repeat, plain, tuple(argv), not real, setting.get(BOARD, ""), found))
+        cells.append(Cell(number, repeat, plain, tuple(argv), virtual, setting.get(BOARD, ""), found))
     return Plan(command.name, tuple(cells), file.rest_s, file.seed, file.repeats)
 
 

@@ -18,6 +18,7 @@ import pytest
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.store.run import read_run
 from s2a_bench.store.sweep import Sweep, read_sweep
+from tests.experiments.test_timeline import recorded_run
 
 ROOT = Path(__file__).parent.parent.parent
 WAIT_S = 120
@@ -195,15 +196,17 @@ def test_a_changed_file_and_another_machine_are_refused_with_one_line(whole: Swe
 @pytest.mark.slow
 def test_a_failed_cell_keeps_its_error_and_is_retried_when_told(tmp_path: Path) -> None:
     file, output = tmp_path / "f.toml", tmp_path / "results"
+    folder = recorded_run(tmp_path, 120, 12)
     file.write_text(
-        'command = "timeline"\n[settings]\nprofile = "rtx-4080"\n[grid]\nplans = [1, 5]\n'  # 5 equal plans are refused
+        f'command = "timeline"\n[settings]\nrate = 5\ntokens-per-skill = 3\ncalibrate = "{folder}"\n'
+        "[grid]\nn-skills = [4, 5]\n"  # no answer is as long as five skills
     )
     done = sweep(file, "--output", output, code=1)
     assert "1 of 2 cells failed" in done.stderr
-    assert "--plans: without --jitter" in done.stdout.replace("\n", " ")
+    assert "0 of 120 answers" in done.stdout.replace("\n", " ")
     folder = only(output)
     (failed,) = read_sweep(folder).cells.query("state == 'failed'").to_dict("records")
-    assert failed["error"].startswith("--plans: without --jitter or --t-nom-cv all plans are the same")
+    assert failed["error"].startswith("--calibrate: 0 of 120 answers have the 15 tokens")
     assert failed["folder"] == ""
     sweep("--resume", folder, code=1)
     assert len(read_sweep(folder).attempts) == 2
@@ -229,6 +232,14 @@ def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp
     assert bad["state"] == "failed"
     assert "/no/such/file.mp4" in bad["error"]
     assert found["state"] == "failed"
+
+
+def test_a_setting_that_makes_no_sense_is_told_before_anything_runs(tmp_path: Path) -> None:
+    file = tmp_path / "f.toml"
+    file.write_text('command = "timeline"\n[grid]\nplans = [1, 5]\n')
+    done = sweep(file, "--output", tmp_path / "results", code=2)
+    assert "plans=5: --plans: without --jitter or --t-nom-cv all plans are the same" in done.stderr
+    assert not (tmp_path / "results").exists()
 
 
 def test_dry_run_prints_cells_and_time_and_leaves_nothing(many: Path) -> None:
@@ -286,7 +297,7 @@ def test_wrong_use_is_one_line(arguments: list[str], message: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('command = "fly"', "command: 'fly' is none of latency, throughput, timeline"),
+        ('command = "fly"', "command: 'fly' is none of boundary, ccrb, latency"),
         (
             'command = "timeline"\n[settings]\npolicies = "naive"',
             "'policies' is no flag of s2a-bench timeline; did you mean policy?",

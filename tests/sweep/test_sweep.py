@@ -142,7 +142,7 @@ FLAGS = {
     "seed": "value",
     "data-only": "switch",
 }
-COMMAND = Command("fly", FLAGS, lambda _: None, {"live": True})  # type: ignore[arg-type]
+COMMAND = Command("fly", FLAGS, lambda argv: "--live" not in argv)  # type: ignore[arg-type]
 
 
 def plan_of(*settings: dict[str, Any], repeats: int = 1, rest_s: float = 0.0, seed: int = 0, **of: Any) -> Plan:
