@@ -144,7 +144,7 @@ def _about(field: FieldInfo) -> str:
     """Return a field's help, with its default where the text does not speak of it."""
     about = field.description or ""
     default = field.get_default(call_default_factory=False)
-    if "[default" in about or default in (None, "", (), False):
+    if "[default" in about or default is None or default is False or default in ("", ()):
         return about
     values = default if isinstance(default, tuple) else (default,)
     return f"{about} [default: {','.join(f'{each:g}' if isinstance(each, float) else str(each) for each in values)}]"

@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from s2a_bench.cli.timeline_live import DEFAULTS
 
 from s2a_bench.clock import VirtualClock, now_ns
-from s2a_bench.experiments.timeline.live.config import LiveConfig
 from s2a_bench.plan import load_skills
 from s2a_bench.runtime import ROBOTS, events
 from s2a_bench.runtime.callables import Motion
@@ -43,18 +41,6 @@ def test_the_example_program_carries_a_plan_out(
     exec(PROGRAM, {})  # noqa: S102 - our own page
     assert capsys.readouterr().out == "completed [0] ['pick(cup)', 'pick(box)']\n"
     assert clock.now_ns() == 5 + 4 * 10**9
-
-
-def test_the_page_names_every_flag_and_the_defaults_that_hold() -> None:
-    rows = dict(re.findall(r"^\| (`--[^|]+) \|\s*([^|]*?)\s*\|", PAGE, re.MULTILINE))
-    documented = {flag for names in rows for flag in re.findall(r"--([a-z-]+)", names)}
-    elsewhere = {"model", "mmproj", "threads", "gpu-layers", "source", "size"}
-    """As in every command that runs a model."""
-    assert set(DEFAULTS) - elsewhere <= documented
-    for flag in ("warmup", "robot", "engine"):
-        assert rows[f"`--{flag}`"] == str(DEFAULTS[flag])
-    assert rows["`--timeout`"] == f"{DEFAULTS['timeout']:g}"
-    assert rows["`--tokens-per-skill`"] == str(LiveConfig.tokens_per_skill[0])
 
 
 def test_the_page_names_every_outcome() -> None:

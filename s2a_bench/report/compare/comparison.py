@@ -23,7 +23,7 @@ LEVEL: Final = 0.05
 """The chance to call any difference one where there is none, over all comparisons together."""
 
 _UNDECLARED: Final = {
-    name: f"s2a_bench.experiments.{name}.view.compared:COMPARED" for name in ("latency", "throughput", "timeline")
+    name: f"s2a_bench.experiments.{name}.view.compared:COMPARED" for name in ("latency", "throughput")
 }
 """Commands that are no declared experiments yet -> what their runs are compared by."""
 

@@ -1,0 +1,32 @@
+"""The flag tables of docs/ are those of the declarations."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent.parent
+PAGES = [page for page in sorted((ROOT / "docs").glob("*.md")) if "<!-- flags: " in page.read_text(encoding="utf-8")]
+SPEC = importlib.util.spec_from_file_location("docs_flags", ROOT / "tools" / "docs_flags.py")
+assert SPEC is not None
+assert SPEC.loader is not None
+docs_flags = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(docs_flags)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_has_the_flags_as_they_are(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert docs_flags.written(text) == text, "run tools/docs_flags.py"
+
+
+def test_a_table_can_be_of_one_group_or_of_the_others() -> None:
+    live, others = docs_flags.table("timeline", group="Live"), docs_flags.table("timeline", "-", "Live")
+    assert "| `--warmup` | 1 | answers before, which policies learn the rate from |" in live.splitlines()
+    assert "`--pace`" in live
+    assert "`--jitter`" not in live
+    assert "| `--n-skills` | 8 | N, skills a plan; several with commas |" in others.splitlines()
+    assert "`--warmup`" not in others
+    assert "`--output`" in others
