@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,12 +69,12 @@ def live_config(
     from s2a_bench.experiments.timeline.live.config import LiveConfig
     from s2a_bench.harness.plan import LatencyConfig
     from s2a_bench.inference import EngineConfig
-    from s2a_bench.ros.config import domain_id
+    from s2a_bench.transport.http import HTTP
+    from s2a_bench.transport.pipeline import first_variants
 
     value = {**DEFAULTS, **given}
     if "transport" not in given and value["url"]:
-        value["transport"] = "http"
-    transport, _, variant = value["transport"].partition("/")
+        value["transport"] = HTTP.name
     width, height = size_of(value["size"])
     if value["pace"] < 0 or ("pace" in given and not value["pace"]):
         raise UsageError(f"--pace: {value['pace']:g} should be above 0")
@@ -89,20 +88,17 @@ def live_config(
         pace=value["pace"],
     )
     requests = LatencyConfig(
-        transports=listed(transport),
-        http=(variant or "as-deployed",) if transport == "http" else ("as-deployed",),
-        ros=(variant or "topic",) if transport == "ros" else ("topic",),
+        transports=listed(value["transport"]),
+        variants=first_variants(),
+        options={HTTP.name: {"url": value["url"], "dialect": value["dialect"]}},
         source=value["source"],
         width=width,
         height=height,
-        url=value["url"],
-        dialect=value["dialect"],
         engine=engine,
         runs=1,
         warmup=value["warmup"],
         seed=seed,
         timeout_s=value["timeout"],
-        domain_id=domain_id(os.environ),
         sample_resources_hz=0,
     )
     return LiveConfig(

@@ -78,6 +78,9 @@ ENGINES: Final[Registry[Callable[[EngineConfig], Engine]]] = Registry(
 )
 """What builds each engine from its configuration."""
 
+CHECKS: dict[str, str] = {"llama-build": "s2a_bench.inference.checks:llama_build"}
+"""Code -> ``module:function`` of the doctor's checks that are about engines."""
+
 
 def open_engine(config: EngineConfig) -> Engine:
     """Start the engine that ``config`` names; raises UsageError for an unknown name, EngineError otherwise."""

@@ -32,7 +32,7 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.trace import Trace
-from s2a_bench.transport.loopback import LoopbackClient
+from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Frame, Request, Token
 
 SCHEMA = json.loads((Path(__file__).parent.parent.parent / "docs" / "schema" / "s2a-bench-1.json").read_text())
@@ -81,7 +81,6 @@ def config(fast: str) -> LiveConfig:
     """Eight household skills of 30 ms each, written by a replay: naive has to wait for every one of them."""
     requests = LatencyConfig(
         transports=("loopback",),
-        http=("as-deployed",),
         width=64,
         height=48,
         engine=EngineConfig("replay", profile=fast),
@@ -141,7 +140,7 @@ def test_a_replay_over_dds_is_executed_by_three_policies_at_once(
     config: LiveConfig, tmp_path: Path, dds_domain: int, ros: str
 ) -> None:
     pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
-    requests = replace(config.requests, transports=("ros",), ros=(ros,), domain_id=dds_domain)
+    requests = replace(config.requests, transports=(f"ros/{ros}",), options={"ros": {"domain_id": dds_domain}})
     run, _ = live(replace(config, requests=requests), tmp_path)
     check(run, f"ros/{ros}")
 
@@ -152,7 +151,7 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
 ) -> None:
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
     engine = EngineConfig(threads=1, pace=60.0)
-    requests = replace(config.requests, engine=engine, transports=("http",), timeout_s=120.0)
+    requests = replace(config.requests, engine=engine, transports=("http/as-deployed",), timeout_s=120.0)
     asked = replace(config, requests=requests, t_nom_s=(0.05,), task="Tidy up.", plans=2)
     view = Watched()
     run = read_run(run_live(asked, tmp_path / "runs", view))
@@ -319,15 +318,15 @@ def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
         ({"robot": "ros"}, "`robot`: ros follows one policy at a time"),
         ({"tokens_per_skill": (4,)}, "--engine replay writes plans of the household skills in 6 tokens a skill"),
         ({"skills": "driving"}, "--engine replay writes plans of the household skills in 6 tokens a skill"),
-        ({"requests": {"transports": ("http", "ros")}}, "--transport: --live follows one stream"),
-        ({"requests": {"transports": ("ros",), "ros": ("topic", "action")}}, "--transport: --live follows one stream"),
+        ({"requests": {"transports": ("http", "ros")}}, "`transport`: `live` follows one stream"),
+        ({"requests": {"transports": ("ros/topic", "ros/action")}}, "`transport`: `live` follows one stream"),
         ({"engine": {"name": "echo", "profile": ""}}, "--engine echo writes no plans"),
         ({"engine": {"pace": 5.0}}, "--pace: --engine replay has its profile's rate"),
         ({"engine": {"name": "llama", "profile": "", "pace": 1e6}}, "--pace: 1e+06 should be above 0"),
         (
             {
                 "engine": {"name": "llama", "profile": "", "pace": 5.0},
-                "requests": {"transports": ("http",), "url": "http://x"},
+                "requests": {"transports": ("http/best-effort?url=http://x",)},
             },
             "--pace needs our own server",
         ),

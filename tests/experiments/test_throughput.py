@@ -35,10 +35,10 @@ REQUESTS = LatencyConfig(transports=("loopback",), max_tokens=16)
         ({"engine": EngineConfig("echo")}, "--engine echo computes nothing"),
         ({"engine": EngineConfig(kv_type="q8_0", flash_attention="off")}, "--kv-type q8_0 needs flash attention"),
         ({"engine": EngineConfig(batch=1)}, "--batch: 1 is not between 32"),
-        ({"runs": 0}, "--runs: 0"),
+        ({"runs": 0}, "`runs`: 0"),
         (
-            {"engine": EngineConfig(sampling="greedy"), "url": "http://x", "transports": ("http",)},
-            "--sampling greedy is our own engine's",
+            {"engine": EngineConfig(sampling="greedy"), "transports": ("http/best-effort?url=http://x",)},
+            "`sampling` greedy is our own engine's",
         ),
     ],
 )

@@ -44,17 +44,14 @@ class Asked(Options):
 
 def live_config(config: CcrbConfig) -> LiveConfig:
     """Return how the model is asked for the plan of a ccrb run; raises UsageError naming the field."""
-    import os
-
     from s2a_bench.experiments.timeline.live.config import REPLAY_SKILLS, REPLAY_TOKENS, LiveConfig
     from s2a_bench.harness.plan import LatencyConfig
     from s2a_bench.inference import EngineConfig
-    from s2a_bench.ros.config import domain_id
+    from s2a_bench.transport.pipeline import first_variants
 
     asked = config.asked
     if asked.replayed and config.tokens_per_skill != REPLAY_TOKENS:
         raise UsageError(f"`engine` replay writes {REPLAY_TOKENS} tokens a skill; leave out `tokens_per_skill`")
-    transport, _, variant = (asked.transport or "ros").partition("/")
     engine = EngineConfig(
         asked.engine or "llama",
         asked.model,
@@ -64,9 +61,8 @@ def live_config(config: CcrbConfig) -> LiveConfig:
         pace=asked.pace or 0.0,
     )
     requests = LatencyConfig(
-        transports=(transport,),
-        http=(variant or "as-deployed",) if transport == "http" else ("as-deployed",),
-        ros=(variant or "topic",) if transport == "ros" else ("topic",),
+        transports=(asked.transport or "ros",),
+        variants=first_variants(),
         width=SIZE[0],
         height=SIZE[1],
         engine=engine,
@@ -74,7 +70,6 @@ def live_config(config: CcrbConfig) -> LiveConfig:
         warmup=1,
         seed=config.seed,
         timeout_s=60.0,
-        domain_id=domain_id(os.environ),
         sample_resources_hz=0,
     )
     return LiveConfig(

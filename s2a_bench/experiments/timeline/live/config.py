@@ -55,13 +55,13 @@ class LiveConfig:
     @property
     def foreign(self) -> bool:
         """Tell whether somebody else's server answers, whose tokenizer is not at hand."""
-        requests = self.requests
-        return bool(requests.url or requests.action or requests.llama_server)
+        return bool(self.requests.foreign)
 
     @property
     def paper_format(self) -> bool:
         """Tell whether plans are written as in the paper, for want of a tokenizer to choose a format with."""
-        return self.requests.engine.name != "llama" or bool(self.requests.url or self.requests.action)
+        started = any(each.transport.program(each.options) for each in self.requests.pipelines)
+        return self.requests.engine.name != "llama" or (self.foreign and not started)
 
     def settings(self) -> list[tuple[int, int, float | None]]:
         """List what is asked for: tokens a skill, skills, and T_nom in s (None: the set's own)."""
@@ -79,12 +79,8 @@ class LiveConfig:
         requests = self.requests
         requests.check()
         _ = self.skill_set
-        cells = len(requests.transports) * max(
-            len(requests.http_variants) if "http" in requests.transports else 1,
-            len(requests.ros) if "ros" in requests.transports else 1,
-        )
-        if cells != 1:
-            raise UsageError("--transport: --live follows one stream; name one, as ros, ros/action or http/binary")
+        if len(requests.pipelines) != 1:
+            raise UsageError("`transport`: `live` follows one stream; name one, as ros, ros/action or http/binary")
         for policy in self.chosen.values():
             policy.stepper(PlanShape(1, 1, Timing(1.0, 1.0, 1.0)))
         if not self.policies:

@@ -29,7 +29,7 @@ from s2a_bench.runtime import ROBOTS, Robot
 from s2a_bench.runtime.events import StreamBroke
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.runtime.record import Record
-from s2a_bench.store.requests import SAMPLES, TOKENS
+from s2a_bench.store.requests import TOKENS, samples_table
 from s2a_bench.store.run import RunWriter
 
 MODE = "live"
@@ -42,7 +42,7 @@ def run_live(config: LiveConfig, output: Path, view: View) -> Path:
     """
     config.check()
     limit_threads()
-    if config.requests.dds_tuning == "tuned":
+    if config.requests.tuned:
         keep_large_blocks()
     with ExitStack() as stack:
         config, asks = word(config, view)
@@ -51,10 +51,11 @@ def run_live(config: LiveConfig, output: Path, view: View) -> Path:
         stack.callback(source.close)
         manifest = {
             "configuration": {**config.to_manifest(), "engine": requests.to_manifest()["engine"]},
-            "environment": environment.collect(),
+            "stages": requests.stages,
+            "environment": environment.collect(requests.packages),
             "seeds": {"sampling": requests.seed, "source": requests.seed},
         }
-        tables = (TIMELINES, SKILLS, SAMPLES, TOKENS)
+        tables = (TIMELINES, SKILLS, samples_table(requests.stages), TOKENS)
         writer = stack.enter_context(RunWriter.create(output, "timeline", manifest, tables))
         view.opened(writer.path)
         stack.enter_context(quick_switching())
