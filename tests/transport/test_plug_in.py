@@ -13,7 +13,7 @@ from pydantic import Field
 from s2a_bench import registry
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.run import run_latency
-from s2a_bench.experiments.latency.view.as_json import to_json
+from s2a_bench.experiments.latency.view.as_json import latency_json
 from s2a_bench.experiments.latency.view.cells import cells_of
 from s2a_bench.experiments.latency.view.figures import write_figures
 from s2a_bench.experiments.latency.view.tables import stage_table, summary_table
@@ -101,7 +101,7 @@ def test_a_run_measures_it_and_everything_shows_it(run: Run) -> None:
     assert [cell.name for cell in cells_of(run)] == names
     assert ("pack", "greet") in {row[:2] for row in stage_table(run).rows}
     assert summary_table(run).header[-1] == "ratio to loopback"
-    whole = to_json(run)
+    whole = latency_json(run)
     assert "greet" in whole["cells"][0]["stages_ms"]
     assert {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]} == {(name, "loopback") for name in names[:3]}
     assert write_figures(run)
