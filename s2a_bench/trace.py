@@ -10,7 +10,7 @@ first token seen by the client is the mark `return`. Everything is in integer na
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -25,20 +25,17 @@ RESIDUAL = ""
 RESIDUAL_LIMIT = 0.05
 """A sample whose residual is a larger share of its e2e without inference is flagged."""
 
+GROUPS: tuple[str, ...] = (
+    *("capture", "encode", "pack", "network", "ingest", "parse", "decode", "queue", "inference", "server", "return"),
+)
+"""The groups of stages in the order of the path."""
+
 STAGES: dict[str, str] = {
     "capture": "capture",
     "convert": "encode",
     "image_encode": "encode",
-    "base64_encode": "encode",
-    "json_pack": "pack",
-    "cdr_pack": "pack",
     "connect": "network",
     "network": "network",
-    "accept": "network",
-    "ingest": "ingest",
-    "json_parse": "parse",
-    "cdr_parse": "parse",
-    "base64_decode": "decode",
     "image_decode": "decode",
     "yuv_decode": "decode",
     "channel_swap": "decode",
@@ -47,13 +44,24 @@ STAGES: dict[str, str] = {
     "server": "server",
     "return": "return",
 }
-"""Fine stage -> group, in the order of the path. `connect` appears where a client is built per request,
-`accept` where a ROS action's goal has to be accepted before work starts,
-`ingest` where the server is a llama-server (last byte packed -> slot started: network, parse, decode and queue), and
-`server` where it is a black box that tells nothing (last byte packed -> first token)."""
+"""Fine stage -> group, in the order of the path: those that any transport may have; it declares the others itself.
+`connect` appears where a client is built per request, `server` where the server is a black box that tells nothing
+(last byte packed -> first token)."""
 
-GROUPS: tuple[str, ...] = tuple(dict.fromkeys(STAGES.values()))
-"""The groups in the order of the path."""
+
+def path_of(own: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """Join the common stages and those of transports, in the order of the path.
+
+    In each group a transport's own come last on the way out, up to `network`, and first on the way in: what is
+    wrapped last is unwrapped first.
+    """
+    declared = {stage: group for stages in own for stage, group in stages.items() if stage not in STAGES}
+    out = GROUPS.index("network")
+    table: dict[str, str] = {}
+    for place, name in enumerate(GROUPS):
+        for stages in (STAGES, declared) if place <= out else (declared, STAGES):
+            table |= {stage: group for stage, group in stages.items() if group == name}
+    return table
 
 
 @dataclass(slots=True)
@@ -135,20 +143,17 @@ class Budget:
         whole = self.e2e_without_inference_ns
         return None if not whole else self.residual_ns / whole
 
-    def groups_ns(self) -> dict[str, int]:
-        """Sum the stages by group; a group without stages is absent."""
+    def groups_ns(self, table: Mapping[str, str]) -> dict[str, int]:
+        """Sum the stages by group, as a run's table of stages says; a group without stages is absent."""
         groups: dict[str, int] = {}
         for stage, duration in self.stages_ns.items():
-            group = STAGES[stage]
+            group = table[stage]
             groups[group] = groups.get(group, 0) + duration
         return groups
 
 
 def budget(chain: Iterable[Mark]) -> Budget:
-    """Derive the durations of a chain; a stage that was marked twice is the sum of both stretches.
-
-    Raises KeyError for a stage that `STAGES` does not list.
-    """
+    """Derive the durations of a chain; a stage that was marked twice is the sum of both stretches."""
     marks = iter(chain)
     stages: dict[str, int] = {}
     residual = 0
@@ -156,7 +161,6 @@ def budget(chain: Iterable[Mark]) -> Budget:
     previous = first
     for stage, now in marks:
         if stage:
-            STAGES[stage]
             stages[stage] = stages.get(stage, 0) + now - previous
         else:
             residual += now - previous

@@ -74,12 +74,12 @@ app.command("doctor")(doctor.doctor)
 app.command("latency")(latency.latency)
 app.command("throughput")(throughput.throughput)
 app.command("study")(study.study)
+app.command("serve")(serve.serve)
 app.command("sweep")(sweep.sweep)
 app.command("compare")(compare.compare)
 app.command("report")(report.report)
 app.add_typer(model.app, name="model", help="Fetch, make and inspect model files.")
 app.add_typer(profile.app, name="profile", help="Measure this machine as a hardware profile, and look at profiles.")
-app.add_typer(serve.app, name="serve", help="Serve a model over HTTP, or as a ROS 2 node.")
 
 
 @app.callback(invoke_without_command=True)

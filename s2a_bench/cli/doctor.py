@@ -24,7 +24,7 @@ def doctor(
     """Check this machine: state, advice, warnings (with the command that mends them) and errors, one line each."""
     from s2a_bench.machine.doctor import LEVELS, Machine, examine, worst
 
-    findings = examine(replace(Machine(), output=output))
+    findings = examine(replace(Machine(), output=output), all_checks())
     if json_:
         json.dump(_as_json(findings), sys.stdout, indent=2, ensure_ascii=False)
         sys.stdout.write("\n")
@@ -32,6 +32,18 @@ def doctor(
         _show(findings)
     limit = "warning" if strict else "error"
     return int(LEVELS.index(worst(findings)) >= LEVELS.index(limit))
+
+
+def all_checks() -> dict[str, str]:
+    """Return the checks of the machine, then those that engines and transports declare."""
+    from s2a_bench.inference import CHECKS as OF_ENGINES
+    from s2a_bench.machine.doctor import CHECKS
+    from s2a_bench.transport import TRANSPORTS
+
+    checks = {**CHECKS, **OF_ENGINES}
+    for _, transport in TRANSPORTS.loaded():
+        checks |= transport.checks
+    return checks
 
 
 def _show(findings: list[Finding]) -> None:
@@ -61,11 +73,14 @@ def _as_json(findings: list[Finding]) -> dict[str, Any]:
     from s2a_bench.machine import environment
     from s2a_bench.machine.doctor import worst
     from s2a_bench.store.schema import SCHEMA
+    from s2a_bench.transport import TRANSPORTS
+
+    packages = [package for _, transport in TRANSPORTS.loaded() for package in transport.packages]
 
     return {
         "schema": SCHEMA,
         "command": "doctor",
-        "environment": environment.collect(),
+        "environment": environment.collect(packages),
         "worst": worst(findings),
         "checks": [asdict(finding) for finding in findings],
         "warnings": [warning.to_manifest() for warning in warnings_of(findings)],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,13 +21,23 @@ if TYPE_CHECKING:
 
 QUICK = {"runs": 10, "warmup": 2, "max_tokens": 8}
 FULL = {"runs": 50, "warmup": 5, "max_tokens": 32}
+WIRES = {"bgr": "raw", "compressed": "jpeg"}
+"""Values of the former --wire -> those of --payload."""
 
 
 def latency(
-    transport: Annotated[str, typer.Option(help="http, ros, loopback; several with commas")] = "http,ros",
+    transport: Annotated[
+        str,
+        typer.Option(
+            help="http, ros, loopback; several with commas, with /VARIANT and ?OPTION=VALUE: ros/topic?payload=yuyv"
+        ),
+    ] = "http,ros",
     source: Annotated[str, typer.Option(help=f"{', '.join(SOURCES)}, as video:FILE")] = "synthetic",
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the frames")] = "640x480",
-    payload: Annotated[str, typer.Option(help="HTTP picture: jpeg, jpeg-preencoded, png, raw")] = "jpeg",
+    payload: Annotated[
+        str,
+        typer.Option(help="how a picture travels: raw, yuyv, jpeg, jpeg-preencoded, png [default: http jpeg, ros raw]"),
+    ] = "",
     http: Annotated[
         str, typer.Option(help="as-deployed, best-effort, binary; several with commas [default: all]")
     ] = "",
@@ -37,7 +46,7 @@ def latency(
         str, typer.Option(help="an action that runs already, as /llama/generate_response of llama_ros (a black box)")
     ] = "",
     result_timeout: Annotated[float, typer.Option(help="seconds an action's result is kept")] = 60.0,
-    wire: Annotated[str, typer.Option(help="ROS picture: bgr, yuyv, compressed")] = "bgr",
+    wire: Annotated[str, typer.Option(hidden=True)] = "",
     url: Annotated[str, typer.Option(help="a server that runs already (a black box)")] = "",
     dialect: Annotated[
         str,
@@ -100,37 +109,45 @@ def latency(
     from s2a_bench.experiments.latency.run import run_latency
     from s2a_bench.harness.plan import DEFAULT_PROMPT, LatencyConfig
     from s2a_bench.inference import default_engine
-    from s2a_bench.ros.config import domain_id
+    from s2a_bench.transport.http import HTTP
+    from s2a_bench.transport.ros import ROS
 
+    if wire:
+        now = WIRES.get(wire, wire)
+        raise UsageError(f"--wire is gone: write --payload {now}, or for ROS alone --transport 'ros?payload={now}'")
     if against not in {"", "paper"}:
         raise UsageError(f"--against: '{against}' should be paper")
     few = QUICK if quick else FULL
     width, height = size_of(size)
     config = LatencyConfig(
         transports=listed(transport),
-        http=listed(http),
-        ros=listed(ros),
-        action=action,
+        variants={HTTP.name: listed(http), ROS.name: listed(ros)},
+        options={
+            HTTP.name: {
+                "connection": connection,
+                "url": url,
+                "served_model": served_model,
+                "dialect": dialect,
+                "api_key_env": api_key_env,
+                "extra_body": text_or_file(extra_body, "--extra-body"),
+                "llama_server": llama_server,
+                "port": port,
+            },
+            ROS.name: {
+                "action": action,
+                "result_timeout": result_timeout,
+                "middleware": middleware,
+                "qos": qos,
+                "dds_tuning": dds_tuning,
+                "namespace": namespace,
+            },
+        },
+        payload=payload,
+        tuned=dds_tuning == "tuned",
         record=record,
-        result_timeout_s=result_timeout,
         source=source,
         width=width,
         height=height,
-        payload=payload,
-        wire=wire,
-        connection=connection,
-        url=url,
-        served_model=served_model,
-        dialect=dialect,
-        api_key_env=api_key_env,
-        extra_body=text_or_file(extra_body, "--extra-body"),
-        llama_server=llama_server,
-        port=port,
-        middleware=middleware,
-        qos=qos,
-        dds_tuning=dds_tuning,
-        domain_id=domain_id(os.environ),
-        namespace=namespace,
         engine=engine_config(
             name=engine or "llama",
             model=model,
@@ -154,7 +171,7 @@ def latency(
     )
     if not engine and config.own_engine and not llama_server:
         chosen = default_engine(partial(typer.echo, err=True))
-        config = replace(config, engine=replace(config.engine, name=chosen))
+        config = replace(config, engine=config.engine.but(name=chosen))
     config.check()
     with RunProgress() as progress:
         try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,15 +20,17 @@ if TYPE_CHECKING:
 QUICK = {"runs": 3, "warmup": 1, "max_tokens": 32}
 FULL = {"runs": 10, "warmup": 2, "max_tokens": 128}
 
-WHERE = {"in-process": "loopback", "http": "http", "ros": "ros"}
-"""Values of ``--transport`` -> the transport."""
-
 
 def throughput(
-    transport: Annotated[str, typer.Option(help="in-process, http, ros; several with commas")] = "in-process",
+    transport: Annotated[
+        str, typer.Option(help="in-process, http, ros, as in latency; several with commas")
+    ] = "in-process",
     source: Annotated[str, typer.Option(help=f"{', '.join(SOURCES)}, as video:FILE")] = "synthetic",
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the frames")] = "640x480",
-    payload: Annotated[str, typer.Option(help="HTTP picture: jpeg, jpeg-preencoded, png, raw")] = "jpeg",
+    payload: Annotated[
+        str,
+        typer.Option(help="how a picture travels: raw, yuyv, jpeg, jpeg-preencoded, png [default: http jpeg, ros raw]"),
+    ] = "",
     http: Annotated[str, typer.Option(help="as-deployed, best-effort, binary; several with commas")] = "as-deployed",
     ros: Annotated[str, typer.Option(help="topic, action; several with commas")] = "topic",
     action: Annotated[
@@ -86,34 +87,34 @@ def throughput(
 ) -> None:
     """Measure tokens a second: prefill, time to first token, every gap between tokens, decode rate by position."""
     from s2a_bench.cli.progress import RunProgress
-    from s2a_bench.experiments.throughput.run import ThroughputConfig, run_throughput
+    from s2a_bench.experiments.throughput.run import IN_PROCESS, ThroughputConfig, run_throughput
     from s2a_bench.harness.plan import DEFAULT_PROMPT, LatencyConfig
-    from s2a_bench.ros.config import domain_id
+    from s2a_bench.transport.http import HTTP
+    from s2a_bench.transport.loopback import LOOPBACK
+    from s2a_bench.transport.ros import ROS
 
     if against not in {"", "paper"}:
         raise UsageError(f"--against: '{against}' should be paper")
-    for name in listed(transport):
-        if name not in WHERE:
-            raise UsageError(f"--transport: '{name}' is none of {', '.join(WHERE)}")
     few = QUICK if quick else FULL
     width, height = size_of(size)
     requests = LatencyConfig(
-        transports=tuple(WHERE[name] for name in listed(transport)),
-        http=listed(http),
-        ros=listed(ros),
-        action=action,
+        transports=tuple(LOOPBACK.name if name == IN_PROCESS else name for name in listed(transport)),
+        variants={HTTP.name: listed(http), ROS.name: listed(ros)},
+        options={
+            HTTP.name: {
+                "url": url,
+                "served_model": served_model,
+                "dialect": dialect,
+                "api_key_env": api_key_env,
+                "extra_body": text_or_file(extra_body, "--extra-body"),
+                "llama_server": llama_server,
+            },
+            ROS.name: {"action": action, "middleware": middleware},
+        },
         source=source,
         width=width,
         height=height,
         payload=payload,
-        url=url,
-        dialect=dialect,
-        api_key_env=api_key_env,
-        extra_body=text_or_file(extra_body, "--extra-body"),
-        served_model=served_model,
-        llama_server=llama_server,
-        middleware=middleware,
-        domain_id=domain_id(os.environ),
         engine=engine_config(
             name=engine,
             model=model,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from random import Random
@@ -17,11 +16,6 @@ from s2a_bench.trace import RESIDUAL, Mark, Trace
 from s2a_bench.transport import CameraSink
 from s2a_bench.transport.pictures import JPEG_QUALITY, bgr_of
 from s2a_bench.types import Frame
-
-
-def fingerprint(frame: Frame) -> int:
-    """Return a checksum of the picture, to notice one that comes twice."""
-    return zlib.crc32(frame.data.reshape(-1).data)
 
 
 class Feed(Protocol):

@@ -1,27 +1,23 @@
-"""What a latency run is asked to do, checked, and the cells that follow from it."""
+"""What a run of requests is asked to do, checked, and the pipelines that follow from it."""
 
 from __future__ import annotations
 
-import re
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import check_replay
-from s2a_bench.ros import MIDDLEWARES
-from s2a_bench.transport import CONNECTIONS, HTTP_VARIANTS, NAMES, PAYLOADS, QOS_PROFILES, ROS_VARIANTS, WIRES, Route
-from s2a_bench.transport.credentials import read_key
-from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
-from s2a_bench.transport.http.merge import read_patch
+from s2a_bench.trace import path_of
+from s2a_bench.transport import TRANSPORTS, Transport
+from s2a_bench.transport.options import checked
+from s2a_bench.transport.pipeline import Pipeline, pipelines, require_payload
 
 LARGEST = 16_384
-ROS_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
-"""ROS 2's rules for an absolute name."""
 MODES = ("request", "stream")
-TUNINGS = ("tuned", "default")
 
 DEFAULT_PROMPT = """You are a robot task planner.
 Skills: go_to(location), open(object), close(object), pick(object), place(object, location).
@@ -30,41 +26,25 @@ Do not output any explanation."""
 """The paper's prompt (section IV-E)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LatencyConfig:
-    """The settings of one ``s2a-bench latency`` run, as the flags of the same names give them."""
+    """The settings of one run of requests, as the flags of the same names give them."""
 
     transports: tuple[str, ...] = ("http", "ros")
-    http: tuple[str, ...] = ()
-    """Variants; empty: all that the server speaks."""
-    ros: tuple[str, ...] = ("topic",)
-    action: str = ""
-    """The full name of somebody else's action, as a llama_ros node's; then no ROS server is started."""
-    result_timeout_s: float = 60.0
+    """Pipeline names: ``transport[/variant][?option=value&...]``."""
+    variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Transport -> the variants to measure where its name has none; those it measures by default unless told."""
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Transport -> option -> value, for the names that do not say it themselves."""
+    payload: str = ""
+    """How pictures travel over every transport; empty: each its own way."""
+    tuned: bool = True
+    """Whether this process and the servers keep large blocks of memory for the next picture."""
     record: Path | None = None
     """Where what travelled is recorded as MCAP."""
     source: str = "synthetic"
     width: int = 640
     height: int = 480
-    payload: str = "jpeg"
-    wire: str = "bgr"
-    connection: str = "keep-alive"
-    url: str = ""
-    served_model: str = "default"
-    """The model's name in requests to a black box."""
-    dialect: str = ""
-    """What a black box speaks; empty: it is asked."""
-    api_key_env: str = ""
-    """The environment variable that holds a black box's API key, which itself is nowhere kept."""
-    extra_body: str = ""
-    """JSON that is merged into every request to a black box."""
-    llama_server: Path | None = None
-    port: int = 0
-    middleware: str = ""
-    qos: str = "reliable"
-    dds_tuning: str = "tuned"
-    domain_id: int = 0
-    namespace: str = "/s2a_bench"
     engine: EngineConfig = field(default_factory=EngineConfig)
     runs: int = 50
     warmup: int = 5
@@ -78,187 +58,90 @@ class LatencyConfig:
     sample_resources_hz: float = 10.0
     """How often CPU, memory, GPU and power are read beside the run; 0: never."""
 
+    @cached_property
+    def pipelines(self) -> list[Pipeline]:
+        """Return what is compared, a cell each; raises UsageError."""
+        return pipelines(self.transports, {**self.options, "": {"payload": self.payload}}, self.variants)
+
     @property
-    def black_box(self) -> bool:
-        """Tell whether the HTTP server is somebody else's."""
-        return bool(self.url or self.llama_server)
+    def used(self) -> list[Transport[Any]]:
+        """Return the transports, each once."""
+        return list({pipeline.transport.name: pipeline.transport for pipeline in self.pipelines}.values())
+
+    @property
+    def stages(self) -> dict[str, str]:
+        """Return stage -> group of the transports, in the order of the path."""
+        return path_of(transport.stages for transport in self.used)
+
+    @property
+    def packages(self) -> list[str]:
+        """Return the packages whose versions belong beside the results of the transports."""
+        return [package for transport in self.used for package in transport.packages]
 
     @property
     def own_engine(self) -> bool:
         """Whether an engine of ours answers over any transport."""
-        foreign = {"http": self.black_box, "ros": bool(self.action)}
-        return not all(foreign.get(transport, False) for transport in self.transports)
+        return not all(pipeline.black_box for pipeline in self.pipelines)
 
     @property
-    def http_variants(self) -> tuple[str, ...]:
-        """Return the variants to measure."""
-        speaks = HTTP_VARIANTS[:2] if self.black_box else HTTP_VARIANTS
-        return self.http or speaks
+    def foreign(self) -> str:
+        """Return the first option that says that a server is not ours, or nothing."""
+        found = (pipeline.transport.foreign_by(pipeline.options) for pipeline in self.pipelines)
+        return next((name for name in found if name), "")
 
     def check(self) -> None:
-        """Raise UsageError, naming the flag, for a value or combination that makes no sense."""
+        """Raise UsageError, naming the field, for a value or combination that makes no sense."""
         if not self.transports:
-            raise UsageError(f"--transport: name at least one of {', '.join(NAMES)}")
-        _one_of("--transport", self.transports, NAMES)
-        _one_of("--http", self.http, HTTP_VARIANTS)
-        _one_of("--ros", self.ros, ROS_VARIANTS)
-        _one_of("--qos", [self.qos], QOS_PROFILES)
-        _one_of("--middleware", [self.middleware] if self.middleware else [], tuple(MIDDLEWARES))
-        _one_of("--payload", [self.payload], PAYLOADS)
-        _one_of("--wire", [self.wire], WIRES)
-        _one_of("--connection", [self.connection], CONNECTIONS)
-        _one_of("--mode", [self.mode], MODES)
-        _one_of("--dds-tuning", [self.dds_tuning], TUNINGS)
-        for flag, value, least, most in (
-            ("--runs", self.runs, 1, 10**9),
-            ("--warmup", self.warmup, 0, 10**9),
-            ("--max-tokens", self.max_tokens, 1, 2**20),
-            ("--seed", self.seed, 0, 2**31 - 1),
-            ("--timeout", self.timeout_s, 0.1, 86_400),
-            ("--result-timeout", self.result_timeout_s, 0, 86_400),
-            ("--fps", self.fps, 0.1, 1_000),
-            ("--sample-resources", self.sample_resources_hz, 0, 1_000),
+            raise UsageError(f"`transport`: name at least one of {', '.join(TRANSPORTS)}")
+        _one_of("mode", self.mode, MODES)
+        for name, value, least, most in (
+            ("runs", self.runs, 1, 10**9),
+            ("warmup", self.warmup, 0, 10**9),
+            ("max_tokens", self.max_tokens, 1, 2**20),
+            ("seed", self.seed, 0, 2**31 - 1),
+            ("timeout", self.timeout_s, 0.1, 86_400),
+            ("fps", self.fps, 0.1, 1_000),
+            ("sample_resources", self.sample_resources_hz, 0, 1_000),
         ):
             if not least <= value <= most:
-                raise UsageError(f"{flag}: {value} is not between {least} and {most}")
+                raise UsageError(f"`{name}`: {value} is not between {least} and {most}")
         if not (16 <= self.width <= LARGEST and 16 <= self.height <= LARGEST) or self.width % 2:  # noqa: PLR2004
             raise UsageError(
-                f"--size: {self.width}x{self.height} should be 16x16 to {LARGEST}x{LARGEST}, of even width"
+                f"`size`: {self.width}x{self.height} should be 16x16 to {LARGEST}x{LARGEST}, of even width"
             )
-        if not ROS_NAME.fullmatch(self.namespace):
-            raise UsageError(f"--namespace: '{self.namespace}' should look like /name: letters, digits, underscores")
-        for flag, text in (("--prompt", self.prompt), ("--grammar", self.grammar)):
+        for name, text in (("prompt", self.prompt), ("grammar", self.grammar)):
             if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
-                raise UsageError(f"{flag}: the text is not valid UTF-8, or has a NUL")
+                raise UsageError(f"`{name}`: the text is not valid UTF-8, or has a NUL")
         check_replay(self.engine)
-        if self.engine.name == "replay" and (self.black_box or self.action):
-            flag = "--url" if self.url else "--llama-server" if self.llama_server else "--action"
-            raise UsageError(f"--engine replay needs our own servers; leave out {flag}")
-        self._check_black_box()
-        self._check_action()
-        self._check_stream()
-
-    def _check_black_box(self) -> None:
-        if self.url and self.llama_server:
-            raise UsageError("--url and --llama-server name two HTTP servers; give one of them")
-        self._check_dialect()
-        if not self.black_box:
-            return
-        flag = "--url" if self.url else "--llama-server"
-        if "http" not in self.transports:
-            raise UsageError(f"{flag} needs http among --transport")
-        if self.url and not _is_url(self.url):
-            raise UsageError(f"--url: '{self.url}' should start with http:// or https:// and name a host")
-        if "@" in urlsplit(self.url).netloc:
-            raise UsageError("--url: leave the password out, which would be kept with the results; see --api-key-env")
-        payloads = open_dialect(self.dialect or "openai").payloads
-        if self.payload not in payloads:
-            spoken = f"--dialect {self.dialect}" if self.dialect else flag
-            raise UsageError(f"--payload {self.payload}: with {spoken} a picture travels as {' or '.join(payloads)}")
-        if "binary" in self.http:
-            raise UsageError(f"--http binary needs our own server; leave it out with {flag}")
-        if self.llama_server and self.engine.name != "llama":
-            raise UsageError(f"--llama-server runs a model; leave out --engine {self.engine.name}")
-
-    def _check_dialect(self) -> None:
-        given = {"--dialect": self.dialect, "--api-key-env": self.api_key_env, "--extra-body": self.extra_body}
-        for flag, value in given.items():
-            if value and not self.url:
-                raise UsageError(f"{flag} is about a server that runs already; name it with --url")
-        _one_of("--dialect", [self.dialect] if self.dialect else [], tuple(DIALECTS))
-        read_key(self.api_key_env)
-        read_patch(self.extra_body)
-
-    def _check_action(self) -> None:
-        if "ros" in self.transports and not self.ros:
-            raise UsageError(f"--ros: name at least one of {', '.join(ROS_VARIANTS)}")
-        if self.action:
-            if not ROS_NAME.fullmatch(self.action):
-                raise UsageError(f"--action: '{self.action}' should look like /llama/generate_response")
-            if "ros" not in self.transports:
-                raise UsageError("--action needs ros among --transport")
-            if self.mode == "stream":
-                raise UsageError("--action: --mode stream needs our own server, which keeps the camera's newest frame")
-        if self.wire == "compressed" and self.mode == "request" and (self.action or "action" in self.ros):
-            raise UsageError("--wire compressed: a goal carries sensor_msgs/Image; use --wire bgr, or --ros topic")
-
-    def _check_stream(self) -> None:
         if self.record is not None and self.record.exists():
-            raise UsageError(f"--record: {self.record} exists already and is not overwritten; name another")
-        if self.mode == "stream" and self.payload == "jpeg-preencoded":
-            raise UsageError("--payload jpeg-preencoded has no meaning in --mode stream; use jpeg")
+            raise UsageError(f"`record`: {self.record} exists already and is not overwritten; name another")
+        for pipeline in self.pipelines:
+            self._check(pipeline)
+        if self.engine.name == "replay" and self.foreign:
+            raise UsageError(f"`engine` replay needs our own servers; leave out `{self.foreign}`")
+        self._check_unused()
+
+    def _check(self, pipeline: Pipeline) -> None:
+        """Check one cell against the settings of the run."""
+        pipeline.transport.check(pipeline.variant, pipeline.options, mode=self.mode, engine=self.engine.name)
+        require_payload(pipeline)
+        if self.mode == "stream" and pipeline.payload == "jpeg-preencoded":
+            raise UsageError("`payload` jpeg-preencoded has no meaning in `mode` stream; use jpeg")
+
+    def _check_unused(self) -> None:
+        """Refuse a server of somebody else's that nobody would ask."""
+        for name in self.options.keys() - {transport.name for transport in self.used}:
+            transport = TRANSPORTS[name]
+            if field_ := transport.foreign_by(checked(transport.options, self.options[name], name)):
+                raise UsageError(f"`{field_}` needs {name} among `transport`")
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return the settings as plain data."""
-        return {
-            **asdict(self),
-            "engine": self.engine.to_manifest(),
-            "http": list(self.http_variants),
-            "size": f"{self.width}x{self.height}",
-        }
+        """Return the settings as plain data, with what every pipeline came to be told."""
+        told = {each.name: each.options.model_dump(mode="json", exclude_defaults=True) for each in self.pipelines}
+        size = f"{self.width}x{self.height}"
+        return {**asdict(self), "engine": self.engine.to_manifest(), "pipelines": told, "size": size}
 
 
-def _is_url(text: str) -> bool:
-    """Tell whether a text names an HTTP server."""
-    try:
-        parts = urlsplit(text)
-        return parts.scheme in {"http", "https"} and bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        return False
-
-
-def _one_of(flag: str, values: tuple[str, ...] | list[str], known: tuple[str, ...]) -> None:
-    for value in values:
-        if value not in known:
-            raise UsageError(f"{flag}: '{value}' is none of {', '.join(known)}")
-
-
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """One thing that is compared: a pipeline with its settings."""
-
-    name: str
-    route: Route
-    payload: str
-    """What travels: the HTTP payload, the ROS wire format, or nothing for loopback."""
-
-
-def route_of(config: LatencyConfig, transport: str, address: str) -> Route:
-    """Return how a transport is wired in a run, for its server and, with a variant added, for its clients."""
-    return Route(
-        transport=transport,
-        address=address,
-        payload=config.payload,
-        wire=config.wire,
-        connection=config.connection,
-        middleware=config.middleware,
-        qos=config.qos,
-        dds_tuning=config.dds_tuning,
-        domain_id=config.domain_id,
-        max_tokens=config.max_tokens,
-        result_timeout_s=config.result_timeout_s,
-        timeout_s=config.timeout_s,
-        model=config.served_model,
-        dialect="llama-server" if config.llama_server else config.dialect,
-        api_key_env=config.api_key_env,
-        extra_body=config.extra_body,
-    )
-
-
-def plan_cells(config: LatencyConfig, addresses: dict[str, str]) -> list[Cell]:
-    """List the cells of a run; ``addresses`` maps each transport to where its server is."""
-    cells = []
-    for transport in config.transports:
-        route = route_of(config, transport, addresses[transport])
-        if transport == "http":
-            cells += [
-                Cell(f"http/{variant}", replace(route, variant=variant, black_box=config.black_box), config.payload)
-                for variant in config.http_variants
-            ]
-        elif transport == "ros":
-            variants = ("action",) if config.action else config.ros
-            route = replace(route, action=config.action, black_box=bool(config.action))
-            cells += [Cell(f"ros/{variant}", replace(route, variant=variant), config.wire) for variant in variants]
-        else:
-            cells.append(Cell(transport, route, ""))
-    return cells
+def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise UsageError(f"`{name}`: '{value}' is none of {', '.join(known)}")

@@ -25,6 +25,7 @@ from s2a_bench.harness.llama_flags import llama_flags
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.models import ModelFiles, load_headers, sha256
+from s2a_bench.transport import Program
 
 READY_TIMEOUT_S = 600.0
 """A model of several GB may have to come from a slow disk."""
@@ -109,9 +110,9 @@ class ServerProcess(ABC):
 class OwnServer(ServerProcess):
     """Our instrumented server."""
 
-    def __init__(self, job: ServerJob, log: Path) -> None:
+    def __init__(self, name: str, job: ServerJob, log: Path) -> None:
         """Start it and tell it its job."""
-        super().__init__(job.route.transport, [sys.executable, "-m", "s2a_bench.harness.serving"], log)
+        super().__init__(name, [sys.executable, "-m", "s2a_bench.harness.serving"], log)
         assert self._process.stdin is not None  # noqa: S101 - opened as a pipe above
         self._process.stdin.write(job.to_json().encode() + b"\n")
         self._process.stdin.flush()
@@ -150,15 +151,15 @@ class LlamaServer(ServerProcess):
     _speaks_json = False
     _cure = COMPILE_AGAIN
 
-    def __init__(self, binary: Path, engine: EngineConfig, port: int, log: Path, *, has_grammar: bool) -> None:
-        """Start the binary on ``port``, or any free one for 0; raises UsageError when it cannot be run.
+    def __init__(self, program: Program, engine: EngineConfig, log: Path, *, has_grammar: bool) -> None:
+        """Start the program on its port, or any free one for 0; raises UsageError when it cannot be run.
 
         Without a grammar dummy weights, which end at random, are kept going to the token limit, as by our own engine.
         """
-        if not (binary.is_file() and os.access(binary, os.X_OK)):
-            raise UsageError(f"--llama-server: {binary} is no program that can be run")
-        port = _free_port(port)
-        command = [str(binary), *llama_flags(engine), "--mmproj", str(engine.mmproj)]
+        if not (program.path.is_file() and os.access(program.path, os.X_OK)):
+            raise UsageError(f"`llama_server`: {program.path} is no program that can be run")
+        port = _free_port(program.port)
+        command = [str(program.path), *llama_flags(engine), "--mmproj", str(engine.mmproj)]
         command += ["--host", "127.0.0.1", "--port", str(port), "--ctx-size", str(engine.context), "--parallel", "1"]
         if engine.gpu_layers == 0:
             command.append("--no-mmproj-offload")
@@ -185,6 +186,10 @@ class LlamaServer(ServerProcess):
         raise ServerDied(f"llama-server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
 
 
+PROGRAMS: dict[str, type[LlamaServer]] = {"llama-server": LlamaServer}
+"""Kind of a transport's `Program` -> how it is started."""
+
+
 def _described(files: ModelFiles) -> dict[str, Any]:
     """Return what the manifest says about the model files of a server that says nothing itself."""
     return {
@@ -205,7 +210,7 @@ def _free_port(wanted: int) -> int:
             probe.listen()
         except OSError as error:
             raise PortInUse(
-                f"--port: {wanted} cannot be had on 127.0.0.1 ({error.strerror}); choose another, or 0 for any free one"
+                f"`port`: {wanted} cannot be had on 127.0.0.1 ({error.strerror}); choose another, or 0 for any free one"
             ) from error
         port: int = probe.getsockname()[1]
         return port

@@ -8,11 +8,14 @@ while a sample is measured; in stream mode, which has no pauses, a thread writes
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from s2a_bench.clock import realtime_offset_ns
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.record import Recorder
+from s2a_bench.transport.ros import ROS
 from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA, FRAME_ID
 from s2a_bench.transport.ros.wire import request_message, token_message
 from s2a_bench.types import Frame, Request, Token
@@ -21,10 +24,10 @@ from s2a_bench.types import Frame, Request, Token
 class RunRecorder:
     """The recording of one run. Use as a context manager."""
 
-    def __init__(self, path: Path, namespace: str, *, live: bool) -> None:
-        """Create the file; raises StoreError, naming ``--record``."""
+    def __init__(self, path: Path, options: Mapping[str, Mapping[str, Any]], *, live: bool) -> None:
+        """Create the file, for the namespace that ROS's ``options`` have; raises StoreError, naming the path."""
         self._recorder = Recorder(path, live=live)
-        self._namespace = namespace
+        self._namespace = ROS.options(**options.get(ROS.name, {})).namespace
         self._offset_ns = realtime_offset_ns()
 
     def frame(self, frame: Frame) -> None:
@@ -34,7 +37,7 @@ class RunRecorder:
             message = ros.image_message(frame, stamp_ns, FRAME_ID)
             self._recorder.write(self._namespace + CAMERA, ros.IMAGE, message, stamp_ns)
         else:
-            message = ros.compressed_image_message(frame.data, stamp_ns, FRAME_ID)
+            message = ros.compressed_image_message(frame.data, stamp_ns, FRAME_ID, frame.encoding)
             self._recorder.write(self._namespace + COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE, message, stamp_ns)
 
     def answer(self, cell: str, request: Request, asked_ns: int, tokens: list[tuple[Token, int]], error: str) -> None:

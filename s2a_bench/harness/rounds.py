@@ -15,7 +15,7 @@ from s2a_bench.errors import TransportError
 from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.harness.backoff import Backoff
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
-from s2a_bench.harness.plan import LatencyConfig, plan_cells
+from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Place, Session
@@ -47,8 +47,8 @@ class Task:
     command: str
     facts: Mapping[str, Any] = field(default_factory=dict)
     """Goes into the manifest's ``configuration``."""
-    names: Mapping[str, str] = field(default_factory=dict)
-    """What the command calls a cell."""
+    in_process: str = ""
+    """What the command calls a cell whose server is in this process; empty: its own name."""
     others: Callable[[LatencyConfig, RunWriter, Sequence[Session]], Sequence[Slot]] = lambda *_: ()
     """Makes what else has a turn in every block; the config has the model files that were found."""
 
@@ -60,10 +60,10 @@ def run_requests(task: Task, config: LatencyConfig, output: Path, progress: Prog
     """
     if config.own_engine:
         need_engine(config.engine.name)
-    if config.llama_server:
+    if any(pipeline.transport.program(pipeline.options) for pipeline in config.pipelines):
         extras.need("gguf", "model")
     limit_threads()
-    malloc_tuned = config.dds_tuning == "tuned" and keep_large_blocks()
+    malloc_tuned = config.tuned and keep_large_blocks()
     with ExitStack() as stack:
         sources = _Sources(config, stack)
         manifest = _manifest(task, config, malloc_tuned=malloc_tuned)
@@ -85,9 +85,10 @@ def _with_model(config: LatencyConfig, progress: Progress) -> LatencyConfig:
 def _manifest(task: Task, config: LatencyConfig, *, malloc_tuned: bool) -> dict[str, Any]:
     return {
         "configuration": {**config.to_manifest(), **task.facts},
-        "environment": environment.collect(),
+        "stages": config.stages,
+        "environment": environment.collect(config.packages),
         "seeds": dict.fromkeys(("order", "sampling", "source", "bootstrap"), config.seed),
-        "tuning": {"dds": config.dds_tuning, "malloc_keeps_large_blocks": malloc_tuned},
+        "tuning": {"dds": "tuned" if config.tuned else "default", "malloc_keeps_large_blocks": malloc_tuned},
         "cadence": "closed loop, the next request when the last is done"
         if config.mode == "request"
         else f"closed loop over an open-loop camera at {config.fps:g} Hz, prompts at random moments",
@@ -120,12 +121,12 @@ class _Sources:
 def _measure(task: Task, config: LatencyConfig, sources: _Sources, writer: RunWriter, progress: Progress) -> None:
     """Start the servers, measure all blocks, and write down what there is to warn of."""
     machine = Machine(output=writer.path)
-    uses_dds = "ros" in config.transports
-    warnings = before_run(config.width, config.height, uses_dds=uses_dds, machine=machine)
-    before = Counters.read(uses_dds=uses_dds)
+    watches_udp = any(transport.watches_udp for transport in config.used)
+    warnings = before_run(config, machine)
+    before = Counters.read(watches_udp=watches_udp)
     guard = SampleGuard()
     with ExitStack() as stack:
-        progress.stage(f"starting {len(config.transports)} servers")
+        progress.stage(f"starting {len(config.used)} servers")
         servers = ServerSet(config, stack, writer.path)
         facts = servers.start()
         writer.update(
@@ -146,7 +147,7 @@ def _measure(task: Task, config: LatencyConfig, sources: _Sources, writer: RunWr
                     last = guard.last_error(session.cell.name)
                     raise TransportError(f"no request of {session.cell.name} succeeded, at last with {last}")
         finally:
-            warnings += [*guard.warnings(), *Counters.read(uses_dds=uses_dds).warnings_since(before)]
+            warnings += [*guard.warnings(), *Counters.read(watches_udp=watches_udp).warnings_since(before)]
             sampler.flush(writer)
             writer.update(warnings=[warning.to_manifest() for warning in warnings], resources=sampler.describe())
 
@@ -157,16 +158,16 @@ def _sessions(
     """Open a client and a feed for each cell, and the recording if one is wanted."""
     recorder: RunRecorder | None = None
     if config.record is not None:
-        recorder = stack.enter_context(RunRecorder(config.record, config.namespace, live=config.mode == "stream"))
+        recorder = stack.enter_context(RunRecorder(config.record, config.options, live=config.mode == "stream"))
     clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
     camera: Camera | None = None
     if config.mode == "stream":
         camera = Camera(sources.open(), config.fps, on_frame=recorder.frame if recorder else None)
         camera.start()
         stack.callback(camera.stop)
-    for cell in plan_cells(config, servers.addresses):
-        with servers.death_explained(cell.route.transport):
-            client = open_client(cell.route, servers.alive(cell.route.transport))
+    for cell in config.pipelines:
+        with servers.death_explained(cell):
+            client = open_client(servers.wiring(cell), servers.alive(cell))
         clients.callback(client.close)
         feed: Feed
         if camera is not None:
@@ -174,8 +175,8 @@ def _sessions(
             feed = StreamFeed(camera, client.camera, int(1e9 / config.fps), random)
         else:
             feed = RequestFeed(sources.open(), preencoded=cell.payload == "jpeg-preencoded")
-        named = replace(cell, name=task.names.get(cell.name, cell.name))
-        yield Session(named, client, feed, config, recorder, sampler)
+        name = task.in_process if cell.transport.in_process and task.in_process else cell.name
+        yield Session(replace(cell, name=name), client, feed, config, recorder, sampler)
 
 
 def run_blocks(slots: Sequence[Slot], others: Sequence[Slot], config: LatencyConfig, progress: Progress) -> None:
@@ -211,7 +212,7 @@ def _slot(
         sampler.flush(writer)
         _write_frames(writer, session.frames())
         guard.see(measured.sample, measured.fingerprint)
-        servers.raise_if_dead(session.cell.route.transport, suspect=bool(measured.sample.error))
+        servers.raise_if_dead(session.cell, suspect=bool(measured.sample.error))
         if measured.fatal is not None:
             raise measured.fatal
         if guard.failures_in_a_row(session.cell.name) >= GIVE_UP_AFTER:

@@ -12,22 +12,29 @@ import os
 import signal
 import sys
 from collections.abc import Generator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from threading import Lock, Thread
 from typing import Any
 
-from s2a_bench.clock import now_ns
+from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import S2AError
+from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
 from s2a_bench.trace import RESIDUAL, Trace
-from s2a_bench.transport import Handler, Route, open_server
+from s2a_bench.transport import Handler, Wiring, open_server
 from s2a_bench.types import Request, Token
 
+PAUSE_NS = 5_000_000
+"""Between the last token and the checksum, which would compete with the sending of tokens for a core."""
 
-def engine_handler(engine: Engine) -> Handler:
-    """Make the handler that lets one request at a time into the engine and marks `queue` and `inference`."""
-    free = Lock()
+
+def engine_handler(engine: Engine, *, pixels: bool = True) -> Handler:
+    """Make the handler that lets one request at a time into the engine and marks `queue` and `inference`.
+
+    With ``pixels`` it also tells the checksum of the picture, once all tokens are on their way.
+    """
+    free, clock = Lock(), SystemClock()
 
     def handle(request: Request, trace: Trace) -> Generator[Token, None, None]:
         trace.mark(RESIDUAL)
@@ -44,29 +51,31 @@ def engine_handler(engine: Engine) -> Handler:
             trace.facts.update(engine.facts)
         finally:
             free.release()
+        if pixels and len(request.images) == 1:
+            clock.sleep_until_ns(now_ns() + PAUSE_NS)
+            trace.facts[RGB_ENGINE] = float(fingerprint(request.images[0]))
 
     return handle
 
 
 @dataclass(frozen=True, slots=True)
 class ServerJob:
-    """What a server process is told: which route, which engine, and whether memory is tuned."""
+    """What a server process is told: which pipeline, which engine, and whether memory is tuned."""
 
-    route: Route
+    wiring: Wiring[Any]
     engine: EngineConfig
     tuned: bool = True
 
     def to_json(self) -> str:
         """Write as one line."""
-        return json.dumps(
-            {"route": asdict(self.route), "engine": self.engine.model_dump(mode="json"), "tuned": self.tuned}
-        )
+        told = {"wiring": self.wiring.to_json(), "engine": self.engine.model_dump(mode="json"), "tuned": self.tuned}
+        return json.dumps(told)
 
     @staticmethod
     def from_json(line: str) -> ServerJob:
         """Read what `to_json` wrote."""
         fields: dict[str, Any] = json.loads(line)
-        return ServerJob(Route(**fields["route"]), EngineConfig(**fields["engine"]), fields["tuned"])
+        return ServerJob(Wiring.from_json(fields["wiring"]), EngineConfig(**fields["engine"]), fields["tuned"])
 
 
 def main() -> int:
@@ -79,7 +88,7 @@ def main() -> int:
     try:
         keeps = job.tuned and keep_large_blocks()
         engine = open_engine(job.engine)
-        server = open_server(job.route, engine_handler(engine))
+        server = open_server(job.wiring, engine_handler(engine))
     except S2AError as error:
         print(json.dumps({"error": str(error), "kind": type(error).__name__}), file=answers, flush=True)
         return error.exit_code

@@ -7,13 +7,16 @@ from itertools import pairwise
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, RequestFailed, S2AError, ServerDied, SourceError, UsageError
-from s2a_bench.harness.feed import Feed, StreamedFrame, StreamFeed, fingerprint
-from s2a_bench.harness.plan import Cell, LatencyConfig
+from s2a_bench.harness.feed import Feed, StreamedFrame, StreamFeed
+from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint
+from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.machine.resources.sampler import Sampler
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import Mark, Trace
 from s2a_bench.transport import Client
+from s2a_bench.transport.options import LOSSLESS
+from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.types import Frame, Request, Token
 
 FATAL = (ServerDied, SourceError, UsageError, EngineError)
@@ -52,7 +55,7 @@ class Session:
 
     def __init__(
         self,
-        cell: Cell,
+        cell: Pipeline,
         client: Client,
         feed: Feed,
         config: LatencyConfig,
@@ -67,6 +70,7 @@ class Session:
         self._recorder = recorder
         self._sampler = sampler or Sampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
+        self._stages = {*config.stages}
         self.prompt_n = 0
         """Tokens of the last prompt, pictures included; 0 where nobody says."""
 
@@ -122,14 +126,17 @@ class Session:
             index, captured_ns, picture = -1, -1, place.block
         if isinstance(self.feed, StreamFeed) and streamed is None:
             error = error or "RequestFailed: the server knew no frame of this camera"
+        rgb_source = None if frame is None else rgb_fingerprint(frame)
+        rgb_engine = _whole(facts.pop(RGB_ENGINE, None))
+        error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)
         self.prompt_n = _whole(facts.get("prompt_n")) or self.prompt_n
         sample = SampleRow(
             cell=self.cell.name,
-            pipeline=self.cell.route.transport,
-            variant=self.cell.route.variant,
+            pipeline=self.cell.transport.name,
+            variant=self.cell.variant,
             payload=self.cell.payload,
-            connection=self.cell.route.connection if self.cell.route.transport == "http" else "",
+            connection=getattr(self.cell.options, "connection", ""),
             engine=config.engine.name,
             mode=config.mode,
             size=f"{config.width}x{config.height}",
@@ -146,6 +153,8 @@ class Session:
             cache_n=_whole(facts.get("cache_n")),
             prompt_n=_whole(facts.get("prompt_n")),
             server_prompt_ms=facts.get("prompt_ms"),
+            rgb_source=rgb_source,
+            rgb_engine=rgb_engine,
             payload_bytes=_whole(facts.get("payload_bytes")),
             facts=facts,
         )
@@ -163,6 +172,14 @@ class Session:
             for position, (token, client_ns) in enumerate(seen)
         ]
         return Measured(sample, tokens, picture)
+
+    def _doubt(self, trace: Trace, rgb_source: int | None, rgb_engine: int | None) -> str:
+        """Return why a request that was answered is none that counts, or nothing."""
+        if unknown := {stage for stage, _ in trace.chain() if stage} - self._stages:
+            return f"TransportError: {self.cell.transport.name} does not declare the stage {', '.join(sorted(unknown))}"
+        if self.cell.payload in LOSSLESS and None not in {rgb_source, rgb_engine} and rgb_source != rgb_engine:
+            return "TransportError: the engine saw other pixels than the camera gave, though nothing should be lost"
+        return ""
 
     def _streamed(self, trace: Trace, request_id: str) -> StreamedFrame | None:
         """Find the camera frame that the answer is about, and complete its marks with the server's."""

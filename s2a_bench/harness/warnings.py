@@ -8,23 +8,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from s2a_bench.clock import realtime_offset_ns
-from s2a_bench.machine.doctor import BEFORE_RUN, Finding, Machine, examine
+from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Finding, Machine, examine
 from s2a_bench.machine.doctor.robot import RMEM_WANTED
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import RESIDUAL_LIMIT, budget
 
-LARGE_PICTURE = 640 * 480
-"""Pixels above which DDS needs more receive buffer than Linux gives by default."""
 CLOCK_STEP_NS = 50_000_000
 HEADERS_OFF_MS, HEADERS_OFF_SHARE = 20.0, 0.25
 """Beyond both, a llama-server's headers did not leave when its slot started."""
 
 
-def before_run(width: int, height: int, *, uses_dds: bool, machine: Machine | None = None) -> list[RunWarning]:
-    """Return the doctor's warnings that concern a run, for pictures of this size in pixels."""
-    codes = [*BEFORE_RUN, *(["rmem-max"] if uses_dds and width * height > LARGE_PICTURE else [])]
-    return warnings_of(examine(machine or Machine(), codes))
+def before_run(config: LatencyConfig | None = None, machine: Machine | None = None) -> list[RunWarning]:
+    """Return the doctor's warnings that concern any run, and those that concern the transports of one of requests."""
+    checks = {code: CHECKS[code] for code in BEFORE_RUN}
+    if config is not None:
+        for transport in config.used:
+            checks |= {code: transport.checks[code] for code in transport.before_run(config.width, config.height)}
+    return warnings_of(examine(machine or Machine(), checks))
 
 
 def warnings_of(findings: Iterable[Finding]) -> list[RunWarning]:
@@ -42,12 +44,12 @@ class Counters:
     realtime_offset_ns: int = 0
 
     @staticmethod
-    def read(*, uses_dds: bool = True) -> Counters:
-        """Read them all; without DDS the packets that the machine dropped were somebody else's."""
+    def read(*, watches_udp: bool = True) -> Counters:
+        """Read them all; without a transport on UDP the packets that the machine dropped were somebody else's."""
         throttles = [_number(path) or 0 for path in _cpu_files("thermal_throttle/core_throttle_count")]
         suspended = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(time.CLOCK_MONOTONIC)
         return Counters(
-            _receive_buffer_errors() if uses_dds else None,
+            _receive_buffer_errors() if watches_udp else None,
             sum(throttles) if throttles else None,
             suspended,
             realtime_offset_ns(),

@@ -50,6 +50,9 @@ ENGINES: Final[Registry[Callable[[EngineConfig], Engine]]] = Registry(
 )
 """What builds each engine from its configuration."""
 
+CHECKS: dict[str, str] = {"llama-build": "s2a_bench.inference.checks:llama_build"}
+"""Code -> ``module:function`` of the doctor's checks that are about engines."""
+
 
 class EngineConfig(Options):
     """Which engine, on which files, with which settings; plain data, so that a server process can be told."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -14,24 +15,14 @@ from s2a_bench.machine.doctor import Machine
 from s2a_bench.machine.doctor.gpu import current_power_mode, identity, nvml
 
 PACKAGES = (
-    "cyclonedds",
-    "fastapi",
-    "httptools",
-    "httpx",
     "huggingface-hub",
-    "json-numpy",
     "llama-cpp-python",
     "numpy",
     "nvidia-ml-py",
     "opencv-python-headless",
-    "orjson",
-    "pybase64",
     "pydantic",
-    "rosbags",
-    "starlette",
-    "uvicorn",
-    "uvloop",
 )
+"""The packages that matter to every result; transports name their own."""
 ROS_VARIABLES = (
     "ROS_DISTRO",
     "ROS_DOMAIN_ID",
@@ -49,8 +40,8 @@ KERNEL_FACTS = {
 }
 
 
-def collect() -> dict[str, Any]:
-    """Read the environment."""
+def collect(packages: Iterable[str] = ()) -> dict[str, Any]:
+    """Read the environment, and the versions of these packages besides."""
     facts: dict[str, Any] = {
         "s2a_bench": __version__,
         "host": platform.node(),
@@ -63,7 +54,7 @@ def collect() -> dict[str, Any]:
         "affinity": sorted(os.sched_getaffinity(0)),
         "load": [round(value, 2) for value in os.getloadavg()],
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
-        "packages": {name: found for name in PACKAGES if (found := _version(name))},
+        "packages": {name: found for name in sorted({*PACKAGES, *packages}) if (found := _version(name))},
         "ros": {name: os.environ[name] for name in ROS_VARIABLES if name in os.environ},
         "gpus": _gpus(),
         "power_mode": (current_power_mode(Machine()) or ("",))[0],

@@ -171,9 +171,10 @@ def image_message(frame: Frame, stamp_ns: int, frame_id: str) -> Any:
     )
 
 
-def compressed_image_message(data: Pixels, stamp_ns: int, frame_id: str) -> Any:
-    """Wrap a JPEG as sensor_msgs/CompressedImage."""
-    return message(COMPRESSED_IMAGE, header=_header(stamp_ns, frame_id), format="bgr8; jpeg compressed bgr8", data=data)
+def compressed_image_message(data: Pixels, stamp_ns: int, frame_id: str, coding: str = "jpeg") -> Any:
+    """Wrap a JPEG or PNG as sensor_msgs/CompressedImage, its format in the words of compressed_image_transport."""
+    format_ = f"bgr8; {coding} compressed bgr8"
+    return message(COMPRESSED_IMAGE, header=_header(stamp_ns, frame_id), format=format_, data=data)
 
 
 def frame_of_image(image: Any, index: int = -1) -> Frame:

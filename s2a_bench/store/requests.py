@@ -7,20 +7,23 @@ derived column is null.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
 from s2a_bench.store.schema import Kind, Table, Value
-from s2a_bench.trace import STAGES, Budget, Mark, budget
+from s2a_bench.trace import Budget, Mark, budget
 
 
 @dataclass(frozen=True, slots=True)
 class SampleRow:
     """One request: which cell, where in the run, its whole chain of marks, and what is known besides.
 
-    ``cell`` is what is compared, e.g. ``http/as-deployed``. ``payload`` is what travels: jpeg, jpeg-preencoded, png
-    or raw over HTTP; bgr, yuyv or compressed over ROS; none for loopback. An empty ``error`` means that the
-    request succeeded. ``frame_age_ns`` is the frame's age when inference starts.
+    ``cell`` is what is compared, e.g. ``http/as-deployed``. ``payload`` is what travels: raw, yuyv, jpeg,
+    jpeg-preencoded or png, nothing for loopback; folders that older versions wrote say bgr for raw and compressed
+    for jpeg over ROS. An empty ``error`` means that the request succeeded. ``frame_age_ns`` is the frame's age when
+    inference starts. ``rgb_source`` is a checksum of the RGB that a reference conversion of the source frame gives,
+    ``rgb_engine`` of the RGB at the engine; null where unknown, as behind a black box.
     """
 
     cell: str
@@ -45,6 +48,8 @@ class SampleRow:
     cache_n: int | None = None
     prompt_n: int | None = None
     server_prompt_ms: float | None = None
+    rgb_source: int | None = None
+    rgb_engine: int | None = None
     facts: dict[str, float] = field(default_factory=dict)
 
 
@@ -109,33 +114,58 @@ def _derive_frame(row: FrameRow) -> dict[str, Value]:
     }
 
 
-_STAGE_COLUMNS: dict[str, Kind] = {f"{stage}_ns": "int64" for stage in STAGES}
+TOKENS: Final[Table[TokenRow]] = Table("tokens", TokenRow)
+"""One row a token."""
 
 
-SAMPLES: Final[Table[SampleRow]] = Table(
-    "samples",
-    SampleRow,
-    _STAGE_COLUMNS
-    | {
+def samples_table(stages: Mapping[str, str]) -> Table[SampleRow]:
+    """Return the table with one row a request, and a column for each of a run's stages.
+
+    `ttft_ns` counts from the prompt: e2e without `capture` (which stream mode does not have).
+    """
+    derived: dict[str, Kind] = {
         "e2e_ns": "int64",
         "e2e_without_inference_ns": "int64",
         "ttft_ns": "int64",
         "residual_ns": "int64",
         "residual_share": "float64",
-    },
-    _derive_sample,
-)
-"""One row a request. `ttft_ns` counts from the prompt: e2e without `capture` (which stream mode does not have)."""
+    }
+    return Table("samples", SampleRow, _columns(stages) | derived, _derive_sample)
 
 
-TOKENS: Final[Table[TokenRow]] = Table("tokens", TokenRow)
-"""One row a token."""
+def frames_table(stages: Mapping[str, str]) -> Table[FrameRow]:
+    """Return the table with one row a frame in stream mode, and a column for each of a run's stages.
+
+    `latency_ns` counts from the intended time (no coordinated omission).
+    """
+    derived: dict[str, Kind] = {"path_ns": "int64", "latency_ns": "int64", "residual_ns": "int64"}
+    return Table("frames", FrameRow, _columns(stages) | derived, _derive_frame)
 
 
-FRAMES: Final[Table[FrameRow]] = Table(
-    "frames",
-    FrameRow,
-    _STAGE_COLUMNS | {"path_ns": "int64", "latency_ns": "int64", "residual_ns": "int64"},
-    _derive_frame,
-)
-"""One row a frame in stream mode. `latency_ns` counts from the intended time (no coordinated omission)."""
+def _columns(stages: Mapping[str, str]) -> dict[str, Kind]:
+    return {f"{stage}_ns": "int64" for stage in stages}
+
+
+EARLIER_STAGES: Final[dict[str, str]] = {
+    "capture": "capture",
+    "convert": "encode",
+    "image_encode": "encode",
+    "base64_encode": "encode",
+    "json_pack": "pack",
+    "cdr_pack": "pack",
+    "connect": "network",
+    "network": "network",
+    "accept": "network",
+    "ingest": "ingest",
+    "json_parse": "parse",
+    "cdr_parse": "parse",
+    "base64_decode": "decode",
+    "image_decode": "decode",
+    "yuv_decode": "decode",
+    "channel_swap": "decode",
+    "queue": "queue",
+    "inference": "inference",
+    "server": "server",
+    "return": "return",
+}
+"""The stages of a folder whose manifest does not have them, as every run had before transports declared their own."""

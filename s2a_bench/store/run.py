@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any, final
 from s2a_bench.errors import StoreError
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.files import CsvFile, count_rows, read_csv, read_parquet, to_pandas, write_parquet
-from s2a_bench.store.requests import FRAMES, SAMPLES, TOKENS, FrameRow, SampleRow, TokenRow
+from s2a_bench.store.requests import (
+    EARLIER_STAGES,
+    TOKENS,
+    FrameRow,
+    SampleRow,
+    TokenRow,
+    frames_table,
+    samples_table,
+)
 from s2a_bench.store.schema import SCHEMA, Row, Table
 
 if TYPE_CHECKING:
@@ -41,15 +49,18 @@ class RunWriter:
         self._manifest = manifest
         self._finished = False
         manifests.write(path, manifest)
-        self._files: dict[Table[Any], CsvFile] = {}
+        self._files: dict[str, tuple[Table[Any], CsvFile]] = {}
+        stages = manifest.get("stages", EARLIER_STAGES)
+        self._samples, self._frames = samples_table(stages), frames_table(stages)
 
     @classmethod
     def create(
-        cls, root: Path, command: str, manifest: dict[str, Any], tables: Iterable[Table[Any]] = (SAMPLES, TOKENS)
+        cls, root: Path, command: str, manifest: dict[str, Any], tables: Iterable[Table[Any]] | None = None
     ) -> RunWriter:
-        """Make ``<root>/<UTC time>-<command>-<host>`` and open the files of ``tables``; others open at their first row.
+        """Make ``<root>/<UTC time>-<command>-<host>`` and open the files of ``tables``, those of requests unless told.
 
-        ``manifest`` may bring ``argv``, ``configuration``, ``environment``, ``warnings``, ``seeds`` and more.
+        Others open at their first row. ``manifest`` may bring ``stages`` (stage -> group, which samples get columns
+        for), ``argv``, ``configuration``, ``environment``, ``warnings``, ``seeds`` and more.
         Raises StoreError, naming ``--output``, where the folder cannot be made.
         """
         host = socket.gethostname()
@@ -76,7 +87,7 @@ class RunWriter:
         }
         manifests.merge(whole, manifest)
         run = cls(path, whole)
-        for table in tables:
+        for table in (run._samples, TOKENS) if tables is None else tables:
             run.append(table, [])
         return run
 
@@ -91,7 +102,7 @@ class RunWriter:
         for table in tables:
             (path / f"{table.name}.parquet").unlink(missing_ok=True)
             if (path / f"{table.name}.csv").exists():
-                run._files[table] = CsvFile(path / f"{table.name}.csv", table.columns, reopen=True)
+                run._files[table.name] = table, CsvFile(path / f"{table.name}.csv", table.columns, reopen=True)
         return run
 
     @property
@@ -101,13 +112,13 @@ class RunWriter:
 
     def append(self, table: Table[Row], rows: Iterable[Row]) -> None:
         """Append rows to a table in one write; the first call creates its file."""
-        if table not in self._files:
-            self._files[table] = CsvFile(self.path / f"{table.name}.csv", table.columns)
-        self._files[table].append(table, rows)
+        if table.name not in self._files:
+            self._files[table.name] = table, CsvFile(self.path / f"{table.name}.csv", table.columns)
+        self._files[table.name][1].append(table, rows)
 
     def sample(self, row: SampleRow) -> None:
         """Append one sample."""
-        self.append(SAMPLES, [row])
+        self.append(self._samples, [row])
 
     def tokens(self, rows: Iterable[TokenRow]) -> None:
         """Append the tokens of one request."""
@@ -115,7 +126,7 @@ class RunWriter:
 
     def frame(self, row: FrameRow) -> None:
         """Append one frame of a stream."""
-        self.append(FRAMES, [row])
+        self.append(self._frames, [row])
 
     def update(self, **facts: Any) -> None:
         """Merge facts into the manifest (mappings key by key) and replace the file."""
@@ -129,10 +140,10 @@ class RunWriter:
         if self._finished:
             return
         self._finished = True
-        for file in self._files.values():
+        for _, file in self._files.values():
             file.close()
         try:
-            for table, file in self._files.items():
+            for table, file in self._files.values():
                 write_parquet(self.path / f"{table.name}.parquet", read_csv(file.path, table.columns))
         finally:
             # The state is written even where there is no room for Parquet, or Ctrl-C comes a second time.
@@ -180,9 +191,15 @@ class Run:
         return {name: count for name, count in counts.items() if count}
 
     @property
+    def stages(self) -> dict[str, str]:
+        """Stage -> group of the run's transports, in the order of the path."""
+        found: dict[str, str] = self.manifest.get("stages", EARLIER_STAGES)
+        return found
+
+    @property
     def samples(self) -> pd.DataFrame:
         """One row a request."""
-        return self.table(SAMPLES)
+        return self.table(samples_table(self.stages))
 
     @property
     def tokens(self) -> pd.DataFrame:
@@ -192,7 +209,7 @@ class Run:
     @property
     def frames(self) -> pd.DataFrame:
         """One row a frame of a stream."""
-        return self.table(FRAMES)
+        return self.table(frames_table(self.stages))
 
 
 def read_run(path: Path) -> Run:

@@ -13,7 +13,7 @@ that its docstring names:
 
 | seam | suite | fixtures |
 |---|---|---|
-| transport | `transport.TransportSuite` | ``connect``: a client of a server that has this handler |
+| transport | `transport.TransportSuite` | ``told``, or the pipeline's ``name`` as an attribute |
 | engine | `engine.EngineSuite` | ``engine``, and ``fresh_engine``, which is closed |
 | frame source | `frame_source.FrameSourceSuite` | ``make_source``: open it with this width and height |
 | policy | `policy.PolicySuite` | ``policy`` |

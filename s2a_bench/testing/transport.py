@@ -1,17 +1,33 @@
-"""What every transport promises, as one suite: subclass `TransportSuite` and say how to connect."""
+"""What every transport promises, as one suite: subclass `TransportSuite` and name the pipeline.
+
+A package that offers a transport tests it like this, once for each of its variants and payloads::
+
+    from s2a_bench.testing.transport import TransportSuite
+
+    class TestToy(TransportSuite):
+        name = "toy"
+
+    class TestToyJpeg(TransportSuite):
+        name, lossless = "toy?payload=jpeg", False
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+import json
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
+from threading import Thread
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import EngineError, RequestFailed
-from s2a_bench.trace import RESIDUAL, STAGES, Trace, budget
-from s2a_bench.transport import Client, Handler
+from s2a_bench.trace import GROUPS, RESIDUAL, STAGES, Trace, budget, path_of
+from s2a_bench.transport import TRANSPORTS, Client, Handler, Transport, Wiring, open_client, open_server
+from s2a_bench.transport.pipeline import one_pipeline, pipelines
 from s2a_bench.types import Frame, Request, Token
 
 Connect = Callable[[Handler], Client]
@@ -53,15 +69,78 @@ def ask(client: Client, request: Request) -> tuple[list[Token], Trace]:
     return list(client.request(request, trace)), trace
 
 
-class TransportSuite:
-    """Run by every transport and variant. Override `connect`; say what its wire does not carry."""
+def wiring(
+    name: str, address: str = "", *, timeout_s: float = 20, max_tokens: int = 512, **options: Any
+) -> Wiring[Any]:
+    """What a client or server of a pipeline's name is told, in a test; a black box is where its options say."""
+    pipeline = one_pipeline(name, **options)
+    address = address or pipeline.transport.foreign(pipeline.options)
+    return pipeline.wiring(address, timeout_s=timeout_s, max_tokens=max_tokens)
 
+
+def connector(told: Wiring[Any]) -> Iterator[Connect]:
+    """Connect through a server on a thread of its own; everything is stopped afterwards."""
+    with ExitStack() as stack:
+
+        def connect(handler: Handler) -> Client:
+            server = open_server(told, handler)
+            thread = Thread(target=server.serve)
+            thread.start()
+            stack.callback(thread.join)
+            stack.callback(server.stop)
+            client = open_client(replace(told, address=server.address), thread.is_alive)
+            stack.callback(client.close)
+            return client
+
+        yield connect
+
+
+class TransportSuite:
+    """Run by every transport and variant. Name the pipeline, or override `told`; say what its wire does not carry."""
+
+    name: ClassVar[str]
+    """As in ``--transport``: the transport, perhaps a variant, perhaps options."""
     lossless = True
+    """Whether the engine should see the camera's very pixels."""
     carries_id_and_limit = True
 
     @pytest.fixture
-    def connect(self) -> Connect:
-        raise NotImplementedError
+    def told(self) -> Wiring[Any]:
+        """What client and server are told; override it for options that only a fixture knows."""
+        return wiring(self.name)
+
+    @pytest.fixture
+    def connect(self, told: Wiring[Any]) -> Iterator[Connect]:
+        yield from connector(told)
+
+    @pytest.fixture
+    def transport(self, told: Wiring[Any]) -> Transport[Any]:
+        return TRANSPORTS[told.transport]
+
+    def test_it_is_found_by_the_name_that_it_declares(self, transport: Transport[Any], told: Wiring[Any]) -> None:
+        assert transport.name == told.transport
+        assert told.variant in (transport.variants or ("",))
+
+    def test_its_stages_are_new_ones_of_known_groups(self, transport: Transport[Any]) -> None:
+        assert set(transport.stages.values()) <= set(GROUPS)
+        assert not transport.stages.keys() & STAGES.keys()
+
+    def test_its_looks_are_of_its_variants(self, transport: Transport[Any]) -> None:
+        assert transport.looks.keys() <= set(transport.variants or ("",))
+
+    def test_every_option_is_documented_and_unknown_ones_are_refused(self, transport: Transport[Any]) -> None:
+        fields = transport.options.model_fields
+        assert [name for name, field in fields.items() if not field.description] == []
+        assert transport.options.model_config.get("frozen")
+        assert transport.options.model_config.get("extra") == "forbid"
+
+    def test_what_a_server_process_is_told_survives_json(self, told: Wiring[Any]) -> None:
+        assert Wiring.from_json(json.loads(json.dumps(told.to_json()))) == told
+
+    def test_the_name_of_a_cell_names_the_same_cell(self, transport: Transport[Any], told: Wiring[Any]) -> None:
+        said = {transport.name: told.options.model_dump(exclude_unset=True)}
+        for cell in pipelines([transport.name], said):
+            assert pipelines([cell.name], said) == [cell]
 
     def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect) -> None:
         client = connect(Recorder(["go", "_to(", "キッチン", ")\n", ""]))
@@ -94,7 +173,7 @@ class TransportSuite:
         if self.lossless:
             np.testing.assert_array_equal(image.data, expected)
 
-    def test_stages_and_residual_sum_to_the_whole(self, connect: Connect) -> None:
+    def test_stages_and_residual_sum_to_the_whole(self, connect: Connect, transport: Transport[Any]) -> None:
         client = connect(Recorder(["x", "y"]))
         begin = now_ns()
         _, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
@@ -104,9 +183,9 @@ class TransportSuite:
         assert sum(spent.stages_ns.values()) + spent.residual_ns == spent.e2e_ns == chain[-1][1] - chain[0][1]
         assert begin <= chain[0][1] <= chain[-1][1] <= end
         assert chain[-1][0] == "return"
-        assert set(spent.stages_ns) <= set(STAGES)
+        assert set(spent.stages_ns) <= set(path_of([transport.stages]))
         assert all(duration >= 0 for duration in spent.stages_ns.values())
-        assert {"convert", "inference", "return"} <= set(spent.stages_ns)
+        assert {"inference", "return"} <= set(spent.stages_ns)
 
     def test_the_servers_marks_come_back(self, connect: Connect) -> None:
         _, trace = ask(connect(Recorder(["x", "y", "z"])), Request("a", "plan"))

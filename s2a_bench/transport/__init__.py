@@ -1,24 +1,52 @@
-"""How pictures and tokens travel: a Client sends one request and yields tokens, a Server feeds a Handler."""
+"""How pictures and tokens travel: a Client sends one request and yields tokens, a Server feeds a Handler.
+
+To add a transport, write a package with a module like this, and offer its instance as an entry point of the group
+``s2a_bench.transports``; nothing in this repository changes::
+
+    class ToyOptions(Options):                      # transport/options.py
+        port: int = Field(0, ge=0, le=65535, description="port; 0: any free one", json_schema_extra=SERVER)
+
+    class Toy(Transport[ToyOptions]):
+        name, options = "toy", ToyOptions           # --transport 'toy?port=7000', serve toy
+        payloads = ("raw",)                         # the first is the default
+        stages = {"frame_length": "pack"}           # marked by its client or server, beside those of trace.STAGES
+
+        def client(self, wiring, alive):
+            from toy.client import ToyClient        # what is heavy is imported here
+            return ToyClient(wiring, alive)
+
+        def server(self, wiring, handler):
+            from toy.server import ToyServer
+            return ToyServer(wiring, handler)
+
+    TOY = Toy()
+
+    [project.entry-points."s2a_bench.transports"]
+    toy = "toy:TOY"
+
+`s2a_bench.testing.transport` is the suite that it should pass.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pkgutil import resolve_name
-from typing import Protocol, TypeAlias
+from functools import cache
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from s2a_bench.errors import UsageError
-from s2a_bench.trace import Trace
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.registry import Registry
 
-HTTP_VARIANTS = ("as-deployed", "best-effort", "binary")
-ROS_VARIANTS = ("topic", "action")
-PAYLOADS = ("jpeg", "jpeg-preencoded", "png", "raw")
-WIRES = ("bgr", "yuyv", "compressed")
-QOS_PROFILES = ("reliable", "sensor_data")
-CONNECTIONS = ("keep-alive", "per-request", "client-per-request")
+if TYPE_CHECKING:
+    from s2a_bench.trace import Trace
+    from s2a_bench.transport.options import Options
+    from s2a_bench.types import Frame, Request, Token
 
-Handler: TypeAlias = Callable[[Request, Trace], Generator[Token, None, None]]
+O = TypeVar("O", bound="Options")  # noqa: E741 - the one type variable here
+
+Handler: TypeAlias = "Callable[[Request, Trace], Generator[Token, None, None]]"
 """What a server does with a request whose pictures are ``rgb8``: it yields tokens and marks the trace.
 
 A handler marks `queue` if it waited for a free engine, `inference` at the first token, and appends the time of
@@ -41,8 +69,10 @@ class CameraSink(Protocol):
 class Client(Protocol):
     """One side of one pipeline. Not thread-safe; one request at a time."""
 
-    camera: CameraSink | None
-    """None where the newest frame goes with the prompt instead."""
+    @property
+    def camera(self) -> CameraSink | None:
+        """None where the newest frame goes with the prompt instead."""
+        ...
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Send a request with its frames as captured, yield tokens as they arrive, mark every stage.
@@ -53,7 +83,7 @@ class Client(Protocol):
         ...
 
     def describe(self) -> dict[str, str]:
-        """Say how the server is asked, as far as the route does not tell, for the manifest."""
+        """Return how the server is asked, as far as the wiring does not tell, for the manifest."""
         ...
 
     def close(self) -> None:
@@ -68,7 +98,7 @@ class Server(Protocol):
     """Where a client of the same transport finds it, known once the server exists."""
 
     def describe(self) -> dict[str, str | int]:
-        """Say what carries the requests, for the manifest."""
+        """Return what carries the requests, for the manifest."""
         ...
 
     def serve(self) -> None:
@@ -81,76 +111,151 @@ class Server(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Route:
-    """How one pipeline is wired; plain data, so that a server process can be told."""
+class Wiring(Generic[O]):
+    """What a client, or the process of a server, is told: one pipeline and where its other end is."""
 
     transport: str
-    variant: str = ""
-    """http: as-deployed, best-effort, binary; ros: topic; loopback has none."""
+    variant: str
+    options: O
+    """``options.payload`` is what travels, the transport's default filled in."""
     address: str = ""
-    """http: base URL (server: ``host:port``, port 0 for any); ros: namespace of the topics."""
-    payload: str = "jpeg"
-    """http: how a picture travels: jpeg, jpeg-preencoded, png, raw."""
-    wire: str = "bgr"
-    """ros: how a picture travels: bgr, yuyv, compressed."""
-    connection: str = "keep-alive"
-    """http: keep-alive, per-request (a new connection), client-per-request (a new client object)."""
+    """A client: where the server is. A server: what it should bind; empty: any."""
     black_box: bool = False
-    """The server is not ours, so it sends no marks."""
-    model: str = "default"
-    """http: the model's name in the request."""
-    dialect: str = ""
-    """http: what a black box speaks, a name of ``http.dialects.DIALECTS``; empty: ask which OpenAI server it is."""
-    api_key_env: str = ""
-    """http: the environment variable that holds a black box's API key."""
-    extra_body: str = ""
-    """http: JSON that is merged into every request's body (RFC 7396)."""
-    middleware: str = ""
-    """ros: cyclonedds or rclpy; empty: rclpy in a sourced ROS 2 environment, else cyclonedds."""
-    qos: str = "reliable"
-    """ros: the camera's quality of service, by its ROS 2 profile: reliable, sensor_data."""
-    dds_tuning: str = "tuned"
-    domain_id: int = 0
-    action: str = ""
-    """ros client: the full name of an action that is not under the namespace, as of a llama_ros node."""
-    max_tokens: int = 512
-    """ros server: the most tokens of a goal, which cannot say itself how many it wants."""
-    result_timeout_s: float = 60.0
-    """ros server: how long a goal's result is kept."""
-    feedback_interval_s: float = 0.0
-    """ros server: the least time between two feedbacks; tokens that come faster share one. 0: a feedback a token."""
-    publish_tokens: bool = False
-    """ros server: whether the tokens of goals also go to the topic ``token``, for plotting."""
+    """Whether the server is not ours, so that it sends no marks."""
     timeout_s: float = 300.0
     """The longest silence before a request counts as failed."""
+    max_tokens: int = 512
+    """The most tokens of a request that cannot say itself how many it wants."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        told = {name: getattr(self, name) for name in ("transport", "variant", "address", "black_box")}
+        told |= {"timeout_s": self.timeout_s, "max_tokens": self.max_tokens}
+        return {**told, "options": self.options.model_dump(mode="json")}
+
+    @staticmethod
+    def from_json(told: Mapping[str, Any]) -> Wiring[Any]:
+        """Read what `to_json` returned."""
+        options = TRANSPORTS[told["transport"]].options.model_validate(told["options"])
+        return Wiring(**{**told, "options": options})
 
 
-TRANSPORTS: dict[str, tuple[str, str]] = {
-    "http": ("s2a_bench.transport.http.client:HttpClient", "s2a_bench.transport.http.server:HttpServer"),
-    "ros/topic": ("s2a_bench.transport.ros.topic:TopicClient", "s2a_bench.transport.ros.server:RosServer"),
-    "ros/action": ("s2a_bench.transport.ros.action:GenerateClient", "s2a_bench.transport.ros.server:RosServer"),
-    "loopback": ("s2a_bench.transport.loopback:LoopbackClient", "s2a_bench.transport.loopback:LoopbackServer"),
-}
-"""Transport or transport/variant -> (client class, built as ``Client(route, alive)``; server class, built as
-``Server(route, handler)``)."""
+@dataclass(frozen=True, slots=True)
+class Program:
+    """Somebody else's server that a run starts on its own model files: its kind, the program, its port (0: any)."""
 
-NAMES = tuple(dict.fromkeys(name.partition("/")[0] for name in TRANSPORTS))
-"""The transports, without their variants."""
+    kind: str
+    path: Path
+    port: int
 
 
-def _implementation(route: Route, side: int) -> Callable[..., object]:
-    for name in (f"{route.transport}/{route.variant}", route.transport):
-        if name in TRANSPORTS:
-            found: Callable[..., object] = resolve_name(TRANSPORTS[name][side])
-            return found
-    raise UsageError(f"--transport: '{route.transport}' is none of {', '.join(NAMES)}")
+class Transport(Generic[O]):
+    """One way to travel, and all that is said about it; subclass it, and make one instance."""
+
+    name: ClassVar[str] = ""
+    options: type[O]
+    """The model of its options."""
+    variants: ClassVar[tuple[str, ...]] = ()
+    """What follows its name, as ``http/binary``; the first is measured unless told."""
+    payloads: ClassVar[tuple[str, ...]] = ()
+    """How pictures can travel, the default first; nothing where they do not travel at all."""
+    stages: ClassVar[Mapping[str, str]] = {}
+    """Stage -> group (one of `trace.GROUPS`), those of `trace.STAGES` left out."""
+    order: ClassVar[float] = 50
+    """How its cells sort among others."""
+    looks: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    """Variant ("" for none) -> colour and line style, in every figure."""
+    compared_with: ClassVar[tuple[str, ...]] = ("loopback",)
+    """The transports by whose cells its own are divided."""
+    packages: ClassVar[tuple[str, ...]] = ()
+    """Python packages whose versions belong beside its results."""
+    checks: ClassVar[Mapping[str, str]] = {}
+    """Code -> ``module:function`` of the doctor's checks that are about it."""
+    watches_udp: ClassVar[bool] = False
+    """Whether UDP packets that the machine drops during a run are a reason for doubt."""
+    in_process: ClassVar[bool] = False
+    """Whether its server is a thread of the client's process."""
+    elsewhere: ClassVar[tuple[str, ...]] = ()
+    """Options that, when set, name a server that is not ours."""
+    serving: ClassVar[Mapping[str, Any]] = {}
+    """Values that options have in `serve` unless told."""
+
+    def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:
+        """Connect to the server at ``wiring.address``; ``alive`` tells whether its process still runs."""
+        raise NotImplementedError
+
+    def server(self, wiring: Wiring[O], handler: Handler) -> Server:
+        """Bind a server, ready to `serve`; raises PortInUse or TransportError."""
+        raise NotImplementedError
+
+    def measured(self, options: O, chosen: Sequence[str]) -> Sequence[str]:  # noqa: ARG002 - for subclasses
+        """Return the variants to measure where the pipeline names none; ``chosen`` is what a flag says."""
+        return chosen or self.variants[:1] or ("",)
+
+    def travels(self, variant: str, options: O) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
+        """Return how pictures can travel over a variant, the default first."""
+        return self.payloads
+
+    def check(self, variant: str, options: O, *, mode: str, engine: str) -> None:
+        """Raise UsageError for options that do not go together with the variant or with a run's settings."""
+
+    def foreign_by(self, options: O) -> str:
+        """Return the option that says that the server is not ours, or nothing."""
+        return next((name for name in self.elsewhere if getattr(options, name)), "")
+
+    def foreign(self, options: O) -> str:  # noqa: ARG002 - for subclasses
+        """Return the address of a server that somebody else runs, or nothing."""
+        return ""
+
+    def program(self, options: O) -> Program | None:  # noqa: ARG002 - for subclasses
+        """Return somebody else's server that the run should start, if that is wanted."""
+        return None
+
+    def bind(self, options: O, taken: Sequence[str]) -> str:  # noqa: ARG002 - for subclasses
+        """Return what a new server of ours should bind, when others of this transport have ``taken`` theirs."""
+        return ""
+
+    def before_run(self, width: int, height: int) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
+        """Return the codes of its checks that matter before a run with pictures of this size in pixels."""
+        return ()
+
+    def ready(self, wiring: Wiring[O], address: str) -> str:
+        """Return what `serve` says once the server is bound."""
+        return f"serving {wiring.transport} at {address}"
 
 
-def open_client(route: Route, alive: Callable[[], bool] = lambda: True) -> Client:
-    """Connect to the server of a route; ``alive`` tells whether its process still runs."""
-    return _implementation(route, 0)(route, alive)  # type: ignore[return-value]
+TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
+    "transports",
+    "transport",
+    {
+        "http": "s2a_bench.transport.http:HTTP",
+        "ros": "s2a_bench.transport.ros:ROS",
+        "loopback": "s2a_bench.transport.loopback:LOOPBACK",
+    },
+)
+"""Name -> what is said about it."""
 
 
-def open_server(route: Route, handler: Handler) -> Server:
+class _Undeclared(Transport[Any]):
+    """What is assumed of a transport of an old run whose package is not here."""
+
+    order = inf
+
+
+@cache
+def declared(name: str) -> Transport[Any]:
+    """Return what is said about a transport, for showing a run; one that is not installed is like any other."""
+    try:
+        return TRANSPORTS[name]
+    except UsageError:
+        return _Undeclared()
+
+
+def open_client(wiring: Wiring[Any], alive: Callable[[], bool] = lambda: True) -> Client:
+    """Connect to the server of a wiring; ``alive`` tells whether its process still runs."""
+    return TRANSPORTS[wiring.transport].client(wiring, alive)
+
+
+def open_server(wiring: Wiring[Any], handler: Handler) -> Server:
     """Bind a server, ready to `serve`; raises PortInUse or TransportError."""
-    return _implementation(route, 1)(route, handler)  # type: ignore[return-value]
+    return TRANSPORTS[wiring.transport].server(wiring, handler)

@@ -18,10 +18,10 @@ def read_key(variable: str) -> str:
     if not variable:
         return ""
     if not VARIABLE.fullmatch(variable):
-        raise UsageError("--api-key-env takes the name of an environment variable, not the key itself")
+        raise UsageError("`api_key_env` takes the name of an environment variable, not the key itself")
     key = os.environ.get(variable, "").strip()
     if not key:
-        raise UsageError("--api-key-env: the environment has no such variable, or it is empty; export it first")
+        raise UsageError("`api_key_env`: the environment has no such variable, or it is empty; export it first")
     if not (key.isascii() and key.isprintable()):
-        raise UsageError(f"--api-key-env: ${variable} holds what no HTTP header can carry")
+        raise UsageError(f"`api_key_env`: ${variable} holds what no HTTP header can carry")
     return key

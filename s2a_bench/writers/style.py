@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final
+
+from s2a_bench.transport import declared
 
 WIDTH_IN: Final = 3.5
 """One column of a two-column paper."""
@@ -29,23 +31,22 @@ GROUP_FILLS: Final = {
 
 RESIDUAL_FILL: Final = ("#FFFFFF", "//////")
 
-_CELL_LOOKS: Final = {
-    "http/as-deployed": ("#D55E00", "-"),
-    "http/best-effort": ("#E69F00", "--"),
-    "http/binary": ("#CC79A7", "-."),
-    "ros/topic": ("#0072B2", "-"),
-    "ros/action": ("#56B4E9", "--"),
-    "loopback": ("#009E73", ":"),
-    "in-process": ("#009E73", ":"),
-}
 _OTHER_LOOKS: Final = (("#56B4E9", "-."), ("#F0E442", "--"), ("#999999", ":"), ("#000000", "-"))
 
 
-def cell_looks(names: list[str]) -> dict[str, tuple[str, str]]:
-    """Return name -> colour and line style; a known cell looks the same in every figure of every run."""
-    others = [name for name in names if name not in _CELL_LOOKS]
-    looks = {name: _OTHER_LOOKS[place % len(_OTHER_LOOKS)] for place, name in enumerate(others)}
-    return looks | {name: look for name, look in _CELL_LOOKS.items() if name in names}
+def cell_looks(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, str]]:
+    """Return name -> colour and line style, for cells given as name -> (transport, variant).
+
+    A cell as its transport declares it looks the same in every figure of every run; others get other looks: those
+    with options of their own, and those whose transport is not here.
+    """
+    looks = {
+        name: declared(transport).looks[variant]
+        for name, (transport, variant) in cells.items()
+        if "?" not in name and variant in declared(transport).looks
+    }
+    others = [name for name in cells if name not in looks]
+    return looks | {name: _OTHER_LOOKS[place % len(_OTHER_LOOKS)] for place, name in enumerate(others)}
 
 
 @contextmanager

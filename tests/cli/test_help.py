@@ -79,7 +79,7 @@ def test_the_version_is_printed() -> None:
         (["latency", "--bogus"], "No such option: --bogus"),
         (["latency", "--runs", "many"], "'--runs'"),
         (["latency", "--port", "70000"], "'--port'"),
-        (["latency", "--payload", "gif"], "--payload: 'gif' is none of jpeg, jpeg-preencoded, png, raw"),
+        (["latency", "--payload", "gif"], "--payload: 'gif' is none of raw, yuyv, jpeg, jpeg-preencoded, png"),
         (["latency", "--transport", "http,pigeon"], "--transport: 'pigeon'"),
         (["latency", "--http", "fast"], "--http: 'fast'"),
         (["latency", "--size", "big"], "--size: 'big' should look like 640x480"),

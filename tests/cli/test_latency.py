@@ -125,13 +125,42 @@ def test_stream_mode_knows_the_age_of_the_frame(tmp_path: Path) -> None:
     assert ros["convert_ns"].isna().all()
 
 
-@pytest.mark.parametrize("wire", ["yuyv", "compressed"])
-def test_other_wire_formats_have_their_stages(tmp_path: Path, wire: str) -> None:
-    run(*SMALL, "--transport", "ros", "--wire", wire, output=tmp_path)
+@pytest.mark.parametrize(
+    ("payload", "stage"), [("yuyv", "yuv_decode"), ("jpeg", "image_decode"), ("jpeg-preencoded", "image_decode")]
+)
+def test_other_payloads_over_ros_have_their_stages(tmp_path: Path, payload: str, stage: str) -> None:
+    run(*SMALL, "--transport", "ros", "--payload", payload, output=tmp_path)
     samples = only_run(tmp_path).samples
     assert (samples["error"] == "").all()
-    stage = {"yuyv": "yuv_decode_ns", "compressed": "image_decode_ns"}[wire]
-    assert samples[stage].notna().all()
+    assert samples[f"{stage}_ns"].notna().all()
+
+
+def test_one_run_compares_payloads_and_options_on_servers_of_their_own(tmp_path: Path) -> None:
+    cells = ["http/binary", "http/binary?payload=png", "http/binary?host=127.0.0.2", "ros/topic?payload=yuyv"]
+    cells += ["ros/topic?qos=sensor_data", "loopback"]
+    done = run(*SMALL, "--transport", ",".join(cells), output=tmp_path)
+    kept = only_run(tmp_path)
+    assert set(kept.samples["cell"]) == set(cells)
+    assert (kept.samples["error"] == "").all()
+    assert kept.manifest["servers"].keys() == {"http", "http-2", "ros", "ros-2"}
+    assert {path.name for path in kept.path.glob("server-*.log")} == {
+        *("server-http.log", "server-http-2.log", "server-ros.log", "server-ros-2.log"),
+    }
+    assert "payload=yuyv" in done.stdout
+
+
+def test_the_engine_saw_the_pixels_of_the_camera(tmp_path: Path) -> None:
+    names = "http/binary?payload=raw,http/best-effort?payload=png,http/binary,ros,ros/topic?payload=yuyv,loopback"
+    run(*SMALL, "--transport", names, output=tmp_path)
+    samples = only_run(tmp_path).samples
+    assert samples[["rgb_source", "rgb_engine"]].notna().all().all()
+    changed = samples[samples["rgb_source"] != samples["rgb_engine"]]
+    assert set(changed["cell"]) == {"http/binary"}
+
+
+def test_the_former_flag_of_ros_says_what_to_write(tmp_path: Path) -> None:
+    said = run(*SMALL, "--wire", "compressed", output=tmp_path, code=2).stderr
+    assert said == "error: --wire is gone: write --payload jpeg, or for ROS alone --transport 'ros?payload=jpeg'\n"
 
 
 def test_a_preencoded_jpeg_leaves_only_base64_to_encode(tmp_path: Path) -> None:

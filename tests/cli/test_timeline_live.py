@@ -79,7 +79,7 @@ def test_a_real_time_run_says_what_is_emulated_and_how_late_it_was(fast: str, tm
         (["--live", "--pace", "-3"], "--pace: -3.0 should be greater than 0"),
         (["--live", "--timeout", "0"], "--timeout: 0.0 should be greater than or equal to 0.1"),
         (["--live", "--transport", "pigeon"], "--transport: 'pigeon' is none of http, ros, loopback"),
-        (["--live", "--transport", "ros/post"], "--ros: 'post' is none of topic, action"),
+        (["--live", "--transport", "ros/post"], "--transport: 'post' is none of ros's topic, action"),
         (["--live", "--size", "64"], "--size: '64' should look like 640x480"),
         (["--live", "--tokens-per-skill", "six"], "--tokens-per-skill: 'six' should be a valid integer"),
         (["--live", "--robot", "kuka"], "--robot: 'kuka' is none of timed, ros"),

@@ -24,10 +24,10 @@ from s2a_bench.experiments.ccrb.view.tables import ccrb_json
 from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.inference import EngineConfig
 from s2a_bench.scenario.ccrb.options import CcrbOptions
-from s2a_bench.store.requests import SAMPLES, TOKENS
+from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.trace import Trace
-from s2a_bench.transport.loopback import LoopbackClient
+from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Request, Token
 
 SCHEMA = json.loads((Path(__file__).parent.parent.parent / "docs" / "schema" / "s2a-bench-1.json").read_text())
@@ -80,7 +80,7 @@ def test_what_is_driven_is_the_scenarios_plan_and_not_the_models(paced: Run) -> 
 
 
 def test_each_request_has_a_picture_of_its_own_and_the_warm_up_is_marked(paced: Run) -> None:
-    samples = paced.table(SAMPLES)
+    samples = paced.samples
     assert list(samples["frame_index"]) == [0, 1]
     assert list(samples["warmup"]) == [True, False]
     assert set(paced.table(TOKENS)["request_id"]) == set(samples["request_id"])

@@ -29,7 +29,7 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.trace import Trace
-from s2a_bench.transport.loopback import LoopbackClient
+from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Frame, Request, Token
 
 SCHEMA = json.loads((Path(__file__).parent.parent.parent / "docs" / "schema" / "s2a-bench-1.json").read_text())

@@ -33,10 +33,10 @@ REQUESTS = LatencyConfig(transports=("loopback",), max_tokens=16)
     [
         ({"max_tokens": 1}, "--max-tokens: a rate needs 2 tokens or more"),
         ({"engine": EngineConfig(name="echo")}, "--engine echo computes nothing"),
-        ({"runs": 0}, "--runs: 0"),
+        ({"runs": 0}, "`runs`: 0"),
         (
-            {"engine": EngineConfig(sampling="greedy"), "url": "http://x", "transports": ("http",)},
-            "--sampling greedy is our own engine's",
+            {"engine": EngineConfig(sampling="greedy"), "transports": ("http/best-effort?url=http://x",)},
+            "`sampling` greedy is our own engine's",
         ),
     ],
 )

@@ -9,7 +9,8 @@ import pytest
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import SourceError
 from s2a_bench.frames import open_source
-from s2a_bench.harness.feed import Camera, RequestFeed, fingerprint
+from s2a_bench.harness.feed import Camera, RequestFeed
+from s2a_bench.harness.pixels import fingerprint
 from s2a_bench.trace import Trace
 from s2a_bench.types import Frame
 

@@ -1,4 +1,4 @@
-"""What a latency run is asked to do."""
+"""What a run of requests is asked to do."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.plan import LatencyConfig, plan_cells
+from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.inference import EngineConfig
 
-ADDRESSES = {"http": "http://127.0.0.1:1", "ros": "/s2a_bench", "loopback": "loopback-0"}
+URL = {"http": {"url": "http://x"}}
 
 
 def names(config: LatencyConfig) -> list[str]:
     config.check()
-    return [cell.name for cell in plan_cells(config, ADDRESSES)]
+    return [cell.name for cell in config.pipelines]
 
 
 def test_all_http_variants_and_ros_are_shown_unless_told() -> None:
@@ -26,76 +26,112 @@ def test_all_http_variants_and_ros_are_shown_unless_told() -> None:
 
 
 def test_cells_follow_the_flags() -> None:
-    config = LatencyConfig(transports=("loopback", "http"), http=("binary",), payload="raw", connection="per-request")
-    loopback, http = plan_cells(config, ADDRESSES)
+    options = {"http": {"connection": "per-request"}}
+    config = LatencyConfig(("loopback", "http"), {"http": ("binary",)}, options, payload="raw")
+    loopback, http = config.pipelines
     assert (loopback.name, loopback.payload) == ("loopback", "")
-    assert (http.name, http.payload, http.route.payload) == ("http/binary", "raw", "raw")
-    assert http.route.connection == "per-request"
+    assert (http.name, http.payload) == ("http/binary", "raw")
+    assert http.options.connection == "per-request"  # type: ignore[attr-defined]
+
+
+def test_a_payload_that_is_not_given_is_each_transports_own() -> None:
+    assert [cell.payload for cell in LatencyConfig(("http/binary", "ros", "loopback")).pipelines] == ["jpeg", "raw", ""]
 
 
 def test_a_foreign_action_is_the_only_ros_cell() -> None:
-    config = LatencyConfig(transports=("ros",), ros=("topic", "action"), action="/llama/generate_response")
-    (cell,) = plan_cells(config, ADDRESSES)
-    assert (cell.name, cell.route.action, cell.route.black_box) == ("ros/action", "/llama/generate_response", True)
+    config = LatencyConfig(("ros",), {"ros": ("topic", "action")}, {"ros": {"action": "/llama/generate_response"}})
+    (cell,) = config.pipelines
+    assert (cell.name, cell.black_box) == ("ros/action", True)
+    assert cell.transport.foreign(cell.options) == "/llama/generate_response"
 
 
 def test_both_ros_variants_are_measured_in_one_run() -> None:
-    assert names(LatencyConfig(transports=("ros",), ros=("topic", "action"))) == ["ros/topic", "ros/action"]
+    assert names(LatencyConfig(("ros",), {"ros": ("topic", "action")})) == ["ros/topic", "ros/action"]
 
 
 def test_a_black_box_is_asked_without_the_binary_variant() -> None:
-    config = LatencyConfig(url="http://localhost:8080")
+    config = LatencyConfig(options={"http": {"url": "http://localhost:8080"}})
     assert names(config) == ["http/as-deployed", "http/best-effort", "ros/topic"]
-    assert plan_cells(config, ADDRESSES)[0].route.black_box
+    assert config.pipelines[0].black_box
+    assert config.foreign == "url"
+
+
+def test_a_black_box_gets_what_its_dialect_takes() -> None:
+    config = LatencyConfig(("http/as-deployed",), options={"http": {"url": "http://x", "dialect": "openvla"}})
+    assert names(config) == ["http/as-deployed"]
+    assert config.pipelines[0].payload == "raw"
+
+
+def test_the_stages_are_those_of_the_transports_in_the_order_of_the_path() -> None:
+    assert [*LatencyConfig(("ros",)).stages] == [
+        *("capture", "convert", "image_encode", "cdr_pack", "connect", "network", "accept", "cdr_parse"),
+        *("image_decode", "yuv_decode", "channel_swap", "queue", "inference", "server", "return"),
+    ]
+    assert "cdr_pack" not in LatencyConfig(("http",)).stages
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"transports": ("http", "pigeon")}, "--transport: 'pigeon' is none of http, ros, loopback"),
-        ({"transports": ()}, "--transport: name at least one of http, ros, loopback"),
-        ({"http": ("fast",)}, "--http: 'fast' is none of as-deployed"),
-        ({"payload": "gif"}, "--payload: 'gif' is none of jpeg"),
-        ({"wire": "rgb"}, "--wire: 'rgb' is none of bgr"),
-        ({"connection": "x"}, "--connection: 'x'"),
-        ({"mode": "x"}, "--mode: 'x'"),
-        ({"dds_tuning": "x"}, "--dds-tuning: 'x'"),
-        ({"runs": 0}, "--runs: 0 is not between 1"),
-        ({"warmup": -1}, "--warmup: -1"),
-        ({"max_tokens": 0}, "--max-tokens: 0"),
-        ({"fps": 0.0}, "--fps: 0.0"),
-        ({"seed": -1}, "--seed: -1 is not between 0 and 2147483647"),
-        ({"max_tokens": 5_000_000_000}, "--max-tokens: 5000000000"),
-        ({"timeout_s": float("nan")}, "--timeout: nan"),
-        ({"timeout_s": float("inf")}, "--timeout: inf"),
-        ({"prompt": "\udcff"}, "--prompt: the text is not valid UTF-8"),
-        ({"namespace": "/a b"}, "--namespace: '/a b'"),
-        ({"width": 200_000, "height": 200_000}, "--size: 200000x200000"),
-        ({"url": "http://[::1"}, "--url: 'http://[::1'"),
-        ({"ros": ("service",)}, "--ros: 'service' is none of topic, action"),
-        ({"ros": ()}, "--ros: name at least one of topic, action"),
-        ({"action": "generate"}, "--action: 'generate' should look like /llama/generate_response"),
-        ({"action": "/x", "transports": ("http",)}, "--action needs ros among --transport"),
-        ({"action": "/x", "mode": "stream"}, "--action: --mode stream needs our own server"),
-        ({"ros": ("action",), "wire": "compressed"}, "--wire compressed: a goal carries sensor_msgs/Image"),
-        ({"width": 641}, "--size: 641x480"),
-        ({"width": 8, "height": 8}, "--size: 8x8"),
-        ({"namespace": "robot"}, "--namespace: 'robot' should look like /name"),
-        ({"url": "localhost:1"}, "--url: 'localhost:1' should start with http"),
-        ({"url": "http://x", "llama_server": Path("y")}, "--url and --llama-server"),
-        ({"url": "http://x", "payload": "raw"}, "--payload raw: with --url a picture travels as jpeg or"),
-        ({"url": "http://x", "dialect": "openvla"}, "--payload jpeg: with --dialect openvla a picture travels as raw"),
-        ({"url": "http://x", "dialect": "smoke"}, "--dialect: 'smoke' is none of s2a, openai"),
-        ({"dialect": "tgi"}, "--dialect is about a server that runs already"),
-        ({"llama_server": Path("x"), "extra_body": "{}"}, "--extra-body is about a server that runs already"),
-        ({"url": "http://x", "extra_body": "{"}, "--extra-body: no JSON"),
-        ({"url": "http://x", "api_key_env": "sk-1"}, "--api-key-env takes the name of an environment variable"),
-        ({"url": "http://x", "api_key_env": "NO_SUCH_KEY"}, "--api-key-env: the environment has no such variable"),
-        ({"url": "http://u:p@x"}, "--url: leave the password out"),
-        ({"url": "http://x", "http": ("binary",)}, "--http binary needs our own server"),
-        ({"url": "http://x", "transports": ("ros",)}, "--url needs http among --transport"),
-        ({"llama_server": Path("x"), "engine": EngineConfig(name="echo")}, "--llama-server runs a model"),
-        ({"mode": "stream", "payload": "jpeg-preencoded"}, "jpeg-preencoded has no meaning in --mode stream"),
+        ({"transports": ("http", "pigeon")}, "`transport`: 'pigeon' is none of http, ros, loopback"),
+        ({"transports": ()}, "`transport`: name at least one of http, ros, loopback"),
+        ({"transports": ("http/fast",)}, "`transport`: 'fast' is none of http's as-deployed, best-effort, binary"),
+        ({"transports": ("loopback/fast",)}, "`transport`: 'fast' is none of loopback's none: it has no variants"),
+        ({"variants": {"http": ("fast",)}}, "`http`: 'fast' is none of http's as-deployed"),
+        ({"variants": {"ros": ("service",)}}, "`ros`: 'service' is none of ros's topic, action"),
+        ({"payload": "gif"}, "`payload`: 'gif' is none of raw, yuyv, jpeg, jpeg-preencoded, png"),
+        ({"payload": "yuyv"}, "`payload`: over http/as-deployed a picture travels as jpeg, jpeg-preencoded, png, raw"),
+        ({"payload": "yuyv"}, "http/as-deployed?payload=jpeg"),
+        ({"options": {"http": {"connection": "x"}}}, "`connection`: 'x' should be 'keep-alive'"),
+        ({"engine": EngineConfig(name="gpt")}, "`engine`: 'gpt' is none of llama, echo"),
+        ({"mode": "x"}, "`mode`: 'x'"),
+        ({"options": {"ros": {"dds_tuning": "x"}}}, "`dds_tuning`: 'x'"),
+        ({"options": {"ros": {"qos": "x"}}}, "`qos`: 'x' should be 'reliable' or 'sensor_data'"),
+        ({"options": {"ros": {"middleware": "x"}}}, "`middleware`: 'x' is none of cyclonedds, rclpy"),
+        ({"options": {"ros": {"result_timeout": -1}}}, "`result_timeout`: -1 should be greater than or equal to 0"),
+        ({"options": {"http": {"port": 70_000}}}, "`port`: 70000 should be less than or equal to 65535"),
+        ({"options": {"http": {"port": "many"}}}, "`port`: 'many' should be a valid integer"),
+        ({"runs": 0}, "`runs`: 0 is not between 1"),
+        ({"warmup": -1}, "`warmup`: -1"),
+        ({"max_tokens": 0}, "`max_tokens`: 0"),
+        ({"fps": 0.0}, "`fps`: 0.0"),
+        ({"seed": -1}, "`seed`: -1 is not between 0 and 2147483647"),
+        ({"max_tokens": 5_000_000_000}, "`max_tokens`: 5000000000"),
+        ({"timeout_s": float("nan")}, "`timeout`: nan"),
+        ({"timeout_s": float("inf")}, "`timeout`: inf"),
+        ({"prompt": "\udcff"}, "`prompt`: the text is not valid UTF-8"),
+        ({"options": {"ros": {"namespace": "/a b"}}}, "`namespace`: '/a b'"),
+        ({"options": {"ros": {"namespace": "robot"}}}, "`namespace`: 'robot' should look like /name"),
+        ({"width": 200_000, "height": 200_000}, "`size`: 200000x200000"),
+        ({"width": 641}, "`size`: 641x480"),
+        ({"width": 8, "height": 8}, "`size`: 8x8"),
+        ({"options": {"http": {"url": "http://[::1"}}}, "`url`: 'http://[::1'"),
+        ({"options": {"http": {"url": "localhost:1"}}}, "`url`: 'localhost:1' should start with http"),
+        ({"options": {"ros": {"action": "generate"}}}, "`action`: 'generate' should look like /name"),
+        ({"options": {"ros": {"action": "/x"}}, "transports": ("http",)}, "`action` needs ros among `transport`"),
+        ({"options": {"ros": {"action": "/x"}}, "transports": ("ros/topic",)}, "`action` is spoken by ros/action"),
+        ({"options": {"ros": {"action": "/x"}}, "mode": "stream"}, "`action`: `mode` stream needs our own server"),
+        (
+            {"variants": {"ros": ("action",)}, "payload": "jpeg"},
+            "`payload`: a goal carries sensor_msgs/Image, not jpeg",
+        ),
+        ({"options": {"http": {"url": "http://x", "llama_server": Path("y")}}}, "`url` and `llama_server`"),
+        ({"options": URL, "payload": "raw"}, "a picture travels as jpeg, jpeg-preencoded, png, not raw"),
+        ({"options": {"http": {"url": "http://x", "dialect": "openvla"}}, "payload": "jpeg"}, "as raw, not jpeg"),
+        ({"options": {"http": {"url": "http://x", "dialect": "smoke"}}}, "`dialect`: 'smoke' is none of s2a, openai"),
+        ({"options": {"http": {"dialect": "tgi"}}}, "`dialect` is about a server that runs already"),
+        ({"options": {"http": {"llama_server": "x", "extra_body": "{}"}}}, "`extra_body` is about a server that runs"),
+        ({"options": {"http": {"url": "http://x", "extra_body": "{"}}}, "`extra_body`: no JSON"),
+        ({"options": {"http": {"url": "http://x", "api_key_env": "sk-1"}}}, "`api_key_env` takes the name of an env"),
+        ({"options": {"http": {"url": "http://x", "api_key_env": "NO_KEY"}}}, "`api_key_env`: the environment has no"),
+        ({"options": {"http": {"url": "http://u:p@x"}}}, "`url`: leave the password out"),
+        ({"options": URL, "variants": {"http": ("binary",)}}, "`http`: binary needs our own server"),
+        ({"options": URL, "transports": ("ros",)}, "`url` needs http among `transport`"),
+        (
+            {"options": {"http": {"llama_server": "x"}}, "engine": EngineConfig(name="echo")},
+            "`llama_server` runs a model",
+        ),
+        ({"mode": "stream", "payload": "jpeg-preencoded"}, "jpeg-preencoded has no meaning in `mode` stream"),
     ],
 )
 def test_what_makes_no_sense_is_named(fields: dict[str, Any], message: str) -> None:
@@ -108,5 +144,6 @@ def test_the_manifest_holds_the_whole_configuration_as_json() -> None:
     config = LatencyConfig(engine=EngineConfig(name="llama", model=Path("m.gguf")))
     kept = json.loads(json.dumps(config.to_manifest(), default=str))
     assert kept["size"] == "640x480"
-    assert kept["http"] == ["as-deployed", "best-effort", "binary"]
+    assert [*kept["pipelines"]] == ["http/as-deployed", "http/best-effort", "http/binary", "ros/topic"]
+    assert kept["pipelines"]["ros/topic"] == {"payload": "raw"}
     assert kept["engine"]["model"] == "m.gguf"

@@ -105,4 +105,4 @@ def test_this_machine_can_be_read() -> None:
 
 def test_packets_lost_by_others_are_no_warning_about_a_run_without_dds() -> None:
     assert Counters.read().receive_buffer_errors is not None
-    assert Counters.read(uses_dds=False).receive_buffer_errors is None
+    assert Counters.read(watches_udp=False).receive_buffer_errors is None

@@ -12,6 +12,7 @@ from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.echo import EchoEngine
 from s2a_bench.inference.paced import PacedEngine
 from s2a_bench.testing.engine import EngineSuite
+from s2a_bench.testing.transport import wiring
 from s2a_bench.types import Request, Token
 
 SECOND = 10**9
@@ -86,7 +87,6 @@ def test_it_says_what_the_rate_is_and_else_what_the_engine_says() -> None:
 
 def test_a_server_process_is_told_the_pace() -> None:
     from s2a_bench.harness.serving import ServerJob
-    from s2a_bench.transport import Route
 
-    job = ServerJob(Route("http"), EngineConfig(model=Path("m.gguf"), pace=4.8))
+    job = ServerJob(wiring("http"), EngineConfig(model=Path("m.gguf"), pace=4.8))
     assert ServerJob.from_json(job.to_json()) == job

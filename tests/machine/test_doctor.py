@@ -14,7 +14,9 @@ from typing import Any
 
 import pytest
 
+from s2a_bench.cli.doctor import all_checks
 from s2a_bench.frames.v4l2_formats import CameraInfo
+from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.harness.warnings import before_run
 from s2a_bench.inference.smoke import Smoke
 from s2a_bench.machine import doctor, environment
@@ -85,11 +87,16 @@ def make(tmp_path: Path) -> Make:
             (root / path).parent.mkdir(parents=True, exist_ok=True)
             (root / path).write_text(text)
         silent: dict[str, Any] = {"run": lambda _command: None, "which": lambda _name: None, "cameras": list}
-        silent["smoke_test"] = lambda: Smoke(0)
         known: dict[str, Any] = {"environ": {}, "cpus": frozenset(range(4)), "finds": lambda _package: True}
         return Machine(root, **(known | silent | {"output": tmp_path} | fields))
 
     return machine
+
+
+@pytest.fixture(autouse=True)
+def no_smoke(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let llama.cpp pass its test, which takes seconds, unless a test says otherwise."""
+    monkeypatch.setattr("s2a_bench.inference.checks.smoke_test", lambda: Smoke(0))
 
 
 @pytest.fixture(autouse=True)
@@ -135,11 +142,14 @@ def card(name: str = "NVIDIA GeForce RTX 4080", reasons: int = 1, persistence: i
 
 
 def see(machine: Machine, code: str) -> Finding:
-    (finding,) = examine(machine, [code])
+    (finding,) = examine(machine, {code: EVERY[code]})
     return finding
 
 
-HARDWARE = [code for code in CHECKS if code not in {"python", "packages", "compiler", "llama-build"}]
+EVERY = all_checks()
+HARDWARE = {
+    code: check for code, check in EVERY.items() if code not in {"python", "packages", "compiler", "llama-build"}
+}
 
 
 def test_a_well_kept_workstation_has_nothing_to_mend(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -426,7 +436,8 @@ def test_amx_is_used_or_off_for_a_reason(
 def test_a_build_that_dies_is_an_error_and_never_loaded_here(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "llama_cpp", None)  # importing it would say that it does not load
     died = Smoke(-4, "llama.cpp failed its test with q8_0 weights: killed by signal 4 (SIGILL)")
-    finding = see(make(RTX, smoke_test=lambda: died), "llama-build")
+    monkeypatch.setattr("s2a_bench.inference.checks.smoke_test", lambda: died)
+    finding = see(make(RTX), "llama-build")
     assert finding == Finding("llama-build", "error", died.message, "make clean setup")
 
 
@@ -436,10 +447,10 @@ def test_only_the_doctor_makes_the_smoke_test() -> None:
 
 @pytest.mark.slow
 def test_every_check_exists_and_uses_its_own_code(make: Make) -> None:
-    found = examine(replace(Machine(), output=make({}).output))
-    assert {finding.code for finding in found} <= CHECKS.keys()
+    found = examine(replace(Machine(), output=make({}).output), EVERY)
+    assert {finding.code for finding in found} <= EVERY.keys()
     assert set(BEFORE_RUN) <= CHECKS.keys()
-    assert [finding.code for finding in found] == [code for code in CHECKS if code in {seen.code for seen in found}]
+    assert [finding.code for finding in found] == [code for code in EVERY if code in {seen.code for seen in found}]
 
 
 SMALL_BUFFER = RTX | {"proc/sys/net/core/rmem_max": "212992"}
@@ -461,7 +472,8 @@ LOOSE = JETSON | {f"{CPU}/cpu0/cpufreq/scaling_min_freq": "1", "var/lib/nvpmodel
 def test_a_run_gets_the_doctors_warnings_that_concern_it(
     make: Make, tree: dict[str, str], width: int, dds: bool, expected: list[str]
 ) -> None:
-    warnings = before_run(width, 480, uses_dds=dds, machine=make(tree))
+    config = LatencyConfig(("ros",) if dds else ("http",), width=width)
+    warnings = before_run(config, make(tree))
     assert [warning.code for warning in warnings] == expected
     assert all(warning.advice for warning in warnings)
 

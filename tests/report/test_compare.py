@@ -6,12 +6,13 @@ import csv
 import io
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import numpy as np
+import pandas as pd
 import pytest
 
 from s2a_bench.errors import UnlikeRuns, UsageError
@@ -389,3 +390,18 @@ def test_a_side_is_one_folder_or_several_each_once(launch: Launch) -> None:
         read_side(f"{paths[0]},{paths[0]}", "A")
     with pytest.raises(UsageError, match="B: name a run folder"):
         read_side(" , ", "B")
+
+
+def test_a_folder_of_the_former_wire_formats_pairs_with_todays_payloads(tmp_path: Path) -> None:
+    """results/reference/echo-raw was written when raw pixels over ROS were called bgr."""
+    old = read_run(Path(__file__).parents[2] / "results" / "reference" / "echo-raw")
+    assert "bgr" in set(old.samples["payload"])
+    names = [each.name for each in fields(SampleRow)]
+    with RunWriter.create(tmp_path, "latency", {"environment": old.manifest["environment"]}) as run:
+        for row in old.samples.to_dict("records"):
+            row |= {"marks": json.loads(row["marks"]), "facts": json.loads(row["facts"])}
+            row["payload"] = {"bgr": "raw"}.get(row["payload"], row["payload"])
+            run.sample(SampleRow(**{name: None if row[name] is pd.NA else row[name] for name in names}))
+    both = open_comparison([old], [read_run(run.path)], unlike=False, least=0.05)
+    assert "ros/topic" in {pair.name for pair in both.pairs}
+    assert both.only == ((), ())

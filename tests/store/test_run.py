@@ -13,9 +13,8 @@ import pytest
 
 from s2a_bench.errors import StoreError
 from s2a_bench.store.files import read_csv, read_parquet
-from s2a_bench.store.requests import FRAMES, SAMPLES, TOKENS, FrameRow, SampleRow, TokenRow
+from s2a_bench.store.requests import EARLIER_STAGES, TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
 from s2a_bench.store.run import RunWriter, read_run
-from s2a_bench.trace import STAGES
 
 CHAIN = [
     ("", 1_000),
@@ -68,7 +67,7 @@ def open_run(tmp_path: Path) -> Iterator[Callable[..., RunWriter]]:
 
     yield create
     for run in runs:
-        for file in run._files.values():
+        for _, file in run._files.values():
             file.close()
 
 
@@ -94,7 +93,7 @@ def test_a_finished_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
     assert row["warmup"] == False  # noqa: E712 - a numpy bool
     assert read.tokens["client_ns"].tolist() == [9_007_199_254_740_993]
     assert read.frames.empty
-    assert list(read.frames.columns) == list(FRAMES.columns)
+    assert list(read.frames.columns) == list(frames_table(EARLIER_STAGES).columns)
 
 
 def test_derived_columns_are_the_budget_of_the_chain(tmp_path: Path) -> None:
@@ -117,8 +116,8 @@ def test_an_absent_stage_is_null_and_never_zero(tmp_path: Path) -> None:
     with RunWriter.create(tmp_path, "latency", {}) as run:
         run.sample(sample())
     samples = read_run(run.path).samples
-    absent = [f"{stage}_ns" for stage in STAGES if stage not in dict(CHAIN)]
-    assert len(absent) == len(STAGES) - 5
+    absent = [f"{stage}_ns" for stage in EARLIER_STAGES if stage not in dict(CHAIN)]
+    assert len(absent) == len(EARLIER_STAGES) - 5
     assert samples[absent].isna().all(axis=None)
     assert pd.isna(samples["frame_age_ns"][0])
 
@@ -136,7 +135,7 @@ def test_a_failed_sample_is_a_row_with_its_error_and_without_durations(tmp_path:
         run.sample(sample("r2"))
     samples = read_run(run.path).samples
     assert samples["error"].tolist() == ['refused: "no", 503\nretry', ""]
-    derived = [*(f"{stage}_ns" for stage in STAGES), "e2e_ns", "ttft_ns", "residual_ns", "residual_share"]
+    derived = [*(f"{stage}_ns" for stage in EARLIER_STAGES), "e2e_ns", "ttft_ns", "residual_ns", "residual_share"]
     assert samples[derived].iloc[0].isna().all()
     assert samples["e2e_ns"].iloc[1] == 11_850
 
@@ -166,7 +165,7 @@ def test_csv_and_parquet_hold_the_same_columns_and_values(tmp_path: Path) -> Non
         run.sample(sample("r2", error="x", server_prompt_ms=float("nan"), facts={"nan": float("nan")}))
         run.tokens(token(index, text, None if index % 2 else index) for index, text in enumerate(texts))
         run.frame(FrameRow("ros/topic", 3, 900, CHAIN[:4], "r1"))
-    for table in (SAMPLES, TOKENS, FRAMES):
+    for table in (samples_table(EARLIER_STAGES), TOKENS, frames_table(EARLIER_STAGES)):
         csv = read_csv(run.path / f"{table.name}.csv", table.columns)
         parquet = read_parquet(run.path / f"{table.name}.parquet", table.columns)
         assert csv.column_names == parquet.column_names == list(table.columns)
@@ -301,12 +300,12 @@ def test_a_full_disk_names_the_file_and_leaves_whole_records(
 ) -> None:
     run = open_run()
     run.sample(sample("r1"))
-    file = run._files[SAMPLES]._file
-    monkeypatch.setattr(run._files[SAMPLES], "_file", FullDisk(file))
+    file = run._files["samples"][1]._file
+    monkeypatch.setattr(run._files["samples"][1], "_file", FullDisk(file))
     with pytest.raises(StoreError, match=r"samples\.csv: No space left on device"):
         run.sample(sample("r2"))
     assert (run.path / "samples.csv").read_bytes().endswith(b"\n")
-    monkeypatch.setattr(run._files[SAMPLES], "_file", file)
+    monkeypatch.setattr(run._files["samples"][1], "_file", file)
     run.sample(sample("r3"))
     assert read_run(run.path).samples["request_id"].tolist() == ["r1", "r3"]
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from random import Random
 from threading import Event, Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,9 +20,9 @@ from s2a_bench.ros import ActionServer, Result, ServerGoal, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
-from s2a_bench.testing.transport import Recorder, ask, yuyv_frame
+from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Client, Route, open_client, open_server
+from s2a_bench.transport import Client, Wiring, open_client, open_server
 from s2a_bench.types import Request, Token
 
 NODE = "/llama_ros/generate_response"
@@ -29,9 +30,9 @@ Node = Callable[..., list[ServerGoal]]
 
 
 @pytest.fixture
-def foreign(dds_domain: int) -> Route:
-    """A route to somebody else's node."""
-    return Route("ros", "action", action=NODE, domain_id=dds_domain, black_box=True, timeout_s=20)
+def foreign(dds_domain: int) -> Wiring[Any]:
+    """A told to somebody else's node."""
+    return wiring("ros/action", action=NODE, domain_id=dds_domain)
 
 
 @pytest.fixture
@@ -72,7 +73,7 @@ def serve(
 
 
 @pytest.mark.parametrize("version", ["6.0", "4.4"])
-def test_a_llama_ros_node_is_driven_in_its_own_version(node: Node, foreign: Route, version: str) -> None:
+def test_a_llama_ros_node_is_driven_in_its_own_version(node: Node, foreign: Wiring[Any], version: str) -> None:
     goals = node(version)
     client = open_client(foreign)
     frame = yuyv_frame()
@@ -92,7 +93,7 @@ def test_a_llama_ros_node_is_driven_in_its_own_version(node: Node, foreign: Rout
     assert client.camera is None
 
 
-def test_a_node_without_a_limit_is_cancelled_after_the_last_wanted_token(node: Node, foreign: Route) -> None:
+def test_a_node_without_a_limit_is_cancelled_after_the_last_wanted_token(node: Node, foreign: Wiring[Any]) -> None:
     ended: list[int] = []
 
     def endless(goal: ServerGoal) -> None:
@@ -125,7 +126,7 @@ def test_a_node_without_a_limit_is_cancelled_after_the_last_wanted_token(node: N
     ],
 )
 def test_a_refusal_fails_the_request(
-    node: Node, foreign: Route, answer: Callable[[ServerGoal], None], message: str
+    node: Node, foreign: Wiring[Any], answer: Callable[[ServerGoal], None], message: str
 ) -> None:
     node(answer=answer)
     client = open_client(foreign)
@@ -136,7 +137,7 @@ def test_a_refusal_fails_the_request(
         client.close()
 
 
-def test_a_node_that_leaves_is_noticed(foreign: Route, dds_domain: int) -> None:
+def test_a_node_that_leaves_is_noticed(foreign: Wiring[Any], dds_domain: int) -> None:
     middleware = open_middleware(domain_id=dds_domain)
     server = middleware.action_server(NODE, GENERATE_RESPONSE)
     client = open_client(foreign)
@@ -160,15 +161,15 @@ def test_a_node_that_leaves_is_noticed(foreign: Route, dds_domain: int) -> None:
     assert left.is_set()
 
 
-def test_no_node_is_said_so(foreign: Route) -> None:
+def test_no_node_is_said_so(foreign: Wiring[Any]) -> None:
     with pytest.raises(ServerDied, match="no action server appeared at /llama_ros/generate_response"):
         open_client(foreign, lambda: False)
 
 
 def test_our_server_stops_at_a_stop_word_and_borrows_no_seed(dds_domain: int) -> None:
     handler = Recorder(["one ", "two ", "three ", "four "])
-    route = Route("ros", "action", "/test_stop", domain_id=dds_domain)
-    server = open_server(route, handler)
+    told = wiring("ros/action", "/test_stop", domain_id=dds_domain)
+    server = open_server(told, handler)
     thread = Thread(target=server.serve)
     thread.start()
     middleware = open_middleware(domain_id=dds_domain)
@@ -190,11 +191,11 @@ def test_our_server_stops_at_a_stop_word_and_borrows_no_seed(dds_domain: int) ->
 
 def test_tokens_faster_than_the_interval_share_a_feedback_and_none_is_lost(dds_domain: int) -> None:
     words = [f"t{number} " for number in range(200)]
-    route = Route("ros", "action", "/test_pace", domain_id=dds_domain, max_tokens=200, feedback_interval_s=0.02)
-    server = open_server(route, Recorder(words))
+    told = wiring("ros/action", "/test_pace", domain_id=dds_domain, max_tokens=200, feedback_interval=0.02)
+    server = open_server(told, Recorder(words))
     thread = Thread(target=server.serve)
     thread.start()
-    client = open_client(replace(route, timeout_s=20))
+    client = open_client(replace(told, timeout_s=20))
     try:
         tokens, _ = ask(client, Request("a", "plan", max_tokens=200))
     finally:
@@ -208,8 +209,8 @@ def test_tokens_faster_than_the_interval_share_a_feedback_and_none_is_lost(dds_d
 @pytest.mark.slow
 def test_ten_thousand_goals_with_random_cancels_leak_nothing(dds_domain: int) -> None:
     random = Random(1)
-    route = Route("ros", "action", "/test_soak", domain_id=dds_domain, max_tokens=4, result_timeout_s=0.5)
-    server = open_server(route, Recorder(["a", "b", "c", "d"]))
+    told = wiring("ros/action", "/test_soak", domain_id=dds_domain, max_tokens=4, result_timeout=0.5)
+    server = open_server(told, Recorder(["a", "b", "c", "d"]))
     thread = Thread(target=server.serve)
     thread.start()
     middleware = open_middleware(domain_id=dds_domain)
@@ -237,8 +238,8 @@ def test_ten_thousand_goals_with_random_cancels_leak_nothing(dds_domain: int) ->
 
 
 def test_impossible_goals_end_and_the_node_stays_up(dds_domain: int) -> None:
-    route = Route("ros", "action", "/test_bad", domain_id=dds_domain)
-    server = open_server(route, Recorder(["fine"]))
+    told = wiring("ros/action", "/test_bad", domain_id=dds_domain)
+    server = open_server(told, Recorder(["fine"]))
     thread = Thread(target=server.serve)
     thread.start()
     middleware = open_middleware(domain_id=dds_domain)
@@ -273,11 +274,11 @@ def test_a_handler_that_breaks_fails_its_goal_only(dds_domain: int) -> None:
                 raise ZeroDivisionError("a bug")
             yield from super().__call__(request, trace)
 
-    route = Route("ros", "action", "/test_broken", domain_id=dds_domain, timeout_s=20)
-    server = open_server(route, Broken(["fine"]))
+    told = wiring("ros/action", "/test_broken", domain_id=dds_domain)
+    server = open_server(told, Broken(["fine"]))
     thread = Thread(target=server.serve)
     thread.start()
-    client = open_client(route)
+    client = open_client(told)
     try:
         for _ in range(6):
             with pytest.raises(RequestFailed, match="a bug"):
@@ -296,11 +297,11 @@ def test_a_server_that_stops_ends_the_answer_under_way(dds_domain: int) -> None:
             Event().wait(0.001)
             yield Token(index, request.prompt)
 
-    route = Route("ros", "action", "/test_stopping", domain_id=dds_domain, timeout_s=20)
-    server = open_server(route, endless)
+    told = wiring("ros/action", "/test_stopping", domain_id=dds_domain)
+    server = open_server(told, endless)
     thread = Thread(target=server.serve)
     thread.start()
-    client = open_client(route)
+    client = open_client(told)
     try:
         tokens = client.request(Request("a", "x", max_tokens=10**9), Trace())
         next(tokens)
@@ -316,16 +317,16 @@ def test_a_server_that_stops_ends_the_answer_under_way(dds_domain: int) -> None:
 def test_our_server_does_not_join_a_node_that_answers_already(node: Node, dds_domain: int) -> None:
     node()
     with pytest.raises(TransportError, match="another server answers under /llama_ros"):
-        open_server(Route("ros", "action", "/llama_ros", domain_id=dds_domain), Recorder(["x"]))
+        open_server(wiring("ros/action", "/llama_ros", domain_id=dds_domain), Recorder(["x"]))
 
 
 def test_goals_of_two_clients_are_answered_one_after_the_other(dds_domain: int) -> None:
-    route = Route("ros", "action", "/test_two", domain_id=dds_domain, max_tokens=100, timeout_s=20)
+    told = wiring("ros/action", "/test_two", domain_id=dds_domain, max_tokens=100)
     handler = Recorder([f"t{number}" for number in range(100)])
-    server = open_server(route, handler)
+    server = open_server(told, handler)
     thread = Thread(target=server.serve)
     thread.start()
-    clients = [open_client(replace(route, address="/test_two")) for _ in range(2)]
+    clients = [open_client(replace(told, address="/test_two")) for _ in range(2)]
     counts: list[int] = []
 
     def count(client: Client) -> None:

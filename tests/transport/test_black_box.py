@@ -12,9 +12,9 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied
-from s2a_bench.testing.transport import yuyv_frame
+from s2a_bench.testing.transport import wiring, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
-from s2a_bench.transport import Route, open_client
+from s2a_bench.transport import open_client
 from s2a_bench.types import Request
 
 Script = list[bytes]
@@ -87,9 +87,7 @@ def serve() -> Iterator[Serve]:
 
 def ask(url: str, request: Request | None = None) -> tuple[list[str], Trace]:
     """Ask a black box; return the texts and the trace."""
-    client = open_client(
-        Route("http", "as-deployed", url, payload="jpeg", black_box=True, dialect="llama-server", timeout_s=20)
-    )
+    client = open_client(wiring("http/as-deployed", url=url, payload="jpeg", dialect="llama-server"))
     trace = Trace()
     trace.mark(RESIDUAL)
     try:
@@ -177,7 +175,7 @@ def test_a_connection_that_the_server_closed_is_opened_again(serve: Serve) -> No
     head = LLAMA_SERVER[0].replace(b"Connection: close\r\n\r\n", b"Keep-Alive: timeout=5, max=100\r\n")
     whole = b"".join(LLAMA_SERVER[1:])
     chunked = [head + b"Transfer-Encoding: chunked\r\n\r\n", b"%x\r\n%s\r\n0\r\n\r\n" % (len(whole), whole)]
-    client = open_client(Route("http", "as-deployed", serve(chunked), black_box=True, dialect="llama-server"))
+    client = open_client(wiring("http/as-deployed", url=serve(chunked), dialect="llama-server"))
     for number in range(20):
         assert len(list(client.request(Request(str(number), "plan"), Trace()))) == 2
     client.close()

@@ -2,46 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack
-from dataclasses import replace
-from threading import Thread
+from typing import Any
 
 import pytest
 
-from s2a_bench.testing.transport import Connect, TransportSuite
-from s2a_bench.transport import Client, Handler, Route, open_client, open_server
-
-
-def connector(route: Route) -> Iterator[Connect]:
-    """Connect through a server on a thread of its own; everything is stopped afterwards."""
-    with ExitStack() as stack:
-
-        def connect(handler: Handler) -> Client:
-            server = open_server(route, handler)
-            thread = Thread(target=server.serve)
-            thread.start()
-            stack.callback(thread.join)
-            stack.callback(server.stop)
-            client = open_client(replace(route, address=server.address, timeout_s=20), thread.is_alive)
-            stack.callback(client.close)
-            return client
-
-        yield connect
+from s2a_bench.testing.transport import TransportSuite, wiring
+from s2a_bench.transport import Wiring
 
 
 class TestLoopback(TransportSuite):
-    @pytest.fixture
-    def connect(self) -> Iterator[Connect]:
-        yield from connector(Route("loopback"))
+    name = "loopback"
 
 
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort", "binary"])
 @pytest.mark.parametrize("payload", ["raw", "png"])
 class TestHttp(TransportSuite):
     @pytest.fixture
-    def connect(self, variant: str, payload: str) -> Iterator[Connect]:
-        yield from connector(Route("http", variant, payload=payload))
+    def told(self, variant: str, payload: str) -> Wiring[Any]:
+        return wiring(f"http/{variant}", payload=payload)
 
 
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort", "binary"])
@@ -49,26 +27,35 @@ class TestHttpJpeg(TransportSuite):
     lossless = False
 
     @pytest.fixture
-    def connect(self, variant: str) -> Iterator[Connect]:
-        yield from connector(Route("http", variant, payload="jpeg"))
+    def told(self, variant: str) -> Wiring[Any]:
+        return wiring(f"http/{variant}")
 
 
 @pytest.mark.parametrize("connection", ["per-request", "client-per-request"])
 class TestHttpConnections(TransportSuite):
     @pytest.fixture
-    def connect(self, connection: str) -> Iterator[Connect]:
-        yield from connector(Route("http", "best-effort", payload="raw", connection=connection))
+    def told(self, connection: str) -> Wiring[Any]:
+        return wiring("http/best-effort?payload=raw", connection=connection)
 
 
+@pytest.mark.parametrize("payload", ["raw", "yuyv", "png"])
 class TestRosTopic(TransportSuite):
     @pytest.fixture
-    def connect(self, dds_domain: int) -> Iterator[Connect]:
-        yield from connector(Route("ros", "topic", domain_id=dds_domain))
+    def told(self, dds_domain: int, payload: str) -> Wiring[Any]:
+        return wiring("ros/topic", domain_id=dds_domain, payload=payload)
+
+
+class TestRosTopicJpeg(TransportSuite):
+    lossless = False
+
+    @pytest.fixture
+    def told(self, dds_domain: int) -> Wiring[Any]:
+        return wiring("ros/topic?payload=jpeg", domain_id=dds_domain)
 
 
 class TestRosAction(TransportSuite):
     carries_id_and_limit = False  # llama_msgs goals have neither
 
     @pytest.fixture
-    def connect(self, dds_domain: int) -> Iterator[Connect]:
-        yield from connector(Route("ros", "action", domain_id=dds_domain, max_tokens=2000))
+    def told(self, dds_domain: int) -> Wiring[Any]:
+        return wiring("ros/action", domain_id=dds_domain, max_tokens=2000)

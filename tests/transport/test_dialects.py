@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from threading import Event
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,9 @@ import pytest
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import decode_image, encode_png, to_bgr
-from s2a_bench.testing.transport import Connect, Recorder, TransportSuite, ask, yuyv_frame
+from s2a_bench.testing.transport import Connect, Recorder, TransportSuite, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Client, Handler, Route, open_client
+from s2a_bench.transport import Client, Handler, Wiring, open_client
 from s2a_bench.transport.http.dialects import DIALECTS
 from s2a_bench.types import Request, Token
 from tests.servers.sockets import CLOSE, Received, Reply, chunk, head, kept_head, serving
@@ -24,9 +25,9 @@ GO_TO = [Token(0, "go", 11), Token(1, "_to", 12)]
 Pieces = list[bytes]
 
 
-def route(speaker: Speaker, url: str, **more: object) -> Route:
-    fields = {"payload": "png", "black_box": True, "dialect": speaker.dialect, "timeout_s": 20.0, **more}
-    return Route("http", "as-deployed", url, **fields)  # type: ignore[arg-type]
+def route(speaker: Speaker, url: str, **more: object) -> Wiring[Any]:
+    fields = {"payload": "png", "dialect": speaker.dialect, **more}
+    return wiring("http/as-deployed", url=url, **fields)  # type: ignore[arg-type]
 
 
 @contextmanager
@@ -60,6 +61,7 @@ def speaker(request: pytest.FixtureRequest) -> Speaker:
 class TestContract(TransportSuite):
     """The transports' contract, as far as a foreign server carries it: no ids, no marks, no raw pixels."""
 
+    name = "http/as-deployed"
     lossless = False
 
     @pytest.fixture
@@ -158,10 +160,10 @@ def test_a_connection_that_breaks_in_the_middle_of_a_chunk_is_a_failure(speaker:
 @pytest.mark.parametrize(
     ("status", "more", "says", "retry_after_s"),
     [
-        ("401 Unauthorized", [], "answered 401: no way; name the environment variable .* --api-key-env", None),
-        ("403 Forbidden", [], "answered 403: no way; .* --api-key-env", None),
-        ("404 Not Found", [], "answered 404: no way; see --url, --dialect and --served-model", None),
-        ("413 Payload Too Large", [], "answered 413: no way; choose a smaller --size", None),
+        ("401 Unauthorized", [], "answered 401: no way; name the environment variable .* `api_key_env`", None),
+        ("403 Forbidden", [], "answered 403: no way; .* `api_key_env`", None),
+        ("404 Not Found", [], "answered 404: no way; see `url`, `dialect` and `served_model`", None),
+        ("413 Payload Too Large", [], "answered 413: no way; choose a smaller `size`", None),
         ("429 Too Many Requests", ["Retry-After: 7"], "answered 429: no way; it asks to wait 7 s; .*quota", 7.0),
         ("503 Service Unavailable", ["retry-after: 1.5"], "answered 503: no way; it asks to wait 1.5 s$", 1.5),
         ("503 Busy", ["Retry-After: Wed, 21 Oct 2015 07:28:00 GMT"], "answered 503: no way$", 0.0),
@@ -186,7 +188,7 @@ def test_googles_retry_delay_is_in_the_body() -> None:
 
 
 def test_a_moved_server_is_not_followed(speaker: Speaker) -> None:
-    with pytest.raises(RequestFailed, match="answered 307: nothing; it moved: give https://elsewhere/ to --url"):
+    with pytest.raises(RequestFailed, match="answered 307: nothing; it moved: give https://elsewhere/ to `url`"):
         said(speaker, [head("307 Moved", "text/plain", "Location: https://elsewhere/")])
 
 
@@ -197,7 +199,7 @@ def test_an_error_with_status_200_is_a_failure(speaker: Speaker, kind: str) -> N
 
 
 def test_a_page_of_another_server_is_named(speaker: Speaker) -> None:
-    with pytest.raises(RequestFailed, match=r"answered 200: <html>.* \(as text/html where .* see --dialect"):
+    with pytest.raises(RequestFailed, match=r"answered 200: <html>.* \(as text/html where .* see `dialect`"):
         said(speaker, [head(kind="text/html"), b"<html>\n<title>router</title>" + b"x" * 500_000])
 
 
@@ -250,7 +252,7 @@ class TestThinking:
 
     def test_alone_is_no_answer(self, speaker: Speaker) -> None:
         pieces = [head(kind=speaker.kind), speaker.thinking("hm"), speaker.closing([])]
-        with pytest.raises(RequestFailed, match="thought and gave no answer: raise --max-tokens"):
+        with pytest.raises(RequestFailed, match="thought and gave no answer: raise `max_tokens`"):
             said(speaker, pieces)
 
 
@@ -345,8 +347,8 @@ class TestKeys:
     ) -> None:
         if value is not None:
             monkeypatch.setenv(name, value)
-        with pytest.raises(UsageError, match="--api-key-env") as error:
-            open_client(Route("http", "as-deployed", "http://x", black_box=True, dialect="openai", api_key_env=name))
+        with pytest.raises(UsageError, match="`api_key_env`") as error:
+            open_client(wiring("http/as-deployed", url="http://x", dialect="openai", api_key_env=name))
         assert "sk-12" not in str(error.value)
         assert "a\nb" not in str(error.value)
 
@@ -372,9 +374,7 @@ class TestKeys:
     ],
 )
 def test_a_url_may_end_at_the_server_the_api_or_the_route(dialect: str, base: str, path: str) -> None:
-    client = open_client(
-        Route("http", "as-deployed", "http://h:1" + base, black_box=True, dialect=dialect, model="a/b")
-    )
+    client = open_client(wiring("http/as-deployed", url="http://h:1" + base, dialect=dialect, served_model="a/b"))
     client.close()
     assert client.describe() == {"url": "http://h:1" + path, "dialect": dialect}
 
@@ -404,7 +404,7 @@ def test_a_grammar_reaches_the_servers_that_know_it_and_is_refused_elsewhere(spe
             ask(client, request)
             assert handler.requests[0].grammar == 'root ::= "x"'
         else:
-            with pytest.raises(UsageError, match=f"--grammar: the dialect '{speaker.dialect}' has no field"):
+            with pytest.raises(UsageError, match=f"`grammar`: the dialect '{speaker.dialect}' has no field"):
                 ask(client, request)
 
 
@@ -441,7 +441,7 @@ def test_both_variants_say_the_same(speaker: Speaker) -> None:
         handler = Recorder(["x"])
         handlers.append(handler)
         with serving(answering(speaker, handler)) as url:
-            client = open_client(Route("http", variant, url, "png", black_box=True, dialect=speaker.dialect))
+            client = open_client(wiring(f"http/{variant}", url=url, payload="png", dialect=speaker.dialect))
             ask(client, Request("a", "Grüße", (yuyv_frame(),), max_tokens=3, seed=5))
             client.close()
     (first,), (second,) = (handler.requests for handler in handlers)

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import PortInUse
-from s2a_bench.testing.transport import Recorder, ask, yuyv_frame
+from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Handler, Route, open_client, open_server
+from s2a_bench.transport import Handler, open_client, open_server
 from s2a_bench.transport.http import own as dialect
 from s2a_bench.types import Request, Token
 
@@ -32,7 +32,7 @@ def handler() -> Recorder:
 def serving(handler: Handler) -> Iterator[str]:
     """Serve for as long as the context lasts."""
     with ExitStack() as stack:
-        server = open_server(Route("http"), handler)
+        server = open_server(wiring("http"), handler)
         thread = Thread(target=server.serve)
         thread.start()
         stack.callback(thread.join)
@@ -47,7 +47,7 @@ def url(handler: Recorder) -> Iterator[str]:
 
 
 def stages(url: str, variant: str, payload: str) -> set[str]:
-    client = open_client(Route("http", variant, url, payload=payload))
+    client = open_client(wiring(f"http/{variant}", url, payload=payload))
     try:
         _, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
     finally:
@@ -73,13 +73,13 @@ def test_each_variant_has_its_stages_and_no_other(url: str, variant: str, payloa
 
 
 def test_a_new_client_per_request_shows_as_connect(url: str) -> None:
-    client = open_client(Route("http", "as-deployed", url, connection="client-per-request"))
+    client = open_client(wiring("http/as-deployed", url, connection="client-per-request"))
     _, trace = ask(client, Request("a", "plan"))
     assert "connect" in budget(trace.chain()).stages_ns
 
 
 def test_our_own_server_is_known_by_its_url_and_keeps_its_marks(url: str) -> None:
-    client = open_client(Route("http", "as-deployed", url, black_box=True))
+    client = open_client(wiring("http/as-deployed", url=url))
     _, trace = ask(client, Request("a", "plan"))
     client.close()
     assert client.describe() == {"url": url + "/v1/chat/completions", "dialect": "s2a"}
@@ -90,7 +90,7 @@ def test_marks_of_another_hosts_clock_are_not_mixed_with_ours(url: str, monkeypa
     monkeypatch.setattr("s2a_bench.transport.http.client.clock_id", lambda: "another boot")
     monkeypatch.setattr("s2a_bench.trace.clock_id", lambda: "another boot")
     monkeypatch.setattr(dialect, "remote_json", lambda remote: {**asdict(remote), "clock": "this boot"})
-    client = open_client(Route("http", "as-deployed", url))
+    client = open_client(wiring("http/as-deployed", url))
     _, trace = ask(client, Request("a", "plan"))
     client.close()
     assert set(budget(trace.chain()).stages_ns) == {"json_pack", "server"}
@@ -105,10 +105,10 @@ def test_connections_are_kept_or_not(
     opened = []
     connect = socket.create_connection
     monkeypatch.setattr(socket, "create_connection", lambda *a, **k: opened.append(1) or connect(*a, **k))
-    server = open_server(Route("http"), handler)
+    server = open_server(wiring("http"), handler)
     thread = Thread(target=server.serve)
     thread.start()
-    client = open_client(Route("http", "as-deployed", server.address, connection=connection))
+    client = open_client(wiring("http/as-deployed", server.address, connection=connection))
     try:
         for _ in range(3):
             ask(client, Request("a", "plan"))
@@ -205,7 +205,7 @@ def test_stopping_in_the_middle_of_an_answer_leaves_no_traceback(capsys: pytest.
         over.wait(30)
         yield Token(1, "on")
 
-    server = open_server(Route("http"), slow)
+    server = open_server(wiring("http"), slow)
     thread = Thread(target=server.serve)
     thread.start()
     body = {"messages": [{"role": "user", "content": "plan"}], "stream": True}
@@ -235,8 +235,8 @@ def test_health_and_models_answer(url: str) -> None:
 
 
 def test_a_port_in_use_is_named(url: str, handler: Recorder) -> None:
-    with pytest.raises(PortInUse, match=r"--port: .* is in use"):
-        open_server(Route("http", address=url.removeprefix("http://")), handler)
+    with pytest.raises(PortInUse, match=r"`port`: .* is in use"):
+        open_server(wiring("http", url.removeprefix("http://")), handler)
 
 
 def test_servers_bind_loopback_unless_told(url: str) -> None:

@@ -38,7 +38,7 @@ def test_patches_do_what_the_rfc_says(target: Any, patch: Any, result: Any) -> N
 
 @pytest.mark.parametrize("text", ["{", "[1]", '"x"', "7", '{"a": NaN}', "[" * 100_000])
 def test_what_is_no_object_is_refused(text: str) -> None:
-    with pytest.raises(UsageError, match="--extra-body"):
+    with pytest.raises(UsageError, match="`extra_body`"):
         read_patch(text)
 
 

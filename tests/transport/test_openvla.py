@@ -11,9 +11,9 @@ import pytest
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import yuyv_to_rgb
-from s2a_bench.testing.transport import ask, yuyv_frame
+from s2a_bench.testing.transport import ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Route, open_client
+from s2a_bench.transport import open_client
 from s2a_bench.types import Frame, Request, Token
 from tests.servers.sockets import Received, Reply, head, serving
 
@@ -26,7 +26,7 @@ def json_head(body: bytes) -> bytes:
 
 def asked(reply: Reply, frame: Frame | None = None, **more: str) -> tuple[list[Token], Trace]:
     with serving(reply) as url:
-        client = open_client(Route("http", "as-deployed", url, "raw", black_box=True, dialect="openvla", **more))
+        client = open_client(wiring("http/as-deployed", url=url, payload="raw", dialect="openvla", **more))
         try:
             return ask(client, Request("a", "pick up the cup", (frame,) if frame else ()))
         finally:
@@ -50,7 +50,7 @@ def test_the_pixels_arrive_as_rgb_and_the_action_comes_back_as_one_token(encodin
         seen.append(received)
         return [json_head(json_numpy.dumps(ACTION).encode())]
 
-    (token,), trace = asked(deploy, frame, model="bridge_orig")
+    (token,), trace = asked(deploy, frame, served_model="bridge_orig")
     payload = json_numpy.loads(seen[0].body)
     assert payload["instruction"] == "pick up the cup"
     assert payload["unnorm_key"] == "bridge_orig"

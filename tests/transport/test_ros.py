@@ -14,9 +14,9 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.testing.transport import Recorder, ask, yuyv_frame
+from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
-from s2a_bench.transport import Client, Handler, Route, open_client, open_server
+from s2a_bench.transport import Client, Handler, Wiring, open_client, open_server
 from s2a_bench.transport.ros.camera import CAMERA
 from s2a_bench.types import Frame, Request, Token
 
@@ -27,23 +27,23 @@ def stack() -> Iterator[ExitStack]:
         yield whole
 
 
-def serve(stack: ExitStack, route: Route, handler: Handler) -> None:
-    server = open_server(route, handler)
+def serve(stack: ExitStack, told: Wiring[Any], handler: Handler) -> None:
+    server = open_server(told, handler)
     thread = Thread(target=server.serve)
     thread.start()
     stack.callback(thread.join)
     stack.callback(server.stop)
 
 
-def connect(stack: ExitStack, route: Route) -> Client:
-    client = open_client(route)
+def connect(stack: ExitStack, told: Wiring[Any]) -> Client:
+    client = open_client(told)
     stack.callback(client.close)
     return client
 
 
 @pytest.fixture
-def route(dds_domain: int) -> Route:
-    return Route("ros", "topic", "/test_ros", domain_id=dds_domain, timeout_s=20)
+def told(dds_domain: int) -> Wiring[Any]:
+    return wiring("ros/topic", "/test_ros", domain_id=dds_domain)
 
 
 def ask_until_seen(client: Client, handler: Recorder, stamp_ns: int) -> Trace:
@@ -58,15 +58,15 @@ def ask_until_seen(client: Client, handler: Recorder, stamp_ns: int) -> Trace:
     raise AssertionError("the server never got the frame")
 
 
-@pytest.mark.parametrize("wire", ["bgr", "yuyv", "compressed"])
-def test_a_request_without_a_picture_is_about_the_newest_frame(stack: ExitStack, route: Route, wire: str) -> None:
-    from dataclasses import replace
-
+@pytest.mark.parametrize("payload", ["raw", "yuyv", "jpeg", "png"])
+def test_a_request_without_a_picture_is_about_the_newest_frame(
+    stack: ExitStack, told: Wiring[Any], dds_domain: int, payload: str
+) -> None:
     import cv2
 
     handler = Recorder(["x"])
-    serve(stack, route, handler)
-    client = connect(stack, replace(route, wire=wire))
+    serve(stack, told, handler)
+    client = connect(stack, wiring("ros/topic", told.address, domain_id=dds_domain, payload=payload))
     assert client.camera is not None
     for seed in (1, 2):
         frame, published = yuyv_frame(seed=seed), Trace()
@@ -74,19 +74,19 @@ def test_a_request_without_a_picture_is_about_the_newest_frame(stack: ExitStack,
         client.camera.publish(frame, published)
     trace = ask_until_seen(client, handler, client.camera.stamp_ns(frame))
     (image,) = handler.requests[-1].images
-    if wire != "compressed":
+    if payload != "jpeg":
         np.testing.assert_array_equal(image.data, cv2.cvtColor(frame.data, cv2.COLOR_YUV2RGB_YUY2))
     assert trace.remote is not None
     stages = [stage for stage, _ in trace.remote.frame_marks]
-    decoding = {"bgr": "channel_swap", "yuyv": "yuv_decode", "compressed": "image_decode"}[wire]
+    decoding = {"raw": "channel_swap", "yuyv": "yuv_decode"}.get(payload, "image_decode")
     assert stages == ["network", "cdr_parse", decoding]
     assert decoding not in budget(trace.chain()).stages_ns
 
 
-def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, route: Route, dds_domain: int) -> None:
+def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, told: Wiring[Any], dds_domain: int) -> None:
     handler = Recorder(["x"])
-    serve(stack, route, handler)
-    client = connect(stack, route)
+    serve(stack, told, handler)
+    client = connect(stack, told)
     middleware = open_middleware(domain_id=dds_domain)
     stack.callback(middleware.close)
     publisher = middleware.publisher("/test_ros" + CAMERA, ros.IMAGE, QoS(1))
@@ -103,7 +103,7 @@ def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, route:
     ask_until_seen(client, handler, client.camera.stamp_ns(frame))
 
 
-def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, route: Route) -> None:
+def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, told: Wiring[Any]) -> None:
     free, go, started, both = Lock(), Event(), Event(), Event()
 
     def handler(request: Request, trace: Trace) -> Generator[Token, None, None]:
@@ -118,8 +118,8 @@ def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, route: Ro
         free.release()
         yield Token(0, request.id)
 
-    serve(stack, route, handler)
-    clients = [connect(stack, route) for _ in range(2)]
+    serve(stack, told, handler)
+    clients = [connect(stack, told) for _ in range(2)]
     traces: dict[str, Any] = {}
 
     def run(client: Client, name: str) -> None:
@@ -137,7 +137,7 @@ def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, route: Ro
     assert budget(traces["2"].chain()).stages_ns["queue"] > 0
 
 
-def test_a_second_server_of_a_namespace_is_refused(stack: ExitStack, route: Route) -> None:
-    serve(stack, route, Recorder(["x"]))
+def test_a_second_server_of_a_namespace_is_refused(stack: ExitStack, told: Wiring[Any]) -> None:
+    serve(stack, told, Recorder(["x"]))
     with pytest.raises(TransportError, match="another server answers under /test_ros"):
-        open_server(route, Recorder(["y"]))
+        open_server(told, Recorder(["y"]))

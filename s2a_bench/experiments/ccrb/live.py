@@ -31,7 +31,7 @@ from s2a_bench.runtime.events import Event, SkillCame
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.scenario import simulator
 from s2a_bench.scenario.ccrb.source import RoadSource
-from s2a_bench.store.requests import SAMPLES, TOKENS
+from s2a_bench.store.requests import TOKENS, samples_table
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
@@ -53,10 +53,11 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
         source = RoadSource(config.scenario.cars, requests.width, requests.height, fps=requests.fps)
         manifest = {
             "configuration": {**config.to_manifest(), "live": {**live.to_manifest(), "source": source.name}},
-            "environment": environment.collect(),
+            "stages": requests.stages,
+            "environment": environment.collect(requests.packages),
             "seeds": {"sampling": requests.seed},
         }
-        tables = (ROLLOUTS, TRAJECTORIES, SKILLS, SAMPLES, TOKENS)
+        tables = (ROLLOUTS, TRAJECTORIES, SKILLS, samples_table(requests.stages), TOKENS)
         writer = stack.enter_context(RunWriter.create(output, "ccrb", manifest, tables))
         progress.opened(writer.path)
         progress.expect(requests.warmup + 1)

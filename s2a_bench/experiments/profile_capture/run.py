@@ -129,12 +129,12 @@ def capture(config: CaptureConfig, stage: Callable[[str], None], advance: Callab
     config.check()
     need_engine(config.engine.name)
     limit_threads()
-    warnings = before_run(config.width, config.height, uses_dds=False)
+    warnings = before_run()
     with ExitStack() as stack:
         stage("loading the model")
         engine = open_model(config.engine)
         stack.callback(engine.close)
-        before = Counters.read(uses_dds=False)
+        before = Counters.read(watches_udp=False)
         asked = answers(engine, config)
         stack.callback(asked.close)  # type: ignore[attr-defined]  # a generator
         recorded = []
@@ -142,7 +142,7 @@ def capture(config: CaptureConfig, stage: Callable[[str], None], advance: Callab
             stage("warming up" if number < config.warmup else "measuring")
             recorded.append(next(asked))
             advance()
-        warnings += Counters.read(uses_dds=False).warnings_since(before)
+        warnings += Counters.read(watches_udp=False).warnings_since(before)
         described = engine.describe()
     stage("fitting the gaps")
     said = [f"{warning.code}: {warning.message}; {warning.advice}" for warning in warnings]

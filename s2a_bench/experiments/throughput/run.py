@@ -36,8 +36,8 @@ class ThroughputConfig:
             raise UsageError("--max-tokens: a rate needs 2 tokens or more")
         if requests.engine.name == "echo":
             raise UsageError("--engine echo computes nothing; --engine llama or replay has tokens a second")
-        if requests.black_box and requests.engine.sampling == "greedy":
-            raise UsageError("--sampling greedy is our own engine's; leave it out with --url or --llama-server")
+        if requests.foreign and requests.engine.sampling == "greedy":
+            raise UsageError(f"`sampling` greedy is our own engine's; leave it out with `{requests.foreign}`")
         if self.reference is None:
             return
         if not (self.reference.is_file() and os.access(self.reference, os.X_OK)):
@@ -60,5 +60,5 @@ def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -
             return []
         return [LlamaBench(config.reference, requests, writer, lambda: max(session.prompt_n for session in sessions))]
 
-    task = Task("throughput", {"reference": config.reference}, {"loopback": IN_PROCESS}, others)
+    task = Task("throughput", {"reference": config.reference}, IN_PROCESS, others)
     return run_requests(task, config.requests, output, progress)

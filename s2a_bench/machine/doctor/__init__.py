@@ -20,7 +20,6 @@ from s2a_bench import extras
 
 if TYPE_CHECKING:
     from s2a_bench.frames.v4l2_formats import CameraInfo
-    from s2a_bench.inference.smoke import Smoke
 
 Level: TypeAlias = Literal["state", "advice", "warning", "error"]
 LEVELS: tuple[Level, ...] = ("state", "advice", "warning", "error")
@@ -63,13 +62,6 @@ def _cameras() -> list[CameraInfo]:
     return list_cameras()
 
 
-def _smoke_test() -> Smoke:
-    """Let llama.cpp answer in a process of its own, which takes seconds."""
-    from s2a_bench.inference.smoke import smoke_test
-
-    return smoke_test()
-
-
 @dataclass(frozen=True, slots=True)
 class Machine:
     """Everything that checks may look at; the defaults are this machine and this process."""
@@ -84,7 +76,6 @@ class Machine:
     finds: Callable[[str], bool] = _finds
     """Whether this Python has a package."""
     cameras: Callable[[], list[CameraInfo]] = _cameras
-    smoke_test: Callable[[], Smoke] = _smoke_test
 
     def read(self, path: str) -> str | None:
         """Return a file's text without blanks and NULs around it; None where it cannot be read."""
@@ -114,7 +105,6 @@ CHECKS: dict[str, str] = {
     "python": "s2a_bench.machine.doctor.software:python",
     "packages": "s2a_bench.machine.doctor.software:packages",
     "compiler": "s2a_bench.machine.doctor.software:compiler",
-    "llama-build": "s2a_bench.machine.doctor.software:llama_build",
     "board": "s2a_bench.machine.doctor.gpu:board",
     "gpu": "s2a_bench.machine.doctor.gpu:gpu",
     "gpu-throttling": "s2a_bench.machine.doctor.gpu:gpu_throttling",
@@ -129,13 +119,9 @@ CHECKS: dict[str, str] = {
     "clock-source": "s2a_bench.machine.doctor.cpu:clock_source",
     "memory": "s2a_bench.machine.doctor.room:memory",
     "disk": "s2a_bench.machine.doctor.room:disk",
-    "rmem-max": "s2a_bench.machine.doctor.robot:rmem_max",
-    "dds": "s2a_bench.machine.doctor.robot:dds",
-    "ros": "s2a_bench.machine.doctor.robot:ros",
-    "middleware": "s2a_bench.machine.doctor.robot:middleware",
     "cameras": "s2a_bench.machine.doctor.robot:cameras",
 }
-"""Code of the findings -> check, in the order in which they are shown."""
+"""Code of the findings -> check, in the order in which they are shown; engines and transports declare their own."""
 
 BEFORE_RUN = (
     *("cpus", "cpu-governor", "jetson-clocks", "load", "temperature", "gpu-throttling", "clock-source", "disk"),
@@ -143,9 +129,9 @@ BEFORE_RUN = (
 """The checks that concern every measurement: those whose trouble distorts its numbers or ends it half-way."""
 
 
-def examine(machine: Machine, codes: Iterable[str] = CHECKS) -> list[Finding]:
-    """Make the named checks, all of them unless told; those with nothing to look at are left out."""
-    found = (resolve_name(CHECKS[code])(machine) for code in codes)
+def examine(machine: Machine, checks: Mapping[str, str] = CHECKS) -> list[Finding]:
+    """Make the checks (code -> ``module:function``); those with nothing to look at are left out."""
+    found = (resolve_name(check)(machine) for check in checks.values())
     return [finding for finding in found if finding is not None]
 
 

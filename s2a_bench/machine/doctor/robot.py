@@ -1,14 +1,8 @@
-"""What the robot's side needs: sockets and interfaces for DDS, a ROS 2 installation, cameras."""
+"""What the robot's side needs: sockets for DDS, and cameras."""
 
 from __future__ import annotations
 
-import platform
-from xml.etree import ElementTree as ET
-
-from s2a_bench.errors import UsageError
 from s2a_bench.machine.doctor import Finding, Machine
-from s2a_bench.ros import WAYS_OUT, default_middleware
-from s2a_bench.ros.config import configuration, domain_id
 
 RMEM_WANTED = 4 << 20
 """Bytes of receive buffer that hold a large picture's fragments while the reader is busy (docs/latency.md)."""
@@ -27,69 +21,6 @@ def rmem_max(machine: Machine) -> Finding | None:
         f"net.core.rmem_max is {rmem}: DDS loses fragments of large pictures and stalls by 200 ms",
         f"sudo sysctl -w net.core.rmem_max={RMEM_WANTED}",
     )
-
-
-def dds(machine: Machine) -> Finding:
-    """Say which domain and interfaces are used."""
-    try:
-        domain = domain_id(machine.environ)
-        text = configuration(machine.environ, "tuned")
-    except UsageError as error:
-        return Finding("dds", "error", str(error), f"unset {str(error).partition(':')[0]}")
-    if text is None:
-        return Finding("dds", "state", f"domain {domain}, CYCLONEDDS_URI {machine.environ['CYCLONEDDS_URI']}")
-    root = ET.fromstring(text)  # noqa: S314 - our own text
-    bound = [str(interface.get("address")) for interface in root.iter("NetworkInterface")]
-    up = [path.split("/")[3] for path, state in machine.read_all("sys/class/net/*/operstate").items() if state == "up"]
-    where = f"loopback only ({', '.join(bound)})" if bound else f"all interfaces: {', '.join(up) or 'none is up'}"
-    multicast = root.findtext(".//AllowMulticast") == "true"
-    told = f"domain {domain}, {where}, {'with' if multicast else 'without'} multicast"
-    if not bound and not up:
-        return Finding("dds", "warning", told, "ip link shows why; or unset ROS_AUTOMATIC_DISCOVERY_RANGE")
-    return Finding("dds", "state", told)
-
-
-def ros(machine: Machine) -> Finding:
-    """Say which ROS 2 is sourced, and whether this Python is the one its rclpy was built for."""
-    distro = machine.environ.get("ROS_DISTRO")
-    prefixes = machine.environ.get("AMENT_PREFIX_PATH", "")
-    if not (distro and prefixes):
-        installed = sorted(path.parent.name for path in machine.root.glob("opt/ros/*/setup.bash"))
-        if not installed:
-            return Finding("ros", "state", "no ROS 2 installed, and none needed")
-        return Finding(
-            "ros",
-            "advice",
-            f"{', '.join(installed)} is installed and not sourced: Cyclone DDS from PyPI is used, not your ROS's DDS",
-            f"source /opt/ros/{installed[-1]}/setup.bash",
-        )
-    rmw = machine.environ.get("RMW_IMPLEMENTATION", "its default RMW")
-    ours = ".".join(platform.python_version_tuple()[:2])
-    built = sorted(
-        {
-            path.parent.parent.name.removeprefix("python")
-            for prefix in prefixes.split(":")
-            for pattern in ("lib/python3*/site-packages/rclpy", "local/lib/python3*/dist-packages/rclpy")
-            for path in (machine.root / prefix.lstrip("/")).glob(pattern)
-        }
-    )
-    if ours in built:
-        return Finding("ros", "state", f"{distro}, {rmw}, rclpy for Python {ours}")
-    told = (
-        f"{distro} is sourced, with rclpy for Python {', '.join(built)}"
-        if built
-        else f"{distro} is sourced without rclpy"
-    )
-    fix = f"make PYTHON=python{built[-1]} VENV=.venv-ros setup" if built else f"sudo apt install ros-{distro}-rclpy"
-    return Finding("ros", "warning", f"{told}; this is Python {ours}, so Cyclone DDS from PyPI has to do", fix)
-
-
-def middleware(machine: Machine) -> Finding:
-    """Say which middleware a run takes unless told, and whether it is there."""
-    name = default_middleware(machine.environ)
-    if machine.finds(name):
-        return Finding("middleware", "state", f"{name} (--middleware takes another)")
-    return Finding("middleware", "error", f"{name} is not installed, so --transport ros cannot run", WAYS_OUT[name])
 
 
 def cameras(machine: Machine) -> Finding:

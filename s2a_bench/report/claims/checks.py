@@ -25,7 +25,7 @@ _EXPANSION: Final = 4 / 3
 _EXPANSION_ROOM: Final = 0.01
 """The body holds the prompt and JSON's own characters besides."""
 _SMALL_BYTES: Final = 50_000
-_LATENCY: Final = "s2a-bench latency --payload jpeg-preencoded"
+_LATENCY: Final = "s2a-bench latency --transport http?payload=jpeg-preencoded,ros"
 _HALF: Final = 0.5
 
 
@@ -196,7 +196,9 @@ def machine_of(run: Run) -> str:
 
 def _pair(run: Run) -> tuple[Cell, Cell] | None:
     """Return HTTP as usually deployed and ROS, where both are told apart from inference."""
-    cells = {cell.name: cell for cell in cells_of(run) if cell.values_ms(_METRIC).size and not cell.has_ingest}
+    cells = {
+        "/".join(cell.path): cell for cell in cells_of(run) if cell.values_ms(_METRIC).size and not cell.has_ingest
+    }
     http = cells.get("http/as-deployed")
     ros = cells.get("ros/topic") or cells.get("ros/action")
     return (http, ros) if http and ros else None

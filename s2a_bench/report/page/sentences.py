@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.tables import TITLES
 from s2a_bench.experiments.study.rows import STUDIES
+from s2a_bench.transport import declared
 from s2a_bench.writers.tables import interval, mean_sd, number
 
 if TYPE_CHECKING:
@@ -35,8 +36,12 @@ def latency_sentences(run: Run) -> list[str]:
     ]
     if medians:
         said.append(f"{TITLES[metric]}, medians: {', '.join(medians)}.")
-    found = [(cell.name, base.name, ratio) for of, cell, base, ratio in ratios(cells, seed_of(run)) if of == metric]
-    return said + [_times(cell, base, ratio) for cell, base, ratio in found if base != "loopback"][:_MOST]
+    found = [
+        _times(cell.name, base.name, ratio)
+        for of, cell, base, ratio in ratios(cells, seed_of(run))
+        if of == metric and not declared(base.pipeline).in_process
+    ]
+    return said + found[:_MOST]
 
 
 def throughput_sentences(run: Run) -> list[str]:

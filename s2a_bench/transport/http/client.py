@@ -17,13 +17,14 @@ import httpx
 from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Route
+from s2a_bench.transport import Wiring
 from s2a_bench.transport.credentials import read_key
 from s2a_bench.transport.http import own
 from s2a_bench.transport.http.detect import body_of, detected
 from s2a_bench.transport.http.dialects import OWN, Event, Picture, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
 from s2a_bench.transport.http.merge import merged, read_patch
+from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.http.refusals import refusal
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Request, Token
@@ -35,33 +36,34 @@ ERROR_LIMIT = 1 << 16
 class HttpClient:
     """One variant of the HTTP pipeline."""
 
-    def __init__(self, route: Route, alive: Callable[[], bool]) -> None:
-        """Prepare to ask the server at ``route.address``; a black box of no known dialect is asked what it is."""
+    def __init__(self, wiring: Wiring[HttpOptions], alive: Callable[[], bool]) -> None:
+        """Prepare to ask the server at ``wiring.address``; a black box of no known dialect is asked what it is."""
         self.camera = None
-        self._route = route
+        self._wiring, self._options = wiring, wiring.options
+        self._model = wiring.options.served_model
         self._alive = alive
-        self._codec = own.CODECS[route.variant]
-        self._key = read_key(route.api_key_env)
-        self._client = self._new_client() if route.connection != "client-per-request" else None
+        self._codec = own.CODECS[wiring.variant]
+        self._key = read_key(wiring.options.api_key_env)
+        self._client = self._new_client() if wiring.options.connection != "client-per-request" else None
         self._dialect = open_dialect(self._dialect_name())
-        self._url = self._dialect.url(route.address, route.model) if route.black_box else self._own_url()
-        self._extra = read_patch(route.extra_body)
+        self._url = self._dialect.url(wiring.address, self._model) if wiring.black_box else self._own_url()
+        self._extra = read_patch(wiring.options.extra_body)
         self._headers = {"content-type": "application/json", **self._authorization()}
-        if route.connection != "keep-alive":
+        if wiring.options.connection != "keep-alive":
             self._headers["connection"] = "close"
 
     def _own_url(self) -> str:
-        return self._route.address.rstrip("/") + own.PATHS[self._route.variant]
+        return self._wiring.address.rstrip("/") + own.PATHS[self._wiring.variant]
 
     def _dialect_name(self) -> str:
-        """Return the dialect that the route names, our own server's, or what the server says."""
-        route = self._route
-        if route.dialect or not route.black_box:
-            return route.dialect or OWN
+        """Return the dialect that the options name, our own server's, or what the server says."""
+        spoken = self._options.spoken
+        if spoken or not self._wiring.black_box:
+            return spoken or OWN
         client = self._client or self._new_client()
         try:
             key = open_dialect("openai").authorization(self._key) if self._key else {}
-            return detected(route.address, client, key)
+            return detected(self._wiring.address, client, key)
         finally:
             if client is not self._client:
                 client.close()
@@ -78,8 +80,8 @@ class HttpClient:
         # a kept connection stays kept, however long a turn of the other cells takes
         limits = httpx.Limits(keepalive_expiry=None)
         # a cloud may be behind a proxy and with certificates that the environment names; what is measured here is not
-        trust_env = self._route.address.startswith("https:")
-        return httpx.Client(timeout=self._route.timeout_s, trust_env=trust_env, limits=limits)
+        trust_env = self._wiring.address.startswith("https:")
+        return httpx.Client(timeout=self._wiring.timeout_s, trust_env=trust_env, limits=limits)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Encode and send the request and yield the streamed tokens."""
@@ -95,8 +97,8 @@ class HttpClient:
                 headers_ns = now_ns()
                 kind = response.headers.get("content-type", "")
                 if response.status_code != httpx.codes.OK or not kind.startswith(self._dialect.media_type):
-                    text = body_of(response, ERROR_LIMIT, self._route.timeout_s)
-                    raise refusal(self._url, response, text, self._route, self._dialect.media_type)
+                    text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
+                    raise refusal(self._url, response, text, self._options, self._dialect.media_type)
                 yield from self._tokens(response, trace, headers_ns, packed_ns)
         finally:
             if client is not self._client:
@@ -112,23 +114,23 @@ class HttpClient:
         try:
             return stack.enter_context(client.stream("POST", self._url, content=body, headers=headers))
         except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
-            if self._route.connection != "keep-alive":
+            if self._options.connection != "keep-alive":
                 raise
             trace.facts["reconnects"] = 1.0
             return stack.enter_context(client.stream("POST", self._url, content=body, headers=headers))
 
     def _pack(self, request: Request, trace: Trace) -> tuple[bytes, dict[str, str]]:
         """Build the body, marking each stage."""
-        if self._route.variant == own.BINARY:
+        if self._wiring.variant == own.BINARY:
             body, headers = self._pack_binary(request, trace)
         else:
             pictures = []
             for frame in request.images:
-                media_type, data = self._dialect.encode(frame, self._route.payload, trace)
+                media_type, data = self._dialect.encode(frame, self._options.payload, trace)
                 text = self._codec.to_base64(data.reshape(-1))
                 trace.mark("base64_encode")
                 pictures.append(Picture(media_type, text, data.shape))
-            fields = merged(self._dialect.body(request, pictures, self._route.model), self._extra)
+            fields = merged(self._dialect.body(request, pictures, self._model), self._extra)
             body, headers = self._codec.dumps(fields), self._headers
         trace.mark("json_pack")
         trace.facts["payload_bytes"] = len(body)
@@ -138,8 +140,8 @@ class HttpClient:
         """Build our own binary variant: the picture is the body, all else a header."""
         media_type, data = "application/octet-stream", None
         for frame in request.images[:1]:
-            media_type, data = encoded(frame, self._route.payload, trace)
-        fields = own.parameters(request, self._route.model)
+            media_type, data = encoded(frame, self._options.payload, trace)
+        fields = own.parameters(request, self._model)
         fields |= {**own.own_parameters(request), "prompt": request.prompt}
         header = json.dumps(fields)  # headers are ASCII, which the standard library's JSON is
         headers = {**self._headers, "content-type": media_type, own.PARAMETERS_HEADER: header}
@@ -166,7 +168,7 @@ class HttpClient:
             raise RequestFailed(f"{self._url} ended the stream before the answer was complete")
         if not first_ns and (thoughts or trace.facts.get("thinking_n")):
             raise RequestFailed(
-                f"{self._url} thought and gave no answer: raise --max-tokens, or turn thinking off with --extra-body"
+                f"{self._url} thought and gave no answer: raise `max_tokens`, or turn thinking off with `extra_body`"
             )
         if thinking_ns:
             trace.facts |= {"thinking_pieces": float(thoughts), "thinking_ms": (first_ns - thinking_ns) / 1e6}
@@ -188,13 +190,13 @@ class HttpClient:
     def _events(self, response: httpx.Response) -> Iterator[Event]:
         """Yield the events of an answer; comments and drops of an event do not count as a sign of life for ever."""
         decoder = Decoder(self._dialect, self._codec.loads)
-        heard_ns, patience_ns = now_ns(), int(self._route.timeout_s * 1e9)
+        heard_ns, patience_ns = now_ns(), int(self._wiring.timeout_s * 1e9)
         for data in response.iter_bytes():
             for event in decoder.feed(data):
                 yield event
                 heard_ns = now_ns()
             if now_ns() - heard_ns > patience_ns:
-                raise RequestFailed(f"{self._url} sent nothing that means anything for {self._route.timeout_s:g} s")
+                raise RequestFailed(f"{self._url} sent nothing that means anything for {self._wiring.timeout_s:g} s")
         yield from decoder.end()
 
     @contextmanager
@@ -217,7 +219,7 @@ class HttpClient:
                 raise ServerDied(f"the server at {url} is gone: {error}") from error
             raise RequestFailed(f"{url} broke the connection: {error}") from error
         except httpx.InvalidURL as error:
-            raise TransportError(f"--url: '{url}' is no URL: {error}") from error
+            raise TransportError(f"`url`: '{url}' is no URL: {error}") from error
 
     def close(self) -> None:
         """Close the kept connection."""

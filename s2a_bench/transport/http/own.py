@@ -17,11 +17,11 @@ import orjson
 import pybase64
 
 from s2a_bench.trace import Remote
-from s2a_bench.transport import HTTP_VARIANTS
+from s2a_bench.transport.http import VARIANTS
 from s2a_bench.transport.http.dialects.common import TEMPERATURE, TOP_P
 from s2a_bench.types import Request
 
-AS_DEPLOYED, BEST_EFFORT, BINARY = HTTP_VARIANTS
+AS_DEPLOYED, BEST_EFFORT, BINARY = VARIANTS
 
 PATHS = {
     AS_DEPLOYED: "/v1/chat/completions",

@@ -10,14 +10,14 @@ from typing import Any
 import httpx
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport import Route
 from s2a_bench.transport.http.dialects.decoder import error_in
+from s2a_bench.transport.http.options import HttpOptions
 
 QUOTED = 200
 """Characters that are shown of a body that is no error object."""
 
 
-def refusal(url: str, response: httpx.Response, body: str, route: Route, expected: str) -> RequestFailed:
+def refusal(url: str, response: httpx.Response, body: str, options: HttpOptions, expected: str) -> RequestFailed:
     """Describe an answer whose status or content type is wrong."""
     try:
         value = json.loads(body)
@@ -26,26 +26,26 @@ def refusal(url: str, response: httpx.Response, body: str, route: Route, expecte
     said = error_in(value) or body[:QUOTED].strip() or "nothing"
     kind = response.headers.get("content-type", "no content type").partition(";")[0]
     if response.status_code == httpx.codes.OK and not kind.startswith(expected):
-        said += f" (as {kind} where {expected} belongs; see --dialect)"
+        said += f" (as {kind} where {expected} belongs; see `dialect`)"
     wait_s = _retry_after_s(response, value)
     asked = f"; it asks to wait {wait_s:g} s" if wait_s else ""
-    advice = _advice(response, route)
+    advice = _advice(response, options)
     line = f"{url} answered {response.status_code}: {' '.join(said.split())}{asked}{'; ' if advice else ''}{advice}"
     return RequestFailed(line, retry_after_s=wait_s)
 
 
-def _advice(response: httpx.Response, route: Route) -> str:
+def _advice(response: httpx.Response, options: HttpOptions) -> str:
     """Return the way out for a status that has one."""
     if response.is_redirect:
-        return f"it moved: give {response.headers.get('location', 'its new place')} to --url"
-    key = f"the key in ${route.api_key_env} is not accepted"
-    no_key = "name the environment variable that holds its key with --api-key-env"
+        return f"it moved: give {response.headers.get('location', 'its new place')} to `url`"
+    key = f"the key in ${options.api_key_env} is not accepted"
+    no_key = "name the environment variable that holds its key with `api_key_env`"
     return {
-        401: key if route.api_key_env else no_key,
-        403: key if route.api_key_env else no_key,
-        404: f"see --url, --dialect and --served-model (now '{route.model}')",
-        413: "choose a smaller --size, or --payload jpeg",
-        429: "it wants fewer requests: see its quota, or --runs",
+        401: key if options.api_key_env else no_key,
+        403: key if options.api_key_env else no_key,
+        404: f"see `url`, `dialect` and `served_model` (now '{options.served_model}')",
+        413: "choose a smaller `size`, or `payload` jpeg",
+        429: "it wants fewer requests: see its quota, or `runs`",
     }.get(response.status_code, "")
 
 

@@ -26,8 +26,9 @@ from pydantic import BaseModel
 
 from s2a_bench.errors import EngineError, PortInUse, RequestFailed, S2AError
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler, Route
+from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.http import own
+from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.types import Frame, Request, Token
 
@@ -291,9 +292,9 @@ def _error(status: int, message: str) -> Response:
 class HttpServer:
     """uvicorn on a socket that is bound before anything is promised."""
 
-    def __init__(self, route: Route, handler: Handler) -> None:
-        """Bind ``host:port`` of ``route.address`` (127.0.0.1 and any port without it); raises PortInUse."""
-        host, _, port = (route.address or "127.0.0.1:0").rpartition(":")
+    def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
+        """Bind ``host:port`` of ``wiring.address`` (127.0.0.1 and any port without it); raises PortInUse."""
+        host, _, port = (wiring.address or "127.0.0.1:0").rpartition(":")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -302,8 +303,8 @@ class HttpServer:
         except OSError as error:
             self._socket.close()
             if error.errno == errno.EADDRINUSE:
-                raise PortInUse(f"--port: {port} is in use on {host}; choose another, or 0 for any free one") from error
-            raise PortInUse(f"--port: cannot bind {host}:{port}: {error.strerror}") from error
+                raise PortInUse(f"`port`: {port} is in use on {host}; choose another, or 0 for any free one") from error
+            raise PortInUse(f"`port`: cannot bind {host}:{port}: {error.strerror}") from error
         self.address = "http://{}:{}".format(*self._socket.getsockname())
         config = uvicorn.Config(
             _received(application(handler)),

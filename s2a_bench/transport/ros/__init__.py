@@ -1,1 +1,107 @@
-"""ROS 2-native: pictures and tokens as topics under real ROS 2 names and types."""
+"""ROS 2-native: pictures and tokens as topics or actions under real ROS 2 names and types."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from itertools import count
+
+from s2a_bench.errors import UsageError
+from s2a_bench.transport import Client, Handler, Server, Transport, Wiring
+from s2a_bench.transport.ros.options import RosOptions
+
+TOPIC, ACTION = VARIANTS = ("topic", "action")
+LARGE_PICTURE = 640 * 480
+"""Pixels above which DDS needs more receive buffer than Linux gives by default."""
+
+
+class Ros(Transport[RosOptions]):
+    """Messages of sensor_msgs and s2a_msgs over a middleware, or the action of llama_ros."""
+
+    name = "ros"
+    options = RosOptions
+    variants = VARIANTS
+    payloads = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
+    stages = {
+        "cdr_pack": "pack",
+        "accept": "network",  # an action's goal is accepted before work starts
+        "cdr_parse": "parse",
+    }
+    order = 20
+    looks = {TOPIC: ("#0072B2", "-"), ACTION: ("#56B4E9", "--")}
+    packages = ("cyclonedds", "rosbags")
+    checks = {
+        "rmem-max": "s2a_bench.machine.doctor.robot:rmem_max",
+        "dds": "s2a_bench.transport.ros.checks:dds",
+        "ros": "s2a_bench.transport.ros.checks:ros",
+        "middleware": "s2a_bench.transport.ros.checks:middleware",
+    }
+    watches_udp = True
+    elsewhere = ("action",)
+    serving = {
+        "namespace": "/llama",
+        "qos": "sensor_data",  # matches reliable cameras as well as best-effort ones
+        "feedback_interval": 0.002,
+        "max_tokens": 512,
+        "publish_tokens": True,
+    }
+
+    def client(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> Client:
+        """Join the domain and wait for the server under the namespace ``wiring.address``."""
+        if wiring.variant == ACTION:
+            from s2a_bench.transport.ros.action import GenerateClient
+
+            return GenerateClient(wiring, alive)
+        from s2a_bench.transport.ros.topic import TopicClient
+
+        return TopicClient(wiring, alive)
+
+    def server(self, wiring: Wiring[RosOptions], handler: Handler) -> Server:
+        """Join the domain alone under the namespace; one server answers both variants."""
+        from s2a_bench.transport.ros.server import RosServer
+
+        return RosServer(wiring, handler)
+
+    def measured(self, options: RosOptions, chosen: Sequence[str]) -> Sequence[str]:
+        """Return topics unless told, and of somebody else's node its action."""
+        return (ACTION,) if options.action else chosen or (TOPIC,)
+
+    def check(self, variant: str, options: RosOptions, *, mode: str, engine: str) -> None:  # noqa: ARG002
+        """Refuse what a goal cannot carry, and a stream that nobody keeps."""
+        from s2a_bench.ros.config import domain_id
+
+        domain_id(os.environ)
+        if options.action and variant != ACTION:
+            raise UsageError(f"`action` is spoken by ros/{ACTION}, not by ros/{variant}")
+        if options.action and mode == "stream":
+            raise UsageError("`action`: `mode` stream needs our own server, which keeps the camera's newest frame")
+        if variant == ACTION and mode == "request" and options.payload not in {"raw", "yuyv"}:
+            raise UsageError(
+                f"`payload`: a goal carries sensor_msgs/Image, not {options.payload}; say it for this transport alone: "
+                f"ros/{ACTION}?payload=raw"
+            )
+
+    def foreign(self, options: RosOptions) -> str:
+        """Return the name of somebody else's action."""
+        return options.action
+
+    def bind(self, options: RosOptions, taken: Sequence[str]) -> str:
+        """Return the namespace, with a number where another server of ours has it."""
+        numbered = (f"{options.namespace}_{number}" for number in count(2))
+        return options.namespace if options.namespace not in taken else next(n for n in numbered if n not in taken)
+
+    def before_run(self, width: int, height: int) -> tuple[str, ...]:
+        """Return the check of the receive buffer, where pictures are large."""
+        return ("rmem-max",) if width * height > LARGE_PICTURE else ()
+
+    def ready(self, wiring: Wiring[RosOptions], address: str) -> str:
+        """Return the names of action and camera."""
+        from s2a_bench.transport.ros.joining import domain_of
+
+        return (
+            f"serving action {address}/generate_response, camera {address}/camera/image_raw, "
+            f"in DDS domain {domain_of(wiring)}"
+        )
+
+
+ROS = Ros()

@@ -12,7 +12,7 @@ from threading import Lock
 from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
-from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, TransportError, UsageError
+from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, TransportError
 from s2a_bench.ros import (
     ActionClient,
     Feedback,
@@ -26,9 +26,10 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
 from s2a_bench.trace import Trace
-from s2a_bench.transport import CameraSink, Route
+from s2a_bench.transport import CameraSink, Wiring
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
-from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join, wait_until
+from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
+from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.wire import READER_QOS, TOKEN_QOS, marks_message, remote_of, token_message
 from s2a_bench.types import Request, Token
 
@@ -44,21 +45,21 @@ NO_SEED = 2**32 - 1
 class GenerateClient:
     """Sends goals and collects the feedback, from our own server or a llama_ros node."""
 
-    def __init__(self, route: Route, alive: Callable[[], bool]) -> None:
+    def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
         """Join the domain and wait for the action; raises ServerDied if it does not appear."""
-        self._route = route
+        self._wiring = wiring
         self._alive = alive
         self._offset_ns = realtime_offset_ns()
-        self.middleware = join(route, "client")
-        namespace = route.address or DEFAULT_NAMESPACE
-        self._name = route.action or namespace + ACTION
+        self.middleware = join(wiring, "client")
+        namespace = namespace_of(wiring)
+        self._name = wiring.options.action or namespace + ACTION
         self.camera: CameraSink | None = None
         try:
             self._client, self._version = self._connect()
             self._marks = None
-            if not route.black_box:
+            if not wiring.black_box:
                 self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, READER_QOS)
-                camera = CameraPublisher(self.middleware, namespace, route.wire, route.qos)
+                camera = CameraPublisher(self.middleware, namespace, wiring.options.payload, wiring.options.qos)
                 self.camera = camera
                 self._wait(lambda: bool(camera.matched()))
                 self._wait(lambda: bool(self._marks and self._marks.matched()))
@@ -74,20 +75,19 @@ class GenerateClient:
         spoken = client.server_version() or version
         if spoken != version:
             self.middleware.close()  # a client of the other version would go on collecting what nobody reads
-            self.middleware = join(self._route, "client")
+            self.middleware = join(self._wiring, "client")
             client = self.middleware.action_client(self._name, GENERATE_RESPONSE, spoken)
             self._wait(client.server_present)
         return client, spoken
 
     def _wait(self, arrived: Callable[[], bool]) -> None:
-        absent = f"no action server appeared at {self._name} in DDS domain {self._route.domain_id}"
+        absent = f"no action server appeared at {self._name} in DDS domain {domain_of(self._wiring)}"
         wait_until(arrived, self._alive, absent)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Send a goal and yield its tokens."""
-        if request.images and self._route.wire == "compressed":
-            raise UsageError("--wire compressed: a goal carries sensor_msgs/Image; use bgr, or --mode stream")
-        images = [picture_message(frame, self._route.wire, self._offset_ns, trace)[1] for frame in request.images]
+        payload = self._wiring.options.payload
+        images = [picture_message(frame, payload, self._offset_ns, trace)[1] for frame in request.images]
         sampling: dict[str, Any] = {"grammar": request.grammar}
         if self._version != "4.4":
             sampling["seed"] = request.seed
@@ -140,14 +140,14 @@ class GenerateClient:
 
     def _next(self, goal_id: bytes) -> Any:
         """Wait for the next event of this goal."""
-        deadline = now_ns() + int(self._route.timeout_s * 1e9)
+        deadline = now_ns() + int(self._wiring.timeout_s * 1e9)
         while now_ns() < deadline:
             event = self._client.next_event(POLL_S)
             if event is not None and event.goal_id == goal_id:
                 return event
             if event is None and not (self._alive() and self._client.server_present()):
                 raise ServerDied(f"the action server {self._name} is gone")
-        raise RequestFailed(f"no feedback for {self._route.timeout_s:.0f} s")
+        raise RequestFailed(f"no feedback for {self._wiring.timeout_s:.0f} s")
 
     def _receive_marks(self, goal_id: str, trace: Trace) -> None:
         """Take the server's marks of this goal; they were sent before its result."""
@@ -162,7 +162,7 @@ class GenerateClient:
         raise RequestFailed("the server's marks did not arrive")
 
     def describe(self) -> dict[str, str]:
-        """Add nothing: the route tells all."""
+        """Add nothing: the wiring tells all."""
         return {}
 
     def close(self) -> None:
@@ -173,15 +173,15 @@ class GenerateClient:
 class ActionFront:
     """The server's side of the variant."""
 
-    def __init__(self, middleware: Middleware, route: Route, cache: CameraCache) -> None:
+    def __init__(self, middleware: Middleware, wiring: Wiring[RosOptions], cache: CameraCache) -> None:
         """Offer the action and create the topics."""
-        namespace = route.address or DEFAULT_NAMESPACE
+        namespace, options = namespace_of(wiring), wiring.options
         self.cache = cache
-        self.max_tokens = route.max_tokens
-        self.feedback_interval_ns = int(route.feedback_interval_s * 1e9)
-        self._server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE, route.result_timeout_s)
+        self.max_tokens = options.max_tokens or wiring.max_tokens
+        self.feedback_interval_ns = int(options.feedback_interval * 1e9)
+        self._server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE, options.result_timeout)
         self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS)
-        self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if route.publish_tokens else None
+        self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if options.publish_tokens else None
         self._active = 0
         self._lock = Lock()
 

@@ -22,37 +22,39 @@ from s2a_bench.types import Frame
 CAMERA = "/camera/image_raw"
 COMPRESSED_CAMERA = "/camera/image_raw/compressed"
 FRAME_ID = "camera"
+PIXELS = frozenset({"raw", "yuyv"})
+"""Payloads that are sensor_msgs/Image; the others are CompressedImage."""
 CAMERA_QOS = {"reliable": QoS(depth=1), "sensor_data": QoS(depth=5, reliable=False)}
 """By the names of ROS 2's profiles; a reliable subscription does not match a best-effort publisher."""
 POLL_S = 0.5
 
 
-def picture_message(frame: Frame, wire: str, offset_ns: int, trace: Trace) -> tuple[str, Any]:
-    """Return (ROS type, message) of a frame for a wire format; ``offset_ns`` turns its stamp into ROS time."""
+def picture_message(frame: Frame, payload: str, offset_ns: int, trace: Trace) -> tuple[str, Any]:
+    """Return (ROS type, message) of a frame for a payload; ``offset_ns`` turns its stamp into ROS time."""
     stamp_ns = frame.stamp_ns + offset_ns
-    if wire == "compressed":
-        _, data = encoded(frame, "jpeg", trace)
-        return ros.COMPRESSED_IMAGE, ros.compressed_image_message(data, stamp_ns, FRAME_ID)
-    if wire == "yuyv" and frame.encoding != "yuv422_yuy2":
-        raise RequestFailed(f"--wire yuyv: this source delivers {frame.encoding}; use --wire bgr")
-    return ros.IMAGE, ros.image_message(bgr_of(frame, trace) if wire == "bgr" else frame, stamp_ns, FRAME_ID)
+    if payload not in PIXELS:
+        media_type, data = encoded(frame, payload, trace)
+        return ros.COMPRESSED_IMAGE, ros.compressed_image_message(data, stamp_ns, FRAME_ID, media_type[len("image/") :])
+    if payload == "yuyv" and frame.encoding != "yuv422_yuy2":
+        raise RequestFailed(f"`payload` yuyv: this source delivers {frame.encoding}; use raw")
+    return ros.IMAGE, ros.image_message(bgr_of(frame, trace) if payload == "raw" else frame, stamp_ns, FRAME_ID)
 
 
 def picture_of(message: Any, trace: Trace) -> Frame:
     """Turn a received image message into an RGB frame; its stamp is ROS time. Raises TransportError."""
     if hasattr(message, "format"):
-        return replace(decoded("image/jpeg", message.data, trace), stamp_ns=ros.stamp_of(message.header))
+        return replace(decoded(f"image/{message.format}", message.data, trace), stamp_ns=ros.stamp_of(message.header))
     return rgb_of(ros.frame_of_image(message), trace)
 
 
 class CameraPublisher:
     """Publishes frames as a ROS 2 camera does."""
 
-    def __init__(self, middleware: Middleware, namespace: str, wire: str, qos: str) -> None:
-        """Create the one topic that ``wire`` needs."""
-        self._wire = wire
+    def __init__(self, middleware: Middleware, namespace: str, payload: str, qos: str) -> None:
+        """Create the one topic that ``payload`` needs."""
+        self._payload = payload
         self._offset_ns = realtime_offset_ns()
-        topic, type_name = (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE) if wire == "compressed" else (CAMERA, ros.IMAGE)
+        topic, type_name = (CAMERA, ros.IMAGE) if payload in PIXELS else (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE)
         self._publisher = middleware.publisher(namespace + topic, type_name, CAMERA_QOS[qos])
 
     def stamp_ns(self, frame: Frame) -> int:
@@ -61,7 +63,7 @@ class CameraPublisher:
 
     def publish(self, frame: Frame, trace: Trace) -> None:
         """Convert, pack and send one frame."""
-        _, message = picture_message(frame, self._wire, self._offset_ns, trace)
+        _, message = picture_message(frame, self._payload, self._offset_ns, trace)
         packed = self._publisher.pack(message)
         trace.mark("cdr_pack")
         self._publisher.send(packed)

@@ -1,28 +1,41 @@
-"""Joining the DDS domain of a route, alone under its namespace where that matters."""
+"""Joining the DDS domain of a wiring, alone under its namespace where that matters."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 
 from s2a_bench.clock import SystemClock
 from s2a_bench.errors import ServerDied, TransportError
 from s2a_bench.ros import Middleware, QoS, Tuning, open_middleware
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE
-from s2a_bench.transport import Route
+from s2a_bench.transport import Wiring
+from s2a_bench.transport.ros.options import RosOptions
 
-DEFAULT_NAMESPACE = "/s2a_bench"
 MATCH_TIMEOUT_S = 15.0
 MATCH_POLL_NS = 10_000_000
 SETTLE_S = 0.3
 """Time to discover a server that is there already."""
 
 
-def join(route: Route, role: str) -> Middleware:
-    """Join the route's domain as the node ``<namespace>/<role>``."""
-    tuning: Tuning = "default" if route.dds_tuning == "default" else "tuned"
-    name = f"{route.address or DEFAULT_NAMESPACE}/{role}"
-    return open_middleware(route.middleware, domain_id=route.domain_id, tuning=tuning, node_name=name)
+def namespace_of(wiring: Wiring[RosOptions]) -> str:
+    """Return where our topics are; somebody else's action is not under it."""
+    return wiring.options.namespace if wiring.options.action else wiring.address or wiring.options.namespace
+
+
+def domain_of(wiring: Wiring[RosOptions]) -> int:
+    """Return the DDS domain; raises UsageError for a ROS_DOMAIN_ID that is none."""
+    said = wiring.options.domain_id
+    return domain_id(os.environ) if said is None else said
+
+
+def join(wiring: Wiring[RosOptions], role: str) -> Middleware:
+    """Join the wiring's domain as the node ``<namespace>/<role>``."""
+    tuning: Tuning = wiring.options.dds_tuning
+    name = f"{namespace_of(wiring)}/{role}"
+    return open_middleware(wiring.options.middleware, domain_id=domain_of(wiring), tuning=tuning, node_name=name)
 
 
 def wait_until(arrived: Callable[[], bool], alive: Callable[[], bool], what: str) -> None:
@@ -35,17 +48,17 @@ def wait_until(arrived: Callable[[], bool], alive: Callable[[], bool], what: str
         clock.sleep_until_ns(clock.now_ns() + MATCH_POLL_NS)
 
 
-def refuse_company(route: Route, namespace: str) -> None:
+def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
     """Raise TransportError if another server listens under ``namespace``: both would answer every request."""
-    probe = join(route, "probe")
+    probe = join(wiring, "probe")
     try:
         publisher = probe.publisher(namespace + "/request", ros.REQUEST, QoS())
         action = probe.action_client(namespace + "/generate_response", GENERATE_RESPONSE)
         probe.subscription(namespace + "/token", ros.TOKEN, QoS()).take(SETTLE_S)
         if publisher.matched() or action.server_present():
             raise TransportError(
-                f"another server answers under {namespace} in DDS domain {route.domain_id}: stop it, "
-                "or choose another domain with ROS_DOMAIN_ID or another --namespace"
+                f"another server answers under {namespace} in DDS domain {domain_of(wiring)}: stop it, "
+                "or choose another domain with ROS_DOMAIN_ID or another `namespace`"
             )
     finally:
         probe.close()

@@ -12,10 +12,11 @@ from threading import Event, Lock, Thread
 from typing import Any, Protocol
 
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler, Route
+from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros.action import ActionFront
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
-from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join, refuse_company
+from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company
+from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.topic import TopicFront
 from s2a_bench.types import Request, Token
 
@@ -59,16 +60,16 @@ WORKERS = 4
 class RosServer:
     """Answers the requests of all fronts."""
 
-    def __init__(self, route: Route, handler: Handler) -> None:
+    def __init__(self, wiring: Wiring[RosOptions], handler: Handler) -> None:
         """Join the domain and create all topics; raises TransportError where another server answers already."""
-        self.address = route.address or DEFAULT_NAMESPACE
+        self.address = namespace_of(wiring)
         self._handler = handler
-        refuse_company(route, self.address)
-        self.middleware = join(route, "server")
-        self._cache = CameraCache(self.middleware, self.address, route.qos)
+        refuse_company(wiring, self.address)
+        self.middleware = join(wiring, "server")
+        self._cache = CameraCache(self.middleware, self.address, wiring.options.qos)
         self._fronts: list[Front] = [
             TopicFront(self.middleware, self.address, self._cache),
-            ActionFront(self.middleware, route, self._cache),
+            ActionFront(self.middleware, wiring, self._cache),
         ]
         self._stopped = Event()
 

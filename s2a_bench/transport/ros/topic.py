@@ -10,9 +10,10 @@ from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, 
 from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Route
+from s2a_bench.transport import Wiring
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
-from s2a_bench.transport.ros.joining import DEFAULT_NAMESPACE, join, wait_until
+from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
+from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.wire import (
     READER_QOS,
     REQUEST_QOS,
@@ -28,18 +29,18 @@ from s2a_bench.types import Request, Token
 class TopicClient:
     """Publishes requests and collects the tokens that carry their id."""
 
-    def __init__(self, route: Route, alive: Callable[[], bool]) -> None:
+    def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
         """Join the domain and wait for the server; raises ServerDied if it does not appear."""
-        self._route = route
+        self._wiring = wiring
         self._alive = alive
         self._offset_ns = realtime_offset_ns()
-        self.middleware = join(route, "client")
-        namespace = route.address or DEFAULT_NAMESPACE
+        self.middleware = join(wiring, "client")
+        namespace = namespace_of(wiring)
         self._publisher = self.middleware.publisher(namespace + "/request", ros.REQUEST, REQUEST_QOS)
         self._subscription = self.middleware.subscription(namespace + "/token", ros.TOKEN, READER_QOS)
-        self.camera = CameraPublisher(self.middleware, namespace, route.wire, route.qos)
+        self.camera = CameraPublisher(self.middleware, namespace, wiring.options.payload, wiring.options.qos)
         ends = (self._publisher, self._subscription, self.camera)  # volatile: what is sent before they match is lost
-        absent = f"no server appeared under {namespace} in DDS domain {route.domain_id}"
+        absent = f"no server appeared under {namespace} in DDS domain {domain_of(wiring)}"
         try:
             wait_until(lambda: all(end.matched() for end in ends), alive, absent)
         except TransportError:
@@ -50,7 +51,7 @@ class TopicClient:
         """Publish the request, with its frames if it has any, and yield its tokens."""
         images: dict[str, list[Any]] = {ros.IMAGE: [], ros.COMPRESSED_IMAGE: []}
         for frame in request.images:
-            type_name, message = picture_message(frame, self._route.wire, self._offset_ns, trace)
+            type_name, message = picture_message(frame, self._wiring.options.payload, self._offset_ns, trace)
             images[type_name].append(message)
         packed = self._publisher.pack(request_message(request, images[ros.IMAGE], images[ros.COMPRESSED_IMAGE]))
         trace.mark("cdr_pack")
@@ -76,7 +77,7 @@ class TopicClient:
 
     def _next(self, request_id: str) -> Any:
         """Wait for the next token of this request, dropping what belongs to others."""
-        deadline = now_ns() + int(self._route.timeout_s * 1e9)
+        deadline = now_ns() + int(self._wiring.timeout_s * 1e9)
         while now_ns() < deadline:
             packed = self._subscription.take(POLL_S)
             if packed is not None:
@@ -85,10 +86,10 @@ class TopicClient:
                     return token
             elif not self._alive():
                 raise ServerDied("the server's process is gone")
-        raise RequestFailed(f"no token for {self._route.timeout_s:.0f} s")
+        raise RequestFailed(f"no token for {self._wiring.timeout_s:.0f} s")
 
     def describe(self) -> dict[str, str]:
-        """Add nothing: the route tells all."""
+        """Add nothing: the wiring tells all."""
         return {}
 
     def close(self) -> None:

@@ -82,7 +82,7 @@ def test_the_stage_table_by_hand(make_run: MakeRun) -> None:
     ]
     assert table.notes == (
         "n = 4 samples a cell, warm-ups left out.",
-        "640x480; payload: http jpeg, ros bgr.",
+        "640x480; payload: http jpeg, ros raw.",
         "Echo engine.",
         "4 of 8 samples have a residual above 5% of e2e without inference.",
     )

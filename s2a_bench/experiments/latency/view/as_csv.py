@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratios, seed_of, stages_present
 from s2a_bench.stats import summary_of
-from s2a_bench.trace import STAGES
 from s2a_bench.writers.csv_text import csv_text
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ def _stages(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
     for cell in cells:
         for stage in (*stages_present([cell]), "residual"):
             if summary := summary_of(cell.values_ms(stage)):
-                yield cell.name, STAGES.get(stage, ""), stage, *_values(summary), cell.emulated
+                yield cell.name, cell.stages.get(stage, ""), stage, *_values(summary), cell.emulated
 
 
 def _summaries(cells: list[Cell]) -> Iterator[tuple[object, ...]]:

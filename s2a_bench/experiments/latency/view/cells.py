@@ -5,13 +5,14 @@ Warm-ups and failed samples are counted and take part in no summary.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import ratio_of_blocks
-from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT, STAGES
+from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
+from s2a_bench.transport import declared
 from s2a_bench.writers.tables import DUMMY, ECHO, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
@@ -26,7 +27,9 @@ if TYPE_CHECKING:
 RATIO_METRICS = ("e2e_without_inference", "e2e")
 """What cells are compared by: columns of the samples, less the unit."""
 
-_ORDER = ("http", "ros", "loopback", "as-deployed", "best-effort", "binary", "topic", "action")
+EARLIER_PAYLOADS = {"bgr": "raw", "compressed": "jpeg"}
+"""Words of older folders for how a picture travels over ROS -> today's."""
+
 _NS_PER_MS = 1e6
 
 
@@ -40,6 +43,8 @@ class Cell:
     tokens: pd.DataFrame
     warmups: int
     errors: int
+    stages: Mapping[str, str]
+    """Stage -> group of the run, in the order of the path."""
 
     @property
     def n(self) -> int:
@@ -52,22 +57,36 @@ class Cell:
         return self.about["pipeline"]
 
     @property
+    def path(self) -> tuple[str, str]:
+        """Return transport and variant."""
+        return self.about["pipeline"], self.about["variant"]
+
+    def is_compared_with(self, base: Cell) -> bool:
+        """Whether the transport declares that its cells are divided by those of another."""
+        return base.pipeline in declared(self.pipeline).compared_with
+
+    @property
     def emulated(self) -> bool:
         """Tell whether a replayed profile answered."""
         return self.about["engine"] == "replay"
 
     def values_ms(self, metric: str) -> Floats:
         """Return the values of a stage, or of another column less ``_ns``, in ms."""
-        return numbers_ms(self.good[f"{metric}_ns"])
+        return numbers_ms(self._column(metric))
+
+    def _column(self, metric: str) -> pd.Series[Any]:
+        """Return a column of ns; that of a stage which the run's transports do not have is empty."""
+        name = f"{metric}_ns"
+        return self.good[name] if name in self.good else self.good["frame_index"].iloc[:0]
 
     @property
     def has_ingest(self) -> bool:
         """Tell whether the server is a llama-server, seen from outside."""
-        return bool(self.values_ms("ingest").size)
+        return bool(self.group_ms("ingest").size)
 
     def group_ms(self, group: str) -> Floats:
         """Return the sums, in ms, of the stages of a group; a sample without such stages has none."""
-        names = [f"{stage}_ns" for stage, of in STAGES.items() if of == group]
+        names = [f"{stage}_ns" for stage, of in self.stages.items() if of == group]
         return _numbers(self.good[names].sum(axis=1, min_count=1)) / _NS_PER_MS
 
     def residual_shares(self) -> Floats:
@@ -92,8 +111,8 @@ class Cell:
     def by_block(self, metric: str) -> dict[int, list[float]]:
         """Return the values of a metric in ms by the block in which they were taken."""
         blocks: dict[int, list[float]] = {}
-        there = self.good[self.good[f"{metric}_ns"].notna()]
-        for block, value in zip(there["block"], there[f"{metric}_ns"], strict=True):
+        values = self._column(metric).dropna()
+        for block, value in zip(self.good.loc[values.index, "block"], values, strict=True):
             blocks.setdefault(int(block), []).append(float(value) / _NS_PER_MS)
         return blocks
 
@@ -104,23 +123,24 @@ def numbers_ms(column: pd.Series[Any]) -> Floats:
 
 
 def cells_of(run: Run) -> list[Cell]:
-    """Split a run into its cells: HTTP, ROS, loopback, then by name."""
-    samples, tokens = run.samples, run.tokens
-    names = sorted(samples["cell"].unique(), key=lambda name: ([_rank(part) for part in name.split("/")], name))
-    return [_cell(name, samples[samples["cell"] == name], tokens[tokens["cell"] == name]) for name in names]
+    """Split a run into its cells, in the order that their transports declare, then by name."""
+    samples, tokens, stages = run.samples, run.tokens, run.stages
+    cells = [
+        _cell(str(name), samples[samples["cell"] == name], tokens[tokens["cell"] == name], stages)
+        for name in samples["cell"].unique()
+    ]
+    return sorted(cells, key=_place)
 
 
 def ratios(cells: list[Cell], seed: int) -> Iterator[tuple[str, Cell, Cell, Ratio]]:
-    """Yield metric, cell, base and ratio: every HTTP cell over every ROS cell, every cell over loopback.
+    """Yield metric, cell, base and ratio: every cell over those of the transports that its own is compared with.
 
     A pair is left out where a cell lacks the metric, as e2e without inference behind a black box.
     """
     for metric in RATIO_METRICS:
         for base in cells:
             for cell in cells:
-                http_to_ros = (cell.pipeline, base.pipeline) == ("http", "ros")
-                to_loopback = base.pipeline == "loopback" != cell.pipeline
-                if (http_to_ros or to_loopback) and (ratio := ratio_between(cell, base, metric, seed)):
+                if cell.is_compared_with(base) and (ratio := ratio_between(cell, base, metric, seed)):
                     yield metric, cell, base, ratio
 
 
@@ -170,23 +190,28 @@ def groups_present(cells: list[Cell]) -> list[str]:
 
 def stages_present(cells: list[Cell]) -> list[str]:
     """List the stages that some sample has, in the order of the path."""
-    return [stage for stage in STAGES if any(cell.values_ms(stage).size for cell in cells)]
+    stages = cells[0].stages if cells else ()
+    return [stage for stage in stages if any(cell.values_ms(stage).size for cell in cells)]
 
 
-def _cell(name: str, samples: pd.DataFrame, tokens: pd.DataFrame) -> Cell:
+def _cell(name: str, samples: pd.DataFrame, tokens: pd.DataFrame, stages: Mapping[str, str]) -> Cell:
     """Sort the samples of one cell into those that count and those that are only counted."""
     about = {
         key: str(samples[key].iloc[0])
         for key in ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
     }
+    about["payload"] = EARLIER_PAYLOADS.get(about["payload"], about["payload"])
     failed = samples["error"] != ""
     good = samples[~samples["warmup"] & ~failed]
-    return Cell(name, about, good, tokens, int(samples["warmup"].sum()), int((failed & ~samples["warmup"]).sum()))
+    errors = int((failed & ~samples["warmup"]).sum())
+    return Cell(name, about, good, tokens, int(samples["warmup"].sum()), errors, stages)
 
 
-def _rank(part: str) -> int:
-    """Place a part of a cell's name."""
-    return _ORDER.index(part) if part in _ORDER else len(_ORDER)
+def _place(cell: Cell) -> tuple[float, str, int, str]:
+    """Sort by the transport's order, its variants in theirs, then by name."""
+    transport, variant = declared(cell.pipeline), cell.about["variant"]
+    known = transport.variants.index(variant) if variant in transport.variants else len(transport.variants)
+    return transport.order, cell.pipeline, known, cell.name
 
 
 def _numbers(column: pd.Series[Any]) -> Floats:

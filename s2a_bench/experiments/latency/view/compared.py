@@ -10,7 +10,7 @@ import numpy as np
 
 from s2a_bench.experiments import Compared, Metric, Subject, by_name
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note
-from s2a_bench.trace import GROUPS, STAGES
+from s2a_bench.trace import GROUPS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,11 +79,12 @@ COMPARED: Final = Compared(
         [
             *(Metric(name, "ms") for name in ("e2e_without_inference", "e2e", "ttft", "frame_age")),
             *TOKEN_METRICS,
-            *(Metric(name, "ms") for name in (*STAGES, "residual")),
+            Metric("residual", "ms"),
             *(Metric(f"{_GROUP}{name}", "ms") for name in GROUPS),
         ]
     ),
     subjects=_subjects,
     origin=origin_of,
     shown=("e2e_without_inference", "e2e", "itl"),
+    own=lambda run: [Metric(stage, "ms") for stage in run.stages],
 )

@@ -26,7 +26,7 @@ def build_latency_bars(run: Run, *, against_paper: bool = False) -> Figure:
     from matplotlib.patches import Patch
 
     cells, metric = _shown(run)
-    looks = cell_looks([cell.name for cell in cells])
+    looks = cell_looks({cell.name: cell.path for cell in cells})
     bars = [(_label(cell), summary_of(cell.values_ms(metric)), looks[cell.name][0]) for cell in cells]
     rows = [(name, found.mean, found.sd or 0.0, mean_sd(found), colour) for name, found, colour in bars if found]
     if against_paper:
@@ -104,7 +104,7 @@ def build_stage_breakdown(run: Run) -> Figure:
 def build_distribution(run: Run) -> Figure:
     """Draw the empirical distribution of e2e without inference, a line a cell; logarithmic where it spreads widely."""
     cells, metric = _shown(run)
-    looks = cell_looks([cell.name for cell in cells])
+    looks = cell_looks({cell.name: cell.path for cell in cells})
     figure = new_figure(2.35 + 0.14 * -(-len(cells) // 2), _title(run, cells, "Distribution", metric))
     axes = figure.subplots()
     every: list[Floats] = [cell.values_ms(metric) for cell in cells]
@@ -168,7 +168,8 @@ def _axis_label(metric: str) -> str:
 def _label(cell: Cell) -> str:
     """Name a row by its cell, and by what travels where that is not said yet."""
     payload = cell.about["payload"]
-    return cell.name if payload in {"none", ""} or payload in cell.name else f"{cell.name}\n({payload})"
+    name = cell.name.replace("?", "\n?")
+    return name if payload in {"none", ""} or payload in name else f"{name}\n({payload})"
 
 
 def _part(cell: Cell, name: str) -> Floats:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, numbers_ms
 from s2a_bench.stats import summary_of
-from s2a_bench.trace import STAGES
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ def frame_table(run: Run) -> TextTable | None:
     cells = cells_of(run)
     used = [_used(run, cell) for cell in cells]
     rows = []
-    for stage, group in STAGES.items():
+    for stage, group in run.stages.items():
         values = [frames[stage] for frames in used]
         if any(found.size for found in values):
             rows.append((group, stage, *(_median(found) for found in values)))
@@ -49,7 +48,7 @@ def frame_table(run: Run) -> TextTable | None:
 def _used(run: Run, cell: Cell) -> dict[str, Floats]:
     """Return the columns, in ms, of the frames that a counted sample of this cell used."""
     frames = run.frames[run.frames["used_by"].isin(cell.good["request_id"])]
-    return {name: numbers_ms(frames[f"{name}_ns"]) for name in (*STAGES, *_FOOT)}
+    return {name: numbers_ms(frames[f"{name}_ns"]) for name in (*run.stages, *_FOOT)}
 
 
 def _median(values: Floats) -> str:

@@ -14,7 +14,7 @@ from s2a_bench.experiments.latency.view.cells import (
     stages_present,
 )
 from s2a_bench.stats import summary_of
-from s2a_bench.trace import RESIDUAL_LIMIT, STAGES
+from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.writers.tables import ABSENT, TextTable, interval, mean_sd, number
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def stage_table(run: Run, *, full: bool = True) -> TextTable:
 
     for stage in stages_present(cells):
         if stage != "inference":
-            group = STAGES[stage]
+            group = run.stages[stage]
             add("" if group == last else group, stage, [cell.values_ms(stage) for cell in cells])
             last = group
     below = len(rows)
@@ -74,9 +74,11 @@ def group_table(run: Run) -> TextTable:
 
 
 def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
-    """Lay out what a publication quotes: n, spread, percentiles, and the ratios to ROS and to loopback."""
+    """Lay out what a publication quotes: n, spread, percentiles, and the ratios to what is compared with."""
     cells = cells_of(run)
-    bases = [cell for cell in cells if cell.pipeline in {"ros", "loopback"} and cell.values_ms(metric).size]
+    bases = [
+        base for base in cells if base.values_ms(metric).size and any(cell.is_compared_with(base) for cell in cells)
+    ]
     rows = []
     for cell in cells:
         summary = summary_of(cell.values_ms(metric))
@@ -116,10 +118,10 @@ def _entry(summary: Summary | None, full: bool) -> str:
 
 
 def _ratio(cell: Cell, base: Cell, metric: str, seed: int) -> str:
-    """Write the ratio of a cell to a base, where that is a comparison: loopback over ROS is none."""
+    """Write the ratio of a cell to a base, where that is a comparison."""
     if cell.name == base.name:
         return "1"
-    if base.pipeline == "ros" and cell.pipeline != "http":
+    if not cell.is_compared_with(base):
         return ABSENT
     return interval(ratio_between(cell, base, metric, seed))
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, seed_of
 from s2a_bench.experiments.throughput.rows import REFERENCE
 from s2a_bench.stats.change import ratio_of_blocks
+from s2a_bench.transport import declared
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -149,7 +150,7 @@ def _by_block(blocks: Iterable[Any], values: Iterable[Any]) -> dict[int, list[fl
 def speeds_of(run: Run) -> list[Speed]:
     """Split a run into its cells: in-process first, then HTTP and ROS."""
     speeds = [Speed(cell) for cell in cells_of(run)]
-    return sorted(speeds, key=lambda speed: speed.cell.pipeline != "loopback")
+    return sorted(speeds, key=lambda speed: not declared(speed.cell.pipeline).in_process)
 
 
 def reference_by_block(run: Run) -> dict[int, list[float]]:
@@ -173,7 +174,7 @@ def reference_depths(run: Run) -> list[int]:
 def ratios_of(run: Run, speeds: list[Speed]) -> Iterator[tuple[str, str, Ratio]]:
     """Yield cell, base and ratio: every cell to llama-bench where it ran, and every other cell to in-process."""
     reference = reference_by_block(run)
-    base = next((speed for speed in speeds if speed.cell.pipeline == "loopback"), None)
+    base = next((speed for speed in speeds if declared(speed.cell.pipeline).in_process), None)
     for speed in speeds:
         values = speed.by_block(RATIO_METRIC)
         if ratio := ratio_of_blocks(values, reference, seed_of(run)):

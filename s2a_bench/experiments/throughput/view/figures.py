@@ -40,7 +40,7 @@ def build_throughput_bars(run: Run, *, against_paper: bool = False) -> Figure:
     from matplotlib.patches import Patch
 
     speeds = [speed for speed in speeds_of(run) if speed.values("tokens_per_s").size]
-    looks = cell_looks([speed.name for speed in speeds])
+    looks = cell_looks({speed.name: speed.cell.path for speed in speeds})
     rows = []
     for speed in speeds:
         found = summarise(speed.values("tokens_per_s"))
@@ -83,7 +83,7 @@ def build_throughput_bars(run: Run, *, against_paper: bool = False) -> Figure:
 def build_gap_distribution(run: Run) -> Figure:
     """Draw the empirical distribution of the gaps between tokens, a line a cell."""
     speeds = [speed for speed in speeds_of(run) if speed.cell.itl_ms().size]
-    looks = cell_looks([speed.name for speed in speeds])
+    looks = cell_looks({speed.name: speed.cell.path for speed in speeds})
     what = "Gaps between tokens, as the client saw them"
     figure = new_figure(2.35 + 0.14 * -(-len(speeds) // 2), _title(run, speeds, what))
     axes = figure.subplots()
@@ -110,7 +110,7 @@ def build_rate_by_position(run: Run) -> Figure:
     import numpy as np
 
     speeds = [speed for speed in speeds_of(run) if speed.by_position()]
-    looks = cell_looks([speed.name for speed in speeds])
+    looks = cell_looks({speed.name: speed.cell.path for speed in speeds})
     figure = new_figure(
         2.2 + 0.14 * -(-len(speeds) // 2), _title(run, speeds, f"Decode rate by position, bins of {BIN}: medians")
     )

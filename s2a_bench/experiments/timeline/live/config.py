@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING, Final
@@ -46,25 +45,24 @@ class Live(Options):
 def requests_of(config: TimelineConfig) -> LatencyConfig:
     """Return how the model is asked: one transport in one variant; prompt and length follow from the plan."""
     from s2a_bench.harness.plan import LatencyConfig
-    from s2a_bench.ros.config import domain_id
+    from s2a_bench.transport.http import HTTP
+    from s2a_bench.transport.pipeline import first_variants
+    from s2a_bench.transport.ros import ROS
 
-    transport, _, variant = (config.transport or ("http" if config.url else "ros")).partition("/")
+    transport = config.transport or (HTTP.name if config.url else ROS.name)
     width, height = config.size
     return LatencyConfig(
         transports=(transport,),
-        http=(variant or "as-deployed",) if transport == "http" else ("as-deployed",),
-        ros=(variant or "topic",) if transport == "ros" else ("topic",),
+        variants=first_variants(),
+        options={HTTP.name: {"url": config.url, "dialect": config.dialect}},
         source=config.source,
         width=width,
         height=height,
-        url=config.url,
-        dialect=config.dialect,
         engine=config.engine.but(profile=",".join(config.profiles)) if config.profiles else config.engine,
         runs=1,
         warmup=config.warmup,
         seed=config.seed,
         timeout_s=config.timeout_s,
-        domain_id=domain_id(os.environ),
         sample_resources_hz=0,
     )
 
@@ -73,7 +71,10 @@ def check_live(config: TimelineConfig) -> None:
     """Refuse what no model, robot or policy can do; raises UsageError naming the fields."""
     from s2a_bench.policy import PlanShape, Timing
 
-    requests_of(config).check()
+    requests = requests_of(config)
+    requests.check()
+    if len(requests.pipelines) != 1:
+        raise UsageError("`transport`: `live` follows one stream; name one, as ros, ros/action or http/binary")
     _ = config.skill_set
     for policy in config.chosen.values():
         policy.stepper(PlanShape(1, 1, Timing(1.0, 1.0, 1.0)))

@@ -15,7 +15,7 @@ from s2a_bench.experiments.timeline.live.asks import Ask, asks_of, prior_of
 from s2a_bench.experiments.timeline.live.config import in_paper_format, requests_of
 from s2a_bench.frames import FrameSource
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.plan import LatencyConfig, plan_cells
+from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.harness.warnings import before_run
@@ -102,18 +102,16 @@ class Link:
     def connect(self, stack: ExitStack, source: FrameSource, robot: str) -> None:
         """Start the server or find the one that runs, and open a client; ``robot`` is who will act, for the record."""
         requests = self.requests
-        (transport,) = requests.transports
-        uses_dds = transport == "ros"
-        self.warnings += before_run(requests.width, requests.height, uses_dds=uses_dds)
-        self.progress.stage(f"starting the {transport} server")
+        (self.cell,) = requests.pipelines
+        self.warnings += before_run(requests)
+        self.progress.stage(f"starting the {self.cell.transport.name} server")
         self.servers = ServerSet(requests, stack, self.writer.path)
         facts = self.servers.start()
         self.facts = self.servers.model(facts)
-        (self.cell,) = plan_cells(requests, self.servers.addresses)
-        with self.servers.death_explained(transport):
-            client = open_client(self.cell.route, self.servers.alive(transport))
+        with self.servers.death_explained(self.cell):
+            client = open_client(self.servers.wiring(self.cell), self.servers.alive(self.cell))
         self.tee = stack.enter_context(closing(Tee(client)))
-        self.feed = RequestFeed(source, preencoded=requests.payload == "jpeg-preencoded")
+        self.feed = RequestFeed(source, preencoded=self.cell.payload == "jpeg-preencoded")
         self.rate = requests.engine.pace
         self.writer.update(
             servers=facts,
@@ -170,8 +168,7 @@ class Link:
             self.answers += not measured.sample.error
         self.writer.sample(measured.sample)
         self.writer.tokens(measured.tokens)
-        transport = self.cell.route.transport
-        self.servers.raise_if_dead(transport, suspect=measured.fatal is not None)
+        self.servers.raise_if_dead(self.cell, suspect=measured.fatal is not None)
         if isinstance(measured.fatal, UsageError) and "grammar" in str(measured.fatal):
             raise UsageError(f"{measured.fatal} (here: `no_grammar`)") from measured.fatal
         if measured.fatal is not None:

@@ -31,7 +31,7 @@ from s2a_bench.runtime import ROBOTS, Robot
 from s2a_bench.runtime.events import StreamBroke
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.runtime.record import Record
-from s2a_bench.store.requests import SAMPLES, TOKENS
+from s2a_bench.store.requests import TOKENS, samples_table
 from s2a_bench.store.run import RunWriter
 
 MODE = "live"
@@ -50,10 +50,11 @@ def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
         stack.callback(source.close)
         manifest = {
             "configuration": {**config.to_manifest(), "engine": requests.to_manifest()["engine"]},
-            "environment": environment.collect(),
+            "stages": requests.stages,
+            "environment": environment.collect(requests.packages),
             "seeds": {"sampling": requests.seed, "source": requests.seed},
         }
-        tables = (TIMELINES, SKILLS, SAMPLES, TOKENS)
+        tables = (TIMELINES, SKILLS, samples_table(requests.stages), TOKENS)
         writer = stack.enter_context(RunWriter.create(output, "timeline", manifest, tables))
         progress.opened(writer.path)
         stack.enter_context(quick_switching())

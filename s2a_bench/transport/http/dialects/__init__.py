@@ -1,4 +1,4 @@
-"""What HTTP servers speak: one adapter a dialect, without any I/O, behind one table.
+"""What HTTP servers speak: one adapter a dialect, without any I/O, built in or offered by a package.
 
 An adapter builds a request's body and says what one message of the answer means. Cutting the bytes into messages is
 the `Decoder`'s; sending, marking stages and telling errors are the client's.
@@ -8,27 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pkgutil import resolve_name
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
-from s2a_bench.errors import UsageError
+from s2a_bench.registry import Registry
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.types import Frame, Pixels, Request
 
 OWN = "s2a"
 """The dialect of our own server, in all its variants."""
-
-DIALECTS: dict[str, str] = {
-    OWN: "s2a_bench.transport.http.dialects.openai:Own",
-    "openai": "s2a_bench.transport.http.dialects.openai:OpenAI",
-    "llama-server": "s2a_bench.transport.http.dialects.openai:LlamaServer",
-    "vllm": "s2a_bench.transport.http.dialects.openai:Vllm",
-    "ollama": "s2a_bench.transport.http.dialects.ollama:Ollama",
-    "tgi": "s2a_bench.transport.http.dialects.tgi:Tgi",
-    "gemini": "s2a_bench.transport.http.dialects.gemini:Gemini",
-    "openvla": "s2a_bench.transport.http.dialects.openvla:OpenVla",
-}
-"""Dialect -> ``module:Class``, built without arguments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +91,23 @@ class Dialect(Protocol):
         ...
 
 
+DIALECTS: Final[Registry[Callable[[], Dialect]]] = Registry(
+    "dialects",
+    "dialect",
+    {
+        OWN: "s2a_bench.transport.http.dialects.openai:Own",
+        "openai": "s2a_bench.transport.http.dialects.openai:OpenAI",
+        "llama-server": "s2a_bench.transport.http.dialects.openai:LlamaServer",
+        "vllm": "s2a_bench.transport.http.dialects.openai:Vllm",
+        "ollama": "s2a_bench.transport.http.dialects.ollama:Ollama",
+        "tgi": "s2a_bench.transport.http.dialects.tgi:Tgi",
+        "gemini": "s2a_bench.transport.http.dialects.gemini:Gemini",
+        "openvla": "s2a_bench.transport.http.dialects.openvla:OpenVla",
+    },
+)
+"""Dialect -> what builds it, without arguments."""
+
+
 def open_dialect(name: str) -> Dialect:
     """Return an adapter by its name; raises UsageError for an unknown one."""
-    if name not in DIALECTS:
-        raise UsageError(f"--dialect: '{name}' is none of {', '.join(DIALECTS)}")
-    dialect: Dialect = resolve_name(DIALECTS[name])()
-    return dialect
+    return DIALECTS[name]()

@@ -41,7 +41,7 @@ def endpoint(base: str, root: str, path: str, query: str = "") -> str:
     try:
         parts = urlsplit(base)
     except ValueError as error:
-        raise UsageError(f"--url: '{base}' is no URL: {error}") from error
+        raise UsageError(f"`url`: '{base}' is no URL: {error}") from error
     here = parts.path.rstrip("/")
     if not here.endswith(path):
         here = here.removesuffix(root) + root + path
@@ -52,8 +52,8 @@ def refuse_grammar(request: Request, name: str) -> None:
     """Raise UsageError for a grammar that the dialect has no field for."""
     if request.grammar:
         raise UsageError(
-            f"--grammar: the dialect '{name}' has no field for a GBNF grammar; leave it out, or ask a server of "
-            "--dialect llama-server or vllm"
+            f"`grammar`: the dialect '{name}' has no field for a GBNF grammar; leave it out, or ask a server of "
+            "`dialect` llama-server or vllm"
         )
 
 

@@ -1,7 +1,6 @@
-"""The pipeline without a wire: the client calls the server's handler, in process, without a copy.
+"""A client that calls the server's handler, in process, without a copy.
 
-The same conversions and the same hand-over as everywhere else, so it is the floor that other transports are
-compared with.
+The same conversions and the same hand-over as everywhere else.
 """
 
 from __future__ import annotations
@@ -13,7 +12,8 @@ from threading import Event
 
 from s2a_bench.errors import EngineError, RequestFailed, ServerDied
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler, Route
+from s2a_bench.transport import Handler, Wiring
+from s2a_bench.transport.options import Options
 from s2a_bench.transport.pictures import bgr_of, rgb_of
 from s2a_bench.types import Request, Token
 
@@ -24,9 +24,9 @@ _numbers = count()
 class LoopbackServer:
     """A handler that clients of this process find by its address."""
 
-    def __init__(self, route: Route, handler: Handler) -> None:
-        """Register under ``route.address``, or a new name without one."""
-        self.address = route.address or f"loopback-{next(_numbers)}"
+    def __init__(self, wiring: Wiring[Options], handler: Handler) -> None:
+        """Register under ``wiring.address``, or a new name without one."""
+        self.address = wiring.address or f"loopback-{next(_numbers)}"
         self.handler = handler
         self._stopped = Event()
         _servers[self.address] = self
@@ -48,11 +48,11 @@ class LoopbackServer:
 class LoopbackClient:
     """Calls the handler directly."""
 
-    def __init__(self, route: Route, alive: Callable[[], bool]) -> None:
+    def __init__(self, wiring: Wiring[Options], alive: Callable[[], bool]) -> None:
         """Remember the address; the server is looked up for each request."""
         del alive  # a server in this process lives as long as it is registered
         self.camera = None
-        self._address = route.address
+        self._address = wiring.address
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Convert, swap channels and hand over, all on the calling thread."""
@@ -72,7 +72,7 @@ class LoopbackClient:
         trace.receive(served.to_remote())
 
     def describe(self) -> dict[str, str]:
-        """Add nothing: the route tells all."""
+        """Add nothing: the wiring tells all."""
         return {}
 
     def close(self) -> None:

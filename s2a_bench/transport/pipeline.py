@@ -1,0 +1,143 @@
+"""Pipeline names, the same in flags, sweeps, tables and code: ``transport[/variant][?option=value&...]``.
+
+``http`` stands for the variants that flags choose, ``http/binary`` for one, ``ros/topic?payload=yuyv`` for one with an
+option of its own. A cell's *canonical* name has the variant, leaves out options that are what they would be without
+being named, and sorts the others. Values are percent-encoded where they need to be (RFC 3986): a comma is ``%2C``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import parse_qsl, quote
+
+from s2a_bench.errors import UsageError
+from s2a_bench.transport import TRANSPORTS, Transport, Wiring
+from s2a_bench.transport.options import Options, checked, server_side, text_of
+
+
+@dataclass(frozen=True, slots=True)
+class Pipeline:
+    """One pipeline with its settings: what is compared."""
+
+    name: str
+    """What its cell is called: canonical, unless a command has a word of its own."""
+    transport: Transport[Any]
+    variant: str
+    options: Options
+
+    @property
+    def payload(self) -> str:
+        """Return how a picture travels; nothing where it does not."""
+        return self.options.payload if self.transport.payloads else ""
+
+    @property
+    def black_box(self) -> bool:
+        """Whether the server is not ours."""
+        return bool(self.transport.foreign_by(self.options))
+
+    @property
+    def server(self) -> tuple[object, ...]:
+        """Return what cells must have in common to share a server."""
+        return (self.transport.name, *server_side(self.options))
+
+    def wiring(self, address: str = "", **told: Any) -> Wiring[Any]:
+        """Return what its client, or its server, is told."""
+        return Wiring(self.transport.name, self.variant, self.options, address, self.black_box, **told)
+
+
+@dataclass(frozen=True, slots=True)
+class _Named:
+    """A name as written: the parts, unchecked."""
+
+    transport: str
+    variant: str
+    options: dict[str, str]
+
+
+def _parse(text: str) -> _Named:
+    """Take a name apart; raises UsageError for options that are no ``option=value``."""
+    path, _, query = text.partition("?")
+    transport, _, variant = path.partition("/")
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
+    except ValueError as error:
+        raise UsageError(f"`transport`: '{text}' should look like {path}?option=value&option=value") from error
+    return _Named(transport, variant, {name.replace("-", "_"): value for name, value in pairs})
+
+
+def pipelines(
+    names: Iterable[str],
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    variants: Mapping[str, Sequence[str]] | None = None,
+) -> list[Pipeline]:
+    """Return the pipelines that names stand for, each once; raises UsageError.
+
+    ``options`` (transport -> option -> value) and ``variants`` (transport -> variants) hold what flags give, for names
+    that do not say it themselves. A ``payload`` under the transport "" is for all that can carry it.
+    """
+    given = {name: dict(values) for name, values in (options or {}).items()}
+    found: dict[str, Pipeline] = {}
+    for text in names:
+        for pipeline in _standing_for(_parse(text), given, variants or {}):
+            found.setdefault(pipeline.name, pipeline)
+    return list(found.values())
+
+
+def first_variants() -> dict[str, tuple[str, ...]]:
+    """Return transport -> its first variant: what one stream takes where its name has none."""
+    return {name: transport.variants[:1] for name, transport in TRANSPORTS.loaded()}
+
+
+def one_pipeline(text: str, **options: Any) -> Pipeline:
+    """Return the one pipeline of a name, its first variant where it names none; ``options`` are as if by flags."""
+    named = _parse(text)
+    transport = TRANSPORTS[named.transport]
+    variants = {transport.name: transport.variants[:1]}
+    return next(_standing_for(named, {transport.name: options}, variants))
+
+
+def _standing_for(
+    named: _Named, given: Mapping[str, Mapping[str, Any]], chosen: Mapping[str, Sequence[str]]
+) -> Iterator[Pipeline]:
+    """Yield a pipeline a variant."""
+    transport = TRANSPORTS[named.transport]
+    flags = {**given.get("", {}), **given.get(transport.name, {})}
+    plain = checked(transport.options, flags, transport.name)
+    asked = checked(transport.options, {**flags, **named.options}, transport.name)
+    variants = [named.variant] if named.variant else transport.measured(asked, chosen.get(transport.name, ()))
+    for variant in variants:
+        if variant not in (transport.variants or ("",)):
+            known = ", ".join(transport.variants) or "none: it has no variants"
+            field = "transport" if named.variant else transport.name
+            raise UsageError(f"`{field}`: '{variant}' is none of {transport.name}'s {known}")
+        can = transport.travels(variant, asked)
+        default, filled = (_filled(options, can) for options in (plain, asked))
+        yield Pipeline(_canonical(transport, variant, filled, default), transport, variant, filled)
+
+
+def _filled(options: Options, can: Sequence[str]) -> Options:
+    """Return the options with a payload, the transport's default where none is given."""
+    return options if options.payload or not can else options.model_copy(update={"payload": can[0]})
+
+
+def require_payload(pipeline: Pipeline) -> None:
+    """Raise UsageError where a picture cannot travel as it should."""
+    can = pipeline.transport.travels(pipeline.variant, pipeline.options)
+    if pipeline.payload and pipeline.payload not in can:
+        path = pipeline.name.partition("?")[0]
+        raise UsageError(
+            f"`payload`: over {path} a picture travels as {', '.join(can)}, not {pipeline.payload}; say it for this "
+            f"transport alone: {path}?payload={can[0]}"
+        )
+
+
+def _canonical(transport: Transport[Any], variant: str, options: Options, default: Options) -> str:
+    """Write the name of a cell."""
+    path = f"{transport.name}/{variant}" if variant else transport.name
+    said = {name: getattr(options, name) for name in sorted(type(options).model_fields)}
+    query = "&".join(
+        f"{name}={quote(text_of(value), safe='/:@')}" for name, value in said.items() if value != getattr(default, name)
+    )
+    return f"{path}?{query}" if query else path

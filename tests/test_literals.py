@@ -1,0 +1,30 @@
+"""Transports are named where they are, and in the few places that are about one of them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import s2a_bench
+
+HERE = Path(s2a_bench.__file__).parent
+NAMED = re.compile(r'"(http|ros|loopback)["/]')
+ALLOWED = {
+    "experiments/ccrb/asked.py": (1, "the default of --live, as below"),
+    "cli/timeline_live.py": (1, "the default of --live: a robot's own transport"),
+    "harness/plan.py": (1, "what is compared unless told: the paper's two pipelines"),
+    "machine/environment.py": (1, "the key of the ROS variables in a manifest"),
+    "report/claims/checks.py": (3, "the paper's claims are about these cells"),
+    "runtime/__init__.py": (1, "the robot that is driven over ROS"),
+}
+"""File -> lines, and why."""
+
+
+def test_no_other_module_names_a_transport() -> None:
+    found = {
+        name: sum(bool(NAMED.search(line)) for line in path.read_text("utf-8").splitlines())
+        for path in sorted(HERE.rglob("*.py"))
+        if not (name := path.relative_to(HERE).as_posix()).startswith(("transport/", "ros/"))
+    }
+    assert {name: count for name, count in found.items() if count} == {name: n for name, (n, _) in ALLOWED.items()}
+    assert sum(count for count, _ in ALLOWED.values()) <= 10

@@ -1,0 +1,133 @@
+"""A transport of somebody else's package needs nothing here but its entry point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from pydantic import Field
+
+from s2a_bench import registry
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.latency.run import run_latency
+from s2a_bench.experiments.latency.view.as_json import latency_json
+from s2a_bench.experiments.latency.view.cells import cells_of
+from s2a_bench.experiments.latency.view.figures import write_figures
+from s2a_bench.experiments.latency.view.tables import stage_table, summary_table
+from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.inference import EngineConfig
+from s2a_bench.store.run import Run, read_run
+from s2a_bench.testing import NullProgress
+from s2a_bench.testing.transport import TransportSuite
+from s2a_bench.trace import Trace
+from s2a_bench.transport import TRANSPORTS, Client, Handler, Server, Transport, Wiring, declared
+from s2a_bench.transport.loopback.in_process import LoopbackClient, LoopbackServer
+from s2a_bench.transport.options import SERVER, Options
+from s2a_bench.types import Request, Token
+
+
+class ToyOptions(Options):
+    number: int = Field(1, ge=1, description="a number", json_schema_extra=SERVER)
+    greeting: str = Field("hello", description="a word")
+
+
+class ToyClient(LoopbackClient):
+    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
+        trace.mark("greet")
+        yield from super().request(request, trace)
+
+
+class Toy(Transport[ToyOptions]):
+    name = "toy"
+    options = ToyOptions
+    stages: ClassVar[dict[str, str]] = {"greet": "pack"}
+    looks: ClassVar[dict[str, tuple[str, str]]] = {"": ("#123456", "-")}
+    packages = ("pytest",)
+    in_process = True
+
+    def client(self, wiring: Wiring[ToyOptions], alive: Callable[[], bool]) -> Client:
+        return ToyClient(wiring, alive)  # type: ignore[arg-type]
+
+    def server(self, wiring: Wiring[ToyOptions], handler: Handler) -> Server:
+        return LoopbackServer(wiring, handler)  # type: ignore[arg-type]
+
+
+TOY = Toy()
+
+
+def offer(monkeypatch: pytest.MonkeyPatch, offered: object) -> None:
+    """Offer an object as the transport ``toy``, as an installed package would."""
+    monkeypatch.setattr(EntryPoint, "load", lambda _point: offered)
+    point = EntryPoint("toy", "toy:TOY", TRANSPORTS.group)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == TRANSPORTS.group else [])
+    forget()
+
+
+def forget() -> None:
+    vars(TRANSPORTS).pop("_offered", None)
+    declared.cache_clear()
+
+
+@pytest.fixture
+def toy(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    offer(monkeypatch, TOY)
+    yield
+    monkeypatch.undo()
+    forget()
+
+
+@pytest.mark.usefixtures("toy")
+class TestToy(TransportSuite):
+    name = "toy?greeting=servus"
+
+
+@pytest.fixture
+def run(toy: None, tmp_path: Path) -> Run:  # noqa: ARG001 - what is measured
+    names = ("loopback", "toy", "toy?greeting=servus", "toy?number=2")
+    few: dict[str, Any] = {"runs": 3, "warmup": 1, "max_tokens": 3, "sample_resources_hz": 0}
+    config = LatencyConfig(names, engine=EngineConfig("echo"), width=64, height=48, **few)
+    return read_run(run_latency(config, tmp_path, NullProgress()))
+
+
+def test_a_run_measures_it_and_everything_shows_it(run: Run) -> None:
+    names = ["toy", "toy?greeting=servus", "toy?number=2", "loopback"]
+    assert (run.samples["error"] == "").all()
+    assert run.samples["greet_ns"].notna().sum() == 12
+    assert run.stages["greet"] == "pack"
+    assert "pytest" in run.manifest["environment"]["packages"]
+    assert [cell.name for cell in cells_of(run)] == names
+    assert ("pack", "greet") in {row[:2] for row in stage_table(run).rows}
+    assert summary_table(run).header[-1] == "ratio to loopback"
+    whole = latency_json(run)
+    assert "greet" in whole["cells"][0]["stages_ms"]
+    assert {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]} == {(name, "loopback") for name in names[:3]}
+    assert write_figures(run)
+
+
+def test_its_folder_reads_where_the_package_is_not(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    forget()
+    assert "toy" not in TRANSPORTS
+    read = read_run(run.path)
+    assert [cell.name for cell in cells_of(read)][-3:] == ["toy", "toy?greeting=servus", "toy?number=2"]
+    assert ("pack", "greet") in {row[:2] for row in stage_table(read).rows}
+    assert write_figures(read)
+
+
+@pytest.mark.usefixtures("toy")
+def test_a_stage_that_nobody_declares_makes_the_sample_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Toy, "stages", {})
+    config = LatencyConfig(("toy", "loopback"), engine=EngineConfig("echo"), width=64, height=48, runs=2, warmup=0)
+    with pytest.raises(Exception, match="toy does not declare the stage greet"):
+        run_latency(config, tmp_path, NullProgress())
+
+
+@pytest.mark.usefixtures("toy")
+def test_its_options_are_checked_like_any_other() -> None:
+    with pytest.raises(UsageError, match="toy has no option 'colour'; it has payload, number, greeting"):
+        LatencyConfig(("toy?colour=red",)).check()
