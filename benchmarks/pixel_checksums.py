@@ -45,7 +45,7 @@ def main() -> None:
 
 def _session(cell: Pipeline, config: LatencyConfig, stack: ExitStack, *, pixels: bool) -> Session:
     """Open a server, a client and a camera of their own."""
-    engine = open_engine(EngineConfig("echo"))
+    engine = open_engine(EngineConfig(name="echo"))
     server = open_server(cell.wiring(), engine_handler(engine, pixels=pixels))
     Thread(target=server.serve, daemon=True).start()
     stack.callback(server.stop)

@@ -47,7 +47,7 @@ def measure() -> Iterator[Measure]:
 
 def handler(*, alter: bool) -> Handler:
     """An echo engine before which a pixel may be altered."""
-    inner = engine_handler(open_engine(EngineConfig("echo")))
+    inner = engine_handler(open_engine(EngineConfig(name="echo")))
 
     def handle(request: Request, trace: Trace) -> Generator[Token, None, None]:
         (image,) = request.images
@@ -75,7 +75,7 @@ def test_a_jpeg_may_change_pixels(measure: Measure) -> None:
 
 
 def test_a_server_that_tells_nothing_leaves_the_engines_pixels_unknown(measure: Measure) -> None:
-    silent = engine_handler(open_engine(EngineConfig("echo")), pixels=False)
+    silent = engine_handler(open_engine(EngineConfig(name="echo")), pixels=False)
     sample = measure("loopback", silent).sample
     assert (sample.error, sample.rgb_engine) == ("", None)
 

@@ -88,7 +88,7 @@ class TestToy(TransportSuite):
 def run(toy: None, tmp_path: Path) -> Run:  # noqa: ARG001 - what is measured
     names = ("loopback", "toy", "toy?greeting=servus", "toy?number=2")
     few: dict[str, Any] = {"runs": 3, "warmup": 1, "max_tokens": 3, "sample_resources_hz": 0}
-    config = LatencyConfig(names, engine=EngineConfig("echo"), width=64, height=48, **few)
+    config = LatencyConfig(names, engine=EngineConfig(name="echo"), width=64, height=48, **few)
     return read_run(run_latency(config, tmp_path, NullProgress()))
 
 
@@ -122,7 +122,7 @@ def test_a_stage_that_nobody_declares_makes_the_sample_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Toy, "stages", {})
-    config = LatencyConfig(("toy", "loopback"), engine=EngineConfig("echo"), width=64, height=48, runs=2, warmup=0)
+    config = LatencyConfig(("toy", "loopback"), engine=EngineConfig(name="echo"), width=64, height=48, runs=2, warmup=0)
     with pytest.raises(Exception, match="toy does not declare the stage greet"):
         run_latency(config, tmp_path, NullProgress())
 
