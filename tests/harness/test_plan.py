@@ -83,7 +83,6 @@ def test_the_stages_are_those_of_the_transports_in_the_order_of_the_path() -> No
         ({"payload": "yuyv"}, "`payload`: over http/as-deployed a picture travels as jpeg, jpeg-preencoded, png, raw"),
         ({"payload": "yuyv"}, "http/as-deployed?payload=jpeg"),
         ({"options": {"http": {"connection": "x"}}}, "`connection`: 'x' should be 'keep-alive'"),
-        ({"engine": EngineConfig(name="gpt")}, "`engine`: 'gpt' is none of llama, echo"),
         ({"mode": "x"}, "`mode`: 'x'"),
         ({"options": {"ros": {"dds_tuning": "x"}}}, "`dds_tuning`: 'x'"),
         ({"options": {"ros": {"qos": "x"}}}, "`qos`: 'x' should be 'reliable' or 'sensor_data'"),
