@@ -1,3 +1,50 @@
-"""Measure how a vision-language model is wired to a robot, stage by stage."""
+"""s2a-bench: what wiring a vision-language model to a robot costs, and when the robot may act on what it streams.
+
+The library's face: every experiment is a function (`latency`, `throughput`, `timeline`, `boundary`, `study`, `ccrb`),
+`load` opens a run folder, `compare` compares two. See docs/library.md.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from s2a_bench.library import Comparison, Run, command, compare, load
+
+    boundary = command("boundary")
+    ccrb = command("ccrb")
+    latency = command("latency")
+    study = command("study")
+    throughput = command("throughput")
+    timeline = command("timeline")
+
+__all__ = [
+    "Comparison",
+    "Run",
+    "boundary",
+    "ccrb",
+    "compare",
+    "latency",
+    "load",
+    "study",
+    "throughput",
+    "timeline",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the library when a name of it is first asked for: importing the package stays light."""
+    if name not in __all__:
+        raise AttributeError(f"module 's2a_bench' has no attribute '{name}'")
+    from s2a_bench import library
+
+    found = getattr(library, name, None) or library.command(name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """Return the names of the library."""
+    return [*__all__, "__version__"]

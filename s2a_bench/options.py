@@ -6,7 +6,7 @@ A configuration that exists is valid: what makes no sense raises UsageError, whi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -69,6 +69,37 @@ def option(default: Any, about: str, *, flag: str = "", **bounds: Any) -> Any:
 def group(options: type[Options], *, only: tuple[str, ...] = (), about: str = "") -> Any:
     """Declare a group of options, of which ``only`` some are flags; ``about`` stands before the help of each."""
     return Field(default_factory=options, json_schema_extra={"only": list(only), "about": about})
+
+
+def places(options: type[Options]) -> dict[str, tuple[str, ...]]:
+    """Return every name under which one option can be given, its field's and its flag's, and the path to its field.
+
+    The options of a group are there by their own names.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    for name, field in options.model_fields.items():
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, Options):
+            found |= {inner: (name, *path) for inner, path in places(kind).items()}
+    for name, field in options.model_fields.items():
+        extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+        if not (isinstance(field.annotation, type) and issubclass(field.annotation, Options)):
+            found |= {name: (name,), str(extra.get("flag") or name).replace("-", "_"): (name,)}
+    return found
+
+
+def placed(options: type[Options], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options, each given by one of its names, as the class takes them; unknown ones stay as they are."""
+    known = places(options)
+    values: dict[str, Any] = {}
+    for name, value in given.items():
+        whole = name in options.model_fields and isinstance(value, (Options, dict))
+        *groups, last = (name,) if whole else known.get(name, (name,))
+        inner = values
+        for each in groups:
+            inner = inner.setdefault(each, {})
+        inner[last] = value
+    return values
 
 
 def _line(error: ErrorDetails, options: type[Options]) -> str:

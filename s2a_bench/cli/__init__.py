@@ -28,6 +28,7 @@ from s2a_bench.cli import (
 from s2a_bench.cli.adapter import with_flags
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS
+from s2a_bench.machine import tuning
 
 INTERRUPTED = 130
 ParseError: Any = typer.BadParameter.__mro__[1]
@@ -98,7 +99,8 @@ def main() -> None:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)
     try:
-        code = app(standalone_mode=False)
+        with tuning.allowed():
+            code = app(standalone_mode=False)
         if code == INTERRUPTED:  # newer typer turns Ctrl-C into this code itself
             _say("interrupted", INTERRUPTED)
     except S2AError as error:

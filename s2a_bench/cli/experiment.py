@@ -60,6 +60,7 @@ def _run(
     experiment: Experiment, config: Options, output: Path, asked: dict[str, Any], *, data_only: bool, as_json: bool
 ) -> None:
     from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.experiments.files import write_shown
     from s2a_bench.store.run import read_run
 
     with RunProgress(experiment.unit) as progress:
@@ -69,24 +70,12 @@ def _run(
             shown = experiment.show(run, **asked)
             if not data_only:
                 progress.stage("drawing")
-                write(run, shown)
+                write_shown(run, shown)
             present(run, shown, progress, as_json=as_json)
         except (S2AError, KeyboardInterrupt):
             if progress.folder is not None:
                 progress.say(f"{experiment.unit} so far: {progress.folder}")
             raise
-
-
-def write(run: Run, shown: Shown) -> None:
-    """Write tables, figures and what else a run shows into its folder; raises StoreError."""
-    from s2a_bench.writers.figures import save
-    from s2a_bench.writers.files import write_texts
-
-    write_texts(run, shown.tables, shown.csvs)
-    if shown.figures:
-        save(run.path / "figures", shown.figures)
-    for name, write_file in shown.files.items():
-        write_file(run.path / name)
 
 
 def present(run: Run, shown: Shown, progress: RunProgress, *, as_json: bool) -> None:

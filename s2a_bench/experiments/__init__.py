@@ -165,3 +165,9 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
     },
 )
 """The experiments by their commands."""
+
+
+def experiment_of(command: str) -> Experiment | None:
+    """Return the experiment whose runs bear a command's name, as ``study-drift`` those of study; None for others."""
+    name = command if command in EXPERIMENTS else command.partition("-")[0]
+    return EXPERIMENTS[name] if name in EXPERIMENTS else None  # noqa: SIM401 - a registry has no default

@@ -1,4 +1,4 @@
-"""Exact colour conversion and image coding on uint8 arrays, by OpenCV on one thread.
+"""Exact colour conversion and image coding on uint8 arrays, by OpenCV.
 
 YUYV is ITU-R BT.601 with limited range (Y 16..235), as V4L2 cameras deliver it. OpenCV computes it in 20-bit
 fixed point, within 1 of the real-valued formula. Pixel arrays may be read-only or windows of larger ones as long as
@@ -16,10 +16,6 @@ if TYPE_CHECKING:
     from s2a_bench.types import Frame, Pixels
 
     BytesLike: TypeAlias = bytes | bytearray | memoryview | Pixels
-
-# One conversion takes a fraction of a millisecond: OpenCV's worker threads save little of it and compete with
-# the model and the middleware for cores, which would disturb what is measured.
-cv2.setNumThreads(1)
 
 # Newer OpenCV has the decoder write RGB itself: the same pixels without another pass over the picture; 4.9 cannot.
 _DECODE_RGB: int | None = getattr(cv2, "IMREAD_COLOR_RGB", None)

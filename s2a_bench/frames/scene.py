@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 import cv2
 import numpy as np
 
-import s2a_bench.frames.convert  # noqa: F401  sets OpenCV to one thread
-
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, ClassVar, cast
 
 import cv2
 
-import s2a_bench.frames.convert  # noqa: F401  sets OpenCV to one thread
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError
 from s2a_bench.frames import check_size

@@ -25,7 +25,7 @@ from s2a_bench.inference.models import resolve
 from s2a_bench.machine import environment
 from s2a_bench.machine.doctor import Machine
 from s2a_bench.machine.resources.sampler import Sampler, open_sampler
-from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
+from s2a_bench.machine.tuning import is_allowed, keep_large_blocks, limit_threads
 from s2a_bench.progress import Progress
 from s2a_bench.store.requests import FrameRow
 from s2a_bench.store.run import RunWriter
@@ -88,7 +88,11 @@ def _manifest(task: Task, config: LatencyConfig, *, malloc_tuned: bool) -> dict[
         "stages": config.stages,
         "environment": environment.collect(config.packages),
         "seeds": dict.fromkeys(("order", "sampling", "source", "bootstrap"), config.seed),
-        "tuning": {"dds": "tuned" if config.tuned else "default", "malloc_keeps_large_blocks": malloc_tuned},
+        "tuning": {
+            "dds": "tuned" if config.tuned else "default",
+            "malloc_keeps_large_blocks": malloc_tuned,
+            "process": is_allowed(),
+        },
         "cadence": "closed loop, the next request when the last is done"
         if config.mode == "request"
         else f"closed loop over an open-loop camera at {config.fps:g} Hz, prompts at random moments",

@@ -20,7 +20,7 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
 from s2a_bench.inference import Engine, EngineConfig, open_engine
-from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
+from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Handler, Wiring, open_server
 from s2a_bench.types import Request, Token
@@ -112,4 +112,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with allowed():
+        sys.exit(main())

@@ -1,9 +1,15 @@
-"""Settings the harness applies to its own processes, all recorded in the manifest."""
+"""Settings that make a process of the harness measure more evenly, all recorded in the manifest.
+
+They are for processes of our own: the command line and the servers allow them, a program that uses the library has to
+ask for them. Where they are not allowed nothing is changed.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
@@ -16,9 +22,28 @@ new frame faults its pages in again, 2.6 us a page (shared/LIMITS.md)."""
 SINGLE_THREADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
+_allowed = False
+
+
+@contextmanager
+def allowed(yes: bool = True) -> Iterator[None]:
+    """Allow this process to be tuned inside the block; what was tuned stays so."""
+    global _allowed  # noqa: PLW0603 - settings of a process are global
+    before, _allowed = _allowed, yes or _allowed
+    try:
+        yield
+    finally:
+        _allowed = before
+
+
+def is_allowed() -> bool:
+    """Whether this process may be tuned."""
+    return _allowed
+
+
 def keep_large_blocks() -> bool:
-    """Tell glibc to keep large freed blocks; returns whether it did (musl has no mallopt)."""
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    """Tell glibc to keep large freed blocks; returns whether it did (not allowed, or musl, which has no mallopt)."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if _allowed else None
     if mallopt is None:
         return False
     trims = bool(mallopt(M_TRIM_THRESHOLD, KEEP_BYTES[0]))
@@ -26,6 +51,15 @@ def keep_large_blocks() -> bool:
 
 
 def limit_threads() -> None:
-    """Keep numeric libraries to one thread each, unless the user decided; llama.cpp has a flag of its own."""
+    """Keep OpenCV and numeric libraries to one thread each, unless the user decided; llama.cpp has a flag of its own.
+
+    One conversion of a picture takes a fraction of a millisecond: OpenCV's worker threads save little of it and compete
+    with the model and the middleware for cores, which would disturb what is measured.
+    """
+    if not _allowed:
+        return
     for name in SINGLE_THREADED:
         os.environ.setdefault(name, "1")
+    import cv2
+
+    cv2.setNumThreads(1)

@@ -186,7 +186,7 @@ def test_the_run_shows_what_its_options_ask_for(made: Callable[..., Run]) -> Non
         ({"rate": float("nan")}, "`rate`: nan should be"),
         ({"profile": "abacus"}, "'abacus' is none of"),
         ({"policies": ("hope",)}, "'hope' is none of"),
-        ({"asked": {"pace": 5.0}}, "`pace` is about a model that answers; it needs `live`"),
+        ({"asked": {"engine": {"pace": 5.0}}}, "`pace` is about a model that answers; it needs `live`"),
         (
             {"asked": {"live": True}, "random": 5},
             "`random` is about tokens that are modelled; leave it out with `live`",

@@ -45,6 +45,7 @@ def differences(baseline: Run, other: Run) -> list[Difference]:
     found = [
         *_of("", *({name: facts[name] for name in _MACHINE if name in facts} for facts in machines), fatal=True),
         *_of("", *(_gpus(facts, "name") for facts in machines), fatal=True),
+        *_of("tuning ", *(_tuning(manifest) for manifest in sides), fatal=True),
         *_of("model ", *({name: facts[name] for name in _MODEL if name in facts} for facts in models), fatal=True),
         *_of("", *(_rest(facts, (*_MACHINE, *_PASSING)) for facts in machines), fatal=False),
         *_of("", *(_gpus(facts, "driver") for facts in machines), fatal=False),
@@ -69,6 +70,12 @@ def _of(prefix: str, first: Mapping[str, Any], second: Mapping[str, Any], *, fat
         baseline, other = (_ABSENT if side is None else str(side) for side in (one, two))
         known = name in first and name in second
         yield Difference(f"{prefix}{name}", baseline, other, fatal and known)
+
+
+def _tuning(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """Return whether the measuring process was tuned; a library's caller may not want that."""
+    tuned = (manifest.get("tuning") or {}).get("process")
+    return {} if tuned is None else {"process": "tuned" if tuned else "not tuned"}
 
 
 def _gpus(facts: Mapping[str, Any], key: str) -> dict[str, Any]:

@@ -1,0 +1,209 @@
+"""The library: every experiment as a function, run folders as objects that show themselves, comparisons.
+
+    import s2a_bench as s2a
+
+    run = s2a.latency(transports=["http", "ros"], engine="echo", runs=50, output="results")
+    run.samples                      # a DataFrame, a row a request, warm-ups marked
+    run.table("stages")              # a table of the run as a DataFrame
+    run.figures()["stage_breakdown"] # matplotlib
+    s2a.compare(run, s2a.load("results/old"))
+
+Nothing here prints, and nothing changes the caller's process unless ``tune=True`` asks for it.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, experiment_of
+from s2a_bench.machine import tuning
+from s2a_bench.options import Options, placed
+from s2a_bench.progress import NullProgress, Progress
+from s2a_bench.store import run as store
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from s2a_bench.report.compare.comparison import ComparedRuns
+    from s2a_bench.writers.tables import TextTable
+
+Folder: TypeAlias = "str | Path | Run"
+
+
+class Run:
+    """One run, read from its folder: its rows, its tables and figures. Shows its main tables in a notebook."""
+
+    def __init__(self, path: str | Path) -> None:
+        """Open a run folder; raises StoreError where it is none."""
+        self._run = store.read_run(Path(path))
+
+    @property
+    def path(self) -> Path:
+        """The run folder."""
+        return self._run.path
+
+    @property
+    def manifest(self) -> Mapping[str, Any]:
+        """What was asked, where it ran, how it ended."""
+        return self._run.manifest
+
+    @property
+    def samples(self) -> pd.DataFrame:
+        """One row a request, warm-ups and failures included and marked; times in integer ns."""
+        return self._run.samples
+
+    @property
+    def tokens(self) -> pd.DataFrame:
+        """One row a token; times in integer ns."""
+        return self._run.tokens
+
+    @property
+    def tables(self) -> tuple[str, ...]:
+        """The names that `table` knows."""
+        return tuple(self._shown.tables)
+
+    def table(self, name: str) -> pd.DataFrame:
+        """Return one of the run's tables: as CSV has it, every digit kept, else as people read it."""
+        import pandas as pd
+
+        shown = self._shown
+        if f"{name}.csv" in shown.csvs:
+            return pd.read_csv(io.StringIO(shown.csvs[f"{name}.csv"]))
+        if name not in shown.tables:
+            raise UsageError(f"a {self.manifest['command']} run has no table '{name}', only {', '.join(self.tables)}")
+        table = shown.tables[name]
+        return pd.DataFrame(table.rows, columns=list(table.header))
+
+    def figures(self) -> dict[str, Figure]:
+        """Draw every figure of the run."""
+        from s2a_bench.writers.style import paper_column
+
+        with paper_column():
+            return {name: draw() for name, draw in self._shown.figures.items()}
+
+    def json(self) -> dict[str, Any]:
+        """Return the object that the command's ``--json`` prints."""
+        return self._shown.json()
+
+    def save(self) -> Path:
+        """Write tables and figures into the run folder, as the command does, and return it."""
+        from s2a_bench.experiments.files import write_shown
+
+        write_shown(self._run, self._shown)
+        return self.path
+
+    @cached_property
+    def _shown(self) -> Shown:
+        experiment = experiment_of(str(self.manifest["command"]))
+        if experiment is None:
+            raise UsageError(f"{self.path}: no experiment here shows {self.manifest['command']} runs")
+        return experiment.show(self._run)
+
+    def __repr__(self) -> str:
+        return f"<{self.manifest['command']} run {self.path}, {self.manifest['state']}>"
+
+    def _repr_html_(self) -> str:
+        shown = self._shown
+        tables = [shown.tables[name] for name in shown.main or shown.tables]
+        said = "".join(f"<p>{escape(sentence)}</p>" for sentence in shown.sentences)
+        return f"<p><code>{escape(repr(self)[1:-1])}</code></p>{said}{''.join(map(_html, tables))}"
+
+
+class Comparison:
+    """What changed between two runs. Shows its table in a notebook."""
+
+    def __init__(self, compared: ComparedRuns) -> None:
+        """Keep what was found."""
+        self._compared = compared
+
+    def table(self) -> pd.DataFrame:
+        """Return a row a cell and metric: both values, the change with its interval, the verdict."""
+        import pandas as pd
+
+        from s2a_bench.report.compare.tables import compare_csv
+
+        return pd.read_csv(io.StringIO(compare_csv(self._compared)))
+
+    def _repr_html_(self) -> str:
+        from s2a_bench.report.compare.tables import compare_table
+
+        return _html(compare_table(self._compared))
+
+
+def run(
+    name: str, *, output: str | Path = "results", progress: Progress | None = None, tune: bool = False, **options: Any
+) -> Run:
+    """Run an experiment by its name; ``options`` are its fields, those of its groups by their own names.
+
+    ``tune`` lets it keep freed memory and limit threads in this process, as the command line does; the manifest says
+    so, and runs with and without are not compared. Raises S2AError for what the caller can mend.
+    """
+    experiment: Experiment = EXPERIMENTS[name]
+    config_class: type[Options] = resolve_name(experiment.config)
+    config = config_class(**placed(config_class, options))
+    with tuning.allowed(tune):
+        return Run(experiment.run_with(config, Path(output), progress or NullProgress()))
+
+
+def load(path: str | Path) -> Run:
+    """Open a run folder; raises StoreError where it is none."""
+    return Run(path)
+
+
+def compare(
+    baseline: Folder | Sequence[Folder],
+    other: Folder | Sequence[Folder],
+    *,
+    unlike: bool = False,
+    metrics: Sequence[str] = (),
+    least: float = 0.05,
+) -> Comparison:
+    """Compare two runs, or two sets of launches; ``least`` is the smallest share that is called a change.
+
+    Raises UnlikeRuns for runs of other machines, models or settings, unless ``unlike``.
+    """
+    from s2a_bench.report.compare import comparison
+
+    sides = [[store.read_run(_path(each)) for each in _several(side)] for side in (baseline, other)]
+    opened = comparison.open_comparison(*sides, unlike=unlike, least=least)
+    wanted = comparison.metrics_of(opened, metrics) if metrics else comparison.shown_metrics(opened)
+    return Comparison(comparison.compare(opened, wanted))
+
+
+def command(name: str) -> Callable[..., Run]:
+    """Return the function of an experiment; its signature is that of `run` without the name."""
+
+    def call(
+        *, output: str | Path = "results", progress: Progress | None = None, tune: bool = False, **options: Any
+    ) -> Run:
+        return run(name, output=output, progress=progress, tune=tune, **options)
+
+    call.__name__ = call.__qualname__ = name
+    call.__doc__ = (
+        f"{EXPERIMENTS[name].about}\n\nSee `s2a_bench.library.run`; the options are those of `s2a-bench {name} --help`."
+    )
+    return call
+
+
+def _several(side: Folder | Sequence[Folder]) -> Sequence[Folder]:
+    return [side] if isinstance(side, (str, Path, Run)) else side
+
+
+def _path(folder: Folder) -> Path:
+    return folder.path if isinstance(folder, Run) else Path(folder)
+
+
+def _html(table: TextTable) -> str:
+    head = "".join(f"<th>{escape(name)}</th>" for name in table.header)
+    rows = "".join(f"<tr>{''.join(f'<td>{escape(text)}</td>' for text in row)}</tr>" for row in table.rows)
+    notes = "".join(f"<p>{escape(str(note))}</p>" for note in table.notes)
+    body = f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
+    return f"<table><caption>{escape(table.title)}</caption>{body}</table>{notes}"

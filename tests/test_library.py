@@ -1,0 +1,86 @@
+"""The library as a notebook uses it: experiments as functions, runs that show themselves, a process left alone."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import s2a_bench as s2a
+from s2a_bench.errors import UsageError, UnlikeRuns
+
+QUIET = """
+import os, sys
+import cv2
+before = dict(os.environ), cv2.getNumThreads()
+import s2a_bench as s2a
+run = s2a.latency(transports=["loopback"], engine="echo", size="64x48", runs=2, warmup=0, output=sys.argv[1])
+assert (dict(os.environ), cv2.getNumThreads()) == before, "the caller's process was changed"
+assert run.manifest["tuning"]["process"] is False
+run = s2a.latency(transports=["loopback"], engine="echo", size="64x48", runs=2, warmup=0, output=sys.argv[1], tune=True)
+assert run.manifest["tuning"]["process"] is True
+print(cv2.getNumThreads())
+"""
+
+
+def test_the_names_are_those_that_it_says() -> None:
+    assert set(s2a.__all__) <= set(dir(s2a))
+    assert all(getattr(s2a, name) is not None for name in s2a.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'teleport'"):
+        _ = s2a.teleport
+
+
+def test_importing_it_is_light() -> None:
+    heavy = ("numpy", "cv2", "pandas", "matplotlib", "pydantic", "llama_cpp", "cyclonedds")
+    code = f"import sys, s2a_bench; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_run_shows_its_rows_tables_and_figures(tmp_path: Path) -> None:
+    run = s2a.boundary(points=5, most_tokens=3, output=tmp_path)
+    assert run.path.parent == tmp_path
+    assert run.manifest["configuration"]["points"] == 5
+    table = run.table("boundary")
+    assert {"duration", "stall_free", "p_stall"} <= set(table.columns)
+    assert "boards" in run.tables
+    assert run.table("boards").columns[0] == "board"
+    assert list(run.figures()) == ["boundary"]
+    assert run.json()["command"] == "boundary"
+    assert "Boards: is naive stall-free?" in run._repr_html_()
+    assert (run.save() / "figures" / "boundary.png").exists()
+    assert s2a.load(run.path).table("boundary").equals(table)
+    with pytest.raises(UsageError, match="no table 'stages', only boundary, boards"):
+        run.table("stages")
+
+
+def test_samples_have_their_warm_ups_marked_and_runs_are_compared(tmp_path: Path) -> None:
+    few = {"transports": ["loopback"], "engine": "echo", "size": "64x48", "runs": 12, "output": tmp_path}
+    one, other = s2a.latency(**few, warmup=2), s2a.latency(**few, warmup=2)
+    assert one.samples["warmup"].tolist() == [True] * 2 + [False] * 12
+    assert set(one.table("stages")["cell"]) == {"loopback"}
+    compared = s2a.compare(one, other.path)
+    assert set(compared.table()["cell"]) == {"loopback"}
+    assert "loopback" in compared._repr_html_()
+
+
+def test_a_field_is_named_in_what_is_wrong(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"^`points`: 1 should be greater than or equal to 2$"):
+        s2a.boundary(points=1, output=tmp_path)
+    with pytest.raises(UsageError, match=r"^`speed` is none of the options profiles"):
+        s2a.boundary(speed=1, output=tmp_path)
+
+
+def test_the_callers_process_stays_as_it_is_unless_asked(tmp_path: Path) -> None:
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", QUIET, str(tmp_path)], capture_output=True, text=True, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "1"
+    untuned, tuned = sorted(tmp_path.iterdir())
+    with pytest.raises(UnlikeRuns, match="tuning process: not tuned against tuned"):
+        s2a.compare(untuned, tuned)
