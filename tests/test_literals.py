@@ -10,8 +10,6 @@ import s2a_bench
 HERE = Path(s2a_bench.__file__).parent
 NAMED = re.compile(r'"(http|ros|loopback)["/]')
 ALLOWED = {
-    "experiments/ccrb/asked.py": (1, "the default of --live, as below"),
-    "cli/timeline_live.py": (1, "the default of --live: a robot's own transport"),
     "harness/plan.py": (1, "what is compared unless told: the paper's two pipelines"),
     "machine/environment.py": (1, "the key of the ROS variables in a manifest"),
     "report/claims/checks.py": (3, "the paper's claims are about these cells"),

@@ -46,7 +46,7 @@ def latency(
         str, typer.Option(help="an action that runs already, as /llama/generate_response of llama_ros (a black box)")
     ] = "",
     result_timeout: Annotated[float, typer.Option(help="seconds an action's result is kept")] = 60.0,
-    wire: Annotated[str, typer.Option(hidden=True)] = "",
+    wire: Annotated[str, typer.Option(hidden=True, help="gone: see --payload")] = "",
     url: Annotated[str, typer.Option(help="a server that runs already (a black box)")] = "",
     dialect: Annotated[
         str,
