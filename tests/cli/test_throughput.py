@@ -120,7 +120,7 @@ def test_a_reference_that_fails_ends_the_run_with_one_line_and_keeps_the_samples
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--transport", "loopback"], "--transport: 'loopback' is none of in-process, http, ros"),
+        (["--transport", "pigeon"], "--transport: 'pigeon' is none of http, ros, loopback"),
         (["--transport", ""], "--transport: name at least one"),
         (["--kv-type", "q3"], "--kv-type: 'q3' is none of f32, f16, q8_0, q4_0"),
         (["--kv-type", "q4_0", "--flash-attention", "off"], "--kv-type q4_0 needs flash attention"),
