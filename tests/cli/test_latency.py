@@ -320,6 +320,7 @@ def test_a_video_is_a_source(tmp_path: Path) -> None:
     assert kept.samples["convert_ns"].isna().all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["request", "stream"])
 def test_a_run_is_recorded_and_its_frames_are_a_source(tmp_path: Path, mode: str) -> None:
     from rosbags.highlevel import AnyReader
@@ -356,6 +357,7 @@ def test_a_repeated_frame_is_a_warning(tmp_path: Path) -> None:
     assert "warning [duplicate-frames]" in said
 
 
+@pytest.mark.slow
 def test_a_real_model_answers_over_both_pipelines(tmp_path: Path) -> None:
     grammar = tmp_path / "yes.gbnf"
     grammar.write_text('root ::= "yes" | "no"\n')

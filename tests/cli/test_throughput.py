@@ -47,6 +47,7 @@ def valid(text: str) -> dict[str, Any]:
     return whole
 
 
+@pytest.mark.slow
 def test_in_process_http_and_ros_stand_beside_llama_bench(tmp_path: Path) -> None:
     program = install(tmp_path)
     everywhere = ["--transport", "in-process,http,ros", "--payload", "raw"]
