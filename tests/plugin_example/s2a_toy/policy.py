@@ -1,0 +1,52 @@
+"""The policy `toy-policy`: start when a share of the plan has arrived; the share is its parameter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from s2a_bench.errors import UsageError
+from s2a_bench.policy import PlanShape, Policy, Start, Stepper, Timing
+from s2a_bench.policy.naive import Queue
+
+
+@dataclass(frozen=True, slots=True)
+class ToyPolicy(Policy):
+    """Wait for N / ``factor`` skills, then run them back to back: factor 1 waits for all of them."""
+
+    name: ClassVar[str] = "toy-policy"
+    factor: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Refuse a factor below 1."""
+        if not self.factor >= 1:
+            raise UsageError(f"`policy`: toy-policy?factor={self.factor:g} should be 1 or more")
+
+    def stepper(self, shape: PlanShape) -> Stepper:
+        """Follow one plan as it arrives."""
+        return ToyStepper(math.ceil(shape.n_skills / self.factor))
+
+
+@dataclass(slots=True)
+class ToyStepper:
+    """Count the skills that are missing before the start."""
+
+    missing: int
+    queue: Queue = field(default_factory=Queue)
+
+    def token(self, at_s: float) -> None:
+        """Ignore it."""
+
+    def fragment(self, at_s: float, timing: Timing) -> None:
+        """Queue the skill."""
+        self.missing -= 1
+        self.queue.fragment(at_s, timing)
+
+    def end(self, at_s: float) -> None:  # noqa: ARG002 - whenever it comes
+        """Stop waiting for more."""
+        self.missing = 0
+
+    def decide(self, now_s: float) -> Start | float:
+        """Start the next skill once enough of them are there."""
+        return math.inf if self.missing > 0 else self.queue.decide(now_s)

@@ -1,0 +1,205 @@
+"""A package of somebody else's adds one of each kind, installed as theirs would be, and nothing here knows of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "tests" / "plugin_example"
+Command = Callable[..., subprocess.CompletedProcess[str]]
+SMALL = ("--size", "64x48", "--runs", "6", "--warmup", "1", "--engine", "echo", "--max-tokens", "3")
+
+
+@pytest.fixture(scope="session")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Install the package offline into a folder of its own; return the environment in which Python finds it."""
+    pytest.importorskip("setuptools", reason="builds the package")
+    source = tmp_path_factory.mktemp("source") / "plugin"
+    subprocess.run(["cp", "-r", str(PACKAGE), str(source)], check=True)  # building writes beside the sources
+    target = tmp_path_factory.mktemp("site")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, "--target", str(target), str(source)], check=True, timeout=120)
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(target), str(ROOT)])}
+
+
+@pytest.fixture
+def command(installed: dict[str, str], tmp_path: Path) -> Command:
+    """Run s2a-bench with the package there, below a folder of this test's own."""
+
+    def run(*arguments: str, code: int = 0) -> subprocess.CompletedProcess[str]:
+        line = [sys.executable, "-m", "s2a_bench", *arguments]
+        done = subprocess.run(
+            line, capture_output=True, text=True, check=False, env=installed, cwd=tmp_path, timeout=240
+        )
+        assert done.returncode == code, done.stderr
+        return done
+
+    return run
+
+
+def folder_of(done: subprocess.CompletedProcess[str], tmp_path: Path) -> Path:
+    """Return the run folder of a command, the newest."""
+    assert "Traceback" not in done.stderr
+    return max((tmp_path / "results").iterdir(), key=lambda path: path.stat().st_mtime_ns)
+
+
+@pytest.fixture
+def measured(command: Command, tmp_path: Path) -> Path:
+    """Measure the toy transport beside loopback."""
+    done = command("latency", "--transport", "toy,loopback", *SMALL)
+    assert re.search(r"toy_frame", done.stdout)
+    assert "ratio to" in done.stdout
+    return folder_of(done, tmp_path)
+
+
+def test_its_tests_are_the_shipped_suites(installed: dict[str, str]) -> None:
+    line = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(PACKAGE), "-c", os.devnull]
+    line += ["--import-mode=importlib", str(PACKAGE / "tests")]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, env=installed, cwd=PACKAGE, timeout=300)
+    assert done.returncode == 0, done.stdout[-3000:]
+    passed = re.search(r"(\d+) passed", done.stdout)
+    assert passed is not None
+    assert int(passed[1]) > 30
+
+
+def test_its_transport_is_measured_with_stages_of_its_own(measured: Path) -> None:
+    samples = pd.read_csv(measured / "samples.csv")
+    toy = samples[samples["cell"] == "toy"]
+    assert (toy["toy_frame_ns"] > 0).all()
+    assert (toy["toy_unframe_ns"] > 0).all()
+    assert (toy["rgb_source"] == toy["rgb_engine"]).all()
+    loopback = samples[samples["cell"] == "loopback"]
+    assert loopback["toy_frame_ns"].isna().all()
+    stages = pd.read_csv(measured / "tables" / "stages.csv")
+    assert set(stages[stages["stage"] == "toy_frame"]["group"]) == {"pack"}
+    ratios = pd.read_csv(measured / "tables" / "ratios.csv")
+    assert {("toy", "loopback")} == set(zip(ratios["of"], ratios["to"], strict=True))
+    assert (measured / "figures" / "stage_breakdown.png").exists()
+
+
+def test_its_runs_are_compared_and_reported(measured: Path, command: Command, tmp_path: Path) -> None:
+    again = folder_of(command("latency", "--transport", "toy,loopback", *SMALL), tmp_path)
+    whole = json.loads(command("compare", str(measured), str(again), "--metric", "toy_frame", "--json").stdout)
+    assert {comparison["cell"] for comparison in whole["comparisons"]} == {"toy"}
+    command("report", str(measured), "--output", str(tmp_path / "report.html"))
+    page = (tmp_path / "report.html").read_text()
+    assert "toy_frame" in page
+    json.loads(command("latency", "--transport", "toy", "--json", *SMALL).stdout)["cells"][0]["stages_ms"]["toy_frame"]
+
+
+def test_an_option_of_its_transport_is_part_of_the_name(command: Command) -> None:
+    done = command("latency", "--transport", "toy?toy_port=70000", *SMALL, code=2)
+    assert "--toy-port: '70000' should be less than or equal to 65535" in done.stderr
+    done = command("latency", "--transport", "toy?speed=9", *SMALL, code=2)
+    assert re.search(r"speed.*toy_port", done.stderr)
+
+
+def test_its_server_runs_by_name(installed: dict[str, str], tmp_path: Path) -> None:
+    line = [sys.executable, "-m", "s2a_bench", "serve", "toy", "--engine", "echo"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True, env=installed, cwd=tmp_path) as server:
+        assert server.stdout is not None
+        said = server.stdout.readline()
+        server.terminate()
+        assert server.wait(20) == 0
+    assert re.search(r"toy at 127\.0\.0\.1:\d+; engine echo", said)
+
+
+def test_its_frame_source_is_a_camera(command: Command, tmp_path: Path) -> None:
+    done = command("latency", "--transport", "loopback", "--source", "toy-stripes", *SMALL)
+    assert json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())["state"] == "finished"
+
+
+def test_its_policy_takes_its_parameter(command: Command) -> None:
+    asked = ("timeline", "--profile", "jetson-agx-orin", "--tokens-per-skill", "6", "--json")
+    cells = {
+        policy: json.loads(command(*asked, "--policy", policy).stdout)["cells"][0]
+        for policy in ("wait-then-act", "toy-policy?factor=1", "toy-policy?factor=4")
+    }
+    assert cells["toy-policy?factor=1"]["start_s"] == cells["wait-then-act"]["start_s"]
+    assert cells["toy-policy?factor=4"]["start_s"] < cells["wait-then-act"]["start_s"]
+    assert cells["toy-policy?factor=4"]["policy"] == "toy-policy?factor=4"
+    assert "1 or more" in command(*asked, "--policy", "toy-policy?factor=0.5", code=2).stderr
+
+
+def test_its_dialect_is_known_by_name(command: Command) -> None:
+    done = command(
+        "latency", "--url", "http://127.0.0.1:9", "--dialect", "toy-chat", "--transport", "http", *SMALL, code=1
+    )
+    assert "nothing answers at http://127.0.0.1:9/toy/chat" in done.stderr
+
+
+def test_its_experiment_is_a_command_and_a_function(
+    command: Command, installed: dict[str, str], tmp_path: Path
+) -> None:
+    assert "toy-clock" in command("--help").stdout
+    assert "--readings" in command("toy-clock", "--help").stdout
+    assert "cost of a reading (ns), median" in command("toy-clock", "--readings", "50").stdout
+    done = command("toy-clock", "--readings", "50", "--json")
+    (cell,) = json.loads(done.stdout)["cells"]
+    assert cell["cost"]["n"] == 50
+    assert "--readings: 0 should be" in command("toy-clock", "--readings", "0", code=2).stderr
+    one, other = sorted((tmp_path / "results").iterdir())
+    assert json.loads(command("compare", str(one), str(other), "--json").stdout)["comparisons"]
+    command("report", str(one), "--output", str(tmp_path / "report.html"))
+    assert "cost of a reading" in (tmp_path / "report.html").read_text()
+    code = "from s2a_bench import library; print(len(library.run('toy-clock', readings=7).table('metrics')))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=installed, cwd=tmp_path
+    )
+    assert done.stdout.strip() == "1", done.stderr
+
+
+def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
+    installed: dict[str, str], tmp_path: Path
+) -> None:
+    broken = tmp_path / "site" / "s2a_broken-1.0.dist-info"
+    broken.mkdir(parents=True)
+    (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: s2a-broken\nVersion: 1.0\n")
+    kinds = ("transports", "experiments", "policies", "dialects", "engines", "frame_sources")
+    (broken / "entry_points.txt").write_text(
+        "".join(f"[s2a_bench.{kind}]\nbroken = s2a_broken:THING\n" for kind in kinds)
+    )
+    environment = installed | {"PYTHONPATH": f"{broken.parent}{os.pathsep}{installed['PYTHONPATH']}"}
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        line = [sys.executable, "-m", "s2a_bench", *arguments]
+        return subprocess.run(
+            line, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path, timeout=120
+        )
+
+    assert run("--help").returncode == 0
+    assert run("boundary", "--points", "3").returncode == 0
+    for arguments in (("broken",), ("latency", "--transport", "broken", *SMALL), ("timeline", "--policy", "broken")):
+        done = run(*arguments)
+        assert done.returncode == 2
+        assert "the package s2a-broken does not load: ModuleNotFoundError" in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_nothing_here_knows_of_it() -> None:
+    project = tomllib.loads((PACKAGE / "pyproject.toml").read_text())["project"]
+    names = {name for points in project["entry-points"].values() for name in points} | {"s2a_toy", "toy_"}
+    for path in (ROOT / "s2a_bench").rglob("*.py"):
+        text = path.read_text()
+        told = {name for name in names - {"toy"} if name in text}
+        assert not told, f"{path} mentions {told}"
+        # as an example in the docstrings for authors of plug-ins
+        assert '"toy"' not in text or path in {
+            ROOT / "s2a_bench/transport/__init__.py",
+            ROOT / "s2a_bench/testing/transport.py",
+        }
