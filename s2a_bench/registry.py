@@ -60,6 +60,10 @@ class Registry(Mapping[str, T], Generic[T]):
     def __len__(self) -> int:
         return len(self._builtins) + len(self._offered)
 
+    def built_in(self) -> tuple[str, ...]:
+        """Return the names of the implementations that are our own."""
+        return tuple(self._builtins)
+
     def loaded(self) -> Iterator[tuple[str, T]]:
         """Yield every name with its implementation, leaving out packages that do not load."""
         for name in self:

@@ -136,6 +136,8 @@ class Experiment:
     """Class of the options that change what is shown and not what is measured."""
     compared: str = ""
     """A `Compared`; without it, its runs are not compared."""
+    cell: str = ""
+    """Class of a cell of its ``--json``, a dataclass, from which docs/schema follows; not declared: any object."""
     unit: str = "samples"
     """What progress counts, and what is kept of a run that breaks off."""
 
@@ -148,6 +150,11 @@ class Experiment:
         """Return what one of its runs shows."""
         shown: Shown = resolve_name(self.view)(run, **asked)
         return shown
+
+    def cell_class(self) -> type | None:
+        """Return the class of a cell of its ``--json``; None where it is not declared."""
+        cell: type | None = resolve_name(self.cell) if self.cell else None
+        return cell
 
     def compared_by(self) -> Compared | None:
         """Return what its runs are compared by; None where they are not."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 class Summary:
     """What n values look like; ``sd`` is the sample standard deviation (n - 1), None for a single value."""
 
-    n: int
-    mean: float
-    sd: float | None
+    n: Annotated[int, {"minimum": 1}]
     median: float
+    mean: float
+    sd: Annotated[float | None, {"minimum": 0}]
     p90: float
     p99: float
 
@@ -41,7 +41,7 @@ def summarise(values: Iterable[float]) -> Summary:
         raise ValueError("there is no summary of no values")
     median, p90, p99 = np.percentile(array, (50, 90, 99))
     sd = float(array.std(ddof=1)) if array.size > 1 else None
-    return Summary(array.size, float(array.mean()), sd, float(median), float(p90), float(p99))
+    return Summary(array.size, float(median), float(array.mean()), sd, float(p90), float(p99))
 
 
 def summary_of(values: NDArray[np.float64]) -> Summary | None:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from s2a_bench.errors import StoreError
 from s2a_bench.store.schema import SCHEMA
@@ -22,9 +22,9 @@ NAME = "manifest.json"
 class RunWarning:
     """One warning: what was seen, and the way out."""
 
-    code: str
-    message: str
-    advice: str
+    code: Annotated[str, {"pattern": "^[a-z0-9-]+$"}]
+    message: Annotated[str, {"minLength": 1}]
+    advice: Annotated[str, {"minLength": 1}]
 
     def to_manifest(self) -> dict[str, str]:
         """Return it as plain data."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.stats import Ratio, summary_of
+from s2a_bench.store.manifest import plain
 from s2a_bench.store.schema import SCHEMA
 
 if TYPE_CHECKING:
@@ -13,6 +15,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from s2a_bench.store.run import Run
+
+
+@dataclass(frozen=True, slots=True)
+class RatioJson:
+    """The median of one cell over that of another; ``ci95`` by the test of compare, None with too few blocks."""
+
+    metric: str
+    of: str
+    to: str
+    value: float | None
+    ci95: tuple[float, float] | None
 
 
 def frame(run: Run, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
@@ -32,22 +45,12 @@ def frame(run: Run, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], *
 
 def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
     """Return one ratio of the object."""
-    interval = None if ratio.low is None or ratio.high is None else [ratio.low, ratio.high]
-    return {"metric": metric, "of": of, "to": to, "value": ratio.value, "ci95": interval}
+    interval = None if ratio.low is None or ratio.high is None else (ratio.low, ratio.high)
+    entry: dict[str, Any] = plain(RatioJson(metric, of, to, ratio.value, interval))
+    return entry
 
 
 def summaries(metrics: Iterable[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:
     """Summarise the metrics that have values; ``n`` tells where only some samples have a stage."""
     found = ((name, summary_of(values)) for name, values in metrics)
-    return {
-        name: {
-            "n": summary.n,
-            "median": summary.median,
-            "mean": summary.mean,
-            "sd": summary.sd,
-            "p90": summary.p90,
-            "p99": summary.p99,
-        }
-        for name, summary in found
-        if summary
-    }
+    return {name: asdict(summary) for name, summary in found if summary}

@@ -16,7 +16,7 @@ def test_a_summary_by_hand() -> None:
 
 
 def test_a_single_value_has_no_spread() -> None:
-    assert summarise([7.0]) == Summary(1, 7.0, None, 7.0, 7.0, 7.0)
+    assert summarise([7.0]) == Summary(1, 7.0, 7.0, None, 7.0, 7.0)
 
 
 def test_no_values_have_no_summary() -> None:

@@ -128,7 +128,7 @@ def test_a_run_without_samples_is_valid(make_run: MakeRun) -> None:
     assert whole["cells"] == whole["ratios"] == []
 
 
-@pytest.mark.parametrize("path", [("cells", 0, "e2e_ms"), ("ratios", 0, "metric"), ("cells", 0, "n"), ("state",)])
+@pytest.mark.parametrize("path", [("cells", 0, "e2e_ms"), ("ratios", 0, "value"), ("cells", 0, "n"), ("state",)])
 def test_the_schema_refuses_what_is_wrong(make_run: MakeRun, path: tuple[Any, ...]) -> None:
     whole = copy.deepcopy(latency_json(make_run(n=2)))
     place: Any = whole

@@ -54,9 +54,9 @@ def test_numbers_have_three_digits(value: float, text: str) -> None:
 
 
 def test_mean_and_sd_share_their_decimals() -> None:
-    assert mean_sd(Summary(50, 101.84, 8.63, 0, 0, 0)) == "102 ± 9"
-    assert mean_sd(Summary(50, 15.52, 1.04, 0, 0, 0)) == "15.5 ± 1.0"
-    assert mean_sd(Summary(1, 15.52, None, 0, 0, 0)) == "15.5"
+    assert mean_sd(Summary(50, 0, 101.84, 8.63, 0, 0)) == "102 ± 9"
+    assert mean_sd(Summary(50, 0, 15.52, 1.04, 0, 0)) == "15.5 ± 1.0"
+    assert mean_sd(Summary(1, 0, 15.52, None, 0, 0)) == "15.5"
 
 
 def test_a_ratio_without_bounds_or_value_says_so() -> None:

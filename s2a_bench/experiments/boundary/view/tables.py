@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.boundary.rows import BOUNDARY
+from s2a_bench.experiments.boundary.view.cell import BoundaryCell
 from s2a_bench.writers.as_json import frame
 from s2a_bench.writers.csv_text import csv_text
 from s2a_bench.writers.tables import ABSENT, EMULATED, PAPERS, Note, TextTable, number
@@ -109,10 +111,10 @@ def disagreements(run: Run) -> int:
 
 def _cells(run: Run) -> Iterator[dict[str, Any]]:
     for row in run.table(BOUNDARY).to_dict("records"):
-        rate = row.pop("tokens_per_s")
+        rate, board = row.pop("tokens_per_s"), row.pop("board")
         rho = row["tokens_per_skill"] / rate / row["duration_s"]
-        named = {str(name): value for name, value in row.items() if name != "board"}
-        yield {**named, "rate_tokens_per_s": rate, "profile": row["board"] or None, "rho": rho, "emulated": True}
+        named: dict[str, Any] = {str(name): value for name, value in row.items()}
+        yield asdict(BoundaryCell(**named, rate_tokens_per_s=rate, profile=board or None, rho=rho, emulated=True))
 
 
 def _verdict(point: dict[Any, Any], *, random: bool) -> str:

@@ -1,0 +1,126 @@
+"""Write docs/schema/*.json from the classes that ``--json`` objects are made of.
+
+`.venv/bin/python tools/schema.py`. A dataclass becomes an object without further keys, its docstring the description;
+`Annotated[type, {...}]` adds bounds and descriptions. Of s2a-bench-1.json the frame's parts and the cells of the
+experiments that declare a class for them (`Experiment.cell`) are written; the rest stays as it stands in the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import re
+import types
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from s2a_bench.experiments import EXPERIMENTS
+from s2a_bench.report.compare.as_json import CompareJson
+from s2a_bench.stats import Summary
+from s2a_bench.store.manifest import RunWarning
+from s2a_bench.trace import GROUPS
+from s2a_bench.writers.as_json import RatioJson
+
+FOLDER = Path(__file__).parent.parent / "docs/schema"
+PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", type(None): "null"}
+
+
+class Parts:
+    """Schemas of types; those of dataclasses are collected under ``$defs``."""
+
+    def __init__(self) -> None:
+        """Start without any."""
+        self.defs: dict[str, dict[str, Any]] = {}
+
+    def of(self, hint: Any) -> dict[str, Any]:  # noqa: PLR0911 - a type, a schema
+        """Return the schema of a type; raises TypeError for one that JSON does not know."""
+        origin, arguments = get_origin(hint), get_args(hint)
+        if origin is Annotated:
+            return self.of(arguments[0]) | {key: value for more in arguments[1:] for key, value in more.items()}
+        if hint is Any:
+            return {}
+        if hint in PLAIN:
+            return {"type": PLAIN[hint]}
+        if dataclasses.is_dataclass(hint):
+            name = re.sub(r"(?<!^)(?=[A-Z])", "_", hint.__name__).lower()  # type: ignore[union-attr]
+            self.defs.setdefault(name, self.object(hint))
+            return {"$ref": f"#/$defs/{name}"}
+        if origin is Literal:
+            return {"const": arguments[0]} if len(arguments) == 1 else {"enum": list(arguments)}
+        if origin in {Union, types.UnionType}:
+            return _either([self.of(one) for one in arguments])
+        if origin is list:
+            return {"type": "array", "items": self.of(arguments[0])}
+        if origin is tuple:
+            n = len(arguments)
+            return {"type": "array", "items": self.of(arguments[0]), "minItems": n, "maxItems": n}
+        if origin is dict:
+            return {"type": "object", "additionalProperties": self.of(arguments[1]) or True}
+        raise TypeError(f"{hint} has no JSON schema")
+
+    def object(self, cls: Any) -> dict[str, Any]:
+        """Return the schema of a dataclass; a field with a default may be absent."""
+        hints = get_type_hints(cls, include_extras=True)
+        fields = dataclasses.fields(cls)
+        return {
+            "description": " ".join((inspect.getdoc(cls) or "").replace("``", "`").replace("None", "null").split()),
+            "type": "object",
+            "required": [field.name for field in fields if field.default is dataclasses.MISSING],
+            "additionalProperties": False,
+            "properties": {field.name: self.of(hints[field.name]) for field in fields},
+        }
+
+
+def compare_schema() -> dict[str, Any]:
+    """Return the schema of `compare --json`."""
+    parts = Parts()
+    return {**_head("s2a-bench-compare-1", "s2a-bench compare --json, version 1"), **parts.object(CompareJson)} | {
+        "$defs": parts.defs
+    }
+
+
+def frame_schema() -> dict[str, Any]:
+    """Return the schema of what the measuring commands print, with what is declared in the place of what was there."""
+    whole: dict[str, Any] = json.loads((FOLDER / "s2a-bench-1.json").read_text(encoding="utf-8"))
+    parts = Parts()
+    whole["$defs"] |= {
+        "summary": parts.object(Summary),
+        "ratio": parts.object(RatioJson),
+        "warning": parts.object(RunWarning),
+    }
+    whole["$defs"]["latency_cell"]["properties"]["groups_ms"]["propertyNames"]["enum"] = list(GROUPS)
+    for name in EXPERIMENTS.built_in():
+        if cell := EXPERIMENTS[name].cell_class():
+            whole["$defs"][f"{name}_cell"] = parts.object(cell)
+    whole["$defs"] |= {name: part for name, part in parts.defs.items() if name not in whole["$defs"]}
+    return whole
+
+
+def _head(name: str, title: str) -> dict[str, Any]:
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"https://s2a-bench.invalid/schema/{name}.json",
+        "title": title,
+    }
+
+
+def _either(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """Join alternatives: a plain type or null as a list of types, else oneOf."""
+    *others, last = found
+    if last == {"type": "null"} and len(others) == 1 and others[0].keys() == {"type"}:
+        return {"type": [others[0]["type"], "null"]}
+    return {"oneOf": found}
+
+
+SCHEMAS = {"s2a-bench-compare-1.json": compare_schema, "s2a-bench-1.json": frame_schema}
+
+
+def text_of(schema: dict[str, Any]) -> str:
+    """Write a schema as its file holds it."""
+    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+
+
+if __name__ == "__main__":
+    for file, build in SCHEMAS.items():
+        (FOLDER / file).write_text(text_of(build()), encoding="utf-8")
