@@ -182,6 +182,11 @@ class Run:
             self.tables[table.name] = _read(self.path, table)
         return self.tables[table.name]
 
+    @property
+    def bootstrap_seed(self) -> int:
+        """Return the seed of intervals: the manifest's ``seeds.bootstrap``, else 0."""
+        return int(self.manifest.get("seeds", {}).get("bootstrap") or 0)
+
     def row_counts(self) -> dict[str, int]:
         """Return how many rows each table of the run has, whoever declared it; empty tables are left out."""
         counts = {name: len(table) for name, table in self.tables.items()}

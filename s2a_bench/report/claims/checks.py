@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.boundary.rows import BOUNDARY
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratio_between, seed_of
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratio_between
 from s2a_bench.experiments.paper import paper_latency, paper_throughput
 from s2a_bench.report.claims.ccrb import CCRB_CLAIMS
 from s2a_bench.report.claims.claim import CONFIRMED, REFUTED, UNTESTABLE, Claim, Finding
@@ -35,7 +35,7 @@ def _slower(run: Run) -> Finding | None:
     if pair is None:
         return None
     http, ros = pair
-    ratio = ratio_between(http, ros, _METRIC, seed_of(run))
+    ratio = ratio_between(http, ros, _METRIC, run.bootstrap_seed)
     if ratio is None or ratio.low is None or ratio.high is None:
         return Finding(UNTESTABLE, "Too few samples for an interval of the ratio.")
     said = f"{_medians(http, ros)} {http.name} over {ros.name}: {interval(ratio)} (95 % interval of the ratio)."
@@ -48,7 +48,7 @@ def _ratio(run: Run) -> Finding | None:
     if pair is None:
         return None
     http, ros = pair
-    ratio = ratio_between(http, ros, _METRIC, seed_of(run))
+    ratio = ratio_between(http, ros, _METRIC, run.bootstrap_seed)
     paper = [claim.mean_ms for claim in paper_latency()]
     claimed = paper[0] / paper[1]
     if ratio is None or ratio.low is None or ratio.high is None:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UnlikeRuns, UsageError
 from s2a_bench.experiments import EXPERIMENTS, Compared, Metric, Subject, by_name
-from s2a_bench.experiments.latency.view.cells import seed_of
 from s2a_bench.report.compare.alike import Difference, differences, in_words
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.stats.change import Change, change_between, holm
@@ -199,7 +198,7 @@ def changes(compared: ComparedRuns, metric: Metric, statistic: str) -> Iterator[
     for pair in compared.pairs:
         if rows := _rows(pair, metric.name):
             exact = all(subject.exact for subject in (*pair.baseline, *pair.other))
-            change = change_between(*rows, statistic, seed=seed_of(compared.baseline[0]), exact=exact)
+            change = change_between(*rows, statistic, seed=compared.baseline[0].bootstrap_seed, exact=exact)
             n = [sum(len(launch) for launch in side) for side in rows]
             yield Comparison(pair, metric, statistic, (n[0], n[1]), change)
 

@@ -21,7 +21,7 @@ _MOST = 6
 
 def latency_sentences(run: Run) -> list[str]:
     """Say how long each cell takes, and how many times as long as ROS or loopback."""
-    from s2a_bench.experiments.latency.view.cells import cells_of, ratios, seed_of
+    from s2a_bench.experiments.latency.view.cells import cells_of, ratios
     from s2a_bench.stats import summary_of
 
     cells = cells_of(run)
@@ -38,7 +38,7 @@ def latency_sentences(run: Run) -> list[str]:
         said.append(f"{TITLES[metric]}, medians: {', '.join(medians)}.")
     found = [
         _times(cell.name, base.name, ratio)
-        for of, cell, base, ratio in ratios(cells, seed_of(run))
+        for of, cell, base, ratio in ratios(cells, run.bootstrap_seed)
         if of == metric and not declared(base.pipeline).in_process
     ]
     return said + found[:_MOST]

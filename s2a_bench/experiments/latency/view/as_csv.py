@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratios, seed_of, stages_present
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratios, stages_present
 from s2a_bench.stats import summary_of
 from s2a_bench.writers.csv_text import csv_text
 
@@ -20,7 +20,7 @@ _METRICS = ("e2e_without_inference", "e2e", "ttft", "frame_age")
 def csv_texts(run: Run) -> dict[str, str]:
     """Return file name -> CSV text: stages.csv, summary.csv, ratios.csv; times in ms, what is absent has no row."""
     cells = cells_of(run)
-    found = ratios(cells, seed_of(run))
+    found = ratios(cells, run.bootstrap_seed)
     return {
         "stages.csv": csv_text(("cell", "group", "stage", *_SUMMARY, "emulated"), _stages(cells)),
         "summary.csv": csv_text(("cell", "metric", "errors", "warmups", *_SUMMARY, "emulated"), _summaries(cells)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, groups_present, ratios, seed_of, stages_present
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, groups_present, ratios, stages_present
 from s2a_bench.writers.as_json import frame, ratio_entry, summaries
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def latency_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
     cells = cells_of(run)
-    found = ratios(cells, seed_of(run))
+    found = ratios(cells, run.bootstrap_seed)
     return frame(
         run,
         [{**about_cell(cell, run), **_cell(cell)} for cell in cells],

@@ -155,11 +155,6 @@ def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | Non
     return ratio_of_blocks(cell.by_block(metric), base.by_block(metric), seed)
 
 
-def seed_of(run: Run) -> int:
-    """Return the seed of the bootstrap: the manifest's ``seeds.bootstrap``, else 0."""
-    return int(run.manifest.get("seeds", {}).get("bootstrap") or 0)
-
-
 def engine_note(run: Run, cells: list[Cell]) -> Note:
     """Say what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
     engines = {cell.about["engine"] for cell in cells}

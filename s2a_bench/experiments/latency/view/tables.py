@@ -10,7 +10,6 @@ from s2a_bench.experiments.latency.view.cells import (
     engine_note,
     groups_present,
     ratio_between,
-    seed_of,
     stages_present,
 )
 from s2a_bench.stats import summary_of
@@ -87,7 +86,7 @@ def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
             if summary
             else [ABSENT] * 4
         )
-        over = [_ratio(cell, base, metric, seed_of(run)) for base in bases]
+        over = [_ratio(cell, base, metric, run.bootstrap_seed) for base in bases]
         rows.append((cell.name, str(cell.n), str(cell.errors), *numbers, *over))
     header = ("cell", "n", "errors", "mean ± sd", "median", "p90", "p99", *(f"ratio to {base.name}" for base in bases))
     title = f"{TITLES[metric]} in ms; ratios of medians [95 % interval]"

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, seed_of
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of
 from s2a_bench.experiments.throughput.rows import REFERENCE
 from s2a_bench.stats.change import ratio_of_blocks
 from s2a_bench.transport import declared
@@ -177,9 +177,9 @@ def ratios_of(run: Run, speeds: list[Speed]) -> Iterator[tuple[str, str, Ratio]]
     base = next((speed for speed in speeds if declared(speed.cell.pipeline).in_process), None)
     for speed in speeds:
         values = speed.by_block(RATIO_METRIC)
-        if ratio := ratio_of_blocks(values, reference, seed_of(run)):
+        if ratio := ratio_of_blocks(values, reference, run.bootstrap_seed):
             yield speed.name, LLAMA_BENCH, ratio
         if base is not None and speed is not base:
-            ratio = ratio_of_blocks(values, base.by_block(RATIO_METRIC), seed_of(run))
+            ratio = ratio_of_blocks(values, base.by_block(RATIO_METRIC), run.bootstrap_seed)
             if ratio:
                 yield speed.name, base.name, ratio
