@@ -1,8 +1,8 @@
 """Write docs/schema/*.json from the classes that ``--json`` objects are made of.
 
 `.venv/bin/python tools/schema.py`. A dataclass becomes an object without further keys, its docstring the description;
-`Annotated[type, {...}]` adds bounds and descriptions. Of s2a-bench-1.json the frame's parts and the cells of the
-experiments that declare a class for them (`Experiment.cell`) are written; the rest stays as it stands in the file.
+`Annotated[type, {...}]` adds bounds and descriptions. Of s2a-bench-1.json the frame, the metrics of timelines and the
+cells of the experiments that declare a class for them (`Experiment.cell`) are written; the rest stays as it stands.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import inspect
 import json
 import re
 import types
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from s2a_bench.experiments import EXPERIMENTS
+from s2a_bench.experiments.timeline.metrics import METRICS, TimelineMetric
 from s2a_bench.report.compare.as_json import CompareJson
 from s2a_bench.stats import Summary
 from s2a_bench.store.manifest import RunWarning
@@ -90,11 +92,24 @@ def frame_schema() -> dict[str, Any]:
         "warning": parts.object(RunWarning),
     }
     whole["$defs"]["latency_cell"]["properties"]["groups_ms"]["propertyNames"]["enum"] = list(GROUPS)
+    whole["$defs"]["timeline_cell"] = with_metrics(whole["$defs"]["timeline_cell"], METRICS)
     for name in EXPERIMENTS.built_in():
         if cell := EXPERIMENTS[name].cell_class():
             whole["$defs"][f"{name}_cell"] = parts.object(cell)
     whole["$defs"] |= {name: part for name, part in parts.defs.items() if name not in whole["$defs"]}
     return whole
+
+
+def with_metrics(cell: dict[str, Any], metrics: Mapping[str, TimelineMetric]) -> dict[str, Any]:
+    """Return a cell with its metrics as their table has them; its other keys stay.
+
+    A metric that goes leaves its entry, to be taken out by hand.
+    """
+    about = {name: entry for name, entry in cell["properties"].items() if name not in metrics}
+    needed = [name for name in cell["required"] if name not in metrics]
+    needed += [name for name, metric in metrics.items() if not metric.optional]
+    properties = about | {name: metric.schema for name, metric in metrics.items()}
+    return {**cell, "required": needed, "properties": properties}
 
 
 def _head(name: str, title: str) -> dict[str, Any]:

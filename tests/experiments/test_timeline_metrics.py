@@ -42,7 +42,7 @@ def test_every_metric_but_motion_is_computed() -> None:
 def test_the_schema_has_every_metric_as_it_is() -> None:
     cell = SCHEMA["$defs"]["timeline_cell"]
     for name, metric in METRICS.items():
-        assert cell["properties"][name] == metric.schema, "run tools/docs_schema.py"
+        assert cell["properties"][name] == metric.schema, "run tools/schema.py"
     assert set(cell["required"]) & set(METRICS) == {name for name, each in METRICS.items() if not each.optional}
 
 
