@@ -21,7 +21,6 @@ from s2a_bench.cli import (
     profile,
     report,
     serve,
-    study,
     sweep,
     throughput,
 )
@@ -73,7 +72,6 @@ app = typer.Typer(
 app.command("doctor")(doctor.doctor)
 app.command("latency")(latency.latency)
 app.command("throughput")(throughput.throughput)
-app.command("study")(study.study)
 app.command("serve")(serve.serve)
 app.command("sweep")(sweep.sweep)
 app.command("compare")(compare.compare)

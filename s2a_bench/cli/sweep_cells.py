@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 VIRTUAL: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     "latency": lambda _: False,
     "throughput": lambda _: False,
-    "study": lambda _: True,
 }
 """Commands by hand that can be swept -> whether one with these parameters computes and measures nothing.
 

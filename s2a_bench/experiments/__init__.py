@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias
@@ -138,6 +139,8 @@ class Experiment:
     """A `Compared`; without it, its runs are not compared."""
     unit: str = "samples"
     """What progress counts, and what is kept of a run that breaks off."""
+    commands: str = ""
+    """The commands that manifests of its runs name, as a shell's pattern: study-*; empty: its name."""
 
     def run_with(self, config: Options, output: Path, progress: Progress) -> Path:
         """Run it and return the run folder; raises S2AError for what a user can mend."""
@@ -162,6 +165,13 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
         "boundary": "s2a_bench.experiments.boundary:EXPERIMENT",
         "ccrb": "s2a_bench.experiments.ccrb:EXPERIMENT",
         "timeline": "s2a_bench.experiments.timeline:EXPERIMENT",
+        "study": "s2a_bench.experiments.study:EXPERIMENT",
     },
 )
 """The experiments by their commands."""
+
+
+def experiment_of(command: str) -> Experiment | None:
+    """Return the experiment whose runs name this command; None if there is none, or it is not installed."""
+    found = (each for _, each in EXPERIMENTS.loaded() if fnmatchcase(command, each.commands or each.name))
+    return next(found, None)
