@@ -79,25 +79,20 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
             yield Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument)
 
 
-def command(
-    function: Callable[..., None],
-    *options: type[Options],
-    about: str,
-    more: Mapping[str, inspect.Parameter] | None = None,
-) -> Callable[..., None]:
+def command(function: Callable[..., None], *options: type[Options], about: str) -> Callable[..., None]:
     """Return a function for typer that builds every class of ``options`` from its flags and calls ``function``.
 
-    ``function`` gets one configuration a class, in order, and the values of ``more``, other parameters, by name.
+    ``function`` gets one configuration a class, in order; its keyword-only parameters that are declared as typer has
+    them are flags too.
     """
-    flags = [flag for each in options for flag in flags_of(each)]
-    parameters = {flag.key: flag.parameter for flag in flags} | dict(more or {})
+    own = _keywords(function)
+    flags = {flag.key: flag.parameter for each in options for flag in flags_of(each)}
 
     def run(**given: Any) -> None:
         with flags_named(*options):
-            rest = {name: given[name] for name in more or {}}
-            function(*(build(each, given) for each in options), **rest)
+            function(*(build(each, given) for each in options), **{name: given[name] for name in own})
 
-    run.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature([*flags.values(), *own.values()])  # type: ignore[attr-defined]
     run.__doc__ = about
     return run
 
@@ -120,6 +115,16 @@ def flags_named(*options: type[Options]) -> Iterator[None]:
 def with_flags(message: str, spelled: Mapping[str, str] | None = None) -> str:
     """Return a library's message with its fields, `max_tokens`, as flags, --max-tokens, or as ``spelled``."""
     return FIELD.sub(lambda field: (spelled or {}).get(field[1]) or f"--{field[1].replace('_', '-')}", message)
+
+
+def _keywords(function: Callable[..., None]) -> dict[str, inspect.Parameter]:
+    """Return the keyword-only parameters of a function that are declared for typer."""
+    parameters = inspect.signature(function, eval_str=True).parameters.items()
+    return {
+        name: each
+        for name, each in parameters
+        if each.kind is each.KEYWORD_ONLY and get_origin(each.annotation) is Annotated
+    }
 
 
 def _nested(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:

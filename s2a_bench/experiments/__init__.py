@@ -165,10 +165,11 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
         "boundary": "s2a_bench.experiments.boundary:EXPERIMENT",
         "ccrb": "s2a_bench.experiments.ccrb:EXPERIMENT",
         "timeline": "s2a_bench.experiments.timeline:EXPERIMENT",
+        "model validity": "s2a_bench.experiments.model_validity:EXPERIMENT",
         "study": "s2a_bench.experiments.study:EXPERIMENT",
     },
 )
-"""The experiments by their commands."""
+"""The experiments by their commands; `model validity` is a command of the group `model`."""
 
 
 def experiment_of(command: str) -> Experiment | None:

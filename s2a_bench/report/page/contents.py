@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.experiments import experiment_of
-from s2a_bench.experiments.model_validity.rows import VALIDITY
 from s2a_bench.report.page import Content
 from s2a_bench.report.page.sentences import (
     latency_sentences,
@@ -49,14 +48,6 @@ def _throughput(run: Run, against_paper: bool) -> Content:
     return Content(throughput_sentences(run), throughput_tables(run), ["throughput"], throughput_csv(run), figures)
 
 
-def _validity(run: Run, _against_paper: bool) -> Content:
-    from s2a_bench.experiments.model_validity.view import validity_tables
-
-    tables = validity_tables(run)
-    answers = len(run.table(VALIDITY))
-    return Content((f"{answers} answers to the prompts were parsed, skill by skill.",), tables, list(tables)[:1])
-
-
 def _other(run: Run, _against_paper: bool) -> Content:
     """Tell what lies in a run that has no view of its own."""
     rows = [f"{name} ({count} rows)" for name, count in run.row_counts().items()]
@@ -66,7 +57,6 @@ def _other(run: Run, _against_paper: bool) -> Content:
 CONTENTS: Final[dict[str, Callable[[Run, bool], Content]]] = {
     "latency": _latency,
     "throughput": _throughput,
-    "model validity": _validity,
 }
 """Command -> what its run shows."""
 
