@@ -142,7 +142,7 @@ def test_where_nothing_can_be_written_nothing_is_measured(home: Path) -> None:
         (["profile", "show", "tx1"], "--profile: 'tx1' is none of fast, jetson-agx-orin"),
         (["profile", "show", "./tx1"], "--profile: there is no file ./tx1"),
         (["profile", "capture", "../x"], "NAME: '../x' should be a plain file name"),
-        (["profile", "capture", "x", "--tokens", "1"], "--tokens: 1 should be 2 or more"),
+        (["profile", "capture", "x", "--tokens", "1"], "--tokens: 1 should be greater than or equal to 2"),
         (["profile", "capture", "x", "--size", "big"], "--size: 'big' should look like"),
         (["latency", "--engine", "replay"], "--engine replay needs --profile NAME"),
         (["latency", "--profile", "fast"], "--profile needs --engine replay; --engine llama answers at its own speed"),
