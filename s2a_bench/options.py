@@ -6,6 +6,7 @@ A configuration that exists is valid: what makes no sense raises UsageError, whi
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -58,12 +59,13 @@ class Options(BaseModel):
         return self.model_dump()
 
 
-def option(default: Any, about: str, *, flag: str = "", **bounds: Any) -> Any:
+def option(default: Any, about: str, *, flag: str = "", argument: bool = False, **bounds: Any) -> Any:
     """Declare a field: ``about`` is its help, ``flag`` its name on the command line where that is not the field's.
 
-    ``bounds`` are pydantic's: ge, gt, le, lt, min_length, pattern.
+    On the command line an ``argument`` is given by its place instead of a flag. A field whose ``default`` is `...` has
+    to be given. ``bounds`` are pydantic's: ge, gt, le, lt, min_length, pattern.
     """
-    return Field(default, description=about, json_schema_extra={"flag": flag} if flag else None, **bounds)
+    return Field(default, description=about, json_schema_extra={"flag": flag, "argument": argument}, **bounds)
 
 
 def group(options: type[Options], *, only: tuple[str, ...] = (), about: str = "") -> Any:
@@ -113,7 +115,7 @@ def _line(error: ErrorDetails, options: type[Options]) -> str:
         return f"`{field}`: name at least one"
     if error["type"] == "value_error":
         return f"`{field}`: {error['ctx']['error']}"
-    said = error["msg"].removeprefix("Input ").removeprefix("Value ")
+    said = re.sub("^(Input|Value|String) ", "", error["msg"])
     return f"`{field}`: {error['input']!r} {said}"
 
 

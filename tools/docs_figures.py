@@ -18,7 +18,8 @@ import numpy as np
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
 from s2a_bench.experiments.boundary.view.figure import build_boundary
-from s2a_bench.experiments.study.run import StudyConfig, run_study
+from s2a_bench.experiments.study.config import StudyConfig
+from s2a_bench.experiments.study.run import run_study
 from s2a_bench.experiments.study.view.figures import build_frontier, build_targets
 from s2a_bench.experiments.timeline.config import TimelineConfig
 from s2a_bench.experiments.timeline.run import run_timeline
@@ -65,9 +66,9 @@ def boundary(config: BoundaryConfig) -> Figure:
     return build_boundary(_run(lambda output: run_boundary(config, output, Quiet())))
 
 
-def study(name: str, config: StudyConfig) -> Run:
+def study(config: StudyConfig) -> Run:
     """Make a study's run."""
-    return _run(lambda output: run_study(name, config, output, Quiet()))
+    return _run(lambda output: run_study(config, output, Quiet()))
 
 
 def safe_start_figure() -> Figure:
@@ -122,8 +123,8 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 }
 
 SLOW: dict[str, Callable[[], Figure]] = {
-    "study-targets": lambda: build_targets(study("targets", StudyConfig(seed=20261121))),
-    "study-frontier": lambda: build_frontier(study("frontier", StudyConfig())),
+    "study-targets": lambda: build_targets(study(StudyConfig(name="targets", seed=20261121))),
+    "study-frontier": lambda: build_frontier(study(StudyConfig(name="frontier"))),
 }
 """Drawn where they are named."""
 

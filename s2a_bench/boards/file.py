@@ -1,76 +1,123 @@
-"""The file of a hardware profile: TOML text to `Profile`, strictly, and back.
-
-Every value is checked where it is read, and an error names the file and the key: a typing error must not become a
-rate that figures show.
-"""
+"""The file of a hardware profile: TOML text to `Profile`, strictly, and back."""
 
 from __future__ import annotations
 
-import json
 import math
-import sys
-import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import Field, ValidationInfo, field_validator
 
 from s2a_bench.boards.gaps import from_table
 from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
+from s2a_bench.toml_file import Line, TomlTable, parse
 
-FACTS = ("board", "model", "capture", "fit", "environment", "source")
+FACTS: Final = ("board", "model", "capture", "fit", "environment", "source")
 """Tables for people and for `profile match`; what is in them is free."""
 
-ORIGINS = ("paper", "measured")
-_LARGEST = 1e9
-_RATE_TOLERANCE = 0.01
-_LINE = 110
-_REQUIRED = ("title", "origin", "tokens_per_s", "prompt_s", "gaps")
+_RATE_TOLERANCE: Final = 0.01
+
+Number = Annotated[float, Field(ge=0, le=1e9)]
+Count = Annotated[int, Field(ge=0)]
+Value = Literal["tokens_per_s", "prompt_s", "prompt_cv", "rate_cv", "gaps", "trace"]
+
+
+class _Trace(TomlTable):
+    """Requests as recorded, warm-ups first."""
+
+    gaps_ns: list[list[Count]]
+    ttft_ns: list[Count] | None = None
+    warmups: Count = Field(0, validate_default=True)
+
+    @field_validator("ttft_ns")
+    @classmethod
+    def _one_a_request(cls, times: list[int] | None, info: ValidationInfo) -> list[int] | None:
+        requests = len(info.data.get("gaps_ns", ()))
+        if times is not None and len(times) != requests:
+            raise ValueError(f"should hold a whole number of ns for each of the {requests} requests")
+        return times
+
+    @field_validator("warmups")
+    @classmethod
+    def _leave_gaps(cls, warmups: int, info: ValidationInfo) -> int:
+        rows = info.data.get("gaps_ns", ())
+        if not any(chain.from_iterable(rows[warmups:])):
+            raise ValueError(f"{warmups} of {len(rows)} requests leave no gaps")
+        return warmups
+
+    @property
+    def gaps_s(self) -> tuple[float, ...]:
+        """Return the gaps of the requests that count, one after the other."""
+        return tuple(gap / 1e9 for gap in chain.from_iterable(self.gaps_ns[self.warmups :]))
+
+
+class _File(TomlTable):
+    """What the file may hold."""
+
+    title: Line
+    origin: Literal["paper", "measured"]
+    tokens_per_s: Annotated[float, Field(gt=0, le=1e9)]
+    prompt_s: Number
+    prompt_cv: Number = 0.0
+    rate_cv: Number = 0.0
+    assumed: list[Value] = Field([])
+    gaps: dict[str, Any]
+    trace: _Trace | None = None
+    board: dict[str, Any] | None = None
+    model: dict[str, Any] | None = None
+    capture: dict[str, Any] | None = None
+    fit: dict[str, Any] | None = None
+    environment: dict[str, Any] | None = None
+    source: dict[str, Any] | None = None
+
+
+def read_profile(path: Path, name: str = "") -> Profile:
+    """Read a file; the profile's name is the file's unless given. Raises UsageError naming file and key."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"profile {path}: cannot be read: {error}") from error
+    return parse_profile(name or path.stem, text, f"profile {path}")
 
 
 def parse_profile(name: str, text: str, where: str) -> Profile:
     """Read a profile; ``where`` begins every error. Raises UsageError naming the key that is wrong."""
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        import tomli as tomllib
+    file = parse(_File, text, where)
     try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"{where}: no TOML: {error}") from error
-    try:
-        return _profile(name, document)
+        return _profile(name, file)
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from error
 
 
-def _profile(name: str, document: Mapping[str, Any]) -> Profile:
-    for key in document:
-        if key not in _READERS and key not in FACTS:
-            raise UsageError(f"{key}: a profile has no such key; it has {', '.join((*_READERS, *FACTS))}")
-    for key in _REQUIRED:
-        if key not in document:
-            raise UsageError(f"{key}: missing")
-    for key in FACTS:
-        if not isinstance(document.get(key, {}), dict):
-            raise UsageError(f"{key}: should be a table")
-        _check_fact(key, document.get(key))
-    values = {"prompt_cv": 0.0} | {key: read(key, document[key]) for key, read in _READERS.items() if key in document}
-    table = values.pop("gaps")
+def _profile(name: str, file: _File) -> Profile:
+    facts = file.model_dump(include=set(FACTS), exclude_none=True)
+    for key, table in facts.items():
+        _check_fact(key, table)
     try:
-        values["gaps"] = from_table(table, 1 / values["tokens_per_s"])
+        gaps = from_table(file.gaps, 1 / file.tokens_per_s)
     except UsageError as error:
         raise UsageError(f"gaps.{error}") from error
-    values["trace_s"] = trace = values.pop("trace", ())
-    if trace:
-        rate = len(trace) / math.fsum(trace)
-        if abs(rate / values["tokens_per_s"] - 1) > _RATE_TOLERANCE:
-            raise UsageError(
-                f"tokens_per_s: {values['tokens_per_s']:g}, but the gaps of [trace] make {rate:g}; correct one of them"
-            )
-    facts = {key: document[key] for key in FACTS if key in document}
-    return Profile(name=name, facts=facts, **values)
+    trace_s = file.trace.gaps_s if file.trace else ()
+    if trace_s and abs((rate := len(trace_s) / math.fsum(trace_s)) / file.tokens_per_s - 1) > _RATE_TOLERANCE:
+        raise UsageError(
+            f"tokens_per_s: {file.tokens_per_s:g}, but the gaps of [trace] make {rate:g}; correct one of them"
+        )
+    return Profile(
+        name=name,
+        title=file.title,
+        origin=file.origin,
+        tokens_per_s=file.tokens_per_s,
+        prompt_s=file.prompt_s,
+        prompt_cv=file.prompt_cv,
+        rate_cv=file.rate_cv,
+        gaps=gaps,
+        trace_s=trace_s,
+        assumed=tuple(file.assumed),
+        facts=facts,
+    )
 
 
 def _check_fact(key: str, value: object) -> None:
@@ -85,134 +132,15 @@ def _check_fact(key: str, value: object) -> None:
             _check_fact(key, inner)
 
 
-def _text(key: str, value: object) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise UsageError(f"{key}: {value!r} should be a text")
-    return value
-
-
-def _origin(key: str, value: object) -> str:
-    if value not in ORIGINS:
-        raise UsageError(f"{key}: {value!r} is none of {', '.join(ORIGINS)}")
-    return str(value)
-
-
-def _number(key: str, value: object) -> float:
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        raise UsageError(f"{key}: {value!r} should be a number")
-    if not 0 <= value <= _LARGEST:
-        raise UsageError(f"{key}: {value!r} should be between 0 and {_LARGEST:g}")
-    return float(value)
-
-
-def _rate(key: str, value: object) -> float:
-    if not _number(key, value):
-        raise UsageError(f"{key}: should be above 0")
-    return _number(key, value)
-
-
-def _assumed(key: str, value: object) -> tuple[str, ...]:
-    names = [name for name in _READERS if name not in {"assumed", "origin", "title"}]
-    if not isinstance(value, list):
-        raise UsageError(f"{key}: should be a list of keys of this file")
-    for item in value:
-        if item not in names:
-            raise UsageError(f"{key}: {item!r} is none of {', '.join(names)}")
-    return tuple(value)
-
-
-def _table(key: str, value: object) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise UsageError(f"{key}: should be a table")
-    return value
-
-
-def _trace(key: str, value: object) -> tuple[float, ...]:
-    """Return the gaps of the requests that count, one after the other, in s."""
-    table = _table(key, value)
-    for name in table:
-        if name not in {"warmups", "ttft_ns", "gaps_ns"}:
-            raise UsageError(f"{key}.{name}: a trace has no such key; it has warmups, ttft_ns, gaps_ns")
-    warmups, rows, ttft = table.get("warmups", 0), table.get("gaps_ns"), table.get("ttft_ns")
-    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
-        raise UsageError(f"{key}.gaps_ns: should be a list of gaps for every request")
-    if not all(_is_count(gap) for row in rows for gap in row):
-        raise UsageError(f"{key}.gaps_ns: should hold whole numbers of ns, none negative")
-    if ttft is not None and not (isinstance(ttft, list) and len(ttft) == len(rows) and all(map(_is_count, ttft))):
-        raise UsageError(f"{key}.ttft_ns: should hold a whole number of ns for each of the {len(rows)} requests")
-    if not _is_count(warmups) or not any(gap for row in rows[warmups:] for gap in row):
-        raise UsageError(f"{key}.warmups: {warmups!r} of {len(rows)} requests leave no gaps")
-    return tuple(gap / 1e9 for gap in chain.from_iterable(rows[warmups:]))
-
-
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-
-_READERS: dict[str, Callable[[str, object], Any]] = {
-    "title": _text,
-    "origin": _origin,
-    "tokens_per_s": _rate,
-    "prompt_s": _number,
-    "prompt_cv": _number,
-    "rate_cv": _number,
-    "assumed": _assumed,
-    "gaps": _table,
-    "trace": _trace,
-}
-"""Key of the file -> what reads it."""
-
-
-def read_profile(path: Path, name: str = "") -> Profile:
-    """Read a file; the profile's name is the file's unless given. Raises UsageError naming file and key."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"profile {path}: cannot be read: {error}") from error
-    return parse_profile(name or path.stem, text, f"profile {path}")
-
-
 def to_toml(document: Mapping[str, Any]) -> str:
     """Write nested tables of texts, numbers, booleans and lists as TOML 1.0; None is left out."""
-    return "\n".join(_lines(document, ())) + "\n"
+    import tomli_w
+
+    return tomli_w.dumps(_told(document))
 
 
-def _lines(table: Mapping[str, Any], path: tuple[str, ...]) -> list[str]:
-    """Write a table's own values, then its tables, as TOML wants them."""
-    lines = [f"{_key(key)} = {_value(value)}" for key, value in table.items() if not isinstance(value, dict | None)]
-    for key, value in table.items():
-        if isinstance(value, dict):
-            inside = (*path, _key(key))
-            lines += ["", f"[{'.'.join(inside)}]", *_lines(value, inside)]
-    return lines
-
-
-def _key(key: str) -> str:
-    bare = key.isascii() and key.replace("-", "").replace("_", "").isalnum()
-    return key if bare else _value(key)
-
-
-def _value(value: object) -> str:
-    """Write one value."""
-    if isinstance(value, str):  # a JSON text is a TOML text, but for DEL
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list | tuple):
-        return _list(value)
-    if isinstance(value, dict):  # inside a list
-        return "{" + ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, int | float):
-        return repr(value)
-    raise TypeError(f"{type(value).__name__} has no place in a profile")
-
-
-def _list(values: Sequence[object]) -> str:
-    """Write a list; a long one goes over several lines, but for the gaps of a request."""
-    items = [_value(item) for item in values]
-    short = f"[{', '.join(items)}]"
-    if len(short) <= _LINE or all(isinstance(item, int) for item in values):
-        return short
-    if all(isinstance(item, float) for item in values):
-        return f"[\n{textwrap.fill(', '.join(items), _LINE, initial_indent='    ', subsequent_indent='    ')},\n]"
-    return "[\n" + "".join(f"    {item},\n" for item in items) + "]"
+def _told(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out what is None, in inner tables too."""
+    return {
+        key: _told(value) if isinstance(value, Mapping) else value for key, value in table.items() if value is not None
+    }

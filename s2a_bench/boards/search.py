@@ -37,12 +37,12 @@ def find_profile(name: str) -> Path:
     """Return the file of a profile, given by name or as a path; raises UsageError naming what there is."""
     if "/" in name or name.endswith(".toml"):
         if not Path(name).is_file():
-            raise UsageError(f"--profile: there is no file {name}")
+            raise UsageError(f"`profile`: there is no file {name}")
         return Path(name)
     files = profile_files()
     if name not in files:
         where = ", ".join(map(str, search_path()))
-        raise UsageError(f"--profile: '{name}' is none of {', '.join(files)} (looked in {where}), and no path")
+        raise UsageError(f"`profile`: '{name}' is none of {', '.join(files)} (looked in {where}), and no path")
     return files[name]
 
 

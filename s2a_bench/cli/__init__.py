@@ -10,7 +10,6 @@ import sys
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
 
 from s2a_bench import __version__
 from s2a_bench.cli import (
@@ -21,45 +20,17 @@ from s2a_bench.cli import (
     profile,
     report,
     serve,
-    study,
     sweep,
     throughput,
 )
 from s2a_bench.cli.adapter import with_flags
+from s2a_bench.cli.experiment import Commands
 from s2a_bench.errors import S2AError
-from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.machine import tuning
 
 INTERRUPTED = 130
 ParseError: Any = typer.BadParameter.__mro__[1]
 """Click's UsageError: newer typer brings a click of its own, so it cannot be named by import."""
-
-
-class Commands(TyperGroup):
-    """The commands by hand and the experiments; an experiment is imported when its command is looked up."""
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of all commands."""
-        return sorted({*super().list_commands(ctx), *EXPERIMENTS})
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command, that of an experiment made from its declaration."""
-        found = super().get_command(ctx, cmd_name)
-        if found is None and cmd_name in EXPERIMENTS:
-            from s2a_bench.cli.experiment import command_of
-
-            single = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False, add_completion=False)
-            single.command(cmd_name)(command_of(EXPERIMENTS[cmd_name]))
-            found = self.commands[cmd_name] = typer.main.get_command(single)
-        return found
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 - its base has it
-        """List every command with its sentence, without importing what experiments are made of."""
-        abouts = {name: command.get_short_help_str(limit=150) for name, command in self.commands.items()}
-        for name, experiment in EXPERIMENTS.loaded():
-            abouts[name] = experiment.about
-        with formatter.section("Commands"):
-            formatter.write_dl(sorted(abouts.items()))
 
 
 app = typer.Typer(
@@ -74,7 +45,6 @@ app = typer.Typer(
 app.command("doctor")(doctor.doctor)
 app.command("latency")(latency.latency)
 app.command("throughput")(throughput.throughput)
-app.command("study")(study.study)
 app.command("serve")(serve.serve)
 app.command("sweep")(sweep.sweep)
 app.command("compare")(compare.compare)

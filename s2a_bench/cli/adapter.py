@@ -35,14 +35,27 @@ class Flag:
     """The field, behind the fields of the groups that it is in."""
     kind: type
     about: str
+    needed: bool = False
+    argument: bool = False
+    """Whether it is given by its place."""
+
+    @property
+    def spelled(self) -> str:
+        """Return it as people write it: --max-tokens, or NAME for an argument."""
+        return self.name.upper() if self.argument else f"--{self.name}"
 
     @property
     def parameter(self) -> inspect.Parameter:
         """Return it as a parameter of the function that typer reads; None says that it was not given."""
-        spelled = f"--{self.name}"
-        declared = typer.Option(spelled, help=self.about, show_default=False)
-        kind: Any = Annotated[Union[self.kind, None], declared]  # noqa: UP007 - made at run time
-        return inspect.Parameter(self.key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+        default = inspect.Parameter.empty if self.needed else None
+        declared: Any = (
+            typer.Argument(metavar=self.spelled, help=self.about, show_default=False)
+            if self.argument
+            else typer.Option(self.spelled, help=self.about, show_default=False)
+        )
+        kind: Any = self.kind if self.needed else Union[self.kind, None]  # noqa: UP007 - made at run time
+        annotation: Any = Annotated[kind, declared]
+        return inspect.Parameter(self.key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
     @property
     def key(self) -> str:
@@ -61,30 +74,25 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
                 if not only or flag.path[0] in only:
                     yield replace(flag, path=(name, *flag.path), about=f"{about}{flag.about}")
         else:
-            yield Flag(
-                str(extra.get("flag") or name.replace("_", "-")), (name,), _kind(field.annotation), _about(field)
-            )
+            flag_name = str(extra.get("flag") or name.replace("_", "-"))
+            kind, argument = _kind(field.annotation), bool(extra.get("argument"))
+            yield Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument)
 
 
-def command(
-    function: Callable[..., None],
-    *options: type[Options],
-    about: str,
-    more: Mapping[str, inspect.Parameter] | None = None,
-) -> Callable[..., None]:
+def command(function: Callable[..., None], *options: type[Options], about: str) -> Callable[..., None]:
     """Return a function for typer that builds every class of ``options`` from its flags and calls ``function``.
 
-    ``function`` gets one configuration a class, in order, and the values of ``more``, other parameters, by name.
+    ``function`` gets one configuration a class, in order; its keyword-only parameters that are declared as typer has
+    them are flags too.
     """
-    flags = [flag for each in options for flag in flags_of(each)]
-    parameters = {flag.key: flag.parameter for flag in flags} | dict(more or {})
+    own = _keywords(function)
+    flags = {flag.key: flag.parameter for each in options for flag in flags_of(each)}
 
     def run(**given: Any) -> None:
         with flags_named(*options):
-            rest = {name: given[name] for name in more or {}}
-            function(*(build(each, given) for each in options), **rest)
+            function(*(build(each, given) for each in options), **{name: given[name] for name in own})
 
-    run.__signature__ = inspect.Signature(list(parameters.values()))  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature([*flags.values(), *own.values()])  # type: ignore[attr-defined]
     run.__doc__ = about
     return run
 
@@ -100,13 +108,23 @@ def flags_named(*options: type[Options]) -> Iterator[None]:
     try:
         yield
     except UsageError as error:
-        spelled = {flag.path[-1]: flag.name for each in options for flag in flags_of(each)}
+        spelled = {flag.path[-1]: flag.spelled for each in options for flag in flags_of(each)}
         raise UsageError(with_flags(str(error), spelled)) from error
 
 
 def with_flags(message: str, spelled: Mapping[str, str] | None = None) -> str:
     """Return a library's message with its fields, `max_tokens`, as flags, --max-tokens, or as ``spelled``."""
-    return FIELD.sub(lambda field: f"--{(spelled or {}).get(field[1]) or field[1].replace('_', '-')}", message)
+    return FIELD.sub(lambda field: (spelled or {}).get(field[1]) or f"--{field[1].replace('_', '-')}", message)
+
+
+def _keywords(function: Callable[..., None]) -> dict[str, inspect.Parameter]:
+    """Return the keyword-only parameters of a function that are declared for typer."""
+    parameters = inspect.signature(function, eval_str=True).parameters.items()
+    return {
+        name: each
+        for name, each in parameters
+        if each.kind is each.KEYWORD_ONLY and get_origin(each.annotation) is Annotated
+    }
 
 
 def _nested(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
@@ -144,7 +162,7 @@ def _about(field: FieldInfo) -> str:
     """Return a field's help, with its default where the text does not speak of it."""
     about = field.description or ""
     default = field.get_default(call_default_factory=False)
-    if "[default" in about or default is None or default is False or default in ("", ()):
+    if field.is_required() or "[default" in about or default is None or default is False or default in ("", ()):
         return about
     values = default if isinstance(default, tuple) else (default,)
     return f"{about} [default: {','.join(f'{each:g}' if isinstance(each, float) else str(each) for each in values)}]"

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
+from typer.core import TyperGroup
 
 from s2a_bench.cli.adapter import build, command, flags_named
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError
+from s2a_bench.experiments import EXPERIMENTS
 
 if TYPE_CHECKING:
     from s2a_bench.cli.progress import RunProgress
@@ -22,14 +23,48 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
 
-def _own(
-    output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
-    data_only: Annotated[
-        bool, typer.Option("--data-only", help="write no tables and figures into the run folder")
-    ] = False,
-    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
-) -> None:
-    """Hold the flags that every experiment has."""
+class Commands(TyperGroup):
+    """The commands of one group: those by hand, those in ``lazy``, and the experiments.
+
+    What is not by hand is imported when it is looked up. The experiment `model validity` belongs to the group `model`.
+    """
+
+    group: ClassVar[str] = ""
+    lazy: ClassVar[Mapping[str, str]] = {}
+    """Name of a command -> its function, as "module:attribute"."""
+
+    @property
+    def _experiments(self) -> dict[str, str]:
+        """Return the experiments of this group by their commands."""
+        words = ((name.rpartition(" "), name) for name in EXPERIMENTS)
+        return {command: name for (group, _, command), name in words if group == self.group}
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of all commands."""
+        return sorted({*super().list_commands(ctx), *self.lazy, *self._experiments})
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command, made from its declaration when it is first asked for."""
+        found = super().get_command(ctx, cmd_name)
+        if found is None and (function := self._function(cmd_name)) is not None:
+            single = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False, add_completion=False)
+            single.command(cmd_name)(function)
+            found = self.commands[cmd_name] = typer.main.get_command(single)
+        return found
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """List every command with its sentence, without importing what experiments are made of."""
+        mine = {name: command for command, name in self._experiments.items()}
+        abouts = {mine[name]: experiment.about for name, experiment in EXPERIMENTS.loaded() if name in mine}
+        for name in {*self.list_commands(ctx)}.difference(mine.values()):
+            abouts[name] = self.get_command(ctx, name).get_short_help_str(limit=150)
+        with formatter.section("Commands"):
+            formatter.write_dl(sorted(abouts.items()))
+
+    def _function(self, name: str) -> Any:
+        if name in self.lazy:
+            return resolve_name(self.lazy[name])
+        return command_of(EXPERIMENTS[self._experiments[name]]) if name in self._experiments else None
 
 
 def options_of(experiment: Experiment) -> tuple[type[Options], ...]:
@@ -47,13 +82,19 @@ def config_of(experiment: Experiment, given: Mapping[str, Any]) -> Options:
 def command_of(experiment: Experiment) -> Callable[..., None]:
     """Return the function that typer makes the experiment's command of."""
 
-    def run(config: Options, *view: Options, output: Path, data_only: bool, json_: bool) -> None:
+    def run(
+        config: Any,
+        *view: Any,
+        output: Annotated[Path, typer.Option(help="folder for run folders")] = Path("results"),
+        data_only: Annotated[
+            bool, typer.Option("--data-only", help="write no tables and figures into the run folder")
+        ] = False,
+        json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+    ) -> None:
         asked = view[0].model_dump() if view else {}
         _run(experiment, config, output, asked, data_only=data_only, as_json=json_)
 
-    own = inspect.signature(_own, eval_str=True).parameters
-    more = {name: parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for name, parameter in own.items()}
-    return command(run, *options_of(experiment), about=experiment.about, more=more)
+    return command(run, *options_of(experiment), about=experiment.about)
 
 
 def _run(

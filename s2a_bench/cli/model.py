@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from s2a_bench import extras
-from s2a_bench.cli.model_validity import validity
+from s2a_bench.cli.experiment import Commands
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
 
@@ -21,7 +21,16 @@ if TYPE_CHECKING:
 SCHEMA = "s2a-bench-model/1"
 """Of `--json`; described by ``docs/schema/s2a-bench-model-1.json``."""
 
-app = typer.Typer(no_args_is_help=True, help="Fetch model files, write dummy ones, say what is in them.")
+
+class ModelCommands(Commands):
+    """The commands below and the experiments on a model alone."""
+
+    group = "model"
+
+
+app = typer.Typer(
+    cls=ModelCommands, no_args_is_help=True, help="Fetch model files, write dummy ones, say what is in them."
+)
 
 
 class Size(str, Enum):
@@ -172,6 +181,3 @@ def dummy(
             )
     typer.echo(files.model)
     typer.echo(files.mmproj)
-
-
-app.command()(validity)

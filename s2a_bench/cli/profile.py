@@ -6,73 +6,31 @@ import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
-from s2a_bench.cli.options import engine_config, size_of, text_or_file
+from s2a_bench.cli.experiment import Commands
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import UsageError
-from s2a_bench.frames import SOURCES
 
 if TYPE_CHECKING:
     from s2a_bench.boards.profile import Profile
 
-app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, add_completion=False)
+
+class ProfileCommands(Commands):
+    """The commands below, and the one that measures."""
+
+    lazy: ClassVar[dict[str, str]] = {"capture": "s2a_bench.cli.profile_capture:capture"}
+    group = "profile"
+
+
+app = typer.Typer(cls=ProfileCommands, no_args_is_help=True, rich_markup_mode=None, add_completion=False)
 
 SCHEMA = "s2a-bench-profile/1"
 """Of `--json`; described by ``docs/schema/s2a-bench-profile-1.json``."""
 
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output")]
-
-
-@app.command("capture")
-def capture(
-    name: Annotated[str, typer.Argument(help="name of the profile; its file is NAME.toml")],
-    title: Annotated[str, typer.Option(help="what figures call it [default: the board's or CPU's name]")] = "",
-    model: Annotated[Path | None, typer.Option(help="GGUF model [default: the tiny dummy]")] = None,
-    mmproj: Annotated[Path | None, typer.Option(help="GGUF vision tower that goes with --model")] = None,
-    threads: Annotated[int, typer.Option(min=0, help="CPU threads of the model; 0: all")] = 0,
-    gpu_layers: Annotated[int, typer.Option(min=-1, help="model layers on the GPU; -1: all")] = 0,
-    context: Annotated[int, typer.Option(min=256, help="context length in tokens")] = 4096,
-    source: Annotated[str, typer.Option(help=f"{', '.join(SOURCES)}, as video:FILE")] = "synthetic",
-    size: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the frames")] = "640x480",
-    requests: Annotated[int, typer.Option(help="requests that count, each about a new frame")] = 20,
-    warmup: Annotated[int, typer.Option(help="requests before them, kept in the file and left out")] = 3,
-    tokens: Annotated[int, typer.Option(help="most tokens an answer")] = 64,
-    prompt: Annotated[str | None, typer.Option(help="text, or @FILE [default: the paper's prompt]")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the frames and the sampling")] = 0,
-    output: Annotated[Path, typer.Option(help="folder for the file")] = Path("profiles"),
-    force: Annotated[bool, typer.Option("--force", help="replace a profile of this name")] = False,
-    json_: Json = False,
-) -> None:
-    """Measure this machine: rate, time to first token and every gap between tokens, for other machines to replay."""
-    from s2a_bench.cli.progress import RunProgress
-    from s2a_bench.experiments.profile_capture.run import CaptureConfig, make_room, write_profile
-    from s2a_bench.experiments.profile_capture.run import capture as measure
-    from s2a_bench.harness.plan import DEFAULT_PROMPT
-
-    width, height = size_of(size)
-    text = DEFAULT_PROMPT if prompt is None else text_or_file(prompt)
-    engine = engine_config(
-        name="llama", model=model, mmproj=mmproj, threads=threads, gpu_layers=gpu_layers, context=context
-    )
-    config = CaptureConfig(name, engine, source, width, height, requests, warmup, tokens, text, seed)
-    config.check()
-    path = output / f"{name}.toml"
-    make_room(path, force=force)
-    with RunProgress() as progress:
-        progress.expect(requests + warmup)
-        tables = measure(config, progress.stage, progress.advance)
-        for warning in tables["capture"]["warnings"]:
-            progress.say(f"warning: {warning}")
-    profile = write_profile({**tables, **({"title": title} if title else {})}, path, force=force)
-    if json_:
-        _print_json("capture", [_facts(profile, path)])
-        return
-    _print(_line(profile))
-    _print(f"gaps: {profile.facts['fit']['family']}, the nearest of {_distances(profile)}")
-    _print(f"profile: {path}")
 
 
 @app.command("list")
@@ -83,7 +41,7 @@ def list_(json_: Json = False) -> None:
 
     found = _readable()
     if json_:
-        _print_json("list", [_facts(profile, path) for profile, path in found])
+        print_profiles("list", [facts_of(profile, path) for profile, path in found])
         return
     table = Table(box=None, pad_edge=False)
     for header in ("name", "board", "origin"):
@@ -108,19 +66,19 @@ def show(name: Annotated[str, typer.Argument(help="a name of 'profile list', or 
     path = find_profile(name)
     profile = read_profile(path)
     if json_:
-        _print_json("show", [_facts(profile, path)])
+        print_profiles("show", [facts_of(profile, path)])
         return
-    _print(_line(profile))
-    _print(f"file: {path}")
+    typer.echo(line_of(profile))
+    typer.echo(f"file: {path}")
     if profile.assumed:
-        _print(f"assumed, not from {profile.origin} data: {', '.join(profile.assumed)}")
-    _print(f"spread: prompt CV {profile.prompt_cv:.3g}, rate CV from answer to answer {profile.rate_cv:.3g}")
-    _print(f"gaps: {_gaps(profile)}")
+        typer.echo(f"assumed, not from {profile.origin} data: {', '.join(profile.assumed)}")
+    typer.echo(f"spread: prompt CV {profile.prompt_cv:.3g}, rate CV from answer to answer {profile.rate_cv:.3g}")
+    typer.echo(f"gaps: {_gaps(profile)}")
     for table, facts in profile.facts.items():
-        _print(f"{table}:")
+        typer.echo(f"{table}:")
         for key, value in facts.items():
             shown = " ".join(str(value).split())
-            _print(f"  {key}: {shown}")
+            typer.echo(f"  {key}: {shown}")
 
 
 @app.command("match")
@@ -131,15 +89,15 @@ def match(json_: Json = False) -> None:
     board = board_facts()
     found = [(profile, path) for profile, path in _readable() if matches(profile, board)]
     if json_:
-        same = [{**_facts(profile, path), "differences": differences(profile, board)} for profile, path in found]
-        _print_json("match", same, board=board)
+        same = [{**facts_of(profile, path), "differences": differences(profile, board)} for profile, path in found]
+        print_profiles("match", same, board=board)
     else:
         kind = ", ".join(str(board[key]) for key in ("model", "gpu", "cpu") if key in board)
-        _print(f"this board: {kind}, {board['cores']} cores")
+        typer.echo(f"this board: {kind}, {board['cores']} cores")
         for profile, _ in found:
-            _print(_line(profile) + "".join(f"; {change}" for change in differences(profile, board)))
+            typer.echo(line_of(profile) + "".join(f"; {change}" for change in differences(profile, board)))
         if not found:
-            _print("no profile is of this board; 's2a-bench profile capture NAME' measures one")
+            typer.echo("no profile is of this board; 's2a-bench profile capture NAME' measures one")
     if not found:
         raise typer.Exit(1)
 
@@ -158,7 +116,7 @@ def _readable() -> list[tuple[Profile, Path]]:
     return found
 
 
-def _facts(profile: Profile, path: Path) -> dict[str, Any]:
+def facts_of(profile: Profile, path: Path) -> dict[str, Any]:
     """Return a profile as plain data; the recording as its length."""
     from s2a_bench.boards.gaps import to_table
 
@@ -190,23 +148,22 @@ def _gaps(profile: Profile, *, full: bool = True) -> str:
     return f"{table['family']}{numbers}{recorded}{assumed}"
 
 
-def _line(profile: Profile) -> str:
+def line_of(profile: Profile) -> str:
+    """Say in one line what a profile is."""
     return (
         f"{profile.name}: {profile.title}, {profile.tokens_per_s:.4g} tokens/s, first token after "
         f"{_ttft_s(profile):.3g} s ({_origin(profile)})"
     )
 
 
-def _distances(profile: Profile) -> str:
+def distances(profile: Profile) -> str:
+    """Say how far each family of gaps is from the recorded ones."""
     fit = profile.facts["fit"]
     return ", ".join(f"{name} {max(gap, fit['distance_sum'][name]):.3f}" for name, gap in fit["distance_gap"].items())
 
 
-def _print(line: str) -> None:
-    typer.echo(line)
-
-
-def _print_json(command: str, profiles: list[dict[str, Any]], **more: Any) -> None:
+def print_profiles(command: str, profiles: list[dict[str, Any]], **more: Any) -> None:
+    """Print the one object of ``--json``."""
     whole = {"schema": SCHEMA, "command": f"profile {command}", **more, "profiles": profiles}
     json.dump(whole, sys.stdout, indent=2, ensure_ascii=False, allow_nan=False, default=str)
     sys.stdout.write("\n")

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 VIRTUAL: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     "latency": lambda _: False,
     "throughput": lambda _: False,
-    "study": lambda _: True,
 }
 """Commands by hand that can be swept -> whether one with these parameters computes and measures nothing.
 
@@ -30,7 +29,7 @@ def command_of(name: str, key: str = "command") -> Command:
     """Describe a command; raises UsageError for one that cannot be swept."""
     from s2a_bench.sweep import Command
 
-    known = sorted({*VIRTUAL, *EXPERIMENTS})
+    known = sorted({*VIRTUAL, *EXPERIMENTS}.intersection(_commands()))
     if name not in known:
         raise UsageError(f"{key}: '{name}' is none of {', '.join(known)}")
     flags: dict[str, Any] = {}

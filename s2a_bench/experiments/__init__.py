@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias
@@ -140,6 +141,8 @@ class Experiment:
     """Class of a cell of its ``--json``, a dataclass, from which docs/schema follows; not declared: any object."""
     unit: str = "samples"
     """What progress counts, and what is kept of a run that breaks off."""
+    commands: str = ""
+    """The commands that manifests of its runs name, as a shell's pattern: study-*; empty: its name."""
 
     def run_with(self, config: Options, output: Path, progress: Progress) -> Path:
         """Run it and return the run folder; raises S2AError for what a user can mend."""
@@ -169,12 +172,14 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
         "boundary": "s2a_bench.experiments.boundary:EXPERIMENT",
         "ccrb": "s2a_bench.experiments.ccrb:EXPERIMENT",
         "timeline": "s2a_bench.experiments.timeline:EXPERIMENT",
+        "model validity": "s2a_bench.experiments.model_validity:EXPERIMENT",
+        "study": "s2a_bench.experiments.study:EXPERIMENT",
     },
 )
-"""The experiments by their commands."""
+"""The experiments by their commands; `model validity` is a command of the group `model`."""
 
 
 def experiment_of(command: str) -> Experiment | None:
-    """Return the experiment whose runs bear a command's name, as ``study-drift`` those of study; None for others."""
-    name = command if command in EXPERIMENTS else command.partition("-")[0]
-    return EXPERIMENTS[name] if name in EXPERIMENTS else None  # noqa: SIM401 - a registry has no default
+    """Return the experiment whose runs name this command; None if there is none, or it is not installed."""
+    found = (each for _, each in EXPERIMENTS.loaded() if fnmatchcase(command, each.commands or each.name))
+    return next(found, None)

@@ -89,11 +89,11 @@ def scores(policy: StreamToAct, plans: Plans) -> Floats:
 def check(plans: int, epsilon: float = EPSILON) -> None:
     """Refuse to calibrate on so few plans that nothing can be promised; raises UsageError."""
     if not 0 < epsilon < 1:
-        raise UsageError(f"--epsilon: {epsilon:g} should be between 0 and 1")
+        raise UsageError(f"`epsilon`: {epsilon:g} should be between 0 and 1")
     if (plans + 1) * epsilon < 1 - ROUNDING:
         raise UsageError(
-            f"--epsilon: {plans} calibration plans promise {1 / (plans + 1):.2g} at best, not {epsilon:g}: "
-            f"take {math.ceil(1 / epsilon - ROUNDING) - 1} or more ({PLANS} are better), or raise --epsilon"
+            f"`epsilon`: {plans} calibration plans promise {1 / (plans + 1):.2g} at best, not {epsilon:g}: "
+            f"take {math.ceil(1 / epsilon - ROUNDING) - 1} or more ({PLANS} are better), or raise `epsilon`"
         )
 
 

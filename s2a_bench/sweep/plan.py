@@ -12,8 +12,9 @@ from typing import Any
 from s2a_bench.boards.search import find_profile
 from s2a_bench.errors import UsageError
 from s2a_bench.sweep import Cell, Command
-from s2a_bench.sweep.file import BOARD, OWN, SweepFile, like
+from s2a_bench.sweep.file import BOARD, OWN, SweepFile
 from s2a_bench.sweep.grid import Setting, rounds
+from s2a_bench.toml_file import like
 
 HASHED_WHOLE = 1 << 20
 """Bytes up to which a file that a setting names is known by its content; a larger one, by size and time."""

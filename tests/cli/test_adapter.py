@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 
 from s2a_bench.cli.adapter import command, flags_of
 from s2a_bench.errors import UsageError
-from s2a_bench.options import Names, Options, WholeNumbers, option
+from s2a_bench.options import Names, Options, Size, TextOrFile, WholeNumbers, group, option
 
 
 class Engine(Options):
@@ -32,10 +33,18 @@ class Asked(Options):
             raise UsageError("`runs`: 10 at most with `quick`, and `t_nom_s` as it is")
 
 
-def run(*arguments: str) -> Asked:
-    got: list[Asked] = []
+class Named(Options):
+    name: str = option(..., "what to do", argument=True, pattern="^[a-z]+$")
+    times: int = option(1, "how often", argument=True)
+    task: TextOrFile = option("", "text, or @FILE")
+    size: Size = option((640, 480), "WIDTHxHEIGHT [default: 640x480]")
+    engine: Engine = group(Engine, only=("threads",), about="the model's ")
+
+
+def run(*arguments: str, options: type[Options] = Asked) -> Any:
+    got: list[Options] = []
     app = typer.Typer()
-    app.command()(command(got.append, Asked, about="Try it."))
+    app.command()(command(got.append, options, about="Try it."))
     result = CliRunner().invoke(app, arguments, catch_exceptions=True)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -50,6 +59,36 @@ def test_flags_reach_their_fields_and_groups() -> None:
     asked = run("--runs", "7", "--t-nom", "2", "--names", "x, y,x", "--lengths", "4,2", "--quick", "--threads", "3")
     assert asked == Asked(runs=7, t_nom_s=2, names=["x", "y"], lengths=(4, 2), quick=True, engine=Engine(threads=3))
     assert run("--model", "m.gguf").engine.model == Path("m.gguf")
+
+
+def test_an_argument_is_given_by_its_place() -> None:
+    assert run("go", "3", "--task", "a", options=Named) == Named(name="go", times=3, task="a")
+    assert run("go", options=Named).times == 1
+    with pytest.raises(UsageError, match=r"^NAME: 'GO' should match pattern"):
+        run("GO", options=Named)
+    with pytest.raises(UsageError, match=r"^`name` is needed$"):
+        Named()
+
+
+def test_a_size_is_width_and_height() -> None:
+    assert run("go", "--size", "64x48", options=Named).size == (64, 48)
+    with pytest.raises(UsageError, match=r"^--size: 'big' should look like 640x480$"):
+        run("go", "--size", "big", options=Named)
+
+
+def test_of_a_group_only_some_fields_may_be_flags() -> None:
+    assert run("go", "--threads", "2", options=Named).engine == Engine(threads=2)
+    about = {flag.name: flag.about for flag in flags_of(Named)}
+    assert about["threads"].startswith("the model's CPU threads; 0: all")
+    assert "model" not in about
+
+
+def test_a_text_may_come_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "task.txt"
+    path.write_text("home")
+    assert run("go", "--task", f"@{path}", options=Named).task == "home"
+    with pytest.raises(UsageError, match=r"^--task: cannot read /no/such: "):
+        run("go", "--task", "@/no/such", options=Named)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from s2a_bench.experiments.study.rows import STUDIES
+from s2a_bench.experiments.study.rows import STUDY_CELLS
 from s2a_bench.store.run import read_run
 
 ROOT = Path(__file__).parent.parent.parent
@@ -39,12 +39,12 @@ def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
     assert kept.manifest["state"] == "finished"
     assert kept.manifest["seeds"] == {"study": 0}
     assert (folder / "studies.parquet").exists()
-    rows = kept.table(STUDIES)
+    rows = kept.table(STUDY_CELLS)
     assert len(rows) == 3 * 17
     assert (rows["plans"] == 100).all()
     for name in ("N -2", "L x 1.25", "gap x 2"):
         assert name in done.stdout
-    for name in ("figures/misfit.png", "figures/misfit.pdf", "tables/wrong-beliefs.md", "tables/wrong-beliefs.tex"):
+    for name in ("figures/misfit.png", "figures/misfit.pdf", "tables/wrong-beliefs.md", "tables/misfit.csv"):
         assert (folder / name).stat().st_size > 0
 
 
@@ -56,7 +56,7 @@ def test_json_is_one_object_that_keeps_its_schema(tmp_path: Path) -> None:
     jsonschema.validate(found, schema)
     assert found["command"] == "study-misfit"
     assert [warning["code"] for warning in found["warnings"]] == ["few-calibration-plans"]
-    rows = read_run(Path(found["run"])).table(STUDIES)
+    rows = read_run(Path(found["run"])).table(STUDY_CELLS)
     assert [cell["p_any_stall"] for cell in found["cells"]] == list(rows["p_any_stall"])
     assert [cell["condition"] for cell in found["cells"]] == list(rows["condition"])
     with pytest.raises(jsonschema.ValidationError):
@@ -68,7 +68,8 @@ def test_json_is_one_object_that_keeps_its_schema(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["fly"], "--study: 'fly' is none of targets, frontier, drift, misfit"),
+        (["fly"], "NAME: 'fly' is none of targets, frontier, drift, misfit"),
+        (["targets", "--plans", "0"], "--plans: 0 should be greater than or equal to 1"),
         (["targets", "--calibration-plans", "20"], "20 calibration plans promise 0.048 at best, not 0.01: take 99 or"),
         (["targets", "--epsilon", "0"], "--epsilon: 0 should be between 0 and 1"),
         (["frontier", "--profile", "rtx-4080"], "--profile: rtx-4080 holds no recorded gaps"),

@@ -13,9 +13,9 @@ from scipy.stats import ks_2samp
 from s2a_bench.boards.gaps import Gaps, Lognormal, Quantiles
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import EngineError, StoreError, UsageError
+from s2a_bench.experiments.profile_capture.config import CaptureConfig
 from s2a_bench.experiments.profile_capture.run import (
     Answer,
-    CaptureConfig,
     answers,
     document,
     open_model,
@@ -50,7 +50,7 @@ def replayed_ns(path: Path, gaps: str, requests: int, tokens: int) -> list[list[
 
 
 def saved(path: Path, recorded: list[Answer], **settings: Any) -> Path:
-    config = CaptureConfig("board", **{"requests": len(recorded) - 2, "warmup": 2, **settings})
+    config = CaptureConfig(name="board", **{"requests": len(recorded) - 2, "warmup": 2, **settings})
     write_profile(document(config, recorded, MODEL, ["load: high; wait"]), path, force=False)
     return path
 
@@ -78,7 +78,7 @@ def test_a_replay_of_the_recording_is_the_recording(tmp_path: Path) -> None:
 
 def test_the_profile_says_what_was_measured(tmp_path: Path) -> None:
     recorded = recording(Lognormal(0.1, 0.2), 3, 22)
-    config = CaptureConfig("board", requests=20, warmup=2, width=320, height=240)
+    config = CaptureConfig(name="board", requests=20, warmup=2, size=(320, 240))
     profile = write_profile(document(config, recorded, MODEL, ["load: high"]), tmp_path / "board.toml", force=False)
     gaps = [gap / 1e9 for answer in recorded[2:] for gap in answer.gaps_ns]
     ttft = np.array([answer.ttft_ns / 1e9 for answer in recorded[2:]])
@@ -108,7 +108,7 @@ def test_a_profile_is_not_overwritten_unless_forced(tmp_path: Path) -> None:
     recorded = recording(Lognormal(0.1, 0.2), 3, 5)
     path = saved(tmp_path / "new" / "board.toml", recorded)
     before = path.read_text()
-    tables = document(CaptureConfig("board", requests=5, warmup=0, seed=9), recorded, MODEL, [])
+    tables = document(CaptureConfig(name="board", requests=5, warmup=0, seed=9), recorded, MODEL, [])
     with pytest.raises(UsageError, match=r"board\.toml exists already; give another NAME or --output, or --force"):
         write_profile(tables, path, force=False)
     assert path.read_text() == before
@@ -127,7 +127,7 @@ def test_answers_too_short_to_time_say_what_to_do() -> None:
     with pytest.raises(
         EngineError, match="the answers were short: 30 gaps in 10 requests, a profile needs 40; give more"
     ):
-        document(CaptureConfig("board", requests=10, warmup=2), short, MODEL, [])
+        document(CaptureConfig(name="board", requests=10, warmup=2), short, MODEL, [])
 
 
 class Asked(EchoEngine):
@@ -143,7 +143,7 @@ class Asked(EchoEngine):
 def test_every_request_is_about_another_picture_with_another_seed() -> None:
     engine = Asked(EngineConfig(name="echo"))
     engine.requests = []
-    asked = answers(engine, CaptureConfig("x", width=64, height=48, tokens=5, seed=3))
+    asked = answers(engine, CaptureConfig(name="x", size=(64, 48), tokens=5, seed=3))
     timed = [next(asked) for _ in range(4)]
     assert all(len(answer.gaps_ns) == 4 and answer.ttft_ns > 0 for answer in timed)
     assert [request.seed for request in engine.requests] == [3, 4, 5, 6]
@@ -155,18 +155,18 @@ def test_every_request_is_about_another_picture_with_another_seed() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"name": "a/b"}, "NAME: 'a/b' should be a plain file name"),
-        ({"name": ""}, "NAME: '' should be"),
-        ({"name": ".hidden"}, "NAME: '.hidden' should be"),
-        ({"requests": 0}, "--requests: 0 should be 1 or more"),
-        ({"warmup": -1}, "--warmup: -1 should be 0 or more"),
-        ({"tokens": 1}, "--tokens: 1 should be 2 or more"),
-        ({"requests": 3, "tokens": 14}, "--requests 3 of --tokens 14 make 39 gaps; a profile needs 40"),
+        ({"name": "a/b"}, "`name`: 'a/b' should be a plain file name"),
+        ({"name": ""}, "`name`: '' should be"),
+        ({"name": ".hidden"}, "`name`: '.hidden' should be"),
+        ({"requests": 0}, "`requests`: 0 should be"),
+        ({"warmup": -1}, "`warmup`: -1 should be"),
+        ({"tokens": 1}, "`tokens`: 1 should be"),
+        ({"requests": 3, "tokens": 14}, "`requests` 3 of `tokens` 14 make 39 gaps; a profile needs 40"),
     ],
 )
-def test_settings_without_sense_name_their_flag(changes: dict[str, Any], message: str) -> None:
+def test_settings_without_sense_name_their_field(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        CaptureConfig(**{"name": "x", **changes}).check()
+        CaptureConfig(**{"name": "x", **changes})
 
 
 @pytest.mark.slow
@@ -183,7 +183,7 @@ def test_a_real_recording_does_not_reject_the_parametric_replay_of_another(
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
     random = Random(0)
     config = CaptureConfig(
-        "x", EngineConfig(threads=1), width=64, height=48, requests=100, warmup=4, tokens=16, prompt="go"
+        name="x", engine=EngineConfig(threads=1), size=(64, 48), requests=100, warmup=4, tokens=16, prompt="go"
     )
     engine = open_model(config.engine)
     asked = answers(engine, config)

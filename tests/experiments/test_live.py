@@ -307,7 +307,7 @@ def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
         ({"policies": ()}, "`policies`: name at least one"),
         ({"policies": ("eager",)}, "--policy: 'eager' is none of"),
         ({"policies": ("s2a-clairvoyant",)}, "s2a-clairvoyant needs to know when every skill will arrive"),
-        ({"skills": "juggling"}, "--skills: 'juggling' is none of"),
+        ({"skills": "juggling"}, "`skills`: 'juggling' is none of"),
         ({"plans": 0}, "`plans`: 0 should be greater than or equal to 1"),
         ({"robot": "kuka"}, "--robot: 'kuka' is none of timed, ros"),
         ({"robot": "ros"}, "`robot` ros: one robot follows one policy"),

@@ -6,22 +6,24 @@ import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
 import pytest
 
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments import experiment_of
 from s2a_bench.experiments.study import drift as study_drift
 from s2a_bench.experiments.study import jitter as study_jitter
 from s2a_bench.experiments.study import misfit as study_misfit
 from s2a_bench.experiments.study import targets as study_targets
-from s2a_bench.experiments.study.rows import STUDIES as TABLE
-from s2a_bench.experiments.study.rows import StudyRow
-from s2a_bench.experiments.study.run import STUDIES, StudyConfig, cells_of, results, run_study
-from s2a_bench.experiments.study.view.as_json import study_json
-from s2a_bench.experiments.study.view.figures import write_study_figure
-from s2a_bench.experiments.study.view.tables import regret_at, study_tables, table_files, targets
+from s2a_bench.experiments.study.config import StudyConfig
+from s2a_bench.experiments.study.rows import STUDY_CELLS, StudyRow
+from s2a_bench.experiments.study.run import results, run_study
+from s2a_bench.experiments.study.studies import STUDIES
+from s2a_bench.experiments.study.view.tables import regret_at
+from s2a_bench.experiments.study.view.targets import targets_of
 from s2a_bench.experiments.study.worlds import World, generator, recorded_plans
 from s2a_bench.policy.conformal import calibrate
 from s2a_bench.policy.estimator import GapPrior
@@ -54,7 +56,7 @@ HARDEST = (
 def frame(rows: list[StudyRow]):  # noqa: ANN201 - pandas is imported late, as in the package
     import pandas as pd
 
-    return pd.DataFrame([dict(zip(TABLE.columns, TABLE.values(row), strict=True)) for row in rows])
+    return pd.DataFrame([dict(zip(STUDY_CELLS.columns, STUDY_CELLS.values(row), strict=True)) for row in rows])
 
 
 def test_the_settings_are_those_of_the_specification() -> None:
@@ -84,24 +86,24 @@ def test_a_world_draws_what_the_specification_says() -> None:
 
 
 def test_every_cell_repeats_by_its_seed_whatever_runs_beside_it() -> None:
-    config = StudyConfig(seed=5, plans=50, calibration_plans=120)
-    cells = cells_of("targets", config)
+    config = StudyConfig(name="targets", seed=5, plans=50, calibration_plans=120)
+    cells = config.cells
     alone = cells[100]()
     assert list(results([cells[3], cells[100]]))[1] == alone
-    assert cells_of("targets", replace(config, seed=6))[100]() != alone
+    assert config.but(seed=6).cells[100]() != alone
 
 
 @pytest.mark.slow
 def test_processes_change_nothing() -> None:
-    cells = cells_of("misfit", StudyConfig(plans=20, calibration_plans=120))
+    cells = StudyConfig(name="misfit", plans=20, calibration_plans=120).cells
     assert list(results(cells, 2)) == list(results(cells))
 
 
 def test_stream_to_act_reaches_its_targets_in_the_hardest_settings() -> None:
-    config = StudyConfig(seed=0, plans=2000)
+    config = StudyConfig(name="targets", plans=2000)
     rows = [row for world in HARDEST for row in study_targets.setting(config, world)]
     online = frame([row for row in rows if row.policy == "stream-to-act"])
-    assert [target.what for target in targets(online) if not target.met] == []
+    assert [target.what for target in targets_of(online) if not target.met] == []
     mean = frame([row for row in rows if row.policy == "s2a-mean"])
     assert mean["p_any_stall"].min() > 0.2
     quantile = frame([row for row in rows if row.policy == "s2a-quantile"])
@@ -110,7 +112,7 @@ def test_stream_to_act_reaches_its_targets_in_the_hardest_settings() -> None:
 
 def test_a_row_is_what_the_plans_say() -> None:
     world = World(4.8, 0.5, 6, 8, 1.0)
-    config = StudyConfig(seed=2, plans=300, calibration_plans=150)
+    config = StudyConfig(name="targets", seed=2, plans=300, calibration_plans=150)
     waiting = study_targets.setting(config, world)[-1]
     rng = generator(2, "targets", world)
     world.draw(rng, 150)
@@ -155,7 +157,7 @@ def test_following_with_a_fixed_caution_is_deciding_all_plans_at_once() -> None:
 
 
 def test_too_short_a_plan_believed_stalls_and_too_long_a_one_is_late() -> None:
-    config = StudyConfig(plans=500)
+    config = StudyConfig(name="misfit", plans=500)
     rows = {row.condition: row for row in study_misfit.cell(config, World(4.8, 0.5, 6, 8, 1.0))}
     assert rows["N +0"].p_any_stall < 0.02
     assert rows["N -2"].p_any_stall > 0.1
@@ -164,7 +166,7 @@ def test_too_short_a_plan_believed_stalls_and_too_long_a_one_is_late() -> None:
 
 
 def test_rare_stalls_cost_more_under_pauses_than_under_even_jitter() -> None:
-    config = StudyConfig(plans=500, calibration_plans=200)
+    config = StudyConfig(name="frontier", plans=500, calibration_plans=200)
     world = World(4.8, 0.5, 6, 8, 1.0)
     costs = {}
     for gaps in study_jitter.families(1 / 4.8, (0.2, 0.1, 0.3)):
@@ -179,11 +181,11 @@ def test_rare_stalls_cost_more_under_pauses_than_under_even_jitter() -> None:
 
 
 def test_a_frontier_marks_where_calibration_would_put_the_robot() -> None:
-    config = StudyConfig(plans=300, calibration_plans=200)
+    config = StudyConfig(name="frontier", plans=300, calibration_plans=200)
     world = World(0.58, 3.0, 1, 8, 2.0)
     rows = study_jitter.cell(config, world)
     (chosen,) = (row for row in rows if row.condition == study_jitter.CALIBRATED)
-    drawn = world.draw(generator(config.seed, study_jitter.NAME, world), config.calibration_plans)
+    drawn = world.draw(generator(config.seed, "frontier", world), config.calibration_plans)
     assert drawn.token_s is not None
     found = calibrate(StreamToAct(GapPrior.fit(drawn.token_s)), drawn, config.epsilon)
     assert chosen.caution == found.caution > 0
@@ -205,45 +207,50 @@ def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest
         monkeypatch.setattr(module, "WORLDS", HARDEST[:1])
     monkeypatch.setattr(study_drift, "REFIT", 32)
     progress = NullProgress()
-    config = StudyConfig(plans=64, calibration_plans=100)
-    folder = run_study(name, config, tmp_path, progress)
+    config = StudyConfig(name=name, plans=64, calibration_plans=100)
+    folder = run_study(config, tmp_path, progress)
     assert folder == progress.folder
-    assert progress.done == len(cells_of(name, config))
+    assert progress.done == len(config.cells)
     run = read_run(folder)
     assert run.manifest["configuration"]["study"] == name
-    assert set(run.table(TABLE)["study"]) == {name}
-    assert (run.table(TABLE)["plans"] > 0).all()
-    tables = study_tables(run)
-    assert all(len(row) == len(table.header) for table in tables for row in table.rows)
-    assert all("nan" not in entry.lower() for table in tables for row in table.rows for entry in row)
-    assert len(table_files(tables)) == len(tables)
-    assert [path.name for path in write_study_figure(run)] == [f"{name}.png", f"{name}.pdf"]
-    told = study_json(run)
+    assert set(run.table(STUDY_CELLS)["study"]) == {name}
+    assert (run.table(STUDY_CELLS)["plans"] > 0).all()
+    found = experiment_of(f"study-{name}")
+    assert found is not None
+    assert found.name == "study"
+    shown = found.show(run)
+    assert all(len(row) == len(table.header) for table in shown.tables.values() for row in table.rows)
+    assert all("nan" not in entry.lower() for table in shown.tables.values() for row in table.rows for entry in row)
+    assert shown.csvs[f"{name}.csv"].count("\n") == len(run.table(STUDY_CELLS)) + 1
+    assert "nan" not in shown.csvs[f"{name}.csv"].lower()
+    assert list(shown.figures) == [name]
+    shown.figures[name]()
+    told = shown.json()
     jsonschema.validate(told, json.loads(SCHEMA.read_text()))
-    assert len(told["cells"]) == len(run.table(TABLE))
+    assert len(told["cells"]) == len(run.table(STUDY_CELLS))
     assert [each["what"] for each in told.get("targets", [])] == (TARGETS if name == "targets" else [])
 
 
 @pytest.mark.parametrize(
-    ("name", "config", "message"),
+    ("asked", "message"),
     [
-        ("fly", StudyConfig(), "--study: 'fly' is none of targets"),
-        ("targets", StudyConfig(jobs=0), "--jobs: 0"),
-        ("targets", StudyConfig(plans=0), "--plans: 0"),
-        ("targets", StudyConfig(seed=-1), "--seed: -1"),
-        ("targets", StudyConfig(calibration_plans=20), "20 calibration plans"),
+        ({}, "`name` is needed"),
+        ({"name": "fly"}, "`name`: 'fly' is none of targets, frontier, drift, misfit"),
+        ({"name": "targets", "jobs": 0}, "`jobs`: 0 should be"),
+        ({"name": "targets", "plans": 0}, "`plans`: 0 should be"),
+        ({"name": "targets", "seed": -1}, "`seed`: -1 should be"),
+        ({"name": "targets", "calibration_plans": 20}, "`epsilon`: 20 calibration plans promise"),
+        ({"name": "targets", "epsilon": 1.5}, "`epsilon`: 1.5 should be between 0 and 1"),
+        ({"name": "frontier", "profile": "rtx-4080"}, "`profile`: rtx-4080 holds no recorded gaps"),
     ],
 )
-def test_wrong_use_is_told_before_anything_is_written(
-    name: str, config: StudyConfig, message: str, tmp_path: Path
-) -> None:
+def test_a_configuration_that_makes_no_sense_is_refused(asked: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        run_study(name, config, tmp_path, NullProgress())
-    assert list(tmp_path.iterdir()) == []
+        StudyConfig(**asked)
 
 
 def test_cells_can_be_sent_to_another_process() -> None:
     import pickle
 
     for name in STUDIES:
-        assert all(isinstance(pickle.loads(pickle.dumps(cell)), partial) for cell in cells_of(name, StudyConfig()))  # noqa: S301
+        assert all(isinstance(pickle.loads(pickle.dumps(cell)), partial) for cell in StudyConfig(name=name).cells)  # noqa: S301

@@ -197,7 +197,7 @@ def test_jitter_that_is_wrong_is_named(jitter: str, message: str) -> None:
         ({"t_nom_cv": 0.6}, "`t_nom_cv`: 0.6"),
         ({"prompt_s": -1.0}, "`prompt_s`: -1"),
         ({"gap_bound": 0.0}, "`gap_bound`: 0"),
-        ({"epsilon": 0.001}, "--epsilon: 400 calibration plans promise"),
+        ({"epsilon": 0.001}, "`epsilon`: 400 calibration plans promise"),
         ({"seed": -1}, "`seed`: -1"),
         ({"jitter": "lognormal:cv=1", "plans": 10**6}, "`plans`: .* skills are more than"),
         ({"n_skills": (1000,), "tokens_per_skill": (1000,)}, "`n_skills`, `tokens_per_skill`: 1000000 tokens a plan"),

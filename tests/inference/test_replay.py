@@ -180,7 +180,7 @@ def test_facts_tell_prompt_and_decoding_time() -> None:
     ("config", "message"),
     [
         (EngineConfig(name="replay"), "--engine replay needs --profile NAME"),
-        (EngineConfig(name="replay", profile="tx1"), "--profile: 'tx1' is none of"),
+        (EngineConfig(name="replay", profile="tx1"), "`profile`: 'tx1' is none of"),
         (
             EngineConfig(name="replay", profile="rtx-4080", gaps="trace"),
             "--gaps trace: profile rtx-4080 holds no recording",

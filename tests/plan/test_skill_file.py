@@ -66,60 +66,68 @@ def test_the_household_speaks_the_papers_plan() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('gap = "hold"', 'gap = "fly"', "gap: 'fly' is none of stop, coast, hold, cruise"),
-        ('gap = "stop"', "gap = 3", "skill home: gap: should be one of stop, coast, hold, cruise"),
+        ('gap = "hold"', 'gap = "fly"', "gap: 'fly' should be 'stop', 'coast', 'hold' or 'cruise'"),
+        ('gap = "stop"', "gap = 3", "skill[home].gap: 3 should be 'stop', 'coast', 'hold' or 'cruise'"),
         ('role = "planner"', "", "role: is missing"),
         ('role = "planner"', 'role = "a\\nb"', "role: should be a text of one line"),
-        ('role = "planner"', 'role = "p"\nrule = 1', "rule: no such key"),
-        ("t_nom_s = 2", "", "skill lift: t_nom_s: is missing; it should be a number"),
-        ("t_nom_s = 2", "t_nom_s = true", "skill lift: t_nom_s: should be a number"),
-        ("t_nom_s = 2", "t_nom_s = inf", "skill lift: t_nom_s: should be a number"),
-        ("t_nom_s = 2", "t_nom_s = 0", "skill lift: t_nom_s: 0 < t_min_s <= t_nom_s <= t_max_s does not hold"),
-        ("t_nom_s = 2", "t_nom_s = 2\nt_max_s = 1.9", "skill lift: t_nom_s: 0 < t_min_s <= t_nom_s <= t_max_s"),
-        ("t_nom_s = 2", "t_nom = 2", "skill lift: t_nom_s: is missing"),
-        ("t_nom_s = 2", "t_nom_s = 2\nspeed = 2", "skill lift: speed: no such key"),
+        ('role = "planner"', 'role = "p"\nrule = 1', "rule: there is no such key; did you mean role?"),
+        ("t_nom_s = 2", "", "skill[lift].t_nom_s: is missing"),
+        ("t_nom_s = 2", "t_nom_s = true", "skill[lift].t_nom_s: should be a number"),
+        ("t_nom_s = 2", "t_nom_s = inf", "skill[lift].t_nom_s: should be a number"),
+        ("t_nom_s = 2", "t_nom_s = 0", "skill[lift]: 0 < t_min_s <= t_nom_s <= t_max_s does not hold"),
+        ("t_nom_s = 2", "t_nom_s = 2\nt_max_s = 1.9", "skill[lift]: 0 < t_min_s <= t_nom_s <= t_max_s"),
+        ("t_nom_s = 2", "t_nom = 2", "skill[lift].t_nom: there is no such key; did you mean t_nom_s?"),
+        (
+            "t_nom_s = 2",
+            "t_nom_s = 2\nspeed = 2",
+            "skill[lift].speed: there is no such key; there are name, arguments, t_nom_s, ",
+        ),
         ('name = "home"', 'name = "go home"', "skill[1].name: 'go home' should be letters, digits and underscores"),
-        ('name = "home"', 'name = "lift"', "skill.name: 'lift' stands there twice"),
+        ('name = "home"', 'name = "lift"', "skill: 'lift' stands there twice"),
         ('name = "home"', "", "skill[1].name: is missing"),
         (
             '"thing", "by',
             '"stuff", "by',
-            "skill lift: arguments: the vocabulary 'stuff' is not defined (thing, height)",
+            "skill[lift].arguments: the vocabulary 'stuff' is not defined (thing, height)",
         ),
-        ('"onto:thing"', '"thing"', "skill lift: arguments: 'thing' stands there twice"),
-        ('"onto:thing"', "3", "skill lift: arguments: 3 should be the name of a vocabulary"),
+        ('"onto:thing"', '"thing"', "skill[lift].arguments: 'thing' stands there twice"),
+        ('"onto:thing"', "3", "skill[lift].arguments[2]: 3 should be a text"),
         ('"küche"', '"a b"', "vocabulary.thing: 'a b' should be printable, without blanks, brackets and commas"),
         ('"küche"', '"a\ufffd"', "vocabulary.thing: 'a\ufffd' should be printable"),
         ('"küche"', '""', "vocabulary.thing: '' should have 1 to 64 characters"),
         ('"küche"', f'"{65 * "k"}"', f"vocabulary.thing: '{65 * 'k'}' should have 1 to 64 characters"),
-        ('name = "home"', f'name = "{65 * "k"}"', f"skill[1].name: '{65 * 'k'}' should be letters, digits and undersc"),
+        ('name = "home"', f'name = "{65 * "k"}"', f"skill[{65 * 'k'}].name: '{65 * 'k'}' should be letters"),
         ('"küche"', '"cup"', "vocabulary.thing: 'cup' stands there twice"),
         ('"küche"', "3", "vocabulary.thing: should be a list of texts, a list of numbers"),
         ('["cup", "küche"]', "[]", "vocabulary.thing: should be a list of texts"),
         ("[vocabulary]", '[vocabulary]\nodd = ["a"]', "vocabulary.odd: no skill has an argument of it"),
         ("to = 0.3", "to = 0.35", "vocabulary.height: 0.35 is not reached from 0.1 in steps of 0.1"),
         ("step = 0.1", "step = 0", "vocabulary.height: a range needs from <= to and step > 0"),
-        ("step = 0.1", 'step = "x"', "vocabulary.height.step: should be a number"),
-        ("step = 0.1", "step = nan", "vocabulary.height.step: should be a number"),
-        ("step = 0.1", "step = 0.1, unit = 1", "vocabulary.height.unit: no such key"),
+        ("step = 0.1", 'step = "x"', "vocabulary.height: a range has the numbers from, to, step, and nothing else"),
+        ("step = 0.1", "step = nan", "vocabulary.height: a range has the numbers from, to, step, and nothing else"),
+        (
+            "step = 0.1",
+            "step = 0.1, unit = 1",
+            "vocabulary.height: a range has the numbers from, to, step, and nothing else",
+        ),
         ("to = 0.3", "to = 100000", "vocabulary.height: 1000000 values; at most 1024"),
         ("to = 0.3", "to = 30", "skill: 1201 calls are possible, at most 1024"),
-        ("[[skill]]", "[[skills]]", "skill: is missing"),
-        ("[vocabulary]", "[vocabulary", "not TOML: "),
+        ("[[skill]]", "[[skills]]", "skills: there is no such key; did you mean skill?"),
+        ("[vocabulary]", "[vocabulary", "no TOML: "),
     ],
 )
 def test_an_error_names_file_and_key(old: str, new: str, message: str) -> None:
     assert old in ARM
     with pytest.raises(UsageError) as caught:
         parse_skills(ARM.replace(old, new), "arm.toml")
-    assert str(caught.value).startswith(f"--skills arm.toml: {message}")
+    assert str(caught.value).startswith(f"`skills` arm.toml: {message}")
     assert caught.value.exit_code == 2
 
 
 def test_a_choice_that_is_neither_a_name_nor_a_file_is_told(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="--skills: 'kitchen' is none of household, driving, and no path"):
+    with pytest.raises(UsageError, match="`skills`: 'kitchen' is none of household, driving, and no path"):
         load_skills("kitchen")
-    with pytest.raises(UsageError, match=r"--skills: cannot read /no/such\.toml .No such file"):
+    with pytest.raises(UsageError, match=r"`skills`: cannot read /no/such\.toml .No such file"):
         load_skills("/no/such.toml")
     latin = tmp_path / "latin.toml"
     latin.write_bytes("name = 'küche'".encode("latin-1"))

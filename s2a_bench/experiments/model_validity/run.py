@@ -7,63 +7,23 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.errors import UsageError
+from s2a_bench.experiments.model_validity.config import ValidityConfig
 from s2a_bench.experiments.model_validity.rows import VALIDITY, ValidityRow
-from s2a_bench.harness.ranges import require
-from s2a_bench.inference import Engine, EngineConfig, open_engine
+from s2a_bench.inference import Engine, open_engine
 from s2a_bench.inference.models import resolve
 from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.machine import environment
-from s2a_bench.plan import Cost, Format, SkillSet, arms, choose_format, load_skills, paper_format, prompt, score
+from s2a_bench.plan import Cost, Format, SkillSet, arms, load_skills, prompt, score
 from s2a_bench.store.run import RunWriter
 from s2a_bench.types import Request
 
 if TYPE_CHECKING:
     from s2a_bench.progress import Progress
 
-COMMAND: Final = "model validity"
-PAPER: Final = "paper"
-"""The paper's format, among the tokens a skill that are asked for."""
 ROOM: Final = 2
 """An answer may have as many times the tokens of the longest plan: without a grammar a model uses more words."""
 TEMPLATE_TOKENS: Final = 256
 """What a chat template may put around a prompt."""
-
-
-@dataclass(frozen=True)
-class ValidityConfig:
-    """Which model is asked for which plans, and how often."""
-
-    engine: EngineConfig = EngineConfig()  # noqa: RUF009 - frozen
-    skills: str = "household"
-    tokens_per_skill: tuple[str, ...] = (PAPER,)
-    """`PAPER`, or whole numbers."""
-    n_skills: int = 8
-    answers: int = 32
-    """Of each format, with the grammar and without."""
-    task: str = ""
-    """What the robot should do, in the user's words."""
-    max_tokens: int | None = None
-    """The most tokens of an answer; None: `ROOM` times what the longest plan costs."""
-    seed: int = 0
-    """Answer k is drawn with this seed + k."""
-
-    def check(self) -> None:
-        """Refuse what makes no sense; raises UsageError naming the flag."""
-        require("--n-skills", [self.n_skills], 1, 100)
-        require("--answers", [self.answers], 1, 1_000_000)
-        require("--seed", [self.seed], 0)
-        if self.max_tokens is not None:
-            require("--max-tokens", [self.max_tokens], 1)
-        if not self.tokens_per_skill:
-            raise UsageError(f"--tokens-per-skill: name at least one, as {PAPER},6,1")
-        for name in self.tokens_per_skill:
-            if name != PAPER and not name.isdecimal():
-                raise UsageError(f"--tokens-per-skill: '{name}' should be {PAPER} or a whole number")
-
-    def format(self, name: str, skills: SkillSet, tokenize: Tokenizer) -> Format:
-        """Return the format that costs so many tokens a skill; raises UsageError where the model has none."""
-        return paper_format(skills) if name == PAPER else choose_format(skills, int(name), tokenize, self.n_skills)
 
 
 @dataclass(frozen=True)
@@ -95,7 +55,6 @@ def run_validity(config: ValidityConfig, output: Path, progress: Progress) -> Pa
 
     A model gets the same prompt and the same seeds with the grammar and without. Rows are kept answer by answer.
     """
-    config.check()
     skills = load_skills(config.skills)
     progress.stage("reading the model's headers")
     model, mmproj = resolve(config.engine)
@@ -104,12 +63,12 @@ def run_validity(config: ValidityConfig, output: Path, progress: Progress) -> Pa
     longest = max(len(tokenize(ask.prompt)) + ask.max_tokens for ask in asks) + TEMPLATE_TOKENS
     chosen = config.engine.but(model=model, mmproj=mmproj, context=max(config.engine.context, longest))
     manifest = {
-        "configuration": {**asdict(config), "engine": chosen.to_manifest()},
+        "configuration": config.but(engine=chosen).to_manifest(),
         "environment": environment.collect(),
         "seeds": {"sampling": config.seed},
         "formats": [ask.to_manifest() for ask in asks],
     }
-    with RunWriter.create(output, COMMAND, manifest, (VALIDITY,)) as writer:
+    with RunWriter.create(output, "model validity", manifest, (VALIDITY,)) as writer:
         progress.opened(writer.path)
         progress.stage("loading the model")
         with closing(open_engine(chosen)) as engine:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.errors import StoreError
+from s2a_bench.experiments import Shown
 from s2a_bench.experiments.model_validity.rows import VALIDITY
 from s2a_bench.policy.conformal import upper_bound
 from s2a_bench.writers.as_json import frame
@@ -75,6 +76,18 @@ def arms_of(run: Run) -> list[Arm]:
         _arm(formats[str(name)], bool(grammar), part)
         for (name, grammar), part in rows.groupby(["format", "grammar"], sort=False)
     ]
+
+
+def show(run: Run, **_: Any) -> Shown:
+    """Return what a run shows; raises StoreError where the folder holds no answers."""
+    tables = validity_tables(run)
+    return Shown(
+        sentences=[f"{len(run.table(VALIDITY))} answers to the prompts were parsed, skill by skill."],
+        tables=tables,
+        main=["validity"],
+        notes=tables["validity"].notes,
+        json=lambda: validity_json(run),
+    )
 
 
 def validity_tables(run: Run) -> dict[str, TextTable]:

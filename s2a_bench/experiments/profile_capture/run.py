@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from s2a_bench.boards.file import parse_profile, to_toml
 from s2a_bench.boards.fit import fit_gaps
@@ -17,9 +17,9 @@ from s2a_bench.boards.gaps import to_table
 from s2a_bench.boards.profile import Profile
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, StoreError, UsageError
+from s2a_bench.experiments.profile_capture.config import LEAST_GAPS, CaptureConfig
 from s2a_bench.frames import open_source
 from s2a_bench.frames.convert import bgr_to_rgb, to_bgr
-from s2a_bench.harness.plan import DEFAULT_PROMPT
 from s2a_bench.harness.warnings import Counters, before_run
 from s2a_bench.inference import Engine, EngineConfig, need_engine
 from s2a_bench.machine import environment
@@ -27,7 +27,9 @@ from s2a_bench.machine.board import board_facts
 from s2a_bench.machine.tuning import limit_threads
 from s2a_bench.types import Frame, Request
 
-LEAST_GAPS = 40
+if TYPE_CHECKING:
+    from s2a_bench.progress import Progress
+
 _MODEL_FACTS = (
     "name",
     "architecture",
@@ -47,39 +49,6 @@ _MODEL_FACTS = (
 
 
 @dataclass(frozen=True, slots=True)
-class CaptureConfig:
-    """What ``s2a-bench profile capture`` is asked to do."""
-
-    name: str
-    engine: EngineConfig = field(default_factory=EngineConfig)
-    source: str = "synthetic"
-    width: int = 640
-    height: int = 480
-    requests: int = 20
-    warmup: int = 3
-    tokens: int = 64
-    prompt: str = DEFAULT_PROMPT
-    seed: int = 0
-
-    def check(self) -> None:
-        """Raise UsageError, naming the flag, for what makes no sense."""
-        if not self.name or self.name.startswith(".") or set(self.name) & set("/\\\0\n"):
-            raise UsageError(f"NAME: {self.name!r} should be a plain file name without .toml")
-        for flag, value, least in (
-            ("--requests", self.requests, 1),
-            ("--warmup", self.warmup, 0),
-            ("--tokens", self.tokens, 2),
-        ):
-            if value < least:
-                raise UsageError(f"{flag}: {value} should be {least} or more")
-        if self.requests * (self.tokens - 1) < LEAST_GAPS:
-            raise UsageError(
-                f"--requests {self.requests} of --tokens {self.tokens} make {self.requests * (self.tokens - 1)} gaps; "
-                f"a profile needs {LEAST_GAPS}"
-            )
-
-
-@dataclass(frozen=True, slots=True)
 class Answer:
     """One request as timed: to its first token, and from each token to the next."""
 
@@ -90,7 +59,7 @@ class Answer:
 def answers(engine: Engine, config: CaptureConfig) -> Iterator[Answer]:
     """Ask again and again, each time about a new picture and with a new seed, and yield the times."""
     with ExitStack() as stack:
-        source = open_source(config.source, config.width, config.height, seed=config.seed)
+        source = open_source(config.source, *config.size, seed=config.seed)
         stack.callback(source.close)
         number = 0
         while True:
@@ -110,7 +79,7 @@ def _timed(engine: Engine, request: Request) -> Answer:
     started = now_ns()
     times = [now_ns() for _ in engine.generate(request)]
     if not times:
-        raise EngineError(f"request {request.id}: the answer was empty; give another --prompt")
+        raise EngineError(f"request {request.id}: the answer was empty; give another `prompt`")
     return Answer(times[0] - started, [after - before for before, after in pairwise(times)])
 
 
@@ -121,17 +90,17 @@ def open_model(config: EngineConfig) -> Engine:
     return LlamaCppEngine(config)
 
 
-def capture(config: CaptureConfig, stage: Callable[[str], None], advance: Callable[[], None]) -> dict[str, Any]:
+def capture(config: CaptureConfig, progress: Progress) -> dict[str, Any]:
     """Measure, and return the profile as the tables of its file.
 
     Raises EngineError where the model's answers are too short to time.
     """
-    config.check()
     need_engine(config.engine.name)
     limit_threads()
+    progress.expect(config.warmup + config.requests)
     warnings = before_run()
     with ExitStack() as stack:
-        stage("loading the model")
+        progress.stage("loading the model")
         engine = open_model(config.engine)
         stack.callback(engine.close)
         before = Counters.read(watches_udp=False)
@@ -139,12 +108,12 @@ def capture(config: CaptureConfig, stage: Callable[[str], None], advance: Callab
         stack.callback(asked.close)  # type: ignore[attr-defined]  # a generator
         recorded = []
         for number in range(config.warmup + config.requests):
-            stage("warming up" if number < config.warmup else "measuring")
+            progress.stage("warming up" if number < config.warmup else "measuring")
             recorded.append(next(asked))
-            advance()
+            progress.advance()
         warnings += Counters.read(watches_udp=False).warnings_since(before)
         described = engine.describe()
-    stage("fitting the gaps")
+    progress.stage("fitting the gaps")
     said = [f"{warning.code}: {warning.message}; {warning.advice}" for warning in warnings]
     return document(config, recorded, described, said)
 
@@ -161,7 +130,7 @@ def document(
     if total < LEAST_GAPS:
         raise EngineError(
             f"the answers were short: {total} gaps in {len(counted)} requests, a profile needs {LEAST_GAPS}; "
-            "give more --requests, or a --prompt that asks for more"
+            "give more `requests`, or a `prompt` that asks for more"
         )
     fit = fit_gaps(rows)
     mean_s = sum(map(sum, rows)) / total
@@ -171,7 +140,7 @@ def document(
     board = board_facts()
     known = environment.collect()
     return {
-        "title": f"{board.get('model') or board.get('gpu') or board.get('cpu') or known['host']}",
+        "title": config.title or str(board.get("model") or board.get("gpu") or board.get("cpu") or known["host"]),
         "origin": "measured",
         "tokens_per_s": 1 / mean_s,
         "prompt_s": prompt_s,
@@ -187,7 +156,7 @@ def document(
             "warmup": config.warmup,
             "tokens": config.tokens,
             "source": config.source,
-            "size": f"{config.width}x{config.height}",
+            "size": "{}x{}".format(*config.size),
             "prompt": config.prompt,
             "seed": config.seed,
             "gaps": total,

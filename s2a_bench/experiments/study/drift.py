@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from s2a_bench.experiments.study.config import Cell, StudyConfig
 from s2a_bench.experiments.study.rows import StudyRow
-from s2a_bench.experiments.study.run import Cell, StudyConfig
 from s2a_bench.experiments.study.to_rows import row_of
 from s2a_bench.experiments.study.worlds import World, generator
 from s2a_bench.policy import Plans, online
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from s2a_bench.policy import Floats
 
-NAME: Final = "drift"
 PLANS: Final = 4000
 BLOCKS: Final = 8
 REFIT: Final = 50
@@ -56,7 +55,7 @@ def cells(config: StudyConfig) -> Sequence[Cell]:
 
 def cell(config: StudyConfig, world: World, drift: str) -> list[StudyRow]:
     """Follow one sequence of plans in each of the three ways."""
-    rng = generator(config.seed, NAME, world, drift)
+    rng = generator(config.seed, config.name, world, drift)
     count = config.plans or PLANS
     calibration = world.draw(rng, config.calibration_plans)
     plans = world.draw(rng, count, drifts(count)[drift])
@@ -66,7 +65,7 @@ def cell(config: StudyConfig, world: World, drift: str) -> list[StudyRow]:
         for block, places in enumerate(np.array_split(np.arange(count), BLOCKS)):
             rows.append(
                 row_of(
-                    NAME,
+                    config.name,
                     world,
                     StreamToAct.name,
                     _at(found, places),

@@ -12,15 +12,14 @@ from functools import partial
 from typing import Final
 
 from s2a_bench.boards.gaps import Bursty, Gaps, Lognormal, Markov, Recorded
+from s2a_bench.experiments.study.config import Cell, StudyConfig
 from s2a_bench.experiments.study.rows import StudyRow
-from s2a_bench.experiments.study.run import Cell, StudyConfig
 from s2a_bench.experiments.study.to_rows import study_row
 from s2a_bench.experiments.study.worlds import TOKEN_CV, World, generator
 from s2a_bench.policy.conformal import GRID, calibrate
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import QuantileStart, StreamToAct
 
-NAME: Final = "frontier"
 PLANS: Final = 4000
 CALIBRATED: Final = "calibrated"
 
@@ -55,14 +54,14 @@ def cells(config: StudyConfig) -> Sequence[Cell]:
 
 def cell(config: StudyConfig, world: World) -> list[StudyRow]:
     """Try every lambda on the same plans, for the elastic rule and the one that never stretches."""
-    rng = generator(config.seed, NAME, world)
+    rng = generator(config.seed, config.name, world)
     calibration = world.draw(rng, config.calibration_plans)
     assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
     prior = GapPrior.fit(calibration.token_s)
     plans = world.draw(rng, config.plans or PLANS)
     cautions = (*GRID, math.inf)
     found = [
-        study_row(NAME, world, kind(prior, caution), plans, calibration_plans=config.calibration_plans)
+        study_row(config.name, world, kind(prior, caution), plans, calibration_plans=config.calibration_plans)
         for kind in (StreamToAct, QuantileStart)
         for caution in cautions
     ]

@@ -10,15 +10,14 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
+from s2a_bench.experiments.study.config import Cell, StudyConfig
 from s2a_bench.experiments.study.rows import StudyRow
-from s2a_bench.experiments.study.run import Cell, StudyConfig
 from s2a_bench.experiments.study.to_rows import study_row
 from s2a_bench.experiments.study.worlds import World, generator
 from s2a_bench.policy.conformal import calibrate
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import StreamToAct
 
-NAME: Final = "misfit"
 PLANS: Final = 4000
 SKILLS: Final = (-4, -2, -1, 0, 1, 2, 4)
 """Skills believed, beyond those that come."""
@@ -37,7 +36,7 @@ def cells(config: StudyConfig) -> Sequence[Cell]:
 
 def cell(config: StudyConfig, world: World) -> list[StudyRow]:
     """Try each wrong belief on the same plans."""
-    rng = generator(config.seed, NAME, world)
+    rng = generator(config.seed, config.name, world)
     calibration = world.draw(rng, config.calibration_plans)
     assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
     policy = StreamToAct(GapPrior.fit(calibration.token_s))
@@ -57,7 +56,7 @@ def cell(config: StudyConfig, world: World) -> list[StudyRow]:
     ]
     return [
         study_row(
-            NAME,
+            config.name,
             world,
             believer,
             replace(plans, shape=believed),

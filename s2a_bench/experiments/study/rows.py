@@ -44,5 +44,5 @@ class StudyRow:
     end_regret_of_wait: float
 
 
-STUDIES: Final[Table[StudyRow]] = Table("studies", StudyRow)
+STUDY_CELLS: Final[Table[StudyRow]] = Table("studies", StudyRow)
 """One row a cell of a study."""

@@ -2,7 +2,7 @@
 
 R {34.2, 4.8, .58} tokens/s (c = .05, .5, 3 s) x L {6, 4, 2, 1} x N {4, 8, 16, 32} x T_nom {.5, 1, 2, 4} s. In each
 setting the prior and lambda come from the calibration plans alone; the other plans are looked at once. What is wanted
-of the result, and whether it was reached, is `report.studies`' to say.
+of the result, and whether it was reached, is `view.targets`' to say.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from functools import partial
 from itertools import product
 from typing import Final
 
+from s2a_bench.experiments.study.config import Cell, StudyConfig
 from s2a_bench.experiments.study.rows import StudyRow
-from s2a_bench.experiments.study.run import Cell, StudyConfig
 from s2a_bench.experiments.study.to_rows import study_row
 from s2a_bench.experiments.study.worlds import World, generator
 from s2a_bench.policy.conformal import calibrate
@@ -22,7 +22,6 @@ from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import MeanStart, QuantileStart, StreamToAct
 from s2a_bench.policy.wait_then_act import WaitThenAct
 
-NAME: Final = "targets"
 PLANS: Final = 5000
 """Plans a setting that are judged."""
 
@@ -41,11 +40,11 @@ def cells(config: StudyConfig) -> Sequence[Cell]:
 
 def setting(config: StudyConfig, world: World) -> list[StudyRow]:
     """Calibrate in one setting and judge stream-to-act there, beside the simpler rules."""
-    rng = generator(config.seed, NAME, world)
+    rng = generator(config.seed, config.name, world)
     calibration = world.draw(rng, config.calibration_plans)
     assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
     policy = StreamToAct(GapPrior.fit(calibration.token_s))
     policy = replace(policy, caution=calibrate(policy, calibration, config.epsilon).caution)
     plans = world.draw(rng, config.plans or PLANS)
     policies = (policy, QuantileStart(policy.prior), MeanStart(policy.prior), WaitThenAct())
-    return [study_row(NAME, world, each, plans, calibration_plans=config.calibration_plans) for each in policies]
+    return [study_row(config.name, world, each, plans, calibration_plans=config.calibration_plans) for each in policies]

@@ -9,7 +9,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UnlikeRuns, UsageError
-from s2a_bench.experiments import EXPERIMENTS, Compared, Metric, Subject, by_name
+from s2a_bench.experiments import EXPERIMENTS, Compared, Metric, Subject, by_name, experiment_of
 from s2a_bench.report.compare.alike import Difference, differences, in_words
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.stats.change import Change, change_between, holm
@@ -122,7 +122,7 @@ def _declared(command: str) -> Compared:
     if command in _UNDECLARED:
         found: Compared = resolve_name(_UNDECLARED[command])
         return found
-    if command in EXPERIMENTS and (by := EXPERIMENTS[command].compared_by()):
+    if (experiment := experiment_of(command)) and (by := experiment.compared_by()):
         return by
     there = ", ".join([*_UNDECLARED, *(name for name, found in EXPERIMENTS.loaded() if found.compared)])
     raise UsageError(f"runs of {command} cannot be compared, only those of {there}")

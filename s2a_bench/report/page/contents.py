@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Final
 
-from s2a_bench.experiments import EXPERIMENTS
-from s2a_bench.experiments.model_validity.rows import VALIDITY
-from s2a_bench.experiments.study.rows import STUDIES
+from s2a_bench.experiments import experiment_of
 from s2a_bench.report.page import Content
 from s2a_bench.report.page.sentences import (
     latency_sentences,
-    study_sentences,
     throughput_sentences,
 )
 from s2a_bench.writers.tables import Note
@@ -26,11 +23,10 @@ def content_of(run: Run, *, against_paper: bool) -> Content:
     if not run.row_counts():
         return Content(summary=("The run has no rows: it ended before anything was measured.",))
     command = str(run.manifest["command"])
-    if command in EXPERIMENTS:
-        shown = EXPERIMENTS[command].show(run, against="paper" if against_paper else "")
+    if (experiment := experiment_of(command)) is not None:
+        shown = experiment.show(run, against="paper" if against_paper else "")
         return Content(shown.sentences, shown.tables, shown.main, shown.csvs, shown.figures, shown.lanes)
-    build = CONTENTS.get(command) or CONTENTS.get(command.partition("-")[0], _other)
-    return build(run, against_paper)
+    return CONTENTS.get(command, _other)(run, against_paper)
 
 
 def _latency(run: Run, against_paper: bool) -> Content:
@@ -52,29 +48,6 @@ def _throughput(run: Run, against_paper: bool) -> Content:
     return Content(throughput_sentences(run), throughput_tables(run), ["throughput"], throughput_csv(run), figures)
 
 
-def _study(run: Run, _against_paper: bool) -> Content:
-    from functools import partial
-
-    from s2a_bench.experiments.study.view.figures import FIGURES
-    from s2a_bench.experiments.study.view.tables import study_tables, table_files
-    from s2a_bench.writers.csv_text import csv_text
-
-    rows = run.table(STUDIES)
-    name = str(rows["study"].iloc[0])
-    tables = table_files(study_tables(run))
-    csvs = {f"{name}.csv": csv_text(tuple(map(str, rows.columns)), _plain(rows))}
-    figures = {name: partial(FIGURES[name], run)} if name in FIGURES else {}
-    return Content(study_sentences(run), tables, list(tables), csvs, figures)
-
-
-def _validity(run: Run, _against_paper: bool) -> Content:
-    from s2a_bench.experiments.model_validity.view import validity_tables
-
-    tables = validity_tables(run)
-    answers = len(run.table(VALIDITY))
-    return Content((f"{answers} answers to the prompts were parsed, skill by skill.",), tables, list(tables)[:1])
-
-
 def _other(run: Run, _against_paper: bool) -> Content:
     """Tell what lies in a run that has no view of its own."""
     rows = [f"{name} ({count} rows)" for name, count in run.row_counts().items()]
@@ -84,21 +57,11 @@ def _other(run: Run, _against_paper: bool) -> Content:
 CONTENTS: Final[dict[str, Callable[[Run, bool], Content]]] = {
     "latency": _latency,
     "throughput": _throughput,
-    "study": _study,
-    "model validity": _validity,
 }
-"""Command, or its first word (study of study-drift), -> what its run shows."""
+"""Command -> what its run shows."""
 
 
 def labels_of(tables: Iterable[TextTable]) -> list[str]:
     """Return the labels that a run carries, since the notes of its tables do."""
     notes = [note for table in tables for note in table.notes if isinstance(note, Note)]
     return list(dict.fromkeys(label for note in notes for label in note.labels))
-
-
-def _plain(rows: object) -> Iterator[tuple[object, ...]]:
-    """Yield rows for a CSV file; what is missing is an empty field."""
-    import pandas as pd
-
-    for row in rows.itertuples(index=False, name=None):  # type: ignore[attr-defined]
-        yield tuple(None if pd.isna(value) else value for value in row)

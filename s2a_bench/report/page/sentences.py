@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.tables import TITLES
-from s2a_bench.experiments.study.rows import STUDIES
 from s2a_bench.transport import declared
 from s2a_bench.writers.tables import interval, mean_sd, number
 
@@ -56,20 +55,6 @@ def throughput_sentences(run: Run) -> list[str]:
             times = _counts([found.n], "request")
             said.append(f"{speed.name}: {mean_sd(found)} tokens/s (mean ± sd of {times}, {source}).")
     return said or ["No request was answered; samples.csv says why."]
-
-
-def study_sentences(run: Run) -> list[str]:
-    """Say how many plans were drawn, and of the targets which were met."""
-    from s2a_bench.experiments.study.view.tables import ONLINE, targets
-
-    rows = run.table(STUDIES)
-    name = str(rows["study"].iloc[0])
-    said = [f"Study {name}: {len(rows)} cells, {int(rows['plans'].sum()):,} drawn plans; nothing is measured."]
-    if name == "targets":
-        judged = targets(rows[rows["policy"] == ONLINE])
-        met = sum(target.met for target in judged)
-        said.append(f"{ONLINE} meets {met} of {len(judged)} targets.")
-    return said
 
 
 def _times(cell: str, base: str, ratio: Ratio) -> str:

@@ -16,7 +16,7 @@ from s2a_bench.report.page import Content
 from s2a_bench.stats import summary_of
 from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import Run
-from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.writers.csv_text import frame_csv
 from s2a_bench.writers.tables import ABSENT, TextTable, mean_sd, number
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def overview(sweep: Sweep, runs: Runs) -> Content:
     tables = {"cells": cell_table(sweep)}
     if measured := measured_table(runs):
         tables = {"overview": measured, **tables}
-    csvs = {"cells.csv": csv_text(tuple(map(str, sweep.cells.columns)), _plain(sweep.cells))}
+    csvs = {"cells.csv": frame_csv(sweep.cells)}
     return Content(said, tables, ["overview"] if measured else [], csvs)
 
 
@@ -143,11 +143,3 @@ def _quantity(cell: Cell, run: Run) -> tuple[str, Floats]:
         return "tokens/s", Speed(cell).values("tokens_per_s")
     metric = next((name for name in ("e2e_without_inference", "e2e") if cell.values_ms(name).size), "e2e")
     return f"{TITLES[metric]}, ms", cell.values_ms(metric)
-
-
-def _plain(rows: Any) -> Iterator[tuple[object, ...]]:
-    """Yield rows for a CSV file; what is missing is an empty field."""
-    import pandas as pd
-
-    for row in rows.itertuples(index=False, name=None):
-        yield tuple(None if value is None or value is pd.NA or value != value else value for value in row)  # noqa: PLR0124 - NaN

@@ -9,18 +9,21 @@ import pytest
 from scipy.stats import binom
 
 from s2a_bench.errors import StoreError
-from s2a_bench.experiments.study.view.tables import regret_at, study_tables, targets
+from s2a_bench.experiments.study.view.tables import regret_at, study_tables
+from s2a_bench.experiments.study.view.targets import ONLINE, targets_of
 from s2a_bench.store.run import RunWriter, read_run
 
 
 def rows(*cells: tuple[float, int, float, float]) -> pd.DataFrame:
     """Make rows of (rho, stalled of 1000 plans, start regret, end regret)."""
     frame = pd.DataFrame(cells, columns=["rho", "stalled", "start_regret", "end_regret"])
-    return frame.assign(plans=1000, p_any_stall=frame["stalled"] / 1000)
+    return frame.assign(policy=ONLINE, plans=1000, p_any_stall=frame["stalled"] / 1000)
 
 
 def test_targets_are_judged_over_all_settings_and_over_the_hard_ones() -> None:
-    found = {each.what: each for each in targets(rows((0.5, 0, 0.0, 0.0), (0.9, 21, 0.12, 0.09), (2.0, 3, 0.0, 0.02)))}
+    found = {
+        each.what: each for each in targets_of(rows((0.5, 0, 0.0, 0.0), (0.9, 21, 0.12, 0.09), (2.0, 3, 0.0, 0.02)))
+    }
     assert found["P(any stall), worst setting"].value == 0.021
     assert not found["P(any stall), worst setting"].met
     high = found["P(any stall), pooled, upper end of 95 %"].value

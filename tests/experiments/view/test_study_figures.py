@@ -7,16 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
-from s2a_bench.errors import StoreError
-from s2a_bench.experiments.study.rows import STUDIES, StudyRow
+from s2a_bench.experiments.study.rows import STUDY_CELLS, StudyRow
 from s2a_bench.experiments.study.view.figures import (
     build_drift,
     build_frontier,
     build_misfit,
     build_targets,
-    write_study_figure,
 )
 from s2a_bench.store.run import Run, RunWriter, read_run
 from s2a_bench.writers.style import paper_column
@@ -57,8 +54,8 @@ def row(**facts: Any) -> StudyRow:
 
 def run_of(path: Path, study: str, rows: Iterable[StudyRow], epsilon: float = 0.01) -> Run:
     manifest = {"configuration": {"study": study, "epsilon": epsilon}}
-    with RunWriter.create(path, f"study-{study}", manifest, (STUDIES,)) as writer:
-        writer.append(STUDIES, rows)
+    with RunWriter.create(path, f"study-{study}", manifest, (STUDY_CELLS,)) as writer:
+        writer.append(STUDY_CELLS, rows)
     return read_run(writer.path)
 
 
@@ -133,10 +130,3 @@ def test_misfit_has_a_panel_a_belief_with_stalls_above_late_starts(tmp_path: Pat
         "tokens a skill",
         "mean gap of the prior",
     ]
-
-
-def test_a_folder_without_a_study_is_told(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as writer:
-        pass
-    with pytest.raises(StoreError, match="holds no study"):
-        write_study_figure(read_run(writer.path))

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.errors import StoreError
-from s2a_bench.experiments.study.rows import STUDIES
-from s2a_bench.experiments.study.view.tables import END, HARD, ONLINE, START, WORLD, WORST
-from s2a_bench.writers.figures import new_figure, save
+from s2a_bench.experiments.study.rows import STUDY_CELLS
+from s2a_bench.experiments.study.view.tables import WORLD
+from s2a_bench.experiments.study.view.targets import END, HARD, ONLINE, START, WORST
+from s2a_bench.writers.figures import new_figure
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,17 +26,9 @@ _LIMIT: Final[dict[str, Any]] = {"color": _INK, "linestyle": (0, (4, 2)), "linew
 _DRAWN: Final = "Plans are drawn from models of the arrivals; nothing is measured."
 
 
-def write_study_figure(run: Run) -> list[Path]:
-    """Write ``figures/<study>.png`` and ``.pdf``; raises StoreError where the folder holds no study."""
-    name = str(run.manifest["configuration"].get("study", ""))
-    if name not in FIGURES:
-        raise StoreError(f"{run.path} holds no study; run s2a-bench study first")
-    return save(run.path / "figures", {name: partial(FIGURES[name], run)})
-
-
 def build_targets(run: Run) -> Figure:
     """Draw stream-to-act's share of stalled plans and regrets, a point a setting, against rho."""
-    rows = run.table(STUDIES)
+    rows = run.table(STUDY_CELLS)
     rows = rows[rows["policy"] == ONLINE]
     hard = rows[rows["rho"] > HARD]
     figure = new_figure(4.9, f"{ONLINE}: {len(rows)} settings, {int(rows['plans'].max()):,} plans each\n{_DRAWN}")
@@ -68,7 +57,7 @@ def build_targets(run: Run) -> Figure:
 
 def build_frontier(run: Run) -> Figure:
     """Draw P(any stall) against start regret as lambda grows, a panel a world, a colour a family of gaps."""
-    rows = run.table(STUDIES)
+    rows = run.table(STUDY_CELLS)
     epsilon = float(run.manifest["configuration"]["epsilon"])
     plans = int(rows["plans"].max())
     figure = new_figure(5.2, f"What rare stalls cost; {plans:,} plans a point\n{_DRAWN}")
@@ -102,7 +91,7 @@ def build_frontier(run: Run) -> Figure:
 
 def build_drift(run: Run) -> Figure:
     """Draw P(any stall) block by block: prior and lambda fixed, lambda tracked, the prior refitted too."""
-    rows = run.table(STUDIES)
+    rows = run.table(STUDY_CELLS)
     rows = rows.assign(
         drift=[text.partition(", ")[0] for text in rows["condition"]],
         arm=[text.partition(", ")[2] for text in rows["condition"]],
@@ -139,7 +128,7 @@ def build_drift(run: Run) -> Figure:
 
 def build_misfit(run: Run) -> Figure:
     """Draw what a wrong length, granularity or rate costs: stalls above, late starts below, a line a world."""
-    rows = run.table(STUDIES)
+    rows = run.table(STUDY_CELLS)
     kinds = {"N": "skills a plan", "L": "tokens a skill", "gap": "mean gap of the prior"}
     rows = rows.assign(
         kind=[text.split()[0] for text in rows["condition"]], step=[text.split()[-1] for text in rows["condition"]]
@@ -247,11 +236,3 @@ def _frontier_legend(families: list[str], epsilon: float) -> list[Any]:
 
 
 _FAMILIES: Final = {"lognormal": "even (lognormal)", "markov": "pauses (markov)", "bursty": "packets (bursty)"}
-
-FIGURES: Final[dict[str, Callable[[Run], Figure]]] = {
-    "targets": build_targets,
-    "frontier": build_frontier,
-    "drift": build_drift,
-    "misfit": build_misfit,
-}
-"""Name of a study -> what draws its run."""

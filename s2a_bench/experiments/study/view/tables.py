@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import StoreError
-from s2a_bench.experiments.study.rows import STUDIES
-from s2a_bench.policy.conformal import upper_bound
+from s2a_bench.experiments.study.rows import STUDY_CELLS
+from s2a_bench.experiments.study.studies import STUDIES, Study
+from s2a_bench.experiments.study.view.targets import HARD, ONLINE, targets_of
 from s2a_bench.writers.tables import ABSENT, DRAWN, Note, TextTable
 
 if TYPE_CHECKING:
@@ -17,43 +18,10 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import Run
 
-ONLINE: Final = "stream-to-act"
-HARD: Final = 0.8
-"""rho above which starting when a skill arrives is not safe."""
-POOLED, WORST, START, END = 0.01, 0.02, 0.05, 0.06
-"""What is wanted of stream-to-act: P(any stall) of all plans and of every setting, mean start and end regret."""
 LEVELS: Final = (0.01, 0.05, 0.20)
 """Shares of stalled plans at which a frontier's regret is read off."""
 WORLD: Final = ["tokens_per_s", "tokens_per_skill", "n_skills", "t_nom_s"]
 _DRAWN: Final = "Plans are drawn from models of the arrivals; nothing here is measured."
-
-
-@dataclass(frozen=True, slots=True)
-class Target:
-    """One thing that is wanted, and what was reached."""
-
-    what: str
-    value: float
-    limit: float
-
-    @property
-    def met(self) -> bool:
-        """Tell whether it was reached."""
-        return self.value <= self.limit
-
-
-def targets(rows: pd.DataFrame) -> list[Target]:
-    """Judge one policy's rows, one a setting, by the limits that stream-to-act has to keep."""
-    hard = rows[rows["rho"] > HARD]
-    stalled, plans = int(rows["stalled"].sum()), int(rows["plans"].sum())
-    return [
-        Target("P(any stall), pooled, upper end of 95 %", upper_bound(stalled, plans, 0.975), POOLED),
-        Target("P(any stall), worst setting", float(rows["p_any_stall"].max()), WORST),
-        Target("start regret, all settings", float(rows["start_regret"].mean()), START),
-        Target("start regret, rho > .8", float(hard["start_regret"].mean()), START),
-        Target("end regret, all settings", float(rows["end_regret"].mean()), END),
-        Target("end regret, rho > .8", float(hard["end_regret"].mean()), END),
-    ]
 
 
 def regret_at(points: pd.DataFrame, level: float, what: str = "start_regret") -> float:
@@ -68,24 +36,24 @@ def regret_at(points: pd.DataFrame, level: float, what: str = "start_regret") ->
     return float(np.interp(level, ordered["p_any_stall"].to_numpy(dtype=float), cheapest))
 
 
-def study_tables(run: Run) -> list[TextTable]:
-    """Lay out a study's run; raises StoreError where the folder holds none."""
-    rows = run.table(STUDIES)
-    name = str(rows["study"].iloc[0]) if len(rows) else ""
-    if name not in _TABLES:
+def study_of(run: Run) -> Study:
+    """Return the study that a run is of; raises StoreError where it is of none."""
+    name = str(run.manifest["configuration"].get("study", ""))
+    if name not in STUDIES:
         raise StoreError(f"{run.path} holds no study; run s2a-bench study first")
-    return list(_TABLES[name](rows))
+    return STUDIES[name]
 
 
-def table_files(tables: Iterable[TextTable]) -> dict[str, TextTable]:
-    """Name each table's file after its title: "Most stalls" -> most-stalls."""
+def study_tables(run: Run) -> dict[str, TextTable]:
+    """Return the tables of a study by their files' names, which are their titles: "Most stalls" is most-stalls."""
+    tables: Iterator[TextTable] = resolve_name(study_of(run).tables)(run.table(STUDY_CELLS))
     return {re.sub(r"[^a-z0-9]+", "-", table.title.lower()).strip("-"): table for table in tables}
 
 
-def _targets(rows: pd.DataFrame) -> Iterator[TextTable]:
+def target_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
     """Show the targets, the policies side by side, and where the online rule has it hardest."""
     online = rows[rows["policy"] == ONLINE]
-    judged = targets(online)
+    judged = targets_of(rows)
     lines: list[tuple[str, ...]] = [
         (each.what, f"{each.value:.2%}", f"{each.limit:.0%}", "met" if each.met else "MISSED") for each in judged
     ]
@@ -120,7 +88,7 @@ def _targets(rows: pd.DataFrame) -> Iterator[TextTable]:
     yield TextTable("Most stalls", header, lines, 0)
 
 
-def _frontier(rows: pd.DataFrame) -> Iterator[TextTable]:
+def frontier_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
     """Show what each share of stalls costs."""
     header = ("R", "L", "N", "T", "rho", "gaps", "policy", *(f"at {level:.0%}" for level in LEVELS))
     lines = [
@@ -136,7 +104,7 @@ def _frontier(rows: pd.DataFrame) -> Iterator[TextTable]:
     yield TextTable("Frontier: what rare stalls cost", header, lines, 7, notes=notes)
 
 
-def _drift(rows: pd.DataFrame) -> Iterator[TextTable]:
+def drift_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
     """Show P(any stall) block by block."""
     blocks = sorted(int(block) for block in rows["block"].unique())
     header = ("R", "L", "N", "T", "rho", "drift", *(str(block + 1) for block in blocks), "late start")
@@ -156,7 +124,7 @@ def _drift(rows: pd.DataFrame) -> Iterator[TextTable]:
     yield TextTable("Drift", header, lines, 6, notes=notes)
 
 
-def _misfit(rows: pd.DataFrame) -> Iterator[TextTable]:
+def misfit_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
     """Show what each wrong belief costs."""
     header = ("R", "L", "N", "T", "rho", "believed", "lambda", "P(stall)", "start", "signed", "end")
     names = ("p_any_stall", "start_regret", "signed_start_regret", "end_regret")
@@ -167,14 +135,6 @@ def _misfit(rows: pd.DataFrame) -> Iterator[TextTable]:
     yield TextTable(
         "Wrong beliefs", header, lines, 6, notes=(Note(f"Calibrated with the right ones. {_DRAWN}", DRAWN),)
     )
-
-
-_TABLES: Final[dict[str, Callable[[pd.DataFrame], Iterator[TextTable]]]] = {
-    "targets": _targets,
-    "frontier": _frontier,
-    "drift": _drift,
-    "misfit": _misfit,
-}
 
 
 def _world(row: pd.Series) -> tuple[str, ...]:

@@ -1,0 +1,111 @@
+"""TOML files that users write: read strictly, so that a typing error becomes no number that figures show.
+
+Every complaint is one line that names the file and the key.
+"""
+
+from __future__ import annotations
+
+import reprlib
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
+from typing import Annotated, Any, TypeVar, get_args
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
+
+from s2a_bench.errors import UsageError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+T = TypeVar("T", bound="TomlTable")
+
+_SHOULD_BE = {
+    "dict_type": "a table",
+    "model_type": "a table",
+    "list_type": "a list",
+    "string_type": "a text",
+    "int_type": "a whole number",
+    "float_type": "a number",
+    "bool_type": "true or false",
+}
+"""Type of an error of pydantic -> what there should be, in TOML's words."""
+
+
+def _one_line(text: str) -> str:
+    if not text.strip() or not text.isprintable():
+        raise ValueError("should be a text of one line")
+    return text
+
+
+Line = Annotated[str, AfterValidator(_one_line)]
+"""A text of one line that is not blank."""
+
+
+class TomlTable(BaseModel):
+    """Base of what a table may hold: every key is known, nothing is converted, numbers are finite."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+def parse(table: type[T], text: str, where: str, parse_float: Callable[[str], Any] = float) -> T:
+    """Read TOML text; ``where`` begins every error. Raises UsageError naming the key that is wrong."""
+    try:
+        content = tomllib.loads(text, parse_float=parse_float)
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"{where}: no TOML: {error}") from error
+    try:
+        return table.model_validate(content)
+    except ValidationError as error:
+        first = min(error.errors(), key=lambda each: each["type"] != "extra_forbidden")
+        raise UsageError(f"{where}: {_line(first, table, content)}") from None
+
+
+def like(key: str, names: Iterable[str]) -> str:
+    """Guess what was meant."""
+    close = get_close_matches(key, list(names), 1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _line(error: ErrorDetails, table: type[TomlTable], content: Any) -> str:
+    """Return one line for what is wrong with one key."""
+    *inside, last = error["loc"]
+    path = _path(error["loc"], content)
+    if error["type"] == "extra_forbidden":
+        for step in inside:
+            table = _table_of(table.model_fields[step].annotation) if isinstance(step, str) else table
+        names = ", ".join(table.model_fields)
+        return f"{path}: there is no such key{like(str(last), table.model_fields) or f'; there are {names}'}"
+    if error["type"] == "missing":
+        return f"{path}: is missing"
+    if error["type"] == "too_short":
+        return f"{path}: is empty"
+    if error["type"] == "value_error":
+        return f"{path}: {error['ctx']['error']}"
+    should = error["msg"].partition(" should ")[2] or error["msg"]
+    wanted = _SHOULD_BE.get(error["type"])
+    return f"{path}: {reprlib.repr(error['input'])} should {f'be {wanted}' if wanted else should}"
+
+
+def _path(steps: Iterable[int | str], content: Any) -> str:
+    """Write a key with the tables that it is in; an element of an array is known by its name, if it has one."""
+    path = ""
+    for step in steps:
+        known = (isinstance(content, Mapping) and step in content) or isinstance(step, int)
+        content = content[step] if known else None
+        if isinstance(step, int):
+            name = content.get("name") if isinstance(content, Mapping) else None
+            path += f"[{name if isinstance(name, str) and name.isidentifier() else step}]"
+        else:
+            path += f".{step}" if path else step
+    return path
+
+
+def _table_of(annotation: Any) -> type[TomlTable]:
+    """Find the table in a field's type: Table, list[Table], Table | None."""
+    if isinstance(annotation, type) and issubclass(annotation, TomlTable):
+        return annotation
+    return next(_table_of(each) for each in get_args(annotation) if each is not type(None))
