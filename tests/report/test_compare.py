@@ -16,11 +16,10 @@ import pandas as pd
 import pytest
 
 from s2a_bench.errors import UnlikeRuns, UsageError
-from s2a_bench.experiments import EXPERIMENTS, Experiment, Metric
+from s2a_bench.experiments import EXPERIMENTS, Metric
 from s2a_bench.experiments.latency.view import compared as latency
 from s2a_bench.experiments.throughput.view import compared as throughput
 from s2a_bench.experiments.timeline.view import compared as timeline
-from s2a_bench.registry import Registry
 from s2a_bench.report.compare.alike import differences
 from s2a_bench.report.compare.as_json import compare_json
 from s2a_bench.report.compare.comparison import (
@@ -147,10 +146,9 @@ def test_a_declared_experiment_is_compared_by_what_it_declares(launch: Launch, m
     runs = launch(1, n=6), launch(2, n=6)
     with pytest.raises(UsageError, match=r"runs of latency cannot be compared, only those of"):
         opened(*runs)
-    declared = replace(EXPERIMENTS["boundary"], compared="s2a_bench.experiments.latency.view.compared:COMPARED")
+    by = "s2a_bench.experiments.latency.view.compared:COMPARED"
+    declared = replace(EXPERIMENTS["boundary"], name="latency", compared=by)
     monkeypatch.setattr("s2a_bench.experiments.boundary.EXPERIMENT", declared)
-    registry = Registry[Experiment]("experiments", "command", {"latency": "s2a_bench.experiments.boundary:EXPERIMENT"})
-    monkeypatch.setattr("s2a_bench.report.compare.comparison.EXPERIMENTS", registry)
     assert opened(*runs).by is latency.COMPARED
 
 
