@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from s2a_bench import extras
+from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import Commands
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import print_json
@@ -105,7 +106,7 @@ def _latency_command(done: Fetched) -> str | None:
     try:
         files = load_headers(EngineConfig(model=model, mmproj=mmproj[0] if mmproj else None))
     except ModelError as error:
-        typer.echo(f"note: {error}", err=True)
+        typer.echo(f"note: {with_flags(str(error))}", err=True)
         return None
     return join(["s2a-bench", "latency", "--model", str(files.model.path), "--mmproj", str(files.mmproj.path)])
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
+from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import Commands
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import UsageError
@@ -112,7 +113,7 @@ def _readable() -> list[tuple[Profile, Path]]:
         try:
             found.append((read_profile(path), path))
         except UsageError as error:
-            typer.echo(f"left out: {error}", err=True)
+            typer.echo(f"left out: {with_flags(str(error))}", err=True)
     return found
 
 

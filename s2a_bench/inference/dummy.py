@@ -89,9 +89,9 @@ def write_dummy(
     where the folder cannot be written.
     """
     if size not in SHAPES:
-        raise UsageError(f"--size: '{size}' is none of {', '.join(SHAPES)}")
+        raise UsageError(f"`size`: '{size}' is none of {', '.join(SHAPES)}")
     if quant not in _FILE_TYPES:
-        raise UsageError(f"--quant: '{quant}' is none of {', '.join(_FILE_TYPES)}")
+        raise UsageError(f"`quant`: '{quant}' is none of {', '.join(_FILE_TYPES)}")
     shape = SHAPES[size]
     files = dummy_files(folder, size, quant, seed)
     vocab = make_vocab(full=size == "full")
@@ -110,7 +110,7 @@ def write_dummy(
         )
     except OSError as error:
         raise ModelError(
-            f"--output {folder}: cannot write the dummy model ({error.strerror or error}); "
+            f"`output` {folder}: cannot write the dummy model ({error.strerror or error}); "
             f"it needs {meter.total / 1e9:.2f} GB, choose another folder"
         ) from error
     return files

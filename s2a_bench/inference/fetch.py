@@ -88,7 +88,7 @@ def wanted(what: str, quant: str | None, mmproj: str | None) -> Wanted:
     if not file or "/" not in repository:
         raise UsageError(f"model fetch: '{what}' is neither {', '.join(HUB_MODELS)} nor ORG/REPO:FILE")
     if quant:
-        raise UsageError(f"--quant {quant}: goes with {', '.join(HUB_MODELS)}; with ORG/REPO:FILE, name the file")
+        raise UsageError(f"`quant` {quant}: goes with {', '.join(HUB_MODELS)}; with ORG/REPO:FILE, name the file")
     return Wanted(repository, (file, mmproj) if mmproj else (file,))
 
 

@@ -144,13 +144,13 @@ class LlamaCppEngine:
                 verbose=llama_log.verbose(),
             )
         except (ValueError, RuntimeError, OSError) as error:
-            raise ModelError(f"--model {files.model.path}: llama.cpp: {llama_log.reason() or error}") from error
+            raise ModelError(f"`model` {files.model.path}: llama.cpp: {llama_log.reason() or error}") from error
         llama_log.silence()  # the library sets its own log level while it loads
         try:
             self._handler._init_mtmd_context(llama)  # noqa: SLF001 load now, not within the first request's time
         except ValueError as error:
             llama.close()
-            raise ModelError(f"--mmproj {files.mmproj.path}: llama.cpp: {error}") from error
+            raise ModelError(f"`mmproj` {files.mmproj.path}: llama.cpp: {error}") from error
         self._pieces = TokenBytes(llama._model.vocab)  # noqa: SLF001
         return llama
 

@@ -68,22 +68,22 @@ def load_headers(config: EngineConfig) -> ModelFiles:
     model_path, mmproj_path = config.model, config.mmproj
     if model_path is None:
         if mmproj_path is not None:
-            raise ModelError(f"--mmproj {mmproj_path}: needs the language model too; give --model, or leave out both")
+            raise ModelError(f"`mmproj` {mmproj_path}: needs the language model too; give `model`, or leave out both")
         model_path, mmproj_path = tiny_dummy()
     elif str(model_path) in HUB_MODELS and not model_path.is_file():
-        model_path, own_mmproj = fetched(str(model_path), "--model")
+        model_path, own_mmproj = fetched(str(model_path), "`model`")
         mmproj_path = mmproj_path or own_mmproj
-    model = read_header(model_path, "--model")
+    model = read_header(model_path, "`model`")
     if model.is_mmproj:
-        raise ModelError(f"--model {model_path}: this is an mmproj (vision tower); give it as --mmproj")
-    mmproj = read_header(mmproj_path or _mmproj_beside(model_path), "--mmproj")
+        raise ModelError(f"`model` {model_path}: this is an mmproj (vision tower); give it as `mmproj`")
+    mmproj = read_header(mmproj_path or _mmproj_beside(model_path), "`mmproj`")
     if not mmproj.is_mmproj:
         raise ModelError(
-            f"--mmproj {mmproj.path}: this is a language model ({mmproj.architecture or 'no architecture'}), "
-            "not an mmproj; give it as --model"
+            f"`mmproj` {mmproj.path}: this is a language model ({mmproj.architecture or 'no architecture'}), "
+            "not an mmproj; give it as `model`"
         )
     if not mmproj.has_vision:
-        raise ModelError(f"--mmproj {mmproj.path}: has no vision tower; give the mmproj of a model that takes pictures")
+        raise ModelError(f"`mmproj` {mmproj.path}: has no vision tower; give the mmproj of a model that takes pictures")
     return ModelFiles(model, mmproj)
 
 
@@ -93,10 +93,10 @@ def _mmproj_beside(model: Path) -> Path:
         return found[0]
     if not found:
         raise ModelError(
-            f"--model {model}: not multimodal by itself, and no mmproj*.gguf lies beside it; give --mmproj"
+            f"`model` {model}: not multimodal by itself, and no mmproj*.gguf lies beside it; give `mmproj`"
         )
     names = ", ".join(path.name for path in found)
-    raise ModelError(f"--model {model}: several mmproj files lie beside it ({names}); choose one with --mmproj")
+    raise ModelError(f"`model` {model}: several mmproj files lie beside it ({names}); choose one with `mmproj`")
 
 
 def sha256(path: Path) -> str:

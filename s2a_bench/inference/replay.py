@@ -41,7 +41,7 @@ def _parametric(profile: Profile) -> Draw:
 def _trace(profile: Profile) -> Draw:
     if not profile.trace_s:
         raise UsageError(
-            f"--gaps trace: profile {profile.name} holds no recording; choose parametric or constant, "
+            f"`gaps` trace: profile {profile.name} holds no recording; choose parametric or constant, "
             "or record one with 's2a-bench profile capture'"
         )
     recorded = Recorded.of(profile.trace_s)
@@ -61,17 +61,17 @@ def check_replay(config: EngineConfig) -> None:
     if config.name == "replay":
         _settings(config)
     elif config.profile or config.gaps:
-        flag = "--profile" if config.profile else "--gaps"
-        raise UsageError(f"{flag} needs --engine replay; --engine {config.name} answers at its own speed")
+        flag = "`profile`" if config.profile else "`gaps`"
+        raise UsageError(f"{flag} needs `engine` replay; `engine` {config.name} answers at its own speed")
 
 
 def _settings(config: EngineConfig) -> tuple[Profile, str, Draw]:
     if not config.profile:
-        raise UsageError("--engine replay needs --profile NAME ('s2a-bench profile list' names them)")
+        raise UsageError("`engine` replay needs `profile` NAME ('s2a-bench profile list' names them)")
     profile = load_profile(config.profile)
     gaps = config.gaps or ("trace" if profile.trace_s else "parametric")
     if gaps not in GAPS:
-        raise UsageError(f"--gaps: '{gaps}' is none of {', '.join(GAPS)}")
+        raise UsageError(f"`gaps`: '{gaps}' is none of {', '.join(GAPS)}")
     return profile, gaps, GAPS[gaps](profile)
 
 

@@ -24,16 +24,16 @@ class Tokenizer:
     def __init__(self, model: Path | None = None) -> None:
         """Load the vocabulary of a GGUF language model, of the tiny dummy if none is named; raises ModelError."""
         path = model or tiny_dummy()[0]
-        header = read_header(path, "--model")
+        header = read_header(path, "`model`")
         if header.is_mmproj:
-            raise ModelError(f"--model {path}: this is an mmproj (vision tower); it has no tokenizer")
+            raise ModelError(f"`model` {path}: this is an mmproj (vision tower); it has no tokenizer")
         llama_log.silence()
         llama_log.reason()
         params = llama_cpp.llama_model_default_params()
         params.vocab_only = True
         self._model = llama_cpp.llama_model_load_from_file(str(path).encode(), params)
         if not self._model:
-            raise ModelError(f"--model {path}: llama.cpp: {llama_log.reason() or 'cannot read its vocabulary'}")
+            raise ModelError(f"`model` {path}: llama.cpp: {llama_log.reason() or 'cannot read its vocabulary'}")
         weakref.finalize(self, llama_cpp.llama_model_free, self._model)
         self._vocab = llama_cpp.llama_model_get_vocab(self._model)
         self.size = int(llama_cpp.llama_vocab_n_tokens(self._vocab))

@@ -28,7 +28,7 @@ def choose_format(skills: SkillSet, tokens_per_skill: int, tokenize: Tokenize, n
     Raises UsageError where this tokenizer has no such format for these skills; the message has the least possible.
     """
     if tokens_per_skill < 1:
-        raise UsageError(f"--tokens-per-skill: {tokens_per_skill} should be 1 or more")
+        raise UsageError(f"`tokens_per_skill`: {tokens_per_skill} should be 1 or more")
     if n_skills < 1:
         raise UsageError(f"a plan has at least one skill, not {n_skills}")
     if tokens_per_skill == 1:
@@ -43,7 +43,7 @@ def choose_format(skills: SkillSet, tokens_per_skill: int, tokenize: Tokenize, n
             fitting.append(found)
     if not fitting:
         raise UsageError(
-            f"--tokens-per-skill {tokens_per_skill}: no way found to write each of the {len(skills.calls)} calls of "
+            f"`tokens_per_skill` {tokens_per_skill}: no way found to write each of the {len(skills.calls)} calls of "
             f"'{skills.name}' in exactly that many tokens of this model; the shortest lines cost up to {shortest}. "
             "Choose another number, or a smaller skill set"
         )
@@ -55,7 +55,7 @@ def _stream(skills: SkillSet, tokenize: Tokenize) -> Format:
     codes = stream_codes(len(calls), tokenize)
     if len(codes) < len(calls):
         raise UsageError(
-            f"--tokens-per-skill 1: '{skills.name}' has {len(calls)} calls, but only {len(codes)} codes of one token "
+            f"`tokens_per_skill` 1: '{skills.name}' has {len(calls)} calls, but only {len(codes)} codes of one token "
             "that do not merge were found in this model's vocabulary; use a smaller skill set, or 2 tokens"
         )
     wording = Codes({call: code.strip() for call, code in zip(calls, codes, strict=True)})

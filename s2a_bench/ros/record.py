@@ -68,12 +68,12 @@ class Recorder:
         self._folder = self._workplace / path.stem if self._single else path
         for taken in (path, self._folder):
             if taken.exists():
-                raise StoreError(f"--record: {taken} exists already and is not overwritten; move it or name another")
+                raise StoreError(f"`record`: {taken} exists already and is not overwritten; move it or name another")
         self._writer = Writer(self._folder, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP)
         try:
             self._writer.open()
         except (OSError, WriterError) as error:
-            raise StoreError(f"--record: cannot write {path}: {error}") from error
+            raise StoreError(f"`record`: cannot write {path}: {error}") from error
         self._connections: dict[tuple[str, str], Any] = {}
         self._queue: SimpleQueue[_Item] = SimpleQueue()
         self._more: SimpleQueue[bool] = SimpleQueue()
@@ -94,7 +94,7 @@ class Recorder:
         ``stamp_ns`` is ROS time, ns since 1970. Raises StoreError once closed, or when writing has failed.
         """
         if self._closed:
-            raise StoreError(f"--record: {self.path} is closed")
+            raise StoreError(f"`record`: {self.path} is closed")
         if self._failure is not None:
             raise self._failure
         raw = isinstance(cdr_or_message, bytes | bytearray | memoryview)
@@ -168,6 +168,6 @@ class Recorder:
         """Name the file and where its remains are."""
         place = self._folder if self._folder.exists() else self.path
         return StoreError(
-            f"--record: writing {self.path} failed: {error or type(error).__name__}; "
+            f"`record`: writing {self.path} failed: {error or type(error).__name__}; "
             f"what was written is in {place} (`mcap recover` makes a damaged file readable)"
         )

@@ -28,7 +28,7 @@ class CsvFile:
         try:
             self._file = path.open("r+b" if reopen else "xb", buffering=0)
         except OSError as error:
-            raise StoreError(f"cannot create {path}: {error.strerror}; choose another --output") from error
+            raise StoreError(f"cannot create {path}: {error.strerror}; choose another `output`") from error
         self._end = len(whole_records(self._file.read())) if reopen else 0
         self._file.truncate(self._end)
         self._file.seek(self._end)

@@ -68,9 +68,9 @@ class RunWriter:
         try:
             path = _make_unique(Path(root), stem)
         except (FileExistsError, NotADirectoryError) as error:
-            raise StoreError(f"--output {root}: {error.filename} is not a folder; name another one") from error
+            raise StoreError(f"`output` {root}: {error.filename} is not a folder; name another one") from error
         except OSError as error:
-            raise StoreError(f"--output {root}: cannot create a folder there: {error.strerror}") from error
+            raise StoreError(f"`output` {root}: cannot create a folder there: {error.strerror}") from error
         whole: dict[str, Any] = {
             "schema": SCHEMA,
             "command": command,

@@ -97,7 +97,7 @@ def connect(address: str, jobs: int) -> Any:
             socket.create_connection((host.rpartition("/")[2], int(port)), PROBE_S).close()
         ray.init(address=address, **quiet)
     except (OSError, ValueError, RuntimeError) as error:
-        raise UsageError(f"--ray: no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
+        raise UsageError(f"`ray`: no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
     return ray
 
 
@@ -107,11 +107,11 @@ def _check(plan: Plan, resources: Mapping[str, float]) -> None:
     if missing:
         offered = ", ".join(name.partition(":")[2] for name in resources if name.startswith("board:"))
         raise UsageError(
-            f"--ray: no node offers {', '.join(missing)} (offered: {offered or 'none'}); start Ray there with "
+            f"`ray`: no node offers {', '.join(missing)} (offered: {offered or 'none'}); start Ray there with "
             f"--resources='{{\"{resource(missing[0])}\": 1}}'"
         )
     if any(not cell.virtual and not cell.board for cell in plan.cells):
-        raise UsageError('--ray: cells that measure need a machine: add board = "NAME" to the sweep file\'s settings')
+        raise UsageError('`ray`: cells that measure need a machine: add board = "NAME" to the sweep file\'s settings')
 
 
 def resource(board: str) -> str:

@@ -53,7 +53,7 @@ def plan_sweep(file: SweepFile, command: Command, boards: Collection[str] | None
     here = [(number, each) for number, each in settings if boards is None or each.get(BOARD, "") in {"", *boards}]
     if not here:
         wanted = ", ".join(dict.fromkeys(str(setting[BOARD]) for _, setting in settings))
-        raise UsageError(f"--board: {file.path} has cells for {wanted} only; name one of them, or use --ray")
+        raise UsageError(f"`board`: {file.path} has cells for {wanted} only; name one of them, or use `ray`")
     cells = []
     for repeat, (number, setting) in rounds(here, file.repeats, file.seed):
         argv = _argv(file, command, setting, file.seed + repeat - 1)

@@ -57,15 +57,15 @@ def check_resume(folder: Path, plan: Plan) -> None:
     """Refuse to go on with another configuration or on another machine; raises UsageError."""
     run = read_run(folder)
     if not is_sweep(run.manifest):
-        raise UsageError(f"--resume: {folder} is the folder of a {run.manifest['command']} run, not of a sweep")
+        raise UsageError(f"`resume`: {folder} is the folder of a {run.manifest['command']} run, not of a sweep")
     if run.manifest["configuration"]["hash"] != plan.config_hash:
         raise UsageError(
-            f"--resume: the sweep in {folder} was another one: its file is {folder / COPY}, and the profiles and files "
+            f"`resume`: the sweep in {folder} was another one: its file is {folder / COPY}, and the profiles and files "
             "that it names count too; start a new sweep, or put back what was changed"
         )
     here = facts_of(environment.collect())
     if other := difference(here, facts_of(run.manifest["environment"])):
-        raise UsageError(f"--resume: {folder} was measured elsewhere: {other}; go on there, or start a new sweep here")
+        raise UsageError(f"`resume`: {folder} was measured elsewhere: {other}; go on there, or start a new sweep here")
 
 
 @contextmanager

@@ -109,7 +109,7 @@ def test_a_profile_is_not_overwritten_unless_forced(tmp_path: Path) -> None:
     path = saved(tmp_path / "new" / "board.toml", recorded)
     before = path.read_text()
     tables = document(CaptureConfig(name="board", requests=5, warmup=0, seed=9), recorded, MODEL, [])
-    with pytest.raises(UsageError, match=r"board\.toml exists already; give another NAME or --output, or --force"):
+    with pytest.raises(UsageError, match=r"board\.toml exists already; give another NAME or `output`, or `force`"):
         write_profile(tables, path, force=False)
     assert path.read_text() == before
     write_profile(tables, path, force=True)
@@ -118,7 +118,7 @@ def test_a_profile_is_not_overwritten_unless_forced(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match=r"--output: cannot write .*file/board\.toml"):
+    with pytest.raises(StoreError, match=r"`output`: cannot write .*file/board\.toml"):
         saved(tmp_path / "file" / "board.toml", recording(Lognormal(0.1, 0.2), 3, 5))
 
 

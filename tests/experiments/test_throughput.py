@@ -31,8 +31,8 @@ REQUESTS = LatencyConfig(transports=("loopback",), max_tokens=16)
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"max_tokens": 1}, "--max-tokens: a rate needs 2 tokens or more"),
-        ({"engine": EngineConfig(name="echo")}, "--engine echo computes nothing"),
+        ({"max_tokens": 1}, "`max_tokens`: a rate needs 2 tokens or more"),
+        ({"engine": EngineConfig(name="echo")}, "`engine` echo computes nothing"),
         ({"runs": 0}, "`runs`: 0"),
         (
             {"engine": EngineConfig(sampling="greedy"), "transports": ("http/best-effort?url=http://x",)},
@@ -60,7 +60,7 @@ def test_a_reference_needs_what_llama_bench_can_do(tmp_path: Path, fields: dict[
         ThroughputConfig(replace(REQUESTS, **fields), program).check()
     assert message in str(error.value)
     for wrong in (tmp_path, tmp_path / "missing", Path(__file__)):
-        with pytest.raises(UsageError, match=r"--reference: .* is no program that can be run"):
+        with pytest.raises(UsageError, match=r"`reference`: .* is no program that can be run"):
             ThroughputConfig(REQUESTS, wrong).check()
 
 

@@ -136,15 +136,15 @@ def test_a_crash_leaves_no_half_file(tmp_path: Path) -> None:
 
 
 def test_wrong_choices_name_their_flag(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="--size: 'huge'"):
+    with pytest.raises(UsageError, match="`size`: 'huge'"):
         write_dummy(tmp_path, "huge")  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="--quant: 'q2'"):
+    with pytest.raises(UsageError, match="`quant`: 'q2'"):
         write_dummy(tmp_path, "tiny", "q2")  # type: ignore[arg-type]
 
 
 def test_a_folder_that_cannot_be_made_is_a_model_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ModelError, match=r"--output .*file/x: cannot write"):
+    with pytest.raises(ModelError, match=r"`output` .*file/x: cannot write"):
         write_dummy(tmp_path / "file" / "x")
 
 

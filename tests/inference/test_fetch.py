@@ -212,7 +212,7 @@ def test_a_later_fetch_goes_on_where_an_earlier_one_ended(hub: Hub, tmp_path: Pa
     (part,) = blobs(tmp_path)
     assert part == f"{hub.digest(MODEL)}.s2a-bench.part"
     with pytest.raises(ModelError, match="not fetched yet"):
-        fetched(NAME, "--model")
+        fetched(NAME, "`model`")
     before = len(hub.gets(MODEL))
     done = fetch(wanted(NAME, None, None))
     assert done.files[0].resumed_at > 2_000_000
@@ -384,14 +384,14 @@ def test_what_is_neither_name_nor_file_is_wrong_usage(what: str) -> None:
 
 
 def test_a_quantisation_goes_with_a_name_only() -> None:
-    with pytest.raises(UsageError, match="--quant Q8_0"):
+    with pytest.raises(UsageError, match="`quant` Q8_0"):
         wanted("a/b:c.gguf", "Q8_0", None)
     assert wanted("a/b:c.gguf", None, "m.gguf") == Wanted("a/b", ("c.gguf", "m.gguf"))
     assert wanted(NAME, "Q8_0", None).files == ("ggml-model-Q8_0.gguf", MMPROJ)
 
 
 def test_a_name_stands_for_its_files_once_they_are_fetched(hub: Hub) -> None:
-    with pytest.raises(ModelError, match=f"^--model {NAME}: not fetched yet; run: s2a-bench model fetch {NAME}$"):
+    with pytest.raises(ModelError, match=f"^`model` {NAME}: not fetched yet; run: s2a-bench model fetch {NAME}$"):
         load_headers(EngineConfig(model=Path(NAME)))
     done = fetch(wanted(NAME, None, None))
     files = load_headers(EngineConfig(model=Path(NAME)))

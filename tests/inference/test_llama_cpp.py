@@ -207,10 +207,10 @@ def test_what_only_llama_cpp_can_tell_is_a_model_error(
     assert tiny.model is not None
     assert tiny.mmproj is not None
     strange = damaged(tiny.model, tmp_path / "model.gguf", b"blk.3.ffn_up.weight", b"blk.3.ffn_xx.weight")
-    with pytest.raises(ModelError, match=r"--model .*model.gguf: llama.cpp: .*blk.3.ffn_up.weight"):
+    with pytest.raises(ModelError, match=r"`model` .*model.gguf: llama.cpp: .*blk.3.ffn_up.weight"):
         LlamaCppEngine(tiny.but(model=strange))
     strange = damaged(tiny.mmproj, tmp_path / "mmproj.gguf", b"resampler.query", b"resampler.xuery")
-    with pytest.raises(ModelError, match=r"--mmproj .*mmproj.gguf: llama.cpp: .*resampler.query"):
+    with pytest.raises(ModelError, match=r"`mmproj` .*mmproj.gguf: llama.cpp: .*resampler.query"):
         LlamaCppEngine(tiny.but(mmproj=strange))
     assert capfd.readouterr() == ("", "")
 

@@ -54,8 +54,8 @@ def test_two_processes_may_make_it_at_once(tmp_path: Path, monkeypatch: pytest.M
 
 def test_a_missing_file_is_named_with_its_flag(tiny: EngineConfig, tmp_path: Path) -> None:
     model, _ = paths(tiny)
-    assert refusal(tmp_path / "no.gguf").startswith(f"--model {tmp_path}/no.gguf: no such file")
-    assert refusal(model, tmp_path / "no.gguf").startswith(f"--mmproj {tmp_path}/no.gguf: no such file")
+    assert refusal(tmp_path / "no.gguf").startswith(f"`model` {tmp_path}/no.gguf: no such file")
+    assert refusal(model, tmp_path / "no.gguf").startswith(f"`mmproj` {tmp_path}/no.gguf: no such file")
 
 
 @pytest.mark.parametrize("content", [b"", b"hello, I am no model", b"GGML\x01\x00\x00\x00"])
@@ -71,11 +71,11 @@ def test_a_folder_is_not_a_model(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.0005, 0.001, 0.5, 0.9999])
 def test_a_file_cut_short_is_told_apart_from_a_whole_one(tiny: EngineConfig, tmp_path: Path, share: float) -> None:
-    for flag, path in zip(("--model", "--mmproj"), paths(tiny), strict=True):
+    for flag, path in zip(("`model`", "`mmproj`"), paths(tiny), strict=True):
         short = tmp_path / "short.gguf"
         data = path.read_bytes()
         short.write_bytes(data[: int(len(data) * share)])
-        message = refusal(short) if flag == "--model" else refusal(paths(tiny)[0], short)
+        message = refusal(short) if flag == "`model`" else refusal(paths(tiny)[0], short)
         assert message.startswith(f"{flag} {short}: ")
         assert "cut short" in message
 
@@ -90,15 +90,15 @@ def test_noise_after_the_magic_is_a_damaged_header(tmp_path: Path) -> None:
 
 def test_the_two_files_are_not_exchangeable(tiny: EngineConfig) -> None:
     model, mmproj = paths(tiny)
-    assert "give it as --mmproj" in refusal(mmproj, model)
-    assert "give it as --model" in refusal(model, model)
+    assert "give it as `mmproj`" in refusal(mmproj, model)
+    assert "give it as `model`" in refusal(model, model)
 
 
 def test_a_language_model_alone_is_not_enough(tiny: EngineConfig, tmp_path: Path) -> None:
     model, mmproj = paths(tiny)
     alone = tmp_path / "model.gguf"
     alone.symlink_to(model)
-    assert "give --mmproj" in refusal(alone)
+    assert "give `mmproj`" in refusal(alone)
     (tmp_path / "mmproj-a.gguf").symlink_to(mmproj)
     assert resolve(EngineConfig(model=alone)) == (alone, tmp_path / "mmproj-a.gguf")
     (tmp_path / "mmproj-b.gguf").symlink_to(mmproj)

@@ -47,7 +47,7 @@ def test_no_model_means_the_tiny_dummy(tokenizer: Tokenizer) -> None:
 
 
 def test_what_is_no_language_model_is_told(tiny: EngineConfig, tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=r"--model /no/such.gguf: "):
+    with pytest.raises(ModelError, match=r"`model` /no/such.gguf: "):
         Tokenizer(Path("/no/such.gguf"))
     with pytest.raises(ModelError, match="this is an mmproj"):
         Tokenizer(tiny.mmproj)

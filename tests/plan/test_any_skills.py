@@ -69,7 +69,7 @@ def test_a_format_is_exact_and_can_be_read_or_is_refused(
     try:
         chosen = choose_format(skills, tokens, tokenize, n_skills)
     except UsageError as error:
-        assert str(error).startswith(f"--tokens-per-skill {tokens}: ")  # noqa: PT017 both are right
+        assert str(error).startswith(f"`tokens_per_skill` {tokens}: ")  # noqa: PT017 both are right
     else:
         assert chosen.cost(tokenize, n_skills) == Cost(tokens, float(tokens), tokens)
         formats.append(chosen)

@@ -103,17 +103,17 @@ def test_lines_that_cost_something_else_in_a_row_are_not_taken() -> None:
     chosen = choose_format(many(3), 5, line_ends_merge)
     assert chosen.name == "numbered letters"
     assert len(line_ends_merge(chosen.write(chosen.skills.calls))) == 15
-    with pytest.raises(UsageError, match="--tokens-per-skill 2: no way found"):
+    with pytest.raises(UsageError, match="`tokens_per_skill` 2: no way found"):
         choose_format(many(3), 2, line_ends_merge)
 
 
 def test_what_the_vocabulary_cannot_say_is_refused_with_the_limit(of_bytes: Tokenizer, of_words: Tokenizer) -> None:
     assert choose_format(many(94), 1, of_bytes).cost(of_bytes, 8).exact
-    with pytest.raises(UsageError, match="--tokens-per-skill 1: 'many' has 95 calls, but only 94 codes of one token"):
+    with pytest.raises(UsageError, match="`tokens_per_skill` 1: 'many' has 95 calls, but only 94 codes of one token"):
         choose_format(many(95), 1, of_bytes)
-    with pytest.raises(UsageError, match=r"--tokens-per-skill 2: no way .* 95 calls of 'many'.* cost up to 7"):
+    with pytest.raises(UsageError, match=r"`tokens_per_skill` 2: no way .* 95 calls of 'many'.* cost up to 7"):
         choose_format(many(95), 2, of_bytes)
-    with pytest.raises(UsageError, match="--tokens-per-skill: 0 should be 1 or more"):
+    with pytest.raises(UsageError, match="`tokens_per_skill`: 0 should be 1 or more"):
         choose_format(many(2), 0, of_bytes)
     with pytest.raises(UsageError, match="a plan has at least one skill, not 0"):
         choose_format(many(2), 2, of_bytes, n_skills=0)

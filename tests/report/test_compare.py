@@ -181,7 +181,7 @@ def test_another_machine_or_model_is_refused_unless_told(
     first, second = launch(1, n=6), launch(2, n=6, manifest=with_(MANIFEST, part, **facts))
     with pytest.raises(UnlikeRuns) as caught:
         opened(first, second)
-    assert str(caught.value) == f"the runs are unlike: {said}; --unlike compares them all the same"
+    assert str(caught.value) == f"the runs are unlike: {said}; `unlike` compares them all the same"
     told = next(
         warning for warning in warnings_of(compared(first, second, "e2e", unlike=True)) if warning.code == "unlike"
     )
@@ -217,7 +217,7 @@ def test_a_fact_that_only_one_run_knows_is_told_and_not_refused(launch: Launch) 
 
 def test_another_setting_under_the_same_name_is_refused_unless_told(launch: Launch) -> None:
     first, second = launch(1, cells=("http/binary",)), launch(2, cells=("http/binary",), payload="raw")
-    with pytest.raises(UnlikeRuns, match="cells of one name differ: http/binary payload: jpeg against raw; --unlike"):
+    with pytest.raises(UnlikeRuns, match="cells of one name differ: http/binary payload: jpeg against raw; `unlike`"):
         opened(first, second)
     assert len(compared(first, second, "e2e", unlike=True).comparisons) == 1
 
@@ -296,7 +296,7 @@ def test_a_gate_is_read(text: str, cells: str, metric: str, rises: bool, limit: 
     "text", ["", "e2e", "e2e>5", "e2e<5%", "e2e>-5%", "e2e=5%", ">5%", "e2e>five%", "e2e>5%x", "e2e>>5%"]
 )
 def test_what_is_no_gate_is_refused_with_an_example(text: str) -> None:
-    with pytest.raises(UsageError, match=r"--fail-if: .* should look like e2e\.median>5%"):
+    with pytest.raises(UsageError, match=r"`fail_if`: .* should look like e2e\.median>5%"):
         read_gate(text)
 
 

@@ -143,10 +143,10 @@ def test_what_was_recorded_before_an_error_is_kept(tmp_path: Path) -> None:
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
-    with pytest.raises(StoreError, match=r"^--record: .*run\.mcap exists already"):
+    with pytest.raises(StoreError, match=r"^`record`: .*run\.mcap exists already"):
         Recorder(path)
     assert path.read_text() == "precious"
-    with pytest.raises(StoreError, match=r"^--record: \. exists already"):
+    with pytest.raises(StoreError, match=r"^`record`: \. exists already"):
         Recorder(Path())
 
 
@@ -159,7 +159,7 @@ def test_remains_of_a_killed_run_are_named(tmp_path: Path) -> None:
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match=r"^--record: cannot write .*run\.mcap: "):
+    with pytest.raises(StoreError, match=r"^`record`: cannot write .*run\.mcap: "):
         Recorder(tmp_path / "file" / "run.mcap")
 
 
@@ -176,7 +176,7 @@ def test_a_failure_is_raised_where_messages_come_from(tmp_path: Path, live: bool
     recorder = Recorder(tmp_path / "run.mcap", live=live)
     recorder.write("/a", STRING, cdr("kept"), 1)
     recorder.write("/a", "no_msgs/msg/Such", b"\0\1\0\0", 2)
-    with pytest.raises(StoreError, match=r"^--record: writing .*run\.mcap failed: .*what was written is in "):
+    with pytest.raises(StoreError, match=r"^`record`: writing .*run\.mcap failed: .*what was written is in "):
         recorder.flush()
     with pytest.raises(StoreError, match="failed"):
         recorder.write("/a", STRING, cdr("lost"), 3)

@@ -263,12 +263,12 @@ def test_two_runs_of_one_second_get_folders_of_their_own(tmp_path: Path, open_ru
 @pytest.mark.parametrize("where", ["file", "file/below"])
 def test_an_output_that_is_no_folder_is_refused_by_name(tmp_path: Path, where: str) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match=r"--output .*file.*is not a folder"):
+    with pytest.raises(StoreError, match=r"`output` .*file.*is not a folder"):
         RunWriter.create(tmp_path / where, "latency", {})
 
 
 def test_an_output_that_cannot_be_written_is_refused_by_name() -> None:
-    with pytest.raises(StoreError, match=r"--output /proc/s2a: cannot create"):
+    with pytest.raises(StoreError, match=r"`output` /proc/s2a: cannot create"):
         RunWriter.create(Path("/proc/s2a"), "latency", {})
 
 

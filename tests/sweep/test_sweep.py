@@ -197,7 +197,7 @@ def test_cells_for_other_boards_are_left_out_and_none_at_all_is_refused() -> Non
     assert [cell.number for cell in sorted(plan_of(*settings, boards=["nano"]).cells, key=lambda c: c.number)] == [2, 3]
     assert len(plan_of(*settings, boards=None).cells) == 3
     assert set(plan_of(*settings).boards) == {"orin", "nano"}
-    with pytest.raises(UsageError, match=r"--board: s\.toml has cells for orin, nano only"):
+    with pytest.raises(UsageError, match=r"`board`: s\.toml has cells for orin, nano only"):
         plan_of(*settings[:2], boards=())
 
 
@@ -400,7 +400,7 @@ def test_a_board_that_is_another_machine_later_is_not_mixed_in(folder: Path) -> 
 
 def test_a_changed_configuration_another_machine_and_no_sweep_are_refused(folder: Path, tmp_path: Path) -> None:
     check_resume(folder, PLAN)
-    with pytest.raises(UsageError, match=r"--resume: the sweep in .* was another one"):
+    with pytest.raises(UsageError, match=r"`resume`: the sweep in .* was another one"):
         check_resume(folder, replace(PLAN, seed=3))
     path = folder / "manifest.json"
     manifest = json.loads(path.read_text())

@@ -206,7 +206,7 @@ def write_profile(tables: dict[str, Any], path: Path, *, force: bool) -> Profile
 def make_room(path: Path, *, force: bool) -> None:
     """Make the file's folder, before anything is measured in vain; raises as `write_profile`."""
     if path.exists() and not force:
-        raise UsageError(f"{path} exists already; give another NAME or --output, or --force to replace it")
+        raise UsageError(f"{path} exists already; give another NAME or `output`, or `force` to replace it")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

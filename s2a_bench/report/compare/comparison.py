@@ -106,11 +106,11 @@ def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bo
     found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
     fatal = [difference for difference in found if difference.fatal]
     if fatal and not unlike:
-        raise UnlikeRuns(f"the runs are unlike: {in_words(fatal)}; --unlike compares them all the same")
+        raise UnlikeRuns(f"the runs are unlike: {in_words(fatal)}; `unlike` compares them all the same")
     sides = [[{cell.name: cell for cell in by.subjects(run)} for run in side] for side in (baseline, other)]
     pairs, only, settings = _match(*sides)
     if settings and not unlike:
-        raise UnlikeRuns(f"cells of one name differ: {in_words(settings)}; --unlike compares them all the same")
+        raise UnlikeRuns(f"cells of one name differ: {in_words(settings)}; `unlike` compares them all the same")
     if not pairs:
         raise UnlikeRuns(f"no cell is in every run: {', '.join(only[0])} against {', '.join(only[1])}")
     metrics = {**by.metrics, **by_name(metric for run in runs for metric in by.own(run))}
@@ -156,7 +156,7 @@ def metrics_of(compared: ComparedRuns, names: Sequence[str]) -> list[tuple[Metri
         if name == "all":
             wanted |= {(metric, metric.statistic): None for metric in metrics.values()}
         else:
-            wanted[metric_of(compared, name, "--metric")] = None
+            wanted[metric_of(compared, name, "`metric`")] = None
     return list(wanted)
 
 

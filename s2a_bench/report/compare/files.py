@@ -38,5 +38,5 @@ def write_comparison(folder: Path, compared: ComparedRuns, whole: Mapping[str, A
                     written.append(folder / f"compare.{suffix}")
                     figure.savefig(written[-1])
     except OSError as error:
-        raise StoreError(f"--output {folder}: {error.strerror}; name another folder") from error
+        raise StoreError(f"`output` {folder}: {error.strerror}; name another folder") from error
     return written

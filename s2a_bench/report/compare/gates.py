@@ -16,7 +16,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.report.compare.comparison import LEVEL, ComparedRuns, Comparison, changes, metric_of
 from s2a_bench.stats.change import holm
 
-_FLAG: Final = "--fail-if"
+_FLAG: Final = "`fail_if`"
 _FORM: Final = re.compile(r"(?:(?P<cells>.+):)?(?P<metric>[\w.]+)\s*(?P<sign>>|<\s*-)\s*(?P<limit>\d+(?:\.\d+)?)\s*%")
 
 PASSED, TRIPPED, UNDECIDED = "passed", "tripped", "undecided"
