@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from pydantic import Field
 
 from s2a_bench import registry
 from s2a_bench.errors import UsageError
@@ -19,6 +18,7 @@ from s2a_bench.experiments.latency.view.figures import write_figures
 from s2a_bench.experiments.latency.view.tables import stage_table, summary_table
 from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.inference import EngineConfig
+from s2a_bench.options import option
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import TransportSuite
@@ -30,8 +30,8 @@ from s2a_bench.types import Request, Token
 
 
 class ToyOptions(Options):
-    number: int = Field(1, ge=1, description="a number", json_schema_extra=SERVER)
-    greeting: str = Field("hello", description="a word")
+    number: int = option(1, "a number", ge=1, side=SERVER)
+    greeting: str = option("hello", "a word")
 
 
 class ToyClient(LoopbackClient):
