@@ -10,7 +10,7 @@ from threading import Thread
 
 from s2a_bench.frames import open_source
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.inference import EngineConfig, open_engine
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=300)
     asked = parser.parse_args()
     cell = one_pipeline(asked.transport)
-    config = LatencyConfig((asked.transport,), max_tokens=4)
+    config = RequestsConfig(transports=asked.transport, max_tokens=4)
     e2e_ms: dict[bool, list[float]] = {True: [], False: []}
     with ExitStack() as stack:
         sessions = {pixels: _session(cell, config, stack, pixels=pixels) for pixels in e2e_ms}
@@ -43,7 +43,7 @@ def main() -> None:
         print(f"{name:15} e2e median {median(values):.3f} ms, quartiles {low:.3f} and {high:.3f}, n = {len(values)}")
 
 
-def _session(cell: Pipeline, config: LatencyConfig, stack: ExitStack, *, pixels: bool) -> Session:
+def _session(cell: Pipeline, config: RequestsConfig, stack: ExitStack, *, pixels: bool) -> Session:
     """Open a server, a client and a camera of their own."""
     engine = open_engine(EngineConfig(name="echo"))
     server = open_server(cell.wiring(), engine_handler(engine, pixels=pixels))

@@ -59,16 +59,27 @@ class Options(BaseModel):
         return self.model_dump()
 
 
-def option(default: Any, about: str, *, flag: str = "", argument: bool = False, **bounds: Any) -> Any:
+def option(
+    default: Any,
+    about: str,
+    *,
+    flag: str = "",
+    argument: bool = False,
+    hidden: bool = False,
+    side: str = "",
+    **bounds: Any,
+) -> Any:
     """Declare a field: ``about`` is its help, ``flag`` its name on the command line where that is not the field's.
 
-    On the command line an ``argument`` is given by its place instead of a flag. A field whose ``default`` is `...` has
-    to be given. ``bounds`` are pydantic's: ge, gt, le, lt, min_length, pattern.
+    On the command line an ``argument`` is given by its place instead of a flag, and a ``hidden`` flag is left out of
+    the help. ``side`` is for the options of a transport, see `transport.options`. A field whose ``default`` is `...`
+    has to be given. ``bounds`` are pydantic's: ge, gt, le, lt, min_length, pattern.
     """
-    return Field(default, description=about, json_schema_extra={"flag": flag, "argument": argument}, **bounds)
+    extra: dict[str, Any] = {"flag": flag, "argument": argument, "hidden": hidden, "side": side}
+    return Field(default, description=about, json_schema_extra=extra, **bounds)
 
 
-def group(options: type[Options], *, only: tuple[str, ...] = (), about: str = "") -> Any:
+def group(options: type[Options], *, only: Iterable[str] = (), about: str = "") -> Any:
     """Declare a group of options, of which ``only`` some are flags; ``about`` stands before the help of each."""
     return Field(default_factory=options, json_schema_extra={"only": list(only), "about": about})
 
@@ -82,7 +93,7 @@ def places(options: type[Options]) -> dict[str, tuple[str, ...]]:
     for name, field in options.model_fields.items():
         kind = field.annotation
         if isinstance(kind, type) and issubclass(kind, Options):
-            found |= {inner: (name, *path) for inner, path in places(kind).items()}
+            found = {inner: (name, *path) for inner, path in places(kind).items()} | found
     for name, field in options.model_fields.items():
         extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
         if not (isinstance(field.annotation, type) and issubclass(field.annotation, Options)):
@@ -152,12 +163,26 @@ def _size(value: Any) -> Any:
 
 def _text(value: Any) -> Any:
     """Read the file that @FILE names."""
-    if not isinstance(value, str) or not value.startswith("@"):
-        return value
+    return _sound(_content(value[1:]) if isinstance(value, str) and value.startswith("@") else value)
+
+
+def _grammar(value: Any) -> Any:
+    """Read a file, unless it is a grammar already: one has a rule."""
+    return _sound(value if isinstance(value, str) and (not value or "::=" in value) else _content(value))
+
+
+def _content(path: str | Path) -> str:
     try:
-        return Path(value[1:]).read_text(encoding="utf-8")
+        return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"cannot read {value[1:]}: {error}") from error
+        raise ValueError(f"cannot read {path}: {error}") from error
+
+
+def _sound(text: Any) -> Any:
+    """Refuse text that cannot be sent."""
+    if isinstance(text, str) and ("\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text)):
+        raise ValueError("the text is not valid UTF-8, or has a NUL")
+    return text
 
 
 SEVERAL = BeforeValidator(_listed)
@@ -177,3 +202,6 @@ Size = Annotated[tuple[int, int], BeforeValidator(_size)]
 
 TextOrFile = Annotated[str, BeforeValidator(_text)]
 """A text, or the content of the file that @FILE names."""
+
+Grammar = Annotated[str, BeforeValidator(_grammar)]
+"""A grammar in GBNF, or the content of the file that has it."""

@@ -15,6 +15,10 @@ class Progress(Protocol):
         """Say where the results go, before the first of them."""
         ...
 
+    def say(self, line: str) -> None:
+        """Say one line that stays."""
+        ...
+
     def stage(self, text: str) -> None:
         """Say what is being done now."""
         ...
@@ -38,6 +42,9 @@ class NullProgress:
     def opened(self, folder: Path) -> None:
         """Keep the folder."""
         self.folder = folder
+
+    def say(self, line: str) -> None:
+        """Say nothing."""
 
     def stage(self, text: str) -> None:
         """Keep the text."""

@@ -15,13 +15,11 @@ from s2a_bench import __version__
 from s2a_bench.cli import (
     compare,
     doctor,
-    latency,
     model,
     profile,
     report,
     serve,
     sweep,
-    throughput,
 )
 from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import Commands
@@ -43,8 +41,6 @@ app = typer.Typer(
     add_completion=False,
 )
 app.command("doctor")(doctor.doctor)
-app.command("latency")(latency.latency)
-app.command("throughput")(throughput.throughput)
 app.command("serve")(serve.serve)
 app.command("sweep")(sweep.sweep)
 app.command("compare")(compare.compare)

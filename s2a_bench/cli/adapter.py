@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,6 +38,7 @@ class Flag:
     needed: bool = False
     argument: bool = False
     """Whether it is given by its place."""
+    hidden: bool = False
 
     @property
     def spelled(self) -> str:
@@ -51,7 +52,7 @@ class Flag:
         declared: Any = (
             typer.Argument(metavar=self.spelled, help=self.about, show_default=False)
             if self.argument
-            else typer.Option(self.spelled, help=self.about, show_default=False)
+            else typer.Option(self.spelled, help=self.about, show_default=False, hidden=self.hidden)
         )
         kind: Any = self.kind if self.needed else Union[self.kind, None]  # noqa: UP007 - made at run time
         annotation: Any = Annotated[kind, declared]
@@ -60,7 +61,7 @@ class Flag:
     @property
     def key(self) -> str:
         """Return the parameter's name."""
-        return "__".join(self.path)
+        return "__".join(self.path).replace("-", "_")
 
 
 def flags_of(options: type[Options]) -> Iterator[Flag]:
@@ -75,8 +76,8 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
                     yield replace(flag, path=(name, *flag.path), about=f"{about}{flag.about}")
         else:
             flag_name = str(extra.get("flag") or name.replace("_", "-"))
-            kind, argument = _kind(field.annotation), bool(extra.get("argument"))
-            yield Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument)
+            kind, argument, hidden = _kind(field.annotation), bool(extra.get("argument")), bool(extra.get("hidden"))
+            yield Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument, hidden)
 
 
 def command(function: Callable[..., None], *options: type[Options], about: str) -> Callable[..., None]:
@@ -86,20 +87,29 @@ def command(function: Callable[..., None], *options: type[Options], about: str) 
     them are flags too.
     """
     own = _keywords(function)
-    flags = {flag.key: flag.parameter for each in options for flag in flags_of(each)}
+    flags = distinct([flag for each in options for flag in flags_of(each)], taken=own)
 
     def run(**given: Any) -> None:
         with flags_named(*options):
             function(*(build(each, given) for each in options), **{name: given[name] for name in own})
 
-    run.__signature__ = inspect.Signature([*flags.values(), *own.values()])  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature([*(flag.parameter for flag in flags), *own.values()])  # type: ignore[attr-defined]
     run.__doc__ = about
     return run
 
 
+def distinct(flags: Sequence[Flag], taken: Iterable[str] = ()) -> list[Flag]:
+    """Return the flags whose names are not ``taken``; of several with one name that in the fewest groups, the first."""
+    names = {name.strip("_").replace("_", "-") for name in taken}
+    owners: dict[str, Flag] = {}
+    for flag in sorted(flags, key=lambda flag: len(flag.path)):
+        owners.setdefault(flag.name, flag)
+    return [flag for flag in flags if flag.name not in names and owners[flag.name] is flag]
+
+
 def build(options: type[Options], given: Mapping[str, Any]) -> Options:
     """Return the configuration that a command's parameters make; raises UsageError naming the field."""
-    return options(**_nested({flag.path: given[flag.key] for flag in flags_of(options)}))
+    return options(**_nested({flag.path: given.get(flag.key) for flag in flags_of(options)}))
 
 
 @contextmanager
@@ -108,7 +118,7 @@ def flags_named(*options: type[Options]) -> Iterator[None]:
     try:
         yield
     except UsageError as error:
-        spelled = {flag.path[-1]: flag.spelled for each in options for flag in flags_of(each)}
+        spelled = {flag.path[-1]: flag.spelled for each in options for flag in distinct([*flags_of(each)])}
         raise UsageError(with_flags(str(error), spelled)) from error
 
 

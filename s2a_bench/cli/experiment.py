@@ -130,7 +130,7 @@ def present(run: Run, shown: Shown, progress: RunProgress, *, as_json: bool) -> 
         return
     console = open_console()
     for name in shown.tables if shown.printed is None else shown.printed:
-        console.print(lay_out(shown.tables[name]))
+        console.print(lay_out(shown.narrow.get(name) or shown.tables[name]))
     for note in shown.notes:
         console.print(note, markup=False, highlight=False)
     for name in shown.files:

@@ -133,7 +133,7 @@ def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
     from s2a_bench.transport import TRANSPORTS, open_server
 
     limit_threads()
-    if getattr(wiring.options, "dds_tuning", "tuned") == "tuned":
+    if TRANSPORTS[wiring.transport].tuned(wiring.options):
         keep_large_blocks()
     engine = open_engine(config)
     try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +13,6 @@ from s2a_bench.experiments import EXPERIMENTS
 if TYPE_CHECKING:
     from s2a_bench.sweep import Command
 
-VIRTUAL: dict[str, Callable[[Mapping[str, Any]], bool]] = {
-    "latency": lambda _: False,
-    "throughput": lambda _: False,
-}
-"""Commands by hand that can be swept -> whether one with these parameters computes and measures nothing.
-
-Of an experiment its configuration says so; each can be swept.
-"""
 ENTRY = f"{__name__}:run"
 """Where a worker finds `run`."""
 
@@ -29,7 +21,7 @@ def command_of(name: str, key: str = "command") -> Command:
     """Describe a command; raises UsageError for one that cannot be swept."""
     from s2a_bench.sweep import Command
 
-    known = sorted({*VIRTUAL, *EXPERIMENTS}.intersection(_commands()))
+    known = sorted({*EXPERIMENTS}.intersection(_commands()))
     if name not in known:
         raise UsageError(f"{key}: '{name}' is none of {', '.join(known)}")
     flags: dict[str, Any] = {}
@@ -61,7 +53,7 @@ def _check(name: str, argv: Sequence[str]) -> bool:
         given = _commands()[name].make_context(name, list(argv)).params
     except ParseError as error:
         raise UsageError(error.format_message()) from error
-    return VIRTUAL[name](given) if name in VIRTUAL else config_of(EXPERIMENTS[name], given).virtual
+    return config_of(EXPERIMENTS[name], given).virtual
 
 
 @cache

@@ -75,15 +75,17 @@ class Subject:
 class Shown:
     """What a run shows, each part by its file's name.
 
-    ``main`` are the tables that stand open on the page, ``printed`` those on the terminal (None: all), ``notes`` what
-    is said below them. ``csvs`` are whole CSV texts, ``figures`` are drawn when called, ``files`` write themselves into
-    the run folder. ``json`` gives the ``--json`` object. ``lanes`` are timelines to look into.
+    ``main`` are the tables that stand open on the page, ``printed`` those on the terminal (None: all), ``narrow`` what
+    is printed in place of tables that are too wide for it, ``notes`` what is said below them. ``csvs`` are whole CSV
+    texts, ``figures`` are drawn when called, ``files`` write themselves into the run folder. ``json`` gives the
+    ``--json`` object. ``lanes`` are timelines to look into.
     """
 
     sentences: Sequence[str] = ()
     tables: Mapping[str, TextTable] = field(default_factory=dict)
     main: Sequence[str] = ()
     printed: Sequence[str] | None = None
+    narrow: Mapping[str, TextTable] = field(default_factory=dict)
     notes: Sequence[str] = ()
     csvs: Mapping[str, str] = field(default_factory=dict)
     figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
@@ -171,6 +173,8 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
     {
         "boundary": "s2a_bench.experiments.boundary:EXPERIMENT",
         "ccrb": "s2a_bench.experiments.ccrb:EXPERIMENT",
+        "latency": "s2a_bench.experiments.latency:EXPERIMENT",
+        "throughput": "s2a_bench.experiments.throughput:EXPERIMENT",
         "timeline": "s2a_bench.experiments.timeline:EXPERIMENT",
         "model validity": "s2a_bench.experiments.model_validity:EXPERIMENT",
         "study": "s2a_bench.experiments.study:EXPERIMENT",

@@ -7,10 +7,25 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
+from s2a_bench.errors import UsageError
+from s2a_bench.options import Options, option
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+
+class AgainstPaper(Options):
+    """Whether the paper's values are drawn beside those of a run."""
+
+    against: str = option("", "paper: draw the paper's values beside ours")
+
+    def check(self) -> None:
+        """Refuse any other publication."""
+        if self.against not in {"", "paper"}:
+            raise UsageError(f"`against`: '{self.against}' should be paper")
+
 
 LABEL = "paper (Jetson AGX Orin), another machine"
 """How the paper's values are called wherever they are shown."""

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+
+from pydantic import create_model
 
 from s2a_bench.errors import UsageError
-from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.replay import check_replay
+from s2a_bench.frames import SOURCES
+from s2a_bench.inference import EngineConfig, default_engine
+from s2a_bench.options import Grammar, Names, Options, Size, TextOrFile, group, option
 from s2a_bench.trace import path_of
 from s2a_bench.transport import TRANSPORTS, Transport
-from s2a_bench.transport.options import checked
+from s2a_bench.transport.options import PAYLOADS, SERVING, Payload, sides
 from s2a_bench.transport.pipeline import Pipeline, pipelines, require_payload
 
 LARGEST = 16_384
-MODES = ("request", "stream")
 
 DEFAULT_PROMPT = """You are a robot task planner.
 Skills: go_to(location), open(object), close(object), pick(object), place(object, location).
@@ -26,47 +27,115 @@ Do not output any explanation."""
 """The paper's prompt (section IV-E)."""
 
 
-@dataclass(frozen=True)
-class LatencyConfig:
-    """The settings of one run of requests, as the flags of the same names give them."""
+def _options() -> type[Options]:
+    """Make a group of the options of each transport; what only concerns `serve` is no flag."""
+    return _made(
+        {
+            name: (each.options, group(each.options, only=[n for n, side in sides(each.options) if side != SERVING]))
+            for name, each in TRANSPORTS.loaded()
+        }
+    )
 
-    transports: tuple[str, ...] = ("http", "ros")
-    """Pipeline names: ``transport[/variant][?option=value&...]``."""
-    variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Transport -> the variants to measure where its name has none; those it measures by default unless told."""
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Transport -> option -> value, for the names that do not say it themselves."""
-    payload: str = ""
-    """How pictures travel over every transport; empty: each its own way."""
-    tuned: bool = True
-    """Whether this process and the servers keep large blocks of memory for the next picture."""
-    record: Path | None = None
-    """Where what travelled is recorded as MCAP."""
-    source: str = "synthetic"
-    width: int = 640
-    height: int = 480
-    engine: EngineConfig = field(default_factory=EngineConfig)
-    runs: int = 50
-    warmup: int = 5
-    mode: str = "request"
-    fps: float = 30.0
-    max_tokens: int = 32
-    prompt: str = DEFAULT_PROMPT
-    grammar: str = ""
-    seed: int = 0
-    timeout_s: float = 300.0
-    sample_resources_hz: float = 10.0
-    """How often CPU, memory, GPU and power are read beside the run; 0: never."""
+
+def _variants(*, first: bool) -> type[Options]:
+    """Make an option for each transport with variants: which to measure, unless told the first or its own choice."""
+    fields: dict[str, Any] = {}
+    for name, each in TRANSPORTS.loaded():
+        if each.variants:
+            about = f"{', '.join(each.variants)}; several with commas"
+            measured = each.variants[:1] if first else each.measured(each.options(), ())
+            default = measured if first else ()
+            fields[name] = (Names, option(default, f"{about} [default: {','.join(measured)}]"))
+    return _made(fields)
+
+
+def _made(fields: dict[str, Any]) -> type[Options]:
+    made: type[Options] = create_model("PerTransport", __base__=Options, **fields)
+    return made
+
+
+if TYPE_CHECKING:
+    TransportOptions: TypeAlias = Options
+    Variants: TypeAlias = Options
+    FirstVariants: TypeAlias = Options
+else:
+    TransportOptions = _options()
+    Variants = _variants(first=False)
+    FirstVariants = _variants(first=True)
+
+
+class RequestsConfig(Options):
+    """The settings of one run of requests."""
+
+    QUICK: ClassVar[dict[str, int]] = {"runs": 10, "warmup": 2, "max_tokens": 8}
+    """What ``quick`` sets, unless told."""
+
+    transports: Names = option(
+        ("http", "ros"),
+        f"{', '.join(TRANSPORTS)}; several with commas, with /VARIANT and ?OPTION=VALUE: ros/topic?payload=yuyv",
+        flag="transport",
+    )
+    source: str = option("synthetic", f"{', '.join(SOURCES)}, as video:FILE")
+    size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]")
+    payload: Payload = option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: http jpeg, ros raw]")
+    variants: Variants = group(Variants)
+    """The variants to measure where a pipeline's name has none; those that a transport measures by default if empty."""
+    options: TransportOptions = group(TransportOptions)
+    """The options of every transport, for names that do not say them themselves."""
+    engine: EngineConfig = group(EngineConfig)
+    runs: int = option(50, "samples a pipeline [default: 50, quick: 10]", ge=1, le=10**9)
+    warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
+    mode: Literal["request", "stream"] = option("request", "request (a frame each), stream (a camera runs)")
+    fps: float = option(30.0, "rate of the camera in --mode stream", ge=0.1, le=1000)
+    max_tokens: int = option(32, "tokens an answer [default: 32, quick: 8]", ge=1, le=2**20)
+    prompt: TextOrFile = option(DEFAULT_PROMPT, "text, or @FILE [default: the paper's prompt]")
+    grammar: Grammar = option("", "GBNF file that every answer obeys")
+    seed: int = option(0, "seed of the order, the source and the sampling", ge=0, le=2**31 - 1)
+    timeout_s: float = option(300.0, "longest silence of a server, in seconds", flag="timeout", ge=0.1, le=86_400)
+    sample_resources_hz: float = option(
+        10.0,
+        "readings a second of CPU, memory, GPU and power beside the run; 0: none",
+        flag="sample-resources",
+        ge=0,
+        le=1000,
+    )
+    record: Path | None = option(None, "also record frames, requests and tokens, as run.mcap (rosbag2)")
+    quick: bool = option(False, "fewer samples: a first look")
+
+    def __init__(self, **given: Any) -> None:
+        """Keep what is given, few samples where a quick look is asked for; raises UsageError naming the field."""
+        super().__init__(**({**self.QUICK, **given} if given.get("quick") else given))
+
+    @property
+    def width(self) -> int:
+        """Return the width of the frames in pixels."""
+        return self.size[0]
+
+    @property
+    def height(self) -> int:
+        """Return the height of the frames in pixels."""
+        return self.size[1]
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Return pipeline names: ``transport[/variant][?option=value&...]``."""
+        return self.transports
 
     @cached_property
     def pipelines(self) -> list[Pipeline]:
         """Return what is compared, a cell each; raises UsageError."""
-        return pipelines(self.transports, {**self.options, "": {"payload": self.payload}}, self.variants)
+        told = {name: {each: getattr(given, each) for each in given.model_fields_set} for name, given in self.options}
+        return pipelines(self.names, {**told, "": {"payload": self.payload}}, dict(self.variants))
 
     @property
     def used(self) -> list[Transport[Any]]:
         """Return the transports, each once."""
         return list({pipeline.transport.name: pipeline.transport for pipeline in self.pipelines}.values())
+
+    @property
+    def tuned(self) -> bool:
+        """Whether this process and the servers keep large blocks of memory for the next picture."""
+        return all(TRANSPORTS[name].tuned(given) for name, given in self.options)
 
     @property
     def stages(self) -> dict[str, str]:
@@ -84,34 +153,32 @@ class LatencyConfig:
         return not all(pipeline.black_box for pipeline in self.pipelines)
 
     @property
+    def starts_program(self) -> bool:
+        """Whether somebody else's server is started on the model's files."""
+        return any(pipeline.transport.program(pipeline.options) for pipeline in self.pipelines)
+
+    @property
     def foreign(self) -> str:
         """Return the first option that says that a server is not ours, or nothing."""
         found = (pipeline.transport.foreign_by(pipeline.options) for pipeline in self.pipelines)
         return next((name for name in found if name), "")
 
+    def answered(self, say: Callable[[str], None]) -> RequestsConfig:
+        """Return it with the engine that can answer where none is named, and ``say`` which if that is not llama."""
+        if "name" in self.engine.model_fields_set or not self.own_engine or self.starts_program:
+            return self
+        return self.but(engine=self.engine.but(name=default_engine(say)))
+
     def check(self) -> None:
-        """Raise UsageError, naming the field, for a value or combination that makes no sense."""
+        """Raise UsageError, naming the field, for a combination that makes no sense."""
+        from s2a_bench.inference.replay import check_replay
+
         if not self.transports:
             raise UsageError(f"`transport`: name at least one of {', '.join(TRANSPORTS)}")
-        _one_of("mode", self.mode, MODES)
-        for name, value, least, most in (
-            ("runs", self.runs, 1, 10**9),
-            ("warmup", self.warmup, 0, 10**9),
-            ("max_tokens", self.max_tokens, 1, 2**20),
-            ("seed", self.seed, 0, 2**31 - 1),
-            ("timeout", self.timeout_s, 0.1, 86_400),
-            ("fps", self.fps, 0.1, 1_000),
-            ("sample_resources", self.sample_resources_hz, 0, 1_000),
-        ):
-            if not least <= value <= most:
-                raise UsageError(f"`{name}`: {value} is not between {least} and {most}")
         if not (16 <= self.width <= LARGEST and 16 <= self.height <= LARGEST) or self.width % 2:  # noqa: PLR2004
             raise UsageError(
                 f"`size`: {self.width}x{self.height} should be 16x16 to {LARGEST}x{LARGEST}, of even width"
             )
-        for name, text in (("prompt", self.prompt), ("grammar", self.grammar)):
-            if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
-                raise UsageError(f"`{name}`: the text is not valid UTF-8, or has a NUL")
         check_replay(self.engine)
         if self.record is not None and self.record.exists():
             raise UsageError(f"`record`: {self.record} exists already and is not overwritten; name another")
@@ -130,18 +197,14 @@ class LatencyConfig:
 
     def _check_unused(self) -> None:
         """Refuse a server of somebody else's that nobody would ask."""
-        for name in self.options.keys() - {transport.name for transport in self.used}:
-            transport = TRANSPORTS[name]
-            if field_ := transport.foreign_by(checked(transport.options, self.options[name], name)):
-                raise UsageError(f"`{field_}` needs {name} among `transport`")
+        used = {transport.name for transport in self.used}
+        for name, given in self.options:
+            if name not in used and (field := TRANSPORTS[name].foreign_by(given)):
+                raise UsageError(f"`{field}` needs {name} among `transport`")
 
     def to_manifest(self) -> dict[str, Any]:
         """Return the settings as plain data, with what every pipeline came to be told."""
         told = {each.name: each.options.model_dump(mode="json", exclude_defaults=True) for each in self.pipelines}
-        size = f"{self.width}x{self.height}"
-        return {**asdict(self), "engine": self.engine.to_manifest(), "pipelines": told, "size": size}
-
-
-def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise UsageError(f"`{name}`: '{value}' is none of {', '.join(known)}")
+        own = self.model_dump(exclude={"quick"})
+        size = {"width": self.width, "height": self.height, "size": f"{self.width}x{self.height}"}
+        return {**own, **size, "tuned": self.tuned, "engine": self.engine.to_manifest(), "pipelines": told}

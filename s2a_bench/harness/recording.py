@@ -8,11 +8,10 @@ while a sample is measured; in stream mode, which has no pauses, a thread writes
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from s2a_bench.clock import realtime_offset_ns
+from s2a_bench.options import Options
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.record import Recorder
 from s2a_bench.transport.ros import ROS
@@ -24,10 +23,10 @@ from s2a_bench.types import Frame, Request, Token
 class RunRecorder:
     """The recording of one run. Use as a context manager."""
 
-    def __init__(self, path: Path, options: Mapping[str, Mapping[str, Any]], *, live: bool) -> None:
-        """Create the file, for the namespace that ROS's ``options`` have; raises StoreError, naming the path."""
+    def __init__(self, path: Path, options: Options, *, live: bool) -> None:
+        """Create the file, for the namespace that ROS's among ``options`` have; raises StoreError, naming the path."""
         self._recorder = Recorder(path, live=live)
-        self._namespace = ROS.options(**options.get(ROS.name, {})).namespace
+        self._namespace = getattr(options, ROS.name).namespace
         self._offset_ns = realtime_offset_ns()
 
     def frame(self, frame: Frame) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 from typing import Any, TypeAlias
@@ -15,7 +15,7 @@ from s2a_bench.errors import TransportError
 from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.harness.backoff import Backoff
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Place, Session
@@ -45,28 +45,26 @@ class Task:
     """What a measuring command asks for besides the requests themselves."""
 
     command: str
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    """Goes into the manifest's ``configuration``."""
     in_process: str = ""
     """What the command calls a cell whose server is in this process; empty: its own name."""
-    others: Callable[[LatencyConfig, RunWriter, Sequence[Session]], Sequence[Slot]] = lambda *_: ()
+    others: Callable[[RequestsConfig, RunWriter, Sequence[Session]], Sequence[Slot]] = lambda *_: ()
     """Makes what else has a turn in every block; the config has the model files that were found."""
 
 
-def run_requests(task: Task, config: LatencyConfig, output: Path, progress: Progress) -> Path:
+def run_requests(task: Task, config: RequestsConfig, output: Path, progress: Progress) -> Path:
     """Measure and return the run folder; whatever happens, the samples so far are in it.
 
     Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
     """
     if config.own_engine:
         need_engine(config.engine.name)
-    if any(pipeline.transport.program(pipeline.options) for pipeline in config.pipelines):
+    if config.starts_program:
         extras.need("gguf", "model")
     limit_threads()
     malloc_tuned = config.tuned and keep_large_blocks()
     with ExitStack() as stack:
         sources = _Sources(config, stack)
-        manifest = _manifest(task, config, malloc_tuned=malloc_tuned)
+        manifest = _manifest(config, malloc_tuned=malloc_tuned)
         writer = stack.enter_context(RunWriter.create(output, task.command, manifest))
         progress.opened(writer.path)
         if config.engine.name == "llama" and extras.installed("gguf"):  # else nobody here reads the files
@@ -75,16 +73,16 @@ def run_requests(task: Task, config: LatencyConfig, output: Path, progress: Prog
         return writer.path
 
 
-def _with_model(config: LatencyConfig, progress: Progress) -> LatencyConfig:
+def _with_model(config: RequestsConfig, progress: Progress) -> RequestsConfig:
     """Find or make the model files, so that every server gets the same."""
     progress.stage("reading the model's headers" if config.engine.model else "the tiny dummy model, made on first use")
     model, mmproj = resolve(config.engine)
-    return replace(config, engine=config.engine.but(model=model, mmproj=mmproj))
+    return config.model_copy(update={"engine": config.engine.but(model=model, mmproj=mmproj)})
 
 
-def _manifest(task: Task, config: LatencyConfig, *, malloc_tuned: bool) -> dict[str, Any]:
+def _manifest(config: RequestsConfig, *, malloc_tuned: bool) -> dict[str, Any]:
     return {
-        "configuration": {**config.to_manifest(), **task.facts},
+        "configuration": config.to_manifest(),
         "stages": config.stages,
         "environment": environment.collect(config.packages),
         "seeds": dict.fromkeys(("order", "sampling", "source", "bootstrap"), config.seed),
@@ -103,7 +101,7 @@ def _manifest(task: Task, config: LatencyConfig, *, malloc_tuned: bool) -> dict[
 class _Sources:
     """Frame sources: one a cell, with the same frames; a device can be opened only once and is shared."""
 
-    def __init__(self, config: LatencyConfig, stack: ExitStack) -> None:
+    def __init__(self, config: RequestsConfig, stack: ExitStack) -> None:
         self._config = config
         self._stack = stack
         self._shared = config.source.startswith("v4l2")
@@ -122,7 +120,7 @@ class _Sources:
         return source
 
 
-def _measure(task: Task, config: LatencyConfig, sources: _Sources, writer: RunWriter, progress: Progress) -> None:
+def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunWriter, progress: Progress) -> None:
     """Start the servers, measure all blocks, and write down what there is to warn of."""
     machine = Machine(output=writer.path)
     watches_udp = any(transport.watches_udp for transport in config.used)
@@ -157,7 +155,7 @@ def _measure(task: Task, config: LatencyConfig, sources: _Sources, writer: RunWr
 
 
 def _sessions(
-    task: Task, config: LatencyConfig, servers: ServerSet, sources: _Sources, sampler: Sampler, stack: ExitStack
+    task: Task, config: RequestsConfig, servers: ServerSet, sources: _Sources, sampler: Sampler, stack: ExitStack
 ) -> Iterator[Session]:
     """Open a client and a feed for each cell, and the recording if one is wanted."""
     recorder: RunRecorder | None = None
@@ -183,7 +181,7 @@ def _sessions(
         yield Session(replace(cell, name=name), client, feed, config, recorder, sampler)
 
 
-def run_blocks(slots: Sequence[Slot], others: Sequence[Slot], config: LatencyConfig, progress: Progress) -> None:
+def run_blocks(slots: Sequence[Slot], others: Sequence[Slot], config: RequestsConfig, progress: Progress) -> None:
     """Run every slot once a block, in a new random order each time; in the first block the others come last.
 
     So that what is compared with the requests can learn from the first of them how long their prompts are.

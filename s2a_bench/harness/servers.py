@@ -10,7 +10,7 @@ from threading import Thread
 from typing import Any
 
 from s2a_bench.errors import ServerDied
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.processes import PROGRAMS, OwnServer, ServerProcess
 from s2a_bench.harness.serving import ServerJob, engine_handler
 from s2a_bench.inference import open_engine
@@ -33,7 +33,7 @@ class _Running:
 class ServerSet:
     """The servers of a run; cells whose server would be told the same share one."""
 
-    def __init__(self, config: LatencyConfig, stack: ExitStack, folder: Path) -> None:
+    def __init__(self, config: RequestsConfig, stack: ExitStack, folder: Path) -> None:
         """Start what ``config`` needs; `ExitStack` stops it."""
         self._config = config
         self._stack = stack

@@ -9,7 +9,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, RequestFailed, S2AError, ServerDied, SourceError, UsageError
 from s2a_bench.harness.feed import Feed, StreamedFrame, StreamFeed
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.machine.resources.sampler import Sampler
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
@@ -58,7 +58,7 @@ class Session:
         cell: Pipeline,
         client: Client,
         feed: Feed,
-        config: LatencyConfig,
+        config: RequestsConfig,
         recorder: RunRecorder | None = None,
         sampler: Sampler | None = None,
     ) -> None:

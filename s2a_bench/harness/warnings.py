@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from s2a_bench.clock import realtime_offset_ns
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Finding, Machine, examine
 from s2a_bench.machine.doctor.robot import RMEM_WANTED
 from s2a_bench.store.manifest import RunWarning
@@ -20,7 +20,7 @@ HEADERS_OFF_MS, HEADERS_OFF_SHARE = 20.0, 0.25
 """Beyond both, a llama-server's headers did not leave when its slot started."""
 
 
-def before_run(config: LatencyConfig | None = None, machine: Machine | None = None) -> list[RunWarning]:
+def before_run(config: RequestsConfig | None = None, machine: Machine | None = None) -> list[RunWarning]:
     """Return the doctor's warnings that concern any run, and those that concern the transports of one of requests."""
     checks = {code: CHECKS[code] for code in BEFORE_RUN}
     if config is not None:

@@ -4,7 +4,7 @@ To add a transport, write a package with a module like this, and offer its insta
 ``s2a_bench.transports``; nothing in this repository changes::
 
     class ToyOptions(Options):                      # transport/options.py
-        port: int = Field(0, ge=0, le=65535, description="port; 0: any free one", json_schema_extra=SERVER)
+        port: int = option(0, "port; 0: any free one", ge=0, le=65535, side=SERVER)
 
     class Toy(Transport[ToyOptions]):
         name, options = "toy", ToyOptions           # --transport 'toy?port=7000', serve toy
@@ -198,6 +198,10 @@ class Transport(Generic[O]):
 
     def check(self, variant: str, options: O, *, mode: str, engine: str) -> None:
         """Raise UsageError for options that do not go together with the variant or with a run's settings."""
+
+    def tuned(self, options: O) -> bool:  # noqa: ARG002 - for subclasses
+        """Whether processes keep large blocks of memory for the next picture, and what else makes it faster."""
+        return True
 
     def foreign_by(self, options: O) -> str:
         """Return the option that says that the server is not ours, or nothing."""

@@ -1,6 +1,7 @@
 """Options of a transport: the base class of their models, which is that of every configuration, and a payload.
 
-An option is the client's business unless its field says `json_schema_extra=SERVER`.
+An option is the client's business unless its ``side`` says that the server's process is told too (`SERVER`), or that
+it is about a server that somebody runs by itself (`SERVING`).
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Final, TypeVar
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator
 
 from s2a_bench import options as base
 from s2a_bench.errors import UsageError
@@ -19,8 +20,11 @@ PAYLOADS: Final = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
 LOSSLESS: Final = frozenset({"", "raw", "yuyv", "png"})
 """Payloads after which the engine sees the camera's very pixels; "" where nothing travels."""
 
-SERVER: Final[dict[str, Any]] = {"side": "server"}
-"""``json_schema_extra`` of an option that the server's process is told too: cells that differ in it get their own."""
+SERVER: Final = "server"
+"""``side`` of an option that the server's process is told too: cells that differ in it get servers of their own."""
+
+SERVING: Final = "serving"
+"""``side`` of such an option that is a flag of `serve` only; a run has it in the name of a pipeline."""
 
 
 def _known(payload: str) -> str:
@@ -29,12 +33,14 @@ def _known(payload: str) -> str:
     return payload
 
 
+Payload = Annotated[str, AfterValidator(_known)]
+"""One of `PAYLOADS`, or nothing."""
+
+
 class Options(base.Options):
     """What every transport can be told; a transport without options of its own uses this class."""
 
-    payload: Annotated[str, AfterValidator(_known)] = Field(
-        "", description="how a picture travels: raw, yuyv, jpeg, jpeg-preencoded, png [default: the transport's own]"
-    )
+    payload: Payload = base.option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: the transport's own]")
 
 
 O = TypeVar("O", bound=Options)  # noqa: E741 - the one type variable here
@@ -42,13 +48,14 @@ O = TypeVar("O", bound=Options)  # noqa: E741 - the one type variable here
 
 def server_side(options: Options) -> tuple[tuple[str, Any], ...]:
     """Return name and value of the options that a server's process is told."""
-    return tuple((name, getattr(options, name)) for name in _server_fields(type(options)))
+    return tuple((name, getattr(options, name)) for name, side in sides(type(options)) if side)
 
 
-def _server_fields(model: type[Options]) -> Iterator[str]:
+def sides(model: type[Options]) -> Iterator[tuple[str, str]]:
+    """Yield every option with its side, "" the client's."""
     for name, field in model.model_fields.items():
-        if isinstance(field.json_schema_extra, dict) and field.json_schema_extra.get("side") == SERVER["side"]:
-            yield name
+        extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+        yield name, str(extra.get("side", ""))
 
 
 def checked(model: type[O], values: Mapping[str, Any], owner: str) -> O:

@@ -86,8 +86,8 @@ def pipelines(
 
 
 def first_variants() -> dict[str, tuple[str, ...]]:
-    """Return transport -> its first variant: what one stream takes where its name has none."""
-    return {name: transport.variants[:1] for name, transport in TRANSPORTS.loaded()}
+    """Return transport -> its first variant, where it has some: what one stream takes where its name has none."""
+    return {name: transport.variants[:1] for name, transport in TRANSPORTS.loaded() if transport.variants}
 
 
 def one_pipeline(text: str, **options: Any) -> Pipeline:

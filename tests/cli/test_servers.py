@@ -82,7 +82,7 @@ def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--url", "http://x", "--dialect", "openvla"], "with --dialect openvla a picture travels as raw"),
+        (["--url", "http://x", "--dialect", "openvla", "--payload", "jpeg"], "a picture travels as raw, not jpeg"),
         (["--url", "http://x", "--api-key-env", KEY], "takes the name of an environment variable, not the key itself"),
         (["--url", "http://x", "--extra-body", "@/no/such"], "--extra-body: cannot read /no/such"),
     ],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.errors import EngineError, UsageError
+from s2a_bench.experiments.throughput.config import ThroughputConfig
 from s2a_bench.experiments.throughput.llama_bench import LlamaBench
 from s2a_bench.experiments.throughput.rows import REFERENCE
-from s2a_bench.experiments.throughput.run import ThroughputConfig
 from s2a_bench.harness.llama_flags import llama_flags
-from s2a_bench.harness.plan import LatencyConfig
 from s2a_bench.harness.rounds import run_blocks
 from s2a_bench.harness.session import Place
 from s2a_bench.inference import EngineConfig
@@ -25,7 +23,7 @@ from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.testing import NullProgress
 from tests.llama_bench_stand_in import install
 
-REQUESTS = LatencyConfig(transports=("loopback",), max_tokens=16)
+REQUESTS = ThroughputConfig(max_tokens=16)
 
 
 @pytest.mark.parametrize(
@@ -42,7 +40,7 @@ REQUESTS = LatencyConfig(transports=("loopback",), max_tokens=16)
 )
 def test_what_makes_no_sense_is_named(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError) as error:
-        ThroughputConfig(replace(REQUESTS, **fields)).check()
+        REQUESTS.but(**fields)
     assert message in str(error.value)
 
 
@@ -50,18 +48,18 @@ def test_what_makes_no_sense_is_named(fields: dict[str, Any], message: str) -> N
     ("fields", "message"),
     [
         ({"grammar": 'root ::= "a"'}, "llama-bench knows no grammar"),
-        ({"engine": EngineConfig(name="replay", profile="jetson-orin-nano")}, "leave out --engine replay"),
+        ({"engine": EngineConfig(name="replay", profile="jetson-orin-nano")}, "leave out `engine` replay"),
     ],
 )
 def test_a_reference_needs_what_llama_bench_can_do(tmp_path: Path, fields: dict[str, Any], message: str) -> None:
     program = install(tmp_path)
-    ThroughputConfig(REQUESTS, program).check()
+    REQUESTS.but(reference=program)
     with pytest.raises(UsageError) as error:
-        ThroughputConfig(replace(REQUESTS, **fields), program).check()
+        REQUESTS.but(reference=program, **fields)
     assert message in str(error.value)
     for wrong in (tmp_path, tmp_path / "missing", Path(__file__)):
         with pytest.raises(UsageError, match=r"`reference`: .* is no program that can be run"):
-            ThroughputConfig(REQUESTS, wrong).check()
+            REQUESTS.but(reference=wrong)
 
 
 @given(st.integers(1, 4), st.integers(0, 2), st.integers(0, 2), st.integers(1, 6), st.integers(0, 99))
@@ -72,7 +70,7 @@ def test_every_block_gives_everyone_one_turn_and_the_others_are_last_at_first(
     turns = [lambda place, name=f"turn{i}": seen.append((name, place)) for i in range(n_turns)]
     others = [lambda place, name=f"other{i}": seen.append((name, place)) for i in range(n_others)]
     progress = NullProgress()
-    run_blocks(turns, others, replace(REQUESTS, warmup=warmup, runs=runs, seed=seed), progress)
+    run_blocks(turns, others, REQUESTS.but(warmup=warmup, runs=runs, seed=seed), progress)
     everyone = {f"turn{i}" for i in range(n_turns)} | {f"other{i}" for i in range(n_others)}
     assert progress.expected == progress.done == len(everyone) * (warmup + runs)
     for block in range(warmup + runs):
@@ -86,7 +84,7 @@ def test_every_block_gives_everyone_one_turn_and_the_others_are_last_at_first(
 def test_the_order_changes_from_block_to_block() -> None:
     seen: list[str] = []
     turns = [lambda _place, name=name: seen.append(name) for name in "abc"]
-    run_blocks(turns, [], replace(REQUESTS, warmup=0, runs=12), NullProgress())
+    run_blocks(turns, [], REQUESTS.but(warmup=0, runs=12), NullProgress())
     assert len({"".join(seen[at : at + 3]) for at in range(0, 36, 3)}) > 2
 
 
@@ -107,7 +105,7 @@ def test_the_reference_computes_with_our_settings_behind_our_prompts_length(tmp_
         flash_attention="on",
     )
     depths = [250, 260]
-    bench = LlamaBench(install(tmp_path), replace(REQUESTS, engine=engine), writer, lambda: depths.pop(0))
+    bench = LlamaBench(install(tmp_path), REQUESTS.but(engine=engine), writer, lambda: depths.pop(0))
     bench(Place(0, 1, warmup=True))
     bench(Place(1, 0, warmup=False))
     writer.finish("finished")

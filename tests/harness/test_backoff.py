@@ -8,7 +8,7 @@ from s2a_bench.clock import VirtualClock
 from s2a_bench.frames import open_source
 from s2a_bench.harness.backoff import Backoff
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.transport import open_client
 from s2a_bench.transport.pipeline import one_pipeline
@@ -36,7 +36,7 @@ def test_a_refused_sample_is_one_row_with_its_error_and_is_not_sent_again(more: 
         cell = one_pipeline("http/as-deployed", url=url, dialect="openai")
         client = open_client(cell.wiring(url))
         source = open_source("synthetic", 64, 48, fps=30.0, seed=0)
-        session = Session(cell, client, RequestFeed(source, preencoded=False), LatencyConfig())
+        session = Session(cell, client, RequestFeed(source, preencoded=False), RequestsConfig())
         measured = session.measure(Place(0, 0, warmup=False))
         client.close()
         source.close()

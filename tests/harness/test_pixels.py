@@ -13,7 +13,7 @@ from s2a_bench.frames import open_source
 from s2a_bench.frames.convert import bgr_to_rgb, encode_jpeg, yuyv_to_bgr
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.pixels import rgb_fingerprint
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.inference import EngineConfig, open_engine
@@ -38,7 +38,7 @@ def measure() -> Iterator[Measure]:
             connecting = connector(cell.wiring(timeout_s=20))
             client = next(connecting)(handler)
             stack.callback(connecting.close)  # type: ignore[attr-defined]  # a generator
-            config = LatencyConfig((name,), max_tokens=3)
+            config = RequestsConfig(transports=name, max_tokens=3)
             session = Session(cell, client, RequestFeed(source, preencoded=False), config)
             return session.measure(Place(0, 0, warmup=False))
 

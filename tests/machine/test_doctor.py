@@ -16,7 +16,7 @@ import pytest
 
 from s2a_bench.cli.doctor import all_checks
 from s2a_bench.frames.v4l2_formats import CameraInfo
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.warnings import before_run
 from s2a_bench.inference.smoke import Smoke
 from s2a_bench.machine import doctor, environment
@@ -472,7 +472,7 @@ LOOSE = JETSON | {f"{CPU}/cpu0/cpufreq/scaling_min_freq": "1", "var/lib/nvpmodel
 def test_a_run_gets_the_doctors_warnings_that_concern_it(
     make: Make, tree: dict[str, str], width: int, dds: bool, expected: list[str]
 ) -> None:
-    config = LatencyConfig(("ros",) if dds else ("http",), width=width)
+    config = RequestsConfig(transports="ros" if dds else "http", size=(width, 480))
     warnings = before_run(config, make(tree))
     assert [warning.code for warning in warnings] == expected
     assert all(warning.advice for warning in warnings)

@@ -8,17 +8,17 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from pydantic import Field
 
 from s2a_bench import registry
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.experiments.latency.view.as_json import latency_json
 from s2a_bench.experiments.latency.view.cells import cells_of
-from s2a_bench.experiments.latency.view.figures import write_figures
+from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.latency.view.tables import stage_table, summary_table
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.inference import EngineConfig
+from s2a_bench.options import option
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import TransportSuite
@@ -30,8 +30,8 @@ from s2a_bench.types import Request, Token
 
 
 class ToyOptions(Options):
-    number: int = Field(1, ge=1, description="a number", json_schema_extra=SERVER)
-    greeting: str = Field("hello", description="a word")
+    number: int = option(1, "a number", ge=1, side=SERVER)
+    greeting: str = option("hello", "a word")
 
 
 class ToyClient(LoopbackClient):
@@ -88,7 +88,7 @@ class TestToy(TransportSuite):
 def run(toy: None, tmp_path: Path) -> Run:  # noqa: ARG001 - what is measured
     names = ("loopback", "toy", "toy?greeting=servus", "toy?number=2")
     few: dict[str, Any] = {"runs": 3, "warmup": 1, "max_tokens": 3, "sample_resources_hz": 0}
-    config = LatencyConfig(names, engine=EngineConfig(name="echo"), width=64, height=48, **few)
+    config = RequestsConfig(transports=names, engine=EngineConfig(name="echo"), size=(64, 48), **few)
     return read_run(run_latency(config, tmp_path, NullProgress()))
 
 
@@ -104,7 +104,7 @@ def test_a_run_measures_it_and_everything_shows_it(run: Run) -> None:
     whole = latency_json(run)
     assert "greet" in whole["cells"][0]["stages_ms"]
     assert {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]} == {(name, "loopback") for name in names[:3]}
-    assert write_figures(run)
+    assert [draw() for draw in latency_figures(run).values()]
 
 
 def test_its_folder_reads_where_the_package_is_not(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,7 +114,7 @@ def test_its_folder_reads_where_the_package_is_not(run: Run, monkeypatch: pytest
     read = read_run(run.path)
     assert [cell.name for cell in cells_of(read)][-3:] == ["toy", "toy?greeting=servus", "toy?number=2"]
     assert ("pack", "greet") in {row[:2] for row in stage_table(read).rows}
-    assert write_figures(read)
+    assert [draw() for draw in latency_figures(read).values()]
 
 
 @pytest.mark.usefixtures("toy")
@@ -122,7 +122,8 @@ def test_a_stage_that_nobody_declares_makes_the_sample_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Toy, "stages", {})
-    config = LatencyConfig(("toy", "loopback"), engine=EngineConfig(name="echo"), width=64, height=48, runs=2, warmup=0)
+    engine = EngineConfig(name="echo")
+    config = RequestsConfig(transports=("toy", "loopback"), engine=engine, size=(64, 48), runs=2, warmup=0)
     with pytest.raises(Exception, match="toy does not declare the stage greet"):
         run_latency(config, tmp_path, NullProgress())
 
@@ -130,4 +131,4 @@ def test_a_stage_that_nobody_declares_makes_the_sample_an_error(
 @pytest.mark.usefixtures("toy")
 def test_its_options_are_checked_like_any_other() -> None:
     with pytest.raises(UsageError, match="toy has no option 'colour'; it has payload, number, greeting"):
-        LatencyConfig(("toy?colour=red",)).check()
+        RequestsConfig(transports="toy?colour=red")

@@ -54,7 +54,7 @@ class CcrbConfig(Options):
     phase: bool = option(False, "also the phase diagram over rate and rear gap, for every gap behaviour")
     phase_rates: Numbers = option((2.0, 12.0), "tokens/s of the phase diagram: from, to")
     phase_gaps_m: Numbers = option((6.0, 30.0), "m to the car behind in the phase diagram: from, to", flag="phase-gaps")
-    phase_points: tuple[int, int] = Field((41, 25), json_schema_extra={"hidden": True})
+    phase_points: tuple[int, int] = option((41, 25), "rates and gaps of the phase diagram", hidden=True)
     random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
     asked: Asked = Field(default_factory=Asked)

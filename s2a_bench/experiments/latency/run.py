@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.rounds import Task, run_requests
 from s2a_bench.progress import Progress
 
 
-def run_latency(config: LatencyConfig, output: Path, progress: Progress) -> Path:
+def run_latency(config: RequestsConfig, output: Path, progress: Progress) -> Path:
     """Measure and return the run folder; whatever happens, the samples so far are in it.
 
     Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
     """
-    config.check()
-    return run_requests(Task("latency"), config, output, progress)
+    return run_requests(Task("latency"), config.answered(progress.say), output, progress)

@@ -17,7 +17,7 @@ from s2a_bench.errors import EngineError
 from s2a_bench.exits import COMPILE_AGAIN, how_it_ended
 from s2a_bench.experiments.throughput.rows import REFERENCE, ReferenceRow
 from s2a_bench.harness.llama_flags import llama_flags
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.session import Place
 from s2a_bench.store.run import RunWriter
 
@@ -28,7 +28,7 @@ LONGEST_S = 7200
 class LlamaBench:
     """One turn of llama-bench a block; called with its place."""
 
-    def __init__(self, program: Path, config: LatencyConfig, writer: RunWriter, depth: Callable[[], int]) -> None:
+    def __init__(self, program: Path, config: RequestsConfig, writer: RunWriter, depth: Callable[[], int]) -> None:
         """Prepare the command; ``depth`` tells how many tokens lie in the context before those that are timed."""
         self._program = program
         self._writer = writer

@@ -6,27 +6,29 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import urlsplit
 
-from pydantic import Field, field_validator
+from pydantic import field_validator
 
 from s2a_bench.errors import UsageError
-from s2a_bench.transport.options import SERVER, Options
+from s2a_bench.options import TextOrFile, option
+from s2a_bench.transport.http.dialects import DIALECTS
+from s2a_bench.transport.options import SERVER, SERVING, Options
 
 
 class HttpOptions(Options):
     """How our HTTP server is reached, or somebody else's is asked."""
 
-    connection: Literal["keep-alive", "per-request", "client-per-request"] = Field(
-        "keep-alive", description="a connection for all requests, a new one each, a new client object each"
+    connection: Literal["keep-alive", "per-request", "client-per-request"] = option(
+        "keep-alive", "keep-alive, per-request (a new connection each), client-per-request (a new client object each)"
     )
-    host: str = Field("127.0.0.1", description="address that our server binds", json_schema_extra=SERVER)
-    port: int = Field(0, ge=0, le=65535, description="port of the server; 0: any free one", json_schema_extra=SERVER)
-    url: str = Field("", description="a server that runs already (a black box)", json_schema_extra=SERVER)
-    served_model: str = Field("default", description="the model's name at the url")
-    dialect: str = Field("", description="what the url speaks [default: ask]")
-    api_key_env: str = Field("", description="NAME of the environment variable with the API key of the url")
-    extra_body: str = Field("", description="JSON merged into every request to the url (RFC 7396)")
-    llama_server: Path | None = Field(
-        None, description="start this llama.cpp server on the same model files (a black box)", json_schema_extra=SERVER
+    host: str = option("127.0.0.1", "address that our server binds", side=SERVING)
+    port: int = option(0, "port of the server; 0: any free one", ge=0, le=65535, side=SERVER)
+    url: str = option("", "a server that runs already (a black box)", side=SERVER)
+    served_model: str = option("default", "the model's name at the url")
+    dialect: str = option("", f"what the url speaks: {', '.join(DIALECTS)} [default: ask]")
+    api_key_env: str = option("", "NAME of the environment variable with the API key of the url")
+    extra_body: TextOrFile = option("", "JSON, or @FILE, merged into every request to the url (RFC 7396)")
+    llama_server: Path | None = option(
+        None, "start this llama.cpp server on the same model files (a black box)", side=SERVER
     )
 
     @field_validator("url")
@@ -41,8 +43,6 @@ class HttpOptions(Options):
     @field_validator("dialect")
     @classmethod
     def _is_spoken(cls, dialect: str) -> str:
-        from s2a_bench.transport.http.dialects import DIALECTS
-
         if dialect and dialect not in DIALECTS:
             raise ValueError(f"'{dialect}' is none of {', '.join(DIALECTS)}")
         return dialect

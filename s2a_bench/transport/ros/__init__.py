@@ -81,6 +81,10 @@ class Ros(Transport[RosOptions]):
                 f"ros/{ACTION}?payload=raw"
             )
 
+    def tuned(self, options: RosOptions) -> bool:
+        """Return False for DDS, and processes, as they come."""
+        return options.dds_tuning == "tuned"
+
     def foreign(self, options: RosOptions) -> str:
         """Return the name of somebody else's action."""
         return options.action

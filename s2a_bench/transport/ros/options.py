@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import field_validator
 
-from s2a_bench.transport.options import SERVER, Options
+from s2a_bench.options import option
+from s2a_bench.transport.options import SERVER, SERVING, Options
 
 NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 """ROS 2's rules for an absolute name."""
@@ -16,40 +17,32 @@ NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 class RosOptions(Options):
     """Where topics and actions are, and what carries them."""
 
-    action: str = Field(
+    action: str = option(
         "",
-        description="an action that runs already, as /llama/generate_response of llama_ros (a black box)",
-        json_schema_extra=SERVER,
+        "an action that runs already, as /llama/generate_response of llama_ros (a black box)",
+        side=SERVER,
     )
-    namespace: str = Field("/s2a_bench", description="namespace of the topics", json_schema_extra=SERVER)
-    domain_id: int | None = Field(
-        None, ge=0, le=232, description="DDS domain [default: ROS_DOMAIN_ID, else 0]", json_schema_extra=SERVER
+    namespace: str = option("/s2a_bench", "namespace of the topics", side=SERVER)
+    domain_id: int | None = option(None, "DDS domain [default: ROS_DOMAIN_ID, else 0]", ge=0, le=232, side=SERVER)
+    middleware: str = option("", "cyclonedds, rclpy [default: rclpy in a sourced ROS 2 environment]", side=SERVER)
+    qos: Literal["reliable", "sensor_data"] = option(
+        "reliable", "the camera topic's: reliable, sensor_data (best effort)", side=SERVER
     )
-    middleware: str = Field(
-        "", description="cyclonedds, rclpy [default: rclpy in a sourced ROS 2 environment]", json_schema_extra=SERVER
+    dds_tuning: Literal["tuned", "default"] = option(
+        "tuned", "tuned (large datagrams and receive buffers), default (DDS as it comes)", side=SERVER
     )
-    qos: Literal["reliable", "sensor_data"] = Field(
-        "reliable", description="quality of service of the camera topic", json_schema_extra=SERVER
-    )
-    dds_tuning: Literal["tuned", "default"] = Field(
-        "tuned", description="large datagrams and receive buffers, or DDS as it comes", json_schema_extra=SERVER
-    )
-    result_timeout: float = Field(
-        60.0, ge=0, le=86_400, description="seconds an action's result is kept", json_schema_extra=SERVER
-    )
-    max_tokens: int | None = Field(
+    result_timeout: float = option(60.0, "seconds an action's result is kept", ge=0, le=86_400, side=SERVER)
+    max_tokens: int | None = option(
         None,
+        "most tokens of a goal, which cannot say how many it wants [default: the run's]",
         ge=1,
         le=2**20,
-        description="most tokens of a goal, which cannot say how many it wants [default: the run's]",
-        json_schema_extra=SERVER,
+        side=SERVING,
     )
-    feedback_interval: float = Field(
-        0.0, ge=0, le=60, description="seconds: tokens that come faster share a feedback", json_schema_extra=SERVER
+    feedback_interval: float = option(
+        0.0, "seconds: tokens that come faster share a feedback", ge=0, le=60, side=SERVING
     )
-    publish_tokens: bool = Field(
-        False, description="also publish the tokens of goals, for plotting", json_schema_extra=SERVER
-    )
+    publish_tokens: bool = option(False, "also publish the tokens of goals, for plotting", side=SERVING)
 
     @field_validator("namespace", "action")
     @classmethod

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from s2a_bench.experiments.latency.view.files import write_tables
 from s2a_bench.experiments.latency.view.frame_path import frame_table
+from s2a_bench.experiments.latency.view.tables import latency_tables
 from s2a_bench.store.requests import FrameRow, SampleRow
 from s2a_bench.store.run import Run, RunWriter, read_run
 from s2a_bench.trace import Mark
@@ -47,9 +47,8 @@ def test_only_frames_of_counted_samples_count(run: Run) -> None:
     ]
 
 
-def test_the_table_is_written_beside_the_others(run: Run) -> None:
-    names = {path.name for path in write_tables(run)}
-    assert {"frames.md", "frames.tex"} <= names
+def test_the_table_is_one_of_the_runs(run: Run) -> None:
+    assert list(latency_tables(run))[-1] == "frames"
 
 
 def test_a_run_without_a_stream_has_no_such_table(tmp_path: Path) -> None:

@@ -9,11 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from s2a_bench.errors import StoreError
+from s2a_bench.experiments.files import write_shown
+from s2a_bench.experiments.latency.view import show
 from s2a_bench.experiments.latency.view.figures import (
     build_distribution,
     build_latency_bars,
     build_stage_breakdown,
-    write_figures,
 )
 from s2a_bench.experiments.paper import LABEL, paper_latency
 from s2a_bench.store.run import Run
@@ -159,9 +160,10 @@ def test_no_text_is_clipped_or_smaller_than_seven_points(
 
 def test_png_and_pdf_are_written_below_the_run(make_run: MakeRun) -> None:
     run = make_run(n=3)
-    paths = write_figures(run, against_paper=True)
-    names = ["latency_bars", "stage_breakdown", "distribution"]
-    assert [path.name for path in paths] == [f"{name}.{suffix}" for name in names for suffix in ("png", "pdf")]
+    write_shown(run, show(run, against="paper"))
+    paths = sorted((run.path / "figures").iterdir())
+    names = ["distribution", "latency_bars", "stage_breakdown"]
+    assert [path.name for path in paths] == [f"{name}.{suffix}" for name in names for suffix in ("pdf", "png")]
     for path in paths:
         head = path.read_bytes()
         assert head.startswith(b"\x89PNG" if path.suffix == ".png" else b"%PDF")
@@ -170,7 +172,7 @@ def test_png_and_pdf_are_written_below_the_run(make_run: MakeRun) -> None:
 
 def test_without_samples_there_are_no_figures(make_run: MakeRun) -> None:
     run = make_run({})
-    assert write_figures(run) == []
+    write_shown(run, show(run))
     assert not (run.path / "figures").exists()
 
 
@@ -178,12 +180,13 @@ def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun) -> None:
     run = make_run(n=1)
     (run.path / "figures").write_text("")
     with pytest.raises(StoreError, match=r"cannot write .*figures"):
-        write_figures(run)
+        write_shown(run, show(run))
 
 
 def test_drawing_leaves_no_global_state(make_run: MakeRun) -> None:
     before = dict(mpl.rcParams)
-    write_figures(make_run(n=1))
+    run = make_run(n=1)
+    write_shown(run, show(run))
     assert dict(mpl.rcParams) == before
 
 

@@ -3,20 +3,22 @@ import io
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from rich.console import Console
 
 from s2a_bench.errors import StoreError
+from s2a_bench.experiments.files import write_shown
+from s2a_bench.experiments.latency.view import show
 from s2a_bench.experiments.latency.view.as_csv import csv_texts
-from s2a_bench.experiments.latency.view.files import write_tables
 from s2a_bench.experiments.latency.view.tables import group_table, stage_table, summary_table
-from s2a_bench.experiments.latency.view.terminal import renderables
 from s2a_bench.stats import Ratio, Summary
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run
 from s2a_bench.writers.tables import interval, mean_sd, number, to_latex, to_markdown
+from s2a_bench.writers.terminal import lay_out
 
 MakeRun = Callable[..., Run]
 NONE = "\N{EN DASH}"
@@ -29,8 +31,11 @@ HAND = {name: {**stages, "return": 0.5} for name, stages in HAND.items()}
 
 def printed(run: Run) -> str:
     console = Console(width=100, file=io.StringIO(), color_system=None)
-    for renderable in renderables(run):
-        console.print(renderable)
+    shown = show(run)
+    for name in shown.printed or ():
+        console.print(lay_out(shown.narrow.get(name) or shown.tables[name]))
+    for note in shown.notes:
+        console.print(note)
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
@@ -179,7 +184,8 @@ def test_a_cell_in_which_everything_failed_is_in_the_summary(
 
 def test_the_files_are_written_below_the_run(make_run: MakeRun) -> None:
     run = make_run(n=3)
-    paths = write_tables(run)
+    write_shown(run, replace(show(run), figures={}))
+    paths = [*(run.path / "tables").iterdir()]
     assert sorted(path.name for path in paths) == [
         "ratios.csv",
         "stages.csv",
@@ -198,7 +204,7 @@ def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun) -> None:
     run = make_run(n=1)
     (run.path / "tables").write_text("")
     with pytest.raises(StoreError, match=r"cannot write .*tables"):
-        write_tables(run)
+        write_shown(run, show(run))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6])
@@ -220,7 +226,7 @@ def test_an_empty_run_prints_a_line(make_run: MakeRun) -> None:
 
 def test_importing_the_tables_imports_no_heavy_library() -> None:
     code = (
-        "import sys; from s2a_bench.experiments.latency.view import as_json, figures, terminal;"
+        "import sys; from s2a_bench.experiments.latency.view import as_json, figures;"
         "print([n for n in ('pandas', 'pyarrow', 'matplotlib', 'scipy', 'numpy', 'rich') if n in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -15,8 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from matplotlib.patches import Rectangle
 
+from s2a_bench.experiments.files import write_shown
 from s2a_bench.experiments.paper import paper_throughput
 from s2a_bench.experiments.throughput.rows import REFERENCE, ReferenceRow
+from s2a_bench.experiments.throughput.view import show
 from s2a_bench.experiments.throughput.view.as_json import throughput_json
 from s2a_bench.experiments.throughput.view.cells import BIN, Speed, ratios_of, speeds_of
 from s2a_bench.experiments.throughput.view.figures import (
@@ -24,7 +26,7 @@ from s2a_bench.experiments.throughput.view.figures import (
     build_gap_distribution,
     build_rate_by_position,
     build_throughput_bars,
-    write_throughput_figures,
+    throughput_figures,
 )
 from s2a_bench.experiments.throughput.view.tables import position_table, speed_table, throughput_csv, throughput_tables
 from s2a_bench.store.requests import SampleRow, TokenRow
@@ -261,9 +263,10 @@ def test_one_late_burst_does_not_hide_the_rates(make: Make) -> None:
 
 def test_the_figures_are_written_and_none_without_rates(make: Make) -> None:
     run = make({"in-process": [10.0] * 40, "http/as-deployed": [1.0] * 40})
-    names = sorted(path.name for path in write_throughput_figures(run, against_paper=True))
+    write_shown(run, show(run, against="paper"))
+    names = sorted(path.name for path in (run.path / "figures").iterdir())
     assert names == [
         f"{name}.{suffix}" for name in ("gaps", "positions", "throughput_bars") for suffix in ("pdf", "png")
     ]
     assert build_gap_distribution(run).axes[0].get_xscale() == "linear"
-    assert write_throughput_figures(make({"in-process": []})) == []
+    assert throughput_figures(make({"in-process": []})) == {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
-from pydantic import Field
+from s2a_bench.options import option
 from s2a_bench.transport import Client, Handler, Server, Transport, Wiring
 from s2a_bench.transport.options import SERVER, Options
 
@@ -13,9 +13,7 @@ from s2a_bench.transport.options import SERVER, Options
 class ToyOptions(Options):
     """The options of `toy`."""
 
-    toy_port: int = Field(
-        0, ge=0, le=65535, description="port of the toy server; 0: any free one", json_schema_extra=SERVER
-    )
+    toy_port: int = option(0, "port of the toy server; 0: any free one", ge=0, le=65535, side=SERVER)
 
 
 class Toy(Transport[ToyOptions]):

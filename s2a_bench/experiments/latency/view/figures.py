@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note, groups_present
 from s2a_bench.experiments.paper import CAVEAT, LABEL, paper_latency
 from s2a_bench.stats import summary_of
-from s2a_bench.writers.figures import LINE_CHARS, WIDE_SPREAD, logarithmic, name_rows, new_figure, save, write_beside
+from s2a_bench.writers.figures import LINE_CHARS, WIDE_SPREAD, logarithmic, name_rows, new_figure, write_beside
 from s2a_bench.writers.style import GREY, GROUP_FILLS, RESIDUAL_FILL, cell_looks
 from s2a_bench.writers.tables import mean_sd, number
 
@@ -122,7 +121,7 @@ def build_distribution(run: Run) -> Figure:
     return figure
 
 
-def latency_figures(run: Run, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
+def latency_figures(run: Run, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
     """Return every figure by its file's name; the paper's values only when asked for. No samples, no figures."""
     if not _shown(run)[0]:
         return {}
@@ -131,12 +130,6 @@ def latency_figures(run: Run, against_paper: bool = False) -> dict[str, Callable
         "stage_breakdown": lambda: build_stage_breakdown(run),
         "distribution": lambda: build_distribution(run),
     }
-
-
-def write_figures(run: Run, against_paper: bool = False) -> list[Path]:
-    """Write ``figures/*.png`` and ``*.pdf``; without samples nothing."""
-    builders = latency_figures(run, against_paper)
-    return save(run.path / "figures", builders) if builders else []
 
 
 def _shown(run: Run) -> tuple[list[Cell], str]:

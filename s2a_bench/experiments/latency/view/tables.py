@@ -12,6 +12,7 @@ from s2a_bench.experiments.latency.view.cells import (
     ratio_between,
     stages_present,
 )
+from s2a_bench.experiments.latency.view.frame_path import frame_table
 from s2a_bench.stats import summary_of
 from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.writers.tables import ABSENT, TextTable, interval, mean_sd, number
@@ -154,3 +155,13 @@ def _engine_notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
     """Say what did not really answer, as a sentence."""
     note = engine_note(run, cells)
     return (note.sentence(),) if note else ()
+
+
+def latency_tables(run: Run) -> dict[str, TextTable]:
+    """Return every table of a latency run by its file's name."""
+    tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
+    if tokens := token_table(run):
+        tables["tokens"] = tokens
+    if frames := frame_table(run):
+        tables["frames"] = frames
+    return tables

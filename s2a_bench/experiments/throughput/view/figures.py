@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.cells import engine_note
@@ -18,7 +17,7 @@ from s2a_bench.experiments.throughput.view.cells import (
     speeds_of,
 )
 from s2a_bench.stats import summarise, summary_of
-from s2a_bench.writers.figures import LINE_CHARS, WIDE_SPREAD, logarithmic, name_rows, new_figure, save, write_beside
+from s2a_bench.writers.figures import LINE_CHARS, WIDE_SPREAD, logarithmic, name_rows, new_figure, write_beside
 from s2a_bench.writers.style import GREY, cell_looks
 from s2a_bench.writers.tables import mean_sd, number
 
@@ -142,12 +141,6 @@ def throughput_figures(run: Run, *, against_paper: bool = False) -> dict[str, Ca
         "gaps": lambda: build_gap_distribution(run),
         "positions": lambda: build_rate_by_position(run),
     }
-
-
-def write_throughput_figures(run: Run, *, against_paper: bool = False) -> list[Path]:
-    """Write ``figures/*.png`` and ``*.pdf``; without rates nothing."""
-    builders = throughput_figures(run, against_paper=against_paper)
-    return save(run.path / "figures", builders) if builders else []
 
 
 def _title(run: Run, speeds: list[Speed], what: str) -> str:

@@ -13,7 +13,7 @@ from s2a_bench.runtime import ROBOTS
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.timeline.config import TimelineConfig
-    from s2a_bench.harness.plan import LatencyConfig
+    from s2a_bench.harness.plan import RequestsConfig
     from s2a_bench.plan import SkillSet
 
 REPLAY_TOKENS: Final = 6
@@ -42,22 +42,20 @@ class Live(Options):
     )
 
 
-def requests_of(config: TimelineConfig) -> LatencyConfig:
+def requests_of(config: TimelineConfig) -> RequestsConfig:
     """Return how the model is asked: one transport in one variant; prompt and length follow from the plan."""
-    from s2a_bench.harness.plan import LatencyConfig
+    from s2a_bench.harness.plan import RequestsConfig
     from s2a_bench.transport.http import HTTP
     from s2a_bench.transport.pipeline import first_variants
     from s2a_bench.transport.ros import ROS
 
     transport = config.transport or (HTTP.name if config.url else ROS.name)
-    width, height = config.size
-    return LatencyConfig(
+    return RequestsConfig(
         transports=(transport,),
         variants=first_variants(),
         options={HTTP.name: {"url": config.url, "dialect": config.dialect}},
         source=config.source,
-        width=width,
-        height=height,
+        size=config.size,
         engine=config.engine.but(profile=",".join(config.profiles)) if config.profiles else config.engine,
         runs=1,
         warmup=config.warmup,
@@ -72,7 +70,6 @@ def check_live(config: TimelineConfig) -> None:
     from s2a_bench.policy import PlanShape, Timing
 
     requests = requests_of(config)
-    requests.check()
     if len(requests.pipelines) != 1:
         raise UsageError("`transport`: `live` follows one stream; name one, as ros, ros/action or http/binary")
     _ = config.skill_set

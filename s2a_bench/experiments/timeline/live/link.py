@@ -15,7 +15,7 @@ from s2a_bench.experiments.timeline.live.asks import Ask, asks_of, prior_of
 from s2a_bench.experiments.timeline.live.config import in_paper_format, requests_of
 from s2a_bench.frames import FrameSource
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.plan import LatencyConfig
+from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.harness.warnings import before_run
@@ -69,16 +69,16 @@ class Tee:
         self._client.close()
 
 
-def word(config: TimelineConfig, progress: Progress) -> tuple[LatencyConfig, list[Ask]]:
+def word(config: TimelineConfig, progress: Progress) -> tuple[RequestsConfig, list[Ask]]:
     """Find the model's files and word what it is asked, with the room that it needs; raises S2AError."""
     requests = requests_of(config)
     if not in_paper_format(config):
         need_engine("llama")
         progress.stage("reading the model's headers" if requests.engine.model else "the tiny dummy model")
         model, mmproj = resolve(requests.engine)
-        requests = replace(requests, engine=requests.engine.but(model=model, mmproj=mmproj))
+        requests = requests.but(engine=requests.engine.but(model=model, mmproj=mmproj))
     asks = asks_of(config, requests.engine.model)
-    return replace(requests, max_tokens=max(ask.max_tokens for ask in asks)), asks
+    return requests.but(max_tokens=max(ask.max_tokens for ask in asks)), asks
 
 
 @dataclass
@@ -86,7 +86,7 @@ class Link:
     """The way to one model, for one run."""
 
     config: TimelineConfig
-    requests: LatencyConfig
+    requests: RequestsConfig
     """As `word` returned them."""
     writer: RunWriter
     progress: Progress
@@ -152,8 +152,7 @@ class Link:
     def ask(self, ask: Ask, plan: int, feed: PlanFeed | None) -> Measured:
         """Make one request and keep its rows; raises what ends the run."""
         requests = self.requests
-        asked = replace(
-            requests,
+        asked = requests.but(
             prompt=ask.prompt,
             grammar=ask.grammar,
             max_tokens=ask.max_tokens,

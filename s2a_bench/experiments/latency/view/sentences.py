@@ -1,12 +1,14 @@
-"""What a run says in a few sentences: what was measured, how often, and what came out, with its interval."""
+"""What a latency run says in a few sentences: what was measured, how often, and what came out, with its interval."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from s2a_bench.experiments.latency.view.cells import cells_of, ratios
 from s2a_bench.experiments.latency.view.tables import TITLES
+from s2a_bench.stats import summary_of
 from s2a_bench.transport import declared
-from s2a_bench.writers.tables import interval, mean_sd, number
+from s2a_bench.writers.tables import interval, number
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,13 +22,11 @@ _MOST = 6
 
 def latency_sentences(run: Run) -> list[str]:
     """Say how long each cell takes, and how many times as long as ROS or loopback."""
-    from s2a_bench.experiments.latency.view.cells import cells_of, ratios
-    from s2a_bench.stats import summary_of
-
-    cells = cells_of(run)
+    if not (cells := cells_of(run)):
+        return []
     about = cells[0].about
     names = ", ".join(cell.name for cell in cells)
-    requests = _counts([cell.n for cell in cells], "request")
+    requests = counts([cell.n for cell in cells], "request")
     said = [f"{requests} a cell over {names}; frames of {about['size']}, {about['mode']} mode."]
     comparable = any(cell.values_ms("e2e_without_inference").size for cell in cells)
     metric = "e2e_without_inference" if comparable else "e2e"
@@ -43,18 +43,11 @@ def latency_sentences(run: Run) -> list[str]:
     return said + found[:_MOST]
 
 
-def throughput_sentences(run: Run) -> list[str]:
-    """Say how many tokens a second each cell generates."""
-    from s2a_bench.experiments.throughput.view.cells import speeds_of
-    from s2a_bench.stats import summary_of
-
-    said = []
-    for speed in speeds_of(run):
-        if found := summary_of(speed.values("tokens_per_s")):
-            source = "the engine's own figure" if speed.told else "as the client saw it"
-            times = _counts([found.n], "request")
-            said.append(f"{speed.name}: {mean_sd(found)} tokens/s (mean ± sd of {times}, {source}).")
-    return said or ["No request was answered; samples.csv says why."]
+def counts(counts: Sequence[int], what: str) -> str:
+    """Say how many there are: 50 requests, or 48 to 50."""
+    low, high = min(counts), max(counts)
+    span = str(low) if low == high else f"{low} to {high}"
+    return f"{span} {what}{'s' * (high != 1)}"
 
 
 def _times(cell: str, base: str, ratio: Ratio) -> str:
@@ -64,10 +57,3 @@ def _times(cell: str, base: str, ratio: Ratio) -> str:
         between = f" (ratio of medians, 95 % interval {interval(ratio).partition(' ')[2][1:-1].replace(',', ' to')})"
     value = "an unknown number of" if ratio.value is None else number(ratio.value)
     return f"{cell} takes {value} times as long as {base}{between}."
-
-
-def _counts(counts: Sequence[int], what: str) -> str:
-    """Say how many there are: 50 requests, or 48 to 50."""
-    low, high = min(counts), max(counts)
-    span = str(low) if low == high else f"{low} to {high}"
-    return f"{span} {what}{'s' * (high != 1)}"
