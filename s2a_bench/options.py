@@ -162,12 +162,10 @@ def _size(value: Any) -> Any:
 
 
 def _text(value: Any) -> Any:
-    """Read the file that @FILE names."""
     return _sound(_content(value[1:]) if isinstance(value, str) and value.startswith("@") else value)
 
 
 def _grammar(value: Any) -> Any:
-    """Read a file, unless it is a grammar already: one has a rule."""
     return _sound(value if isinstance(value, str) and (not value or "::=" in value) else _content(value))
 
 

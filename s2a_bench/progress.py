@@ -67,7 +67,7 @@ class Picture(Protocol):
         ...
 
     def lines(self) -> Iterable[str]:
-        """Say what came of it, for where there is no terminal."""
+        """Return what came of it, for where there is no terminal."""
         ...
 
 

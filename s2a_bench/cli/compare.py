@@ -75,7 +75,7 @@ def compare(
 
 
 def _gate_code(judgements: Sequence[Judgement]) -> int:
-    """Say what the gates found, and return the exit code: a tripped gate before one that cannot be judged."""
+    """Return what the gates found, and return the exit code: a tripped gate before one that cannot be judged."""
     from s2a_bench.report.compare import gates as compare_gates
     from s2a_bench.report.compare.tables import change_text
 
@@ -89,5 +89,4 @@ def _gate_code(judgements: Sequence[Judgement]) -> int:
 
 
 def _say(line: str) -> None:
-    """Print a line beside the result."""
     print(line, file=sys.stderr)  # noqa: T201 - the command line's own output

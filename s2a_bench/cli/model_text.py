@@ -41,7 +41,6 @@ def renderables(info: GgufInfo, sha256: str | None) -> list[RenderableType]:
 
 
 def _clean(text: object) -> str:
-    """Keep what a file says from steering the terminal."""
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in str(text))
 
 

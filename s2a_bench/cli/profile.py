@@ -158,7 +158,7 @@ def line_of(profile: Profile) -> str:
 
 
 def distances(profile: Profile) -> str:
-    """Say how far each family of gaps is from the recorded ones."""
+    """Return how far each family of gaps is from the recorded ones."""
     fit = profile.facts["fit"]
     return ", ".join(f"{name} {max(gap, fit['distance_sum'][name]):.3f}" for name, gap in fit["distance_gap"].items())
 

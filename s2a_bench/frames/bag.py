@@ -86,7 +86,6 @@ class Recording:
         self._reader = None
 
     def _start(self) -> Iterator[tuple[Any, int, bytes]]:
-        """Go to the first picture."""
         return cast("Iterator[tuple[Any, int, bytes]]", self._reader.messages([self._connection]))
 
     def _next(self) -> Any:

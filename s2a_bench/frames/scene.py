@@ -100,5 +100,4 @@ def _noise(width: int, height: int, cell: int, rng: np.random.Generator) -> Plan
 
 
 def _blur(plane: Plane, sigma_px: float) -> Plane:
-    """Blur with a Gaussian."""
     return cast("Plane", cv2.GaussianBlur(plane, (0, 0), sigma_px))

@@ -66,7 +66,7 @@ class SyntheticCamera:
         self._scene = None
 
     def _corner(self, t_s: float) -> tuple[int, int]:
-        """Say where the window's upper left corner is; x is even, so that pixel pairs stay whole."""
+        """Return where the window's upper left corner is; x is even, so that pixel pairs stay whole."""
         across, down = (0.5 + 0.5 * math.sin(math.tau * t_s / period_s) for period_s in PERIODS_S)
         return round(across * self._room[0] / 2) * 2, round(down * self._room[1])
 

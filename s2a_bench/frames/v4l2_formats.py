@@ -104,5 +104,4 @@ def _sizes(device: int, code: int, ioctl: Ioctl) -> list[tuple[int, int]]:
 
 
 def _text(raw: bytes) -> str:
-    """Read a C string."""
     return raw.partition(b"\0")[0].decode("ascii", "replace").strip()

@@ -64,7 +64,7 @@ class ServerProcess(ABC):
         return self._process.pid
 
     def alive(self) -> bool:
-        """Tell whether the process still runs."""
+        """Return whether the process still runs."""
         return self._process.poll() is None
 
     def ends_within(self, timeout_s: float) -> bool:
@@ -97,7 +97,6 @@ class ServerProcess(ABC):
             self._log.close()
 
     def _ask_to_stop(self) -> None:
-        """Ask in the way that this server understands."""
         self._process.terminate()
 
     def __enter__(self) -> ServerProcess:  # noqa: PYI034 - Self is typing's since 3.11
@@ -221,5 +220,4 @@ PR_SET_PDEATHSIG = 1
 
 
 def _die_with_parent() -> None:
-    """Have the kernel end the child when the harness is gone, however it went."""
     _prctl(PR_SET_PDEATHSIG, signal.SIGTERM)

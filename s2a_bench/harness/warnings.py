@@ -135,7 +135,7 @@ class SampleGuard:
         return self._succeeded.get(cell, 0)
 
     def warnings(self) -> list[RunWarning]:
-        """Say what was seen."""
+        """Return what was seen."""
         return [
             *_told(
                 self._repeated,

@@ -31,7 +31,7 @@ class Engine(Protocol):
         ...
 
     def describe(self) -> dict[str, str | int | float | bool]:
-        """Say what answers, for the manifest: engine, model file, hash, whether the weights are dummies."""
+        """Return what answers, for the manifest: engine, model file, hash, whether the weights are dummies."""
         ...
 
     def close(self) -> None:

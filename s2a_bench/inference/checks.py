@@ -21,7 +21,7 @@ BUILT_FOR = f"{sys.prefix}/s2a-bench-llama".lstrip("/")
 
 
 def llama_build(machine: Machine) -> Finding | None:
-    """Say what llama-cpp-python was built for, whether GPU or AMX lie idle because of it, and whether it works."""
+    """Return what llama-cpp-python was built for, whether GPU or AMX lie idle because of it, and whether it works."""
     if not machine.finds("llama_cpp"):
         return None
     seen = smoke_test()
@@ -50,7 +50,7 @@ def llama_build(machine: Machine) -> Finding | None:
 
 
 def _amx(machine: Machine, cpuinfo: str, flags: list[str]) -> str:
-    """Say whether this CPU has AMX and llama.cpp uses it."""
+    """Return whether this CPU has AMX and llama.cpp uses it."""
     if " amx_tile" not in cpuinfo:
         return "no AMX in this CPU"
     if "AMX_INT8" in flags:

@@ -60,17 +60,17 @@ class GgufHeader:
 
     @property
     def is_mmproj(self) -> bool:
-        """Tell whether this is a projector file and not a language model."""
+        """Return whether this is a projector file and not a language model."""
         return self.architecture == "clip"
 
     @property
     def has_vision(self) -> bool:
-        """Tell whether a projector file holds a vision tower."""
+        """Return whether a projector file holds a vision tower."""
         return self.fields.get("clip.has_vision_encoder") is True
 
     @property
     def is_dummy(self) -> bool:
-        """Tell whether our `model dummy` wrote the file."""
+        """Return whether our `model dummy` wrote the file."""
         return self.fields.get("s2a_bench.dummy") is True
 
 

@@ -242,7 +242,7 @@ class LlamaCppEngine:
             raise EngineError(f"llama: the grammar of request {request.id} is not valid GBNF: {wrong}")
 
     def describe(self) -> dict[str, str | int | float | bool]:
-        """Say what answers; the first call hashes the files, which takes seconds for gigabytes."""
+        """Return what answers; the first call hashes the files, which takes seconds for gigabytes."""
         model, mmproj = self._files.model, self._files.mmproj
         facts: dict[str, str | int | float | bool] = {
             "engine": "llama",

@@ -29,7 +29,7 @@ _callback = llama_cpp.llama_log_callback(_keep)  # must outlive the library's us
 
 
 def verbose() -> bool:
-    """Tell whether the user wants llama.cpp's log."""
+    """Return whether the user wants llama.cpp's log."""
     return os.environ.get(VARIABLE) == "1"
 
 

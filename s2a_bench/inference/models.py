@@ -27,7 +27,7 @@ class ModelFiles:
 
     @property
     def dummy(self) -> bool:
-        """Tell whether any of the weights are dummies."""
+        """Return whether any of the weights are dummies."""
         return self.model.is_dummy or self.mmproj.is_dummy
 
 

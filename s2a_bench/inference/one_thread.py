@@ -95,7 +95,7 @@ class OneThreadEngine:
             wait([writing])
 
     def describe(self) -> dict[str, str | int | float | bool]:
-        """Say what the engine says."""
+        """Return what the engine says."""
         described: dict[str, str | int | float | bool] = self._submit(self._engine.describe).result()
         return described
 

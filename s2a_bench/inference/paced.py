@@ -41,7 +41,7 @@ class PacedEngine:
                 tokens.close()  # the rest is not wanted
 
     def describe(self) -> dict[str, str | int | float | bool]:
-        """Say what the engine says, and the rate."""
+        """Return what the engine says, and the rate."""
         return {**self._engine.describe(), "paced_tokens_per_s": self._rate}
 
     def close(self) -> None:

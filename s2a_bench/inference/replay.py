@@ -120,7 +120,7 @@ class ReplayEngine:
         return float(Lognormal(profile.prompt_s, profile.prompt_cv).sample(rng, 1, 1)[0, 0])
 
     def describe(self) -> dict[str, str | int | float | bool]:
-        """Say which profile is played and how; ``dummy`` is that of the recorded model."""
+        """Return which profile is played and how; ``dummy`` is that of the recorded model."""
         profile = self._profile
         return {
             "engine": "replay",

@@ -32,7 +32,7 @@ def board_facts() -> dict[str, Any]:
 
 
 def matches(profile: Profile, board: Mapping[str, Any]) -> bool:
-    """Tell whether everything that a profile says of its kind of board holds for this one."""
+    """Return whether everything that a profile says of its kind of board holds for this one."""
     named = {key: value for key, value in profile.facts.get("board", {}).items() if key in KIND}
     return bool(named) and all(_same(key, value, board.get(key)) for key, value in named.items())
 

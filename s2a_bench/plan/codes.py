@@ -56,5 +56,4 @@ def _apart(count: int, tokenize: Tokenize, candidates: Iterator[str]) -> list[st
 
 
 def _candidates(length: int) -> Iterator[str]:
-    """Yield short texts without blanks, the most readable first."""
     return iter(_ONE) if length == 1 else map("".join, product(string.ascii_letters, repeat=length))

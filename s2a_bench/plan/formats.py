@@ -24,7 +24,7 @@ class Cost:
 
     @property
     def exact(self) -> bool:
-        """Tell whether every call costs the same."""
+        """Return whether every call costs the same."""
         return self.least == self.most
 
 

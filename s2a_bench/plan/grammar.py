@@ -85,7 +85,6 @@ def _tree(words: Sequence[_Word], alphabet: _Alphabet) -> str:
 
 
 def _common(words: Sequence[_Word], longest: int) -> int:
-    """Return how many symbols, up to ``longest``, all words begin with."""
     return next((at for at in range(longest) if len({word[at] for word in words}) > 1), longest)
 
 

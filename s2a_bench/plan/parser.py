@@ -220,7 +220,7 @@ def _look_up(line: str, format_: Format) -> _Found:
 
 
 def _explain(text: str, line: str, format_: Format) -> _Bad:
-    """Say why a text is no call."""
+    """Return why a text is no call."""
     wording = format_.wording
     fields = wording.fields(text)
     if not fields:

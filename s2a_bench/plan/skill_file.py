@@ -89,7 +89,6 @@ def _range(content: Mapping[str, Any]) -> tuple[Value, ...]:
 
 
 def _plain(value: Decimal) -> int | float:
-    """Return an int where the number is whole."""
     return int(value) if value == value.to_integral_value() else float(value)
 
 

@@ -76,7 +76,7 @@ class Stepper(Protocol):
         ...
 
     def decide(self, now_s: float) -> Start | float:
-        """Say what to do while no skill runs: start the next one, or when to ask again (inf: when something happens).
+        """Return what to do while no skill runs: start the next one, or when to ask again (inf: on an event).
 
         It is asked again at that time, and before it at every token, fragment and end. After a Start the policy takes
         the skill as started at ``now_s``; it is asked again when that has ended, held on or not.

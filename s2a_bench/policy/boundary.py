@@ -38,7 +38,7 @@ def slowest_rate(tokens_per_skill: ArrayLike, duration_s: float) -> Floats:
 
 
 def analytic(grid: Grid, duration_s: float) -> Flags:
-    """Say where steady arrivals are stall-free, shape (K, J): L / R <= T."""
+    """Return where steady arrivals are stall-free, shape (K, J): L / R <= T."""
     rates: Floats = np.array(grid.tokens_per_s, dtype=np.float64)
     return slowest_rate(grid.tokens_per_skill, duration_s)[:, np.newaxis] <= rates
 

@@ -98,7 +98,7 @@ def check(plans: int, epsilon: float = EPSILON) -> None:
 
 
 def coarse(plans: int, epsilon: float = EPSILON) -> bool:
-    """Tell whether these are too few plans for the second promise, even if none of them stalls: worth a warning."""
+    """Return whether these are too few plans for the second promise, even if none of them stalls: worth a warning."""
     return upper_bound(0, plans, CONFIDENCE) > CEILING * epsilon
 
 
@@ -179,7 +179,7 @@ def upper_bound(stalled: int, plans: int, confidence: float) -> float:
 
 
 def stalled(policy: Policy, plans: Plans) -> NDArray[np.bool_]:
-    """Tell which plans stall at all, shape (M,)."""
+    """Return which plans stall at all, shape (M,)."""
     import numpy as np
 
     from s2a_bench.policy.metrics import stalls

@@ -115,7 +115,7 @@ class ActionClient(Protocol):
         ...
 
     def server_present(self) -> bool:
-        """Tell whether a whole server is matched now."""
+        """Return whether a whole server is matched now."""
         ...
 
     def server_version(self) -> str | None:
@@ -241,7 +241,7 @@ class Middleware(Protocol):
         ...
 
     def describe(self) -> dict[str, str | int]:
-        """Say what carries the messages: implementation, version, domain, configuration."""
+        """Return what carries the messages: implementation, version, domain, configuration."""
         ...
 
     def close(self) -> None:

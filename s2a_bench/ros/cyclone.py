@@ -24,7 +24,6 @@ from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise, type
 
 
 def _topic_qos(qos: QoS, type_name: str) -> Qos:
-    """Return a topic endpoint's QoS, with the type hash that ROS tools look for."""
     return dds_qos(qos, f"typehash={type_hash(type_name)};")
 
 
@@ -129,7 +128,7 @@ class CycloneMiddleware:
         return server
 
     def describe(self) -> dict[str, str | int]:
-        """Say which Cyclone, which domain, and the whole configuration."""
+        """Return which Cyclone, which domain, and the whole configuration."""
         return {
             "middleware": "cyclonedds",
             "version": package_version("cyclonedds"),

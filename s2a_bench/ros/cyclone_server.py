@@ -187,7 +187,6 @@ class CycloneActionServer:
         return self._get_result.pack(response(status=int(status), result=result))
 
     def _publish_status(self) -> None:
-        """Publish the status array; under the lock, so that the newest is published last."""
         self._status.send(status_array(self._goals.listed()))
 
     def _serve(self) -> None:

@@ -61,7 +61,7 @@ class _End:
         self.reader = RawReader(participant, *received, dds_qos(READER_QOS, user_data(received[1])))
 
     def matched(self) -> bool:
-        """Tell whether both endpoints of one peer are matched."""
+        """Return whether both endpoints of one peer are matched."""
         ids = [{peer[self._peer_key] for peer in end.peers() if self._peer_key in peer} for end in self.ends()]
         return bool(ids[0] & ids[1])
 

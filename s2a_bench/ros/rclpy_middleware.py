@@ -107,7 +107,7 @@ class RclpyMiddleware:
         return server
 
     def describe(self) -> dict[str, str | int]:
-        """Say which rclpy on which rmw."""
+        """Return which rclpy on which rmw."""
         distribution = os.environ.get("ROS_DISTRO", "")
         try:
             version = package_version("rclpy")

@@ -39,7 +39,7 @@ def from_ros(message: Any, type_name: str, version: str) -> Any:
 
 
 def fits(cls: Any, type_name: str, version: str = ros.DEFAULT_VERSION) -> bool:
-    """Tell whether a generated class has our fields in our order, down to the last nested one.
+    """Return whether a generated class has our fields in our order, down to the last nested one.
 
     Bytes cannot tell: serialisers of ROS leave the padding as they found it.
     """

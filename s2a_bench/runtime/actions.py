@@ -98,7 +98,7 @@ class ActionRobot:
                     report(self._error(event))
 
     def _error(self, event: ActionEvent) -> str:
-        """Say what went wrong with a goal; nothing if it went well."""
+        """Return what went wrong with a goal; nothing if it went well."""
         if not isinstance(event, Result):
             return "the robot rejected the goal"
         if event.status != Status.SUCCEEDED:

@@ -29,7 +29,7 @@ class Motion:
 
     @property
     def aborted(self) -> bool:
-        """Tell whether to stop as soon as that is safe."""
+        """Return whether to stop as soon as that is safe."""
         return self._aborted
 
     @property
@@ -56,7 +56,7 @@ class Motion:
             self._changed.notify_all()
 
     def ended(self) -> bool:
-        """Tell whether the function has returned."""
+        """Return whether the function has returned."""
         return self._over
 
     def abort(self) -> None:

@@ -119,7 +119,7 @@ class Executor:
 
     @property
     def _whole(self) -> bool:
-        """Tell whether all announced skills have come."""
+        """Return whether all announced skills have come."""
         return len(self.record.arrivals) >= self._announced
 
     def _tell(self, at_ns: int) -> float:
@@ -141,7 +141,6 @@ class Executor:
         self._close(at_ns)
 
     def _fail(self, outcome: Outcome, why: str) -> None:
-        """Remember what went wrong first."""
         self._failure = self._failure or (outcome, why)
 
     def _over(self, at_ns: int, index: int, error: str) -> None:

@@ -61,7 +61,7 @@ class Simulator(Protocol):
 
     @property
     def steers(self) -> bool:
-        """Tell whether cars can leave their lane."""
+        """Return whether cars can leave their lane."""
         ...
 
     @property

@@ -156,5 +156,4 @@ class Carla:
 
 
 def _dot(at: Any, origin: Any, direction: Any) -> float:
-    """Return how far a place lies from another along a direction, in the plane."""
     return float((at.x - origin.x) * direction.x + (at.y - origin.y) * direction.y)

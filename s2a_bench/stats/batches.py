@@ -51,7 +51,7 @@ class Launch:
         self.levels = np.array([row[0] if len(row) == 1 else np.median(row) for row in rows])
 
     def allows(self, statistic: str) -> bool:
-        """Tell whether there are enough values for an interval."""
+        """Return whether there are enough values for an interval."""
         quantile = STATISTICS[statistic] or 0.0
         return self.n_rows >= FEWEST_ROWS and (
             statistic == "median" or round(len(self.values) * (1 - quantile), 6) >= FEWEST_BEYOND

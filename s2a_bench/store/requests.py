@@ -78,7 +78,6 @@ class FrameRow:
 
 
 def _stage_values(spent: Budget) -> dict[str, Value]:
-    """Name each duration of a budget by its column."""
     return {f"{stage}_ns": duration for stage, duration in spent.stages_ns.items()}
 
 

@@ -232,7 +232,6 @@ def _read(path: Path, table: Table[Any]) -> pd.DataFrame:
 
 
 def _slug(name: str) -> str:
-    """Make a name fit for one part of a path."""
     return re.sub(r"[^A-Za-z0-9._]+", "-", name).strip("-.") or "unnamed"
 
 

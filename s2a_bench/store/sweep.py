@@ -67,7 +67,7 @@ class Sweep:
 
 
 def is_sweep(manifest: dict[str, Any]) -> bool:
-    """Tell whether a run folder is a sweep's."""
+    """Return whether a run folder is a sweep's."""
     return bool(manifest.get("command") == COMMAND)
 
 

@@ -35,7 +35,7 @@ def rounds(items: Sequence[Item], repeats: int, seed: int) -> Iterator[tuple[int
 
 
 def _agrees(setting: Setting, pattern: Mapping[str, Any]) -> bool:
-    """Tell whether every key of the pattern has, or lists, the setting's value."""
+    """Return whether every key of the pattern has, or lists, the setting's value."""
     return all(
         key in setting and setting[key] in (value if isinstance(value, list) else [value])
         for key, value in pattern.items()

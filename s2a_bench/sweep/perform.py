@@ -92,5 +92,4 @@ def _outside(argv: list[str], log: Path) -> str:
 
 
 def _stop_with_parent() -> None:
-    """Let it close its run folder and stop its servers."""
     end_with_parent(signal.SIGTERM)

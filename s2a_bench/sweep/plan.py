@@ -110,7 +110,6 @@ def _argv(file: SweepFile, command: Command, setting: Setting, seed: int) -> lis
 
 
 def _text(value: Any) -> str:
-    """Write a value as a flag takes it."""
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)
 
 

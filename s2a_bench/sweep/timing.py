@@ -38,7 +38,7 @@ def earlier(output: Path, command: str) -> list[Sweep]:
 
 
 def expect(cells: Sequence[Cell], rest_s: float, width: int, sweeps: Sequence[Sweep], workers: Workers) -> Expected:
-    """Say how long cells will take: with the times of the same cells, of cells of the same command, or of the first."""
+    """Return how long cells will take, by the times of the same cells, of the same command, or of the first."""
     for sweep in sweeps:
         done = sweep.cells[sweep.cells["state"] == "finished"]
         if len(done):

@@ -118,7 +118,6 @@ def _standing_for(
 
 
 def _filled(options: Options, can: Sequence[str]) -> Options:
-    """Return the options with a payload, the transport's default where none is given."""
     return options if options.payload or not can else options.model_copy(update={"payload": can[0]})
 
 

@@ -148,10 +148,8 @@ def _entry(text: str, kind: str, *, names: bool) -> str:
 
 
 def _plain(number: str) -> str:
-    """Write a number, perhaps with its deviation, for siunitx."""
     return number.replace("±", r"\pm")
 
 
 def _row(entries: Sequence[str]) -> str:
-    """Write one row; what opens with a bracket would be read as an option of the row before it."""
     return " & ".join(f"{{{text}}}" if text.startswith("[") else text for text in entries) + r" \\"

@@ -84,5 +84,4 @@ def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:
 
 
 def _finite(value: float) -> float | None:
-    """Return a plain number; None where there is none."""
     return float(value) if math.isfinite(value) else None

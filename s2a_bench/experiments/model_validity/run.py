@@ -38,7 +38,7 @@ class _Ask:
     max_tokens: int
 
     def to_manifest(self) -> dict[str, Any]:
-        """Say what is asked for."""
+        """Return what is asked for."""
         return {
             "name": self.name,
             "skill_set": self.format.skills.name,

@@ -147,7 +147,6 @@ def _cell(run: Run, arm: Arm) -> dict[str, Any]:
 
 
 def _names(arm: Arm) -> tuple[str, str]:
-    """Name a line of a table."""
     return arm.about["name"], "with" if arm.grammar else "without"
 
 
@@ -166,7 +165,7 @@ def _shares(run: Run, arms: list[Arm]) -> TextTable:
 
 
 def _formats(run: Run) -> TextTable:
-    """Say what was asked for, and what it costs with this model."""
+    """Return what was asked for, and what it costs with this model."""
     lines: list[tuple[str, ...]] = [
         (
             about["name"],
@@ -180,7 +179,7 @@ def _formats(run: Run) -> TextTable:
 
 
 def _notes(run: Run, arms: list[Arm]) -> Iterator[str]:
-    """Say what a reader must know besides the numbers."""
+    """Return what a reader must know besides the numbers."""
     yield "[]: 95 % Clopper-Pearson; for lines as if they were independent, which those of one answer are not."
     yield f"The first {run.manifest['configuration']['n_skills']} lines of an answer count. One prompt, no picture."
     if run.manifest["model"]["dummy"]:

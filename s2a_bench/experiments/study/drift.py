@@ -124,10 +124,8 @@ def _scores(stalls: NDArray[np.bool_]) -> list[float]:
 
 
 def _at(found: Metrics, *places: NDArray[np.intp]) -> Metrics:
-    """Pick elements of every array."""
     return _each(found, lambda values: values[places])
 
 
 def _each(found: Metrics, change: Callable[[Any], Any]) -> Metrics:
-    """Change every array."""
     return Metrics(*(change(getattr(found, item.name)) for item in fields(Metrics)))

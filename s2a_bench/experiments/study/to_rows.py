@@ -85,5 +85,4 @@ def row_of(
 
 
 def _mean(values: Floats) -> float:
-    """Average over the plans that have the number."""
     return float(np.nanmean(values))

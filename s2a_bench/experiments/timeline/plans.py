@@ -38,7 +38,7 @@ class Board:
 
     @property
     def even(self) -> bool:
-        """Tell whether every plan's tokens come at the same times."""
+        """Return whether every plan's tokens come at the same times."""
         return isinstance(self.gaps, Constant) and self.prompt_cv == self.rate_cv == 0
 
     def tokens(self, count: int, rng: np.random.Generator, plans: int) -> Floats:
@@ -107,7 +107,6 @@ def _gaps(jitter: str, profile: Profile) -> Gaps:
 
 
 def _factors(cv: float, rng: np.random.Generator, plans: int) -> Floats | float:
-    """Draw factors of mean 1, one a plan."""
     return Lognormal(1.0, cv).sample(rng, 1, plans)[0] if cv else 1.0
 
 

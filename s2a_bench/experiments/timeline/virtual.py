@@ -81,7 +81,7 @@ def board_facts(board: Board) -> dict[str, Any]:
 
 
 def calibration_warnings(calibrations: dict[str, Any]) -> list[RunWarning]:
-    """Say where stream-to-act could not be calibrated well."""
+    """Return where stream-to-act could not be calibrated well."""
     waits = [name for name, found in calibrations.items() if found["caution"] is None]
     if not waits:
         return []

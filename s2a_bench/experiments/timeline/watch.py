@@ -41,7 +41,7 @@ class Scene:
         return draw(self, now_ns(), width)
 
     def lines(self) -> Iterator[str]:
-        """Say how each policy's plan went."""
+        """Return how each policy's plan went."""
         return (f"  {record.policy}: {summary(record)}" for record in self.records)
 
 
@@ -96,7 +96,6 @@ class _Axis:
 
 
 def _row(name: str, names: int, lane: Text, status: str) -> Text:
-    """Put a lane between its name and its numbers."""
     return Text.assemble(f"{name:<{names}} ", lane, f" {status}", no_wrap=True, overflow="crop")
 
 

@@ -51,7 +51,6 @@ def _run(command: Sequence[str]) -> str | None:
 
 
 def _finds(package: str) -> bool:
-    """Tell whether a package could be imported, without importing it."""
     return extras.installed(package)
 
 

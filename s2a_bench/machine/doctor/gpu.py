@@ -59,7 +59,7 @@ def is_jetson(machine: Machine) -> bool:
 
 
 def has_nvidia(machine: Machine) -> bool:
-    """Tell whether there is a working NVIDIA GPU."""
+    """Return whether there is a working NVIDIA GPU."""
     return machine.read("proc/driver/nvidia/version") is not None or is_jetson(machine)
 
 
@@ -171,7 +171,7 @@ def jetson_clocks(machine: Machine) -> Finding | None:
 
 
 def _moves(machine: Machine, folder: str, low: str, high: str, *, gpu_only: bool) -> bool:
-    """Tell whether one of the devices has a range of clocks."""
+    """Return whether one of the devices has a range of clocks."""
     lowest = machine.read_all(f"{folder}/{low}")
     return any(
         value != machine.read(f"{path.rpartition('/')[0]}/{high}")

@@ -44,7 +44,6 @@ def packages(machine: Machine) -> Finding:  # noqa: ARG001 - the packages of thi
 
 
 def _applies(requirement: Requirement, extra: str = "") -> bool:
-    """Whether a package is needed on this platform with an extra, or with none."""
     return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
 

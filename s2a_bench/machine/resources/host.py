@@ -84,7 +84,6 @@ class Memory:
         """Nothing is held."""
 
     def _rss(self, process: str) -> int:
-        """Return a process's resident bytes: the second number of statm, in pages (proc(5))."""
         return int((self._root / process / "statm").read_text().split()[1]) * PAGE_BYTES
 
     def _available(self) -> int:

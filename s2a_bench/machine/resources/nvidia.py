@@ -59,7 +59,7 @@ class Nvml:
                 self._nvml.nvmlShutdown()
 
     def _answers(self, query: Query) -> bool:
-        """Tell whether there is a GPU, and whether all answer; boards differ in what they measure."""
+        """Return whether there is a GPU, and whether all answer; boards differ in what they measure."""
         try:
             return bool([query(gpu) for gpu in self._gpus])
         except self._failed:
@@ -79,5 +79,4 @@ def _queries(nvml: Any) -> dict[str, tuple[Callable[[list[float]], float], Query
 
 
 def _text(value: str | bytes) -> str:
-    """Return text; older bindings return bytes."""
     return value.decode() if isinstance(value, bytes) else value

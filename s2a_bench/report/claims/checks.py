@@ -136,12 +136,10 @@ def _rate(claim: PaperThroughput, run: Run) -> Finding | None:
 
 
 def _suffices(run: Run) -> Finding | None:
-    """Judge the green region of figure 2: above the paper's line naive never stalls."""
     return _region(run, above=True)
 
 
 def _required(run: Run) -> Finding | None:
-    """Judge the red region of figure 2: below the paper's line naive stalls."""
     return _region(run, above=False)
 
 
@@ -173,7 +171,7 @@ def _region(run: Run, *, above: bool) -> Finding | None:
 
 
 def is_board(run: Run, name: str) -> bool:
-    """Tell whether a run was measured on the board of that name."""
+    """Return whether a run was measured on the board of that name."""
     facts = run.manifest.get("environment", {})
     names = [str(facts.get("board", "")), *(str(gpu.get("name", "")) for gpu in facts.get("gpus", []))]
     wanted = name.lower().removeprefix("jetson ").split()
@@ -205,7 +203,7 @@ def _pair(run: Run) -> tuple[Cell, Cell] | None:
 
 
 def _medians(http: Cell, ros: Cell) -> str:
-    """Say what both take, and of how many samples, with what payload."""
+    """Return what both take, and of how many samples, with what payload."""
     found = [summary_of(cell.values_ms(_METRIC)) for cell in (http, ros)]
     texts = [f"{mean_sd(each)} ms" for each in found if each]
     return f"Without inference {' and '.join(texts)} (mean ± sd, n = {http.n}, payload {http.about['payload']})."
@@ -220,7 +218,6 @@ def _means(cell: Cell) -> dict[str, float]:
 
 
 def _bytes(cell: Cell) -> Any:
-    """Return what the bodies weigh."""
     return cell.good["payload_bytes"].dropna().to_numpy(dtype="float64")
 
 

@@ -180,23 +180,21 @@ def _end(cell: Timelines) -> float:
 
 
 def _stalls(cell: Timelines) -> bool:
-    """Tell whether a cell has stalls that count (above 20 ms)."""
     return bool((cell.mean("stalls") or 0.0) > 0)
 
 
 def _listed(cells: Sequence[Timelines]) -> str:
-    """Say how much cells stall."""
+    """Return how much cells stall."""
     means = [(cell, cell.mean("stalls") or 0.0, cell.mean("stall_s") or 0.0) for cell in cells]
     return "; ".join(f"{cell.policy} at L = {cell.setting[1]}: {n:g} stalls of {s:.2f} s" for cell, n, s in means)
 
 
 def _lengths(cells: Sequence[Timelines]) -> str:
-    """List the granularities."""
     return ", ".join(str(length) for length in dict.fromkeys(cell.setting[1] for cell in cells))
 
 
 def _basis(run: Run, cells: Sequence[Timelines]) -> str:
-    """Say what timelines are made of, and what of it the paper does not say."""
+    """Return what timelines are made of, and what of it the paper does not say."""
     emulated = any(cell.about("emulated") for cell in cells)
     shapes = " and ".join(f"N = {n}, T_nom = {t:g} s" for n, t in dict.fromkeys(cell.setting[2:] for cell in cells))
     what = "EMULATED at the rate of table II" if emulated else f"Executed on {run.manifest.get('host')}"

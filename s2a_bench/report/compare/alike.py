@@ -85,7 +85,6 @@ def _gpus(facts: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 
 def _rest(facts: Mapping[str, Any], known: tuple[str, ...]) -> dict[str, Any]:
-    """Return the facts that are not looked at elsewhere."""
     return _flat({name: value for name, value in facts.items() if name not in known})
 
 

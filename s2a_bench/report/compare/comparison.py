@@ -79,7 +79,7 @@ class ComparedRuns:
 
     @property
     def launches(self) -> bool:
-        """Tell whether launches were repeated on both sides, so that they are what the test goes by."""
+        """Return whether launches were repeated on both sides, so that they are what the test goes by."""
         return len(self.baseline) > 1 and len(self.other) > 1
 
     @property

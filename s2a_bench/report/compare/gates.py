@@ -33,7 +33,7 @@ class Gate:
     limit: float
 
     def beyond(self, relative: float | None, rises: bool) -> bool:
-        """Tell whether a change is past the limit; one that started from nothing has no size and is past every one."""
+        """Give whether a change is past the limit; one that started from nothing has no size and is past every one."""
         if relative is None:
             return rises == self.rises
         return relative > self.limit if self.rises else relative < self.limit

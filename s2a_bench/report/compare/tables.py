@@ -31,7 +31,7 @@ def compare_table(compared: ComparedRuns) -> TextTable:
 
 
 def notes(compared: ComparedRuns) -> tuple[str, ...]:
-    """Say what A and B are, and how a verdict comes about."""
+    """Return what A and B are, and how a verdict comes about."""
     unit = "launches" if compared.launches else f"{BATCHES} batches in time of each launch"
     return (
         title(compared),
@@ -42,7 +42,7 @@ def notes(compared: ComparedRuns) -> tuple[str, ...]:
 
 
 def title(compared: ComparedRuns) -> str:
-    """Say what A and B are, and what did not really answer."""
+    """Return what A and B are, and what did not really answer."""
     sides = (", ".join(run.path.resolve().name for run in side) for side in (compared.baseline, compared.other))
     origin = dict.fromkeys(note for run in (*compared.baseline, *compared.other) for note in compared.by.origin(run))
     return " ".join(("A: {}. B: {}.".format(*sides), *origin))
@@ -72,7 +72,6 @@ def change_text(one: Comparison) -> str:
 
 
 def _title(one: Comparison) -> str:
-    """Name a metric with its statistic and unit."""
     return f"{one.metric.name}: {one.statistic}" + (f", {one.metric.unit}" if one.metric.unit else "")
 
 

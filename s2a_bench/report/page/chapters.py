@@ -41,7 +41,7 @@ def title_of(manifest: Mapping[str, Any]) -> str:
 
 
 def when(manifest: Mapping[str, Any]) -> str:
-    """Say when a run began, for people."""
+    """Return when a run began, for people."""
     return str(manifest.get("started", "at an unknown time")).replace("T", " ").replace("+00:00", " UTC")
 
 
@@ -51,7 +51,7 @@ def repeat_command(manifest: Mapping[str, Any]) -> str:
 
 
 def mixed_machines(chapters: Sequence[Chapter]) -> list[str]:
-    """Say which runs come from machines unlike the first one's; their numbers are nowhere pooled."""
+    """Return which runs come from machines unlike the first one's; their numbers are nowhere pooled."""
     if not chapters:
         return []
     first = chapters[0]
@@ -68,7 +68,6 @@ def mixed_machines(chapters: Sequence[Chapter]) -> list[str]:
 
 
 def _of_machine(found: Difference) -> bool:
-    """Tell whether a difference makes it another machine."""
     return found.fatal and not found.what.startswith("model ")
 
 
@@ -87,7 +86,6 @@ def _chapter(run: Run, title: str, against_paper: bool, **more: Any) -> Chapter:
 
 
 def _slug(name: str) -> str:
-    """Make a folder's name fit for a path that LaTeX reads, and for an id."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", name) or "run"
 
 

@@ -25,7 +25,7 @@ def content_of(run: Run, *, against_paper: bool) -> Content:
 
 
 def _other(run: Run) -> Content:
-    """Tell what lies in a run that has no view of its own."""
+    """Return what lies in a run that has no view of its own."""
     rows = [f"{name} ({count} rows)" for name, count in run.row_counts().items()]
     return Content(summary=(f"There is no view of {run.manifest['command']} runs; this one holds {', '.join(rows)}.",))
 

@@ -114,5 +114,4 @@ def _lane(cell: Timelines, colour: str, *, own_tokens: bool) -> Lane:
 
 
 def _complete_s(cell: Timelines) -> tuple[float, ...]:
-    """Return when each skill's fragment was complete."""
     return tuple(cell.skills["arrival_ns"].to_numpy(dtype="float64") / 1e9)

@@ -100,7 +100,6 @@ def _is_virtual(run: Run) -> bool:
 
 
 def _overlap(one: Run, other: Run) -> bool:
-    """Tell whether two runs have a cell of one name, as repeats without anything random have."""
     return bool(set(one.table(TIMELINES)["cell"]) & set(other.table(TIMELINES)["cell"]))
 
 

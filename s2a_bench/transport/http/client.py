@@ -72,7 +72,7 @@ class HttpClient:
         return self._dialect.authorization(self._key) if self._key else {}
 
     def describe(self) -> dict[str, str]:
-        """Say who is asked, and how, for the manifest."""
+        """Return who is asked, and how, for the manifest."""
         return {"url": self._url, "dialect": self._dialect.name}
 
     def _new_client(self) -> httpx.Client:

@@ -45,7 +45,6 @@ class Codec:
 
 
 def _dumps(value: Any) -> bytes:
-    """Serialise exactly as httpx and the OpenAI SDK do."""
     return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
 
 

@@ -12,7 +12,7 @@ from s2a_bench.ros.config import configuration, domain_id
 
 
 def dds(machine: Machine) -> Finding:
-    """Say which domain and interfaces are used."""
+    """Return which domain and interfaces are used."""
     try:
         domain = domain_id(machine.environ)
         text = configuration(machine.environ, "tuned")
@@ -32,7 +32,7 @@ def dds(machine: Machine) -> Finding:
 
 
 def ros(machine: Machine) -> Finding:
-    """Say which ROS 2 is sourced, and whether this Python is the one its rclpy was built for."""
+    """Return which ROS 2 is sourced, and whether this Python is the one its rclpy was built for."""
     distro = machine.environ.get("ROS_DISTRO")
     prefixes = machine.environ.get("AMENT_PREFIX_PATH", "")
     if not (distro and prefixes):
@@ -67,7 +67,7 @@ def ros(machine: Machine) -> Finding:
 
 
 def middleware(machine: Machine) -> Finding:
-    """Say which middleware a run takes unless told, and whether it is there."""
+    """Return which middleware a run takes unless told, and whether it is there."""
     name = default_middleware(machine.environ)
     if machine.finds(name):
         return Finding("middleware", "state", f"{name} (--middleware takes another)")

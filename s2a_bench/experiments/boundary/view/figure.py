@@ -142,7 +142,7 @@ def _mark_boards(axes: Axes, run: Run) -> None:
 
 
 def _title(run: Run) -> str:
-    """Say what is drawn, and what it is made of."""
+    """Return what is drawn, and what it is made of."""
     asked = run.manifest["configuration"]
     t_nom_s = asked["t_nom_s"]
     facts = [f"N = {asked['n_skills']}", f"$T_\\mathrm{{nom}}$ = {t_nom_s:g} s"]

@@ -35,7 +35,7 @@ def marks_of(run: Run) -> list[tuple[str, float, pd.DataFrame]]:
 
 
 def is_random(run: Run) -> bool:
-    """Tell whether plans differ at a point."""
+    """Return whether plans differ at a point."""
     return bool((run.table(BOUNDARY)["plans"] > 1).any())
 
 
@@ -91,7 +91,7 @@ def boundary_json(run: Run) -> dict[str, Any]:
 
 
 def boundary_sentences(run: Run) -> list[str]:
-    """Say whether the formula holds, and what the paper's line leaves out."""
+    """Return whether the formula holds, and what the paper's line leaves out."""
     points = len(run.table(BOUNDARY))
     said = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
     if is_random(run):
@@ -118,13 +118,13 @@ def _cells(run: Run) -> Iterator[dict[str, Any]]:
 
 
 def _verdict(point: dict[Any, Any], *, random: bool) -> str:
-    """Say whether a point is stall-free; with jitter how often it is not."""
+    """Return whether a point is stall-free; with jitter how often it is not."""
     said = "stall-free" if point["stall_free"] else "stalls"
     return f"{said}, P = {point['p_stall']:.1%}" if random else said
 
 
 def _notes(run: Run) -> tuple[str, ...]:
-    """Say what a reader must know besides the numbers."""
+    """Return what a reader must know besides the numbers."""
     points = len(run.table(BOUNDARY))
     notes = [
         "Naive runs every skill for T_nom. The paper draws the line for T_min, which holds if skills may end early."

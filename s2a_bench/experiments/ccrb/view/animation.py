@@ -100,7 +100,7 @@ class Panel:
         return picture, f"{self._row['policy']}   {facts}", self._said(now, hit=hit), hit
 
     def _said(self, now: Any, *, hit: bool) -> str:
-        """Say what the ego does, or what happened to it."""
+        """Return what the ego does, or what happened to it."""
         if hit:
             speed = self._row["rear_impact_mps" if self._row["outcome"] in {"rear", "both"} else "front_impact_mps"]
             first = "rear" if self._row["outcome"] == "both" else self._row["outcome"]

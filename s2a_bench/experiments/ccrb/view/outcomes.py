@@ -98,7 +98,7 @@ def rate_span_here(run: Run, gap: str) -> tuple[float, float] | None:
 
 
 def has(run: Run, study: str) -> bool:
-    """Tell whether a run holds a study."""
+    """Return whether a run holds a study."""
     return bool((run.table(ROLLOUTS)["study"] == study).any())
 
 
@@ -131,6 +131,6 @@ def _cell(row: dict[Any, Any]) -> dict[str, Any]:
 
 
 def _compared(theirs: pd.DataFrame, mine: pd.DataFrame, column: str) -> tuple[pd.Series[Any], pd.Series[Any]]:
-    """Tell where a policy's impact is faster than stream-to-act's, and where slower."""
+    """Return where a policy's impact is faster than stream-to-act's, and where slower."""
     difference = theirs[column].astype("float64").fillna(0.0) - mine[column].astype("float64").fillna(0.0)
     return difference > LEAST_IMPACT_MPS, difference < -LEAST_IMPACT_MPS

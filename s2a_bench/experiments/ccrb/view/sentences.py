@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def ccrb_sentences(run: Run) -> list[str]:
-    """Say what became of the cars, and where that ordering of the policies holds."""
+    """Return what became of the cars, and where that ordering of the policies holds."""
     said = [
         f"{row['policy']}: {SAID[row['outcome']]}, {row['stalls']} stalls of {row['stall_ns'] / 1e9:.2f} s."
         for row in rollouts_of(run, "point").to_dict("records")
@@ -31,7 +31,7 @@ def ccrb_sentences(run: Run) -> list[str]:
 
 
 def ccrb_notes(run: Run) -> list[str]:
-    """Say what the terminal says below the tables: findings, the studies' speed, and files written besides."""
+    """Return what the terminal says below the tables: findings, the studies' speed, and files written besides."""
     said = findings(run)
     if studies := run.manifest.get("studies"):
         speed = studies["rollouts_per_cpu_s"]
@@ -40,7 +40,7 @@ def ccrb_notes(run: Run) -> list[str]:
 
 
 def origin_notes(run: Run) -> tuple[str, ...]:
-    """Say what the numbers are made of, and which laws they hang on."""
+    """Return what the numbers are made of, and which laws they hang on."""
     asked = configuration(run)
     notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
     notes.append(f"Rear: {law(asked)}.")
@@ -60,7 +60,7 @@ def tokens_line(run: Run) -> Note:
 
 
 def _live_notes(run: Run) -> list[str]:
-    """Say what is real of a run on a model's tokens, and what is not."""
+    """Return what is real of a run on a model's tokens, and what is not."""
     live = run.manifest["live"]
     rate = rollouts_of(run, "point")["tokens_per_s"].iloc[0]
     line = tokens_line(run)
@@ -74,7 +74,7 @@ def _live_notes(run: Run) -> list[str]:
 
 
 def _emulated_notes(run: Run) -> list[str]:
-    """Say what modelled tokens are made of."""
+    """Return what modelled tokens are made of."""
     board = run.manifest["boards"][0]
     rates = {"paper": "the paper's rate (table II)", "measured": "a measured rate", "given": "a rate as given"}
     rate = f"{rates[board['origin']]}, {board['tokens_per_s']:g}/s"
@@ -86,12 +86,12 @@ def _emulated_notes(run: Run) -> list[str]:
 
 
 def findings(run: Run) -> list[str]:
-    """Say what the phase diagram shows, gap behaviour by gap behaviour."""
+    """Return what the phase diagram shows, gap behaviour by gap behaviour."""
     return [_finding(run, gap) for gap in GAPS] if has(run, "phase") else []
 
 
 def _finding(run: Run, gap: str) -> str:
-    """Say where the paper's ordering holds under one gap behaviour."""
+    """Return where the paper's ordering holds under one gap behaviour."""
     share = share_of(scenes_of(run, "phase", gap), "paper")
     said = f"{gap}: the paper's ordering holds at {share.value:.1%} of the diagram"
     span, here = rate_span(run, gap), rate_span_here(run, gap)

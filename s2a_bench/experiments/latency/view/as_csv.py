@@ -55,5 +55,4 @@ def _summaries(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
 
 
 def _values(summary: Summary) -> tuple[object, ...]:
-    """Return a summary's values in the order of the header."""
     return tuple(getattr(summary, name) for name in _SUMMARY)

@@ -67,7 +67,7 @@ class Cell:
 
     @property
     def emulated(self) -> bool:
-        """Tell whether a replayed profile answered."""
+        """Return whether a replayed profile answered."""
         return self.about["engine"] == "replay"
 
     def values_ms(self, metric: str) -> Floats:
@@ -81,7 +81,7 @@ class Cell:
 
     @property
     def has_ingest(self) -> bool:
-        """Tell whether the server is a llama-server, seen from outside."""
+        """Return whether the server is a llama-server, seen from outside."""
         return bool(self.group_ms("ingest").size)
 
     def group_ms(self, group: str) -> Floats:
@@ -156,7 +156,7 @@ def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | Non
 
 
 def engine_note(run: Run, cells: list[Cell]) -> Note:
-    """Say what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
+    """Return what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
     engines = {cell.about["engine"] for cell in cells}
     notes = []
     if "echo" in engines:
@@ -169,7 +169,7 @@ def engine_note(run: Run, cells: list[Cell]) -> Note:
 
 
 def _emulated(model: dict[str, Any]) -> Note:
-    """Say which board was played, how, and where its rate is from."""
+    """Return which board was played, how, and where its rate is from."""
     note = f"EMULATED: replayed profile {model.get('profile', '')}".rstrip()
     said = [Note(f"{model['gaps']} gaps")] if "gaps" in model else []
     said += [Note("the paper's rate", PAPERS)] if model.get("origin") == "paper" else []
@@ -210,5 +210,4 @@ def _place(cell: Cell) -> tuple[float, str, int, str]:
 
 
 def _numbers(column: pd.Series[Any]) -> Floats:
-    """Return the values that are there as floats."""
     return column.dropna().to_numpy(dtype="float64")

@@ -29,7 +29,7 @@ def subject_of(cell: Cell, rows: Callable[[str], Rows]) -> Subject:
 
 
 def origin_of(run: Run) -> list[str]:
-    """Say what did not really answer the requests of a run."""
+    """Return what did not really answer the requests of a run."""
     note = engine_note(run, cells_of(run))
     return [note.sentence()] if note else []
 

@@ -142,7 +142,7 @@ def _shown(run: Run) -> tuple[list[Cell], str]:
 
 
 def _title(run: Run, cells: list[Cell], what: str, metric: str) -> str:
-    """Say what is drawn, from how many samples, of what size, and what did not really answer."""
+    """Return what is drawn, from how many samples, of what size, and what did not really answer."""
     counts = sorted({cell.n for cell in cells})
     facts = [f"n = {' to '.join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))} a cell"]
     facts += sorted({cell.about["size"] for cell in cells}) + sorted({f"{cell.about['mode']} mode" for cell in cells})
@@ -154,7 +154,6 @@ def _title(run: Run, cells: list[Cell], what: str, metric: str) -> str:
 
 
 def _axis_label(metric: str) -> str:
-    """Name the axis with its unit."""
     return "e2e without inference (ms)" if metric == "e2e_without_inference" else "e2e, inference included (ms)"
 
 
@@ -166,5 +165,4 @@ def _label(cell: Cell) -> str:
 
 
 def _part(cell: Cell, name: str) -> Floats:
-    """Return the values of a group or of the residual in ms."""
     return cell.values_ms("residual") if name == "residual" else cell.group_ms(name)

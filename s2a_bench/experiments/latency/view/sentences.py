@@ -21,7 +21,7 @@ _MOST = 6
 
 
 def latency_sentences(run: Run) -> list[str]:
-    """Say how long each cell takes, and how many times as long as ROS or loopback."""
+    """Return how long each cell takes, and how many times as long as ROS or loopback."""
     if not (cells := cells_of(run)):
         return []
     about = cells[0].about
@@ -44,14 +44,14 @@ def latency_sentences(run: Run) -> list[str]:
 
 
 def counts(counts: Sequence[int], what: str) -> str:
-    """Say how many there are: 50 requests, or 48 to 50."""
+    """Return how many there are: 50 requests, or 48 to 50."""
     low, high = min(counts), max(counts)
     span = str(low) if low == high else f"{low} to {high}"
     return f"{span} {what}{'s' * (high != 1)}"
 
 
 def _times(cell: str, base: str, ratio: Ratio) -> str:
-    """Say how many times as long as a base a cell takes."""
+    """Return how many times as long as a base a cell takes."""
     between = ""
     if ratio.low is not None and ratio.high is not None:
         between = f" (ratio of medians, 95 % interval {interval(ratio).partition(' ')[2][1:-1].replace(',', ' to')})"

@@ -127,7 +127,7 @@ def _ratio(cell: Cell, base: Cell, metric: str, seed: int) -> str:
 
 
 def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
-    """Say what a reader must know besides the numbers."""
+    """Return what a reader must know besides the numbers."""
     counts = sorted({cell.n for cell in cells})
     span = " to ".join(str(count) for count in dict.fromkeys((*counts[:1], *counts[-1:])))
     notes = [f"n = {span} samples a cell, warm-ups left out." if counts else "No samples."]
@@ -152,7 +152,7 @@ def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
 
 
 def _engine_notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
-    """Say what did not really answer, as a sentence."""
+    """Return what did not really answer, as a sentence."""
     note = engine_note(run, cells)
     return (note.sentence(),) if note else ()
 

@@ -34,7 +34,7 @@ def show(run: Run, **_: Any) -> Shown:
 
 
 def study_sentences(run: Run) -> list[str]:
-    """Say how many plans were drawn, and of the targets which were met."""
+    """Return how many plans were drawn, and of the targets which were met."""
     rows = run.table(STUDY_CELLS)
     plans = int(rows["plans"].sum())
     said = [f"Study {study_of(run).name}: {len(rows)} cells, {plans:,} drawn plans; nothing is measured."]

@@ -161,7 +161,6 @@ _ARMS: Final = {
 
 
 def _by(rows: pd.DataFrame, columns: list[str]) -> list[tuple[tuple[Any, ...], pd.DataFrame]]:
-    """Split rows by columns, in the order in which they came."""
     return [(key, part) for key, part in rows.groupby(columns, sort=False)]
 
 
@@ -173,12 +172,10 @@ def _world(rows: pd.DataFrame) -> str:
 
 
 def _percent(value: float, _place: object = None) -> str:
-    """Write a share at an axis."""
     return f"{value * 100:g} %"
 
 
 def _needed(points: pd.DataFrame) -> pd.DataFrame:
-    """Keep a frontier's points, lambda growing, up to the first without stalls: more caution buys nothing."""
     return points[(points["stalled"] == 0).shift(fill_value=False).cummax() == 0]
 
 

@@ -138,7 +138,6 @@ def misfit_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
 
 
 def _world(row: pd.Series) -> tuple[str, ...]:
-    """Name a setting."""
     return (*(f"{row[name]:g}" for name in WORLD), f"{row['rho']:.2f}")
 
 

@@ -103,7 +103,7 @@ class Speed:
 
     @property
     def told(self) -> bool:
-        """Tell whether the engine said how long it evaluated; else the paper's rate is the client's."""
+        """Return whether the engine said how long it evaluated; else the paper's rate is the client's."""
         return bool(self.requests["told"].any())
 
     @property

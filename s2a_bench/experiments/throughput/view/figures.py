@@ -144,7 +144,7 @@ def throughput_figures(run: Run, *, against_paper: bool = False) -> dict[str, Ca
 
 
 def _title(run: Run, speeds: list[Speed], what: str) -> str:
-    """Say what is drawn, from how many requests of how many tokens, and what did not really answer."""
+    """Return what is drawn, from how many requests of how many tokens, and what did not really answer."""
     counts = sorted({speed.cell.n for speed in speeds})
     facts = [f"n = {' to '.join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))} a cell"]
     tokens = summary_of(speeds[0].values("tokens"))

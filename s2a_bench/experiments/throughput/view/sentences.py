@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def throughput_sentences(run: Run) -> list[str]:
-    """Say how many tokens a second each cell generates."""
+    """Return how many tokens a second each cell generates."""
     said = []
     for speed in speeds_of(run):
         if found := summary_of(speed.values("tokens_per_s")):

@@ -136,7 +136,7 @@ def throughput_csv(run: Run) -> dict[str, str]:
 
 
 def _notes(run: Run, speeds: list[Speed]) -> tuple[str, ...]:
-    """Say what a reader must know besides the numbers."""
+    """Return what a reader must know besides the numbers."""
     notes = [
         "N / T_eval is the engine's own figure, as in the paper; decode is (n - 1) / (t_last - t_first) at the client."
     ]

@@ -61,7 +61,7 @@ class Tee:
         plan.ended(now_ns())
 
     def describe(self) -> dict[str, str]:
-        """Say what the client says."""
+        """Return what the client says."""
         return self._client.describe()
 
     def close(self) -> None:
@@ -130,7 +130,7 @@ class Link:
 
     @property
     def emulated(self) -> bool:
-        """Tell whether the engine is the replay of a profile."""
+        """Return whether the engine is the replay of a profile."""
         return bool(self.facts.get("emulated", False))
 
     def warm_up(self, ask: Ask) -> GapPrior | None:

@@ -144,7 +144,7 @@ class _Live:
         )
 
     def _remarks(self) -> str:
-        """Say what is not as it seems."""
+        """Return what is not as it seems."""
         pace = self.config.engine.pace
         paced = f", paced to {pace:g} tokens/s" if pace else ""
         dummy = ", dummy weights" if self.link.facts.get("dummy") else ""

@@ -102,7 +102,7 @@ def panels(cells: Sequence[Timelines]) -> Iterator[tuple[tuple[str, int, int, fl
 
 
 def origin_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
-    """Say what the timelines are made of: emulated or not, whose rates, what is assumed."""
+    """Return what the timelines are made of: emulated or not, whose rates, what is assumed."""
     boards = run.manifest.get("boards", [])
     notes = []
     if any(cell.about("emulated") and cell.about("mode") != "live" for cell in cells):
@@ -130,13 +130,13 @@ def origin_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
 
 
 def _jitter(run: Run) -> str:
-    """Say how evenly tokens come."""
+    """Return how evenly tokens come."""
     jitter = run.manifest.get("configuration", {}).get("jitter", "none")
     return {"none": "evenly", "profile": "with the profiles' jitter"}.get(jitter, f"with jitter {jitter}")
 
 
 def _live_notes(run: Run) -> list[Note]:
-    """Say what is real in a live run, and what is not."""
+    """Return what is real in a live run, and what is not."""
     live = run.manifest.get("live")
     if not live:
         return []
@@ -154,7 +154,7 @@ def _live_notes(run: Run) -> list[Note]:
 
 
 def jitter_notes(run: Run) -> tuple[str, ...]:
-    """Say how late the executors' robots had their orders."""
+    """Return how late the executors' robots had their orders."""
     found = run.manifest.get("start_jitter")
     if not found:
         return ()

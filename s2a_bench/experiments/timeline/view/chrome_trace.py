@@ -102,10 +102,8 @@ def _slice(pid: int, tid: int, name: str, start_us: int, end_us: int, args: dict
 
 
 def _instant(pid: int, tid: int, name: str, at_us: int) -> Event:
-    """Make an instant event of its thread."""
     return {"ph": "i", "s": "t", "pid": pid, "tid": tid, "name": name, "cat": "timeline", "ts": at_us}
 
 
 def _us(value_ns: int) -> int:
-    """Round to microseconds."""
     return round(value_ns / 1e3)

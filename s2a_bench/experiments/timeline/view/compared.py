@@ -44,7 +44,6 @@ def _subjects(run: Run) -> list[Subject]:
 
 
 def _rows(cell: Timelines, metric: str) -> list[Floats]:
-    """Return a metric of every plan that has it."""
     return list(cell.values(metric)[:, None])
 
 

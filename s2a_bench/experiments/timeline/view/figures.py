@@ -160,13 +160,13 @@ def _legend(cells: Sequence[Timelines]) -> list[object]:
 
 
 def _stretched(cell: Timelines) -> bool:
-    """Tell whether some skill is visibly longer than planned."""
+    """Return whether some skill is visibly longer than planned."""
     longer_ns = cell.skills["end_ns"] - cell.skills["start_ns"] - cell.skills["nominal_ns"]
     return bool((longer_ns > _VISIBLE_NS).any())
 
 
 def _title(run: Run, cells: Sequence[Timelines], width_in: float) -> str:
-    """Say what is drawn, and what it is made of."""
+    """Return what is drawn, and what it is made of."""
     n_skills, t_nom_s = cells[0].setting[2:]
     what = f"Execution timelines: N = {n_skills} skills, $T_\\mathrm{{nom}}$ = {t_nom_s:g} s"
     if (plans := max(cell.n for cell in cells)) > 1:
@@ -178,6 +178,6 @@ def _title(run: Run, cells: Sequence[Timelines], width_in: float) -> str:
 
 
 def _dark(colour: str) -> bool:
-    """Tell whether white is read better on it than black."""
+    """Return whether white is read better on it than black."""
     red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
     return 0.299 * red + 0.587 * green + 0.114 * blue < 128  # noqa: PLR2004 - half way

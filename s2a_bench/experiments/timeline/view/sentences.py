@@ -25,7 +25,7 @@ def timeline_sentences(run: Run) -> list[str]:
 
 
 def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
-    """Say how one policy does over its settings."""
+    """Return how one policy does over its settings."""
     stalling = [cell for cell in cells if cell.p_any_stall > 0]
     starts = sorted(cell.mean("start_s") or 0.0 for cell in cells)
     ends = sorted(cell.mean("end_s") or 0.0 for cell in cells)

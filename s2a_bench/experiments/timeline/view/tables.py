@@ -154,7 +154,7 @@ ONLINE_LIVE = ("stream-to-act", "live")
 
 
 def _plan_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
-    """Say how many plans there are, and what stream-to-act knew before them."""
+    """Return how many plans there are, and what stream-to-act knew before them."""
     notes = []
     plans = {cell.n for cell in cells}
     if max(plans, default=1) > 1:

@@ -83,11 +83,11 @@ class Dialect(Protocol):
         ...
 
     def event(self, message: Any) -> Event:
-        """Say what one message means; whatever it raises for a message of another form is the Decoder's to catch."""
+        """Return what one message means; whatever it raises for a message of another form is the Decoder's to catch."""
         ...
 
     def starts_with_headers(self, facts: dict[str, float]) -> bool:
-        """Tell whether the response's headers are known to have left when inference started."""
+        """Return whether the response's headers are known to have left when inference started."""
         ...
 
 

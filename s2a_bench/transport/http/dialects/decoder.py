@@ -57,7 +57,7 @@ class Decoder:
             yield Event(error=f"the server sent {error}")
 
     def _event(self, message: str) -> Event:
-        """Say what one message means."""
+        """Return what one message means."""
         if message == DONE:
             return Event(finish="done")
         try:

@@ -86,7 +86,6 @@ class LlamaServer(OpenAI):
     name = "llama-server"
 
     def _extra(self, request: Request) -> dict[str, Any]:
-        """Turn the cache off: a repeated picture must not give a false fast first token."""
         return {"cache_prompt": False, **({"grammar": request.grammar} if request.grammar else {})}
 
 
