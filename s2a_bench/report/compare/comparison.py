@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UnlikeRuns, UsageError
@@ -20,11 +19,6 @@ if TYPE_CHECKING:
 
 LEVEL: Final = 0.05
 """The chance to call any difference one where there is none, over all comparisons together."""
-
-_UNDECLARED: Final = {
-    name: f"s2a_bench.experiments.{name}.view.compared:COMPARED" for name in ("latency", "throughput")
-}
-"""Commands that are no declared experiments yet -> what their runs are compared by."""
 
 SAME, UNCLEAR, TOO_FEW = "same", "unclear", "too few"
 
@@ -119,12 +113,9 @@ def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bo
 
 def _declared(command: str) -> Compared:
     """Return what runs of a command are compared by; raises UsageError where nothing is declared."""
-    if command in _UNDECLARED:
-        found: Compared = resolve_name(_UNDECLARED[command])
-        return found
     if (experiment := experiment_of(command)) and (by := experiment.compared_by()):
         return by
-    there = ", ".join([*_UNDECLARED, *(name for name, found in EXPERIMENTS.loaded() if found.compared)])
+    there = ", ".join(name for name, found in EXPERIMENTS.loaded() if found.compared)
     raise UsageError(f"runs of {command} cannot be compared, only those of {there}")
 
 
