@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from typing import Any
+from typing import Any, ClassVar
 
 import typer
 
@@ -18,7 +18,6 @@ from s2a_bench.cli import (
     model,
     profile,
     report,
-    serve,
     sweep,
 )
 from s2a_bench.cli.adapter import with_flags
@@ -31,8 +30,15 @@ ParseError: Any = typer.BadParameter.__mro__[1]
 """Click's UsageError: newer typer brings a click of its own, so it cannot be named by import."""
 
 
+class TopCommands(Commands):
+    """The commands below, and the experiments."""
+
+    lazy: ClassVar[dict[str, str]] = {"serve": "s2a_bench.cli.serve:serve"}
+    abouts: ClassVar[dict[str, str]] = {"serve": "Serve a model over HTTP, as a ROS 2 node, or over another transport."}
+
+
 app = typer.Typer(
-    cls=Commands,
+    cls=TopCommands,
     name="s2a-bench",
     help="Measure how a vision-language model is wired to a robot, and when the robot may act.",
     no_args_is_help=True,
@@ -41,7 +47,6 @@ app = typer.Typer(
     add_completion=False,
 )
 app.command("doctor")(doctor.doctor)
-app.command("serve")(serve.serve)
 app.command("sweep")(sweep.sweep)
 app.command("compare")(compare.compare)
 app.command("report")(report.report)

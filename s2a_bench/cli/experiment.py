@@ -32,6 +32,8 @@ class Commands(TyperGroup):
     group: ClassVar[str] = ""
     lazy: ClassVar[Mapping[str, str]] = {}
     """Name of a command -> its function, as "module:attribute"."""
+    abouts: ClassVar[Mapping[str, str]] = {}
+    """What the list of commands says of those in ``lazy`` that are dear to import."""
 
     @property
     def _experiments(self) -> dict[str, str]:
@@ -56,7 +58,8 @@ class Commands(TyperGroup):
         """List every command with its sentence, without importing what experiments are made of."""
         mine = {name: command for command, name in self._experiments.items()}
         abouts = {mine[name]: experiment.about for name, experiment in EXPERIMENTS.loaded() if name in mine}
-        for name in {*self.list_commands(ctx)}.difference(mine.values()):
+        abouts |= self.abouts
+        for name in {*self.list_commands(ctx)}.difference(mine.values(), abouts):
             abouts[name] = self.get_command(ctx, name).get_short_help_str(limit=150)
         with formatter.section("Commands"):
             formatter.write_dl(sorted(abouts.items()))

@@ -4,134 +4,115 @@ from __future__ import annotations
 
 import signal
 import sys
+from copy import copy
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
 import typer
+from pydantic import create_model
 
-from s2a_bench.cli.options import engine_config
+from s2a_bench.cli.adapter import command
 from s2a_bench.errors import UsageError
+from s2a_bench.inference import EngineConfig
+from s2a_bench.options import Options, group, option, placed, places
+from s2a_bench.transport import TRANSPORTS, Transport, Wiring
+from s2a_bench.transport.options import sides
+from s2a_bench.transport.pipeline import one_pipeline
 
-if TYPE_CHECKING:
-    from s2a_bench.inference import EngineConfig
-    from s2a_bench.transport import Wiring
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
-ENGINE: dict[str, Any] = {
-    "engine": "llama",
-    "model": "",
-    "mmproj": "",
-    "threads": 0,
-    "gpu_layers": 0,
-    "context": 4096,
-    "profile": "",
-    "gaps": "",
-}
-"""What holds of the engine where neither a flag nor the TOML file says otherwise."""
-
+ENGINE = ("name", "model", "mmproj", "threads", "gpu_layers", "context", "profile", "gaps")
+"""The engine's options that a server has flags for."""
+_NUMBER = EngineConfig.model_fields["threads"]
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-LEAST = {"gpu_layers": -1, "context": 256}
 
 
-def serve(
-    transport: Annotated[str, typer.Argument(help="http, ros, or another, as TRANSPORT[/VARIANT][?OPTION=VALUE&...]")],
-    engine: Annotated[
-        str | None, typer.Option(help="llama, echo, replay (a --profile: EMULATED) [default: llama]")
-    ] = None,
-    model: Annotated[str | None, typer.Option(help="GGUF model [default: the tiny dummy]")] = None,
-    mmproj: Annotated[str | None, typer.Option(help="GGUF vision tower that goes with --model")] = None,
-    threads: Annotated[int | None, typer.Option(min=0, help="CPU threads of the model; 0: all")] = None,
-    gpu_layers: Annotated[int | None, typer.Option(min=-1, help="model layers on the GPU; -1: all")] = None,
-    context: Annotated[int | None, typer.Option(min=256, help="context length in tokens")] = None,
-    profile: Annotated[
-        str | None, typer.Option(help="replay: the board to play, a name of 'profile list' or a path")
-    ] = None,
-    gaps: Annotated[
-        str | None, typer.Option(help="replay: trace, parametric, constant [default: trace if recorded]")
-    ] = None,
-    host: Annotated[str | None, typer.Option(help="http: address to bind [default: 127.0.0.1]")] = None,
-    port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="http: port; 0: any free one [default: 8080]")
-    ] = None,
-    namespace: Annotated[str | None, typer.Option(help="ros: of the action and the topics [default: /llama]")] = None,
-    middleware: Annotated[str | None, typer.Option(help="ros: cyclonedds, rclpy")] = None,
-    qos: Annotated[str | None, typer.Option(help="ros: the camera topics': sensor_data, reliable")] = None,
-    dds_tuning: Annotated[str | None, typer.Option(help="ros: tuned, default")] = None,
-    feedback_interval: Annotated[
-        float | None, typer.Option(min=0, help="ros: seconds; faster tokens share a feedback [default: 0.002]")
-    ] = None,
-    max_tokens: Annotated[int | None, typer.Option(min=1, help="ros: most tokens of a goal [default: 512]")] = None,
-    result_timeout: Annotated[
-        float | None, typer.Option(min=0, help="ros: seconds a result is kept [default: 60]")
-    ] = None,
-    config: Annotated[Path | None, typer.Option(help="TOML file with these flags as keys; a flag wins over it")] = None,
-) -> None:
-    """Serve a model until interrupted: over HTTP (OpenAI's dialect), as a ROS 2 node, or over another transport."""
-    flags = {name: value for name, value in locals().items() if name not in {"transport", "config"}}
-    from s2a_bench.transport import TRANSPORTS
-    from s2a_bench.transport.pipeline import one_pipeline
-
-    given = {name: value for name, value in flags.items() if value is not None}
-    chosen = TRANSPORTS[transport.partition("?")[0].partition("/")[0]]
-    known = [*ENGINE, *(name for name in chosen.options.model_fields if name != "payload")]
-    for name in given.keys() - {*known}:
-        raise UsageError(f"`{name}` is no option of {chosen.name}; it has {', '.join(known)}")
-    from_file = _read(config, known) if config else {}
-    settings = {**ENGINE, **chosen.serving, **from_file, **given}
-    pipeline = one_pipeline(transport, **{name: value for name, value in settings.items() if name not in ENGINE})
-    _run(pipeline.wiring(chosen.bind(pipeline.options, ())), _engine(settings))
+def _told(transport: Transport[Any]) -> list[str]:
+    """Return the options that the server of a transport is told."""
+    return [name for name, side in sides(transport.options) if side and name not in transport.elsewhere]
 
 
-def _read(path: Path, known: list[str]) -> dict[str, Any]:
-    """Read the file; raises UsageError for a key that it should not have, or for an engine's value of another kind."""
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        import tomli as tomllib
+def _as_served(transport: Transport[Any]) -> type[Options]:
+    """Return a transport's options with the defaults that they have here."""
+    fields: dict[str, Any] = {}
+    for name, default in transport.serving.items():
+        field = copy(transport.options.model_fields[name])
+        field.default = default
+        fields[name] = (field.annotation, field)
+    made: type[Options] = create_model(transport.options.__name__, __base__=transport.options, **fields)
+    return made
+
+
+def _config() -> type[Options]:
+    """Make the options of `serve`: the engine's, and a group of what each transport's server is told."""
+    fields: dict[str, Any] = {
+        "pipeline": (
+            str,
+            option(
+                ..., "http, ros, or another, as TRANSPORT[/VARIANT][?OPTION=VALUE&...]", flag="transport", argument=True
+            ),
+        ),
+        "engine": (EngineConfig, group(EngineConfig, only=ENGINE)),
+    }
+    for name, each in TRANSPORTS.loaded():
+        if told := _told(each):
+            fields[name] = (_as_served(each), group(_as_served(each), only=told, about=f"{name}: "))
+    about = "TOML file with these flags as keys; a flag wins over it"
+    return create_model("ServeConfig", __base__=Options, **fields, config=(Path | None, option(None, about)))
+
+
+def _serve(config: Any) -> None:
+    """Serve what was asked for; raises UsageError for an option of another transport."""
+    chosen = TRANSPORTS[config.pipeline.partition("?")[0].partition("/")[0]]
+    own = getattr(config, chosen.name, None)
+    for other, _ in TRANSPORTS.loaded():
+        if other != chosen.name and (given := [*getattr(config, other, Options()).given()]):
+            raise UsageError(f"`{given[0]}` is no option of {chosen.name}; it has {', '.join(_told(chosen))}")
+    of_engine, of_transport = _read(config.config, chosen) if config.config else ({}, {})
+    flags = {name: getattr(own, name) for name in own.given()} if own else {}
+    engine = {name: getattr(config.engine, name) for name in config.engine.given()}
+    pipeline = one_pipeline(config.pipeline, **{**chosen.serving, **of_transport, **flags})
+    _run(pipeline.wiring(chosen.bind(pipeline.options, ())), EngineConfig(**{**of_engine, **engine}))
+
+
+def _read(path: Path, chosen: Transport[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return a file's options of the engine and of the transport; raises UsageError naming the key."""
     try:
         whole = tomllib.loads(path.read_text())
     except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"--config: cannot read {path}: {error}") from error
+        raise UsageError(f"`config`: cannot read {path}: {error}") from error
     except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"--config: {path} is no TOML: {error}") from error
-    for key, value in whole.items():
-        name = key.replace("-", "_")
+        raise UsageError(f"`config`: {path} is no TOML: {error}") from error
+    known = ["engine", *ENGINE[1:], *_told(chosen)]
+    values = {key.replace("-", "_"): value for key, value in whole.items()}
+    for name, value in values.items():
         if name not in known:
-            raise UsageError(f"--config {path}: '{key}' is none of {', '.join(known).replace('_', '-')}")
-        if name in ENGINE and (not isinstance(value, type(ENGINE[name])) or isinstance(value, bool)):
-            raise UsageError(f"--config {path}: {key} = {value!r} should be like {ENGINE[name]!r}")
-    return {key.replace("-", "_"): value for key, value in whole.items()}
-
-
-def _engine(settings: dict[str, Any]) -> EngineConfig:
-    """Make the engine's configuration; raises UsageError."""
-    from s2a_bench.inference.replay import check_replay
-
-    for name in ("threads", "gpu_layers", "context"):
-        if settings[name] < LEAST.get(name, 0):
-            raise UsageError(f"`{name}`: {settings[name]} is below {LEAST.get(name, 0)}")
-    model, mmproj = (Path(settings[key]) if settings[key] else None for key in ("model", "mmproj"))
-    engine = engine_config(
-        name=settings["engine"],
-        model=model,
-        mmproj=mmproj,
-        threads=settings["threads"],
-        gpu_layers=settings["gpu_layers"],
-        context=settings["context"],
-        profile=settings["profile"],
-        gaps=settings["gaps"],
-    )
-    check_replay(engine)
-    return engine
+            raise UsageError(f"`config` {path}: '{name}' is none of {', '.join(known).replace('_', '-')}")
+        if isinstance(value, bool) and chosen.options.model_fields.get(name, _NUMBER).annotation is not bool:
+            raise UsageError(f"`config` {path}: {name} = {value} should be a number or a text")
+    of_engine = placed(EngineConfig, {name: value for name, value in values.items() if name in places(EngineConfig)})
+    of_transport = {name: value for name, value in values.items() if name in _told(chosen)}
+    try:
+        EngineConfig(**of_engine)
+        chosen.options(**of_transport)
+    except UsageError as error:
+        raise UsageError(f"`config` {path}: {error}") from error
+    return of_engine, of_transport
 
 
 def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
     """Serve until SIGINT or SIGTERM, then end cleanly with exit code 0."""
     from s2a_bench.harness.serving import engine_handler
     from s2a_bench.inference import open_engine
+    from s2a_bench.inference.replay import check_replay
     from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
-    from s2a_bench.transport import TRANSPORTS, open_server
+    from s2a_bench.transport import open_server
 
+    check_replay(config)
     limit_threads()
     if TRANSPORTS[wiring.transport].tuned(wiring.options):
         keep_large_blocks()
@@ -153,3 +134,6 @@ def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
         server.serve()
     finally:
         engine.close()
+
+
+serve = command(_serve, _config(), about="Serve a model until interrupted: over HTTP, as a ROS 2 node, or otherwise.")

@@ -90,8 +90,8 @@ def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -
     ("text", "message"),
     [
         ("colour = 1", "'colour' is none of engine, model"),
-        ('threads = "many"', "threads = 'many' should be like 0"),
-        ("threads = true", "threads = True should be like 0"),
+        ('threads = "many"', "--threads: 'many' should be a valid integer"),
+        ("threads = true", "threads = True should be a number"),
         ("= 1", "is no TOML"),
         ("max-tokens = 0", "max-tokens: 0 should be greater than or equal to 1"),
         ("result-timeout = inf", "result-timeout: inf should be less than or equal to 86400"),
