@@ -17,7 +17,7 @@ KEEP_BYTES = (1 << 30, 1 << 25)
 """The first that glibc takes: older ones refuse a threshold above 32 MiB.
 
 Blocks up to this size stay with the process. Without it glibc returns every frame's memory to the kernel and each
-new frame faults its pages in again, 2.6 us a page (shared/LIMITS.md)."""
+new frame faults its pages in again, 2.6 us a page."""
 
 SINGLE_THREADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 

@@ -19,7 +19,7 @@ RANGES = ("OFF", "LOCALHOST", "SUBNET", "SYSTEM_DEFAULT")
 TUNED_GENERAL = "<MaxMessageSize>65500B</MaxMessageSize><FragmentSize>65000B</FragmentSize>"
 TUNED_INTERNAL = '<Internal><SocketReceiveBufferSize max="16MB"/></Internal>'
 """Fragments of nearly the largest UDP datagram, and the receive buffer the kernel allows: half the time for a VGA
-image, and no lost fragments at 1920x1080 (shared/LIMITS.md)."""
+image, and no lost fragments at 1920x1080."""
 
 PATIENT = "<InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
 """Cyclone 11 stops announcing itself to addresses where nobody has answered for 30 s; a peer that finds others by

@@ -1,4 +1,4 @@
-"""What real servers say, dialect by dialect, written from their sources (shared/PROTOCOLS.md), and what they demand."""
+"""What real servers say, dialect by dialect, written from their sources, and what they demand."""
 
 from __future__ import annotations
 

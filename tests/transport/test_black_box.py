@@ -50,7 +50,7 @@ LLAMA_SERVER: Script = [
     USAGE,
     DONE,
 ]
-"""What llama-server sends (shared/PROTOCOLS.md)."""
+"""What llama-server sends."""
 
 
 @pytest.fixture

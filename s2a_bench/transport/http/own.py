@@ -54,7 +54,7 @@ STANDARD = Codec(
     to_base64=lambda data: base64.b64encode(data).decode("ascii"),
     from_base64=base64.b64decode,
 )
-# validate=True is pybase64's fast path: .06 against .35 ms for a VGA frame (shared/LIMITS.md)
+# validate=True is pybase64's fast path: .06 against .35 ms for a VGA frame
 FAST = Codec(
     dumps=orjson.dumps,
     loads=orjson.loads,
