@@ -198,7 +198,3 @@ def test_resizing_averages_and_leaves_a_fitting_picture_alone() -> None:
     bgr[:, 4:] = 200
     assert resize(bgr, 8, 4) is bgr
     assert resize(bgr, 2, 1).tolist() == [[[0, 0, 0], [200, 200, 200]]]
-
-
-def test_opencv_runs_on_one_thread() -> None:
-    assert cv2.getNumThreads() == 1
