@@ -216,4 +216,4 @@ def make_room(path: Path, *, force: bool) -> None:
 
 
 def _unwritable(path: Path, why: str) -> StoreError:
-    return StoreError(f"--output: cannot write {path}: {why}")
+    return StoreError(f"`output`: cannot write {path}: {why}")
