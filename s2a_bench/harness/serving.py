@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from threading import Lock, Thread
 from typing import Any
 
-from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
 from s2a_bench.inference import Engine, EngineConfig, open_engine
@@ -25,16 +25,13 @@ from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Handler, Wiring, open_server
 from s2a_bench.types import Request, Token
 
-PAUSE_NS = 5_000_000
-"""Between the last token and the checksum, which would compete with the sending of tokens for a core."""
-
 
 def engine_handler(engine: Engine, *, pixels: bool = True) -> Handler:
     """Make the handler that lets one request at a time into the engine and marks `queue` and `inference`.
 
     With ``pixels`` it also tells the checksum of the picture, once all tokens are on their way.
     """
-    free, clock = Lock(), SystemClock()
+    free = Lock()
 
     def handle(request: Request, trace: Trace) -> Generator[Token, None, None]:
         trace.mark(RESIDUAL)
@@ -52,7 +49,6 @@ def engine_handler(engine: Engine, *, pixels: bool = True) -> Handler:
         finally:
             free.release()
         if pixels and len(request.images) == 1:
-            clock.sleep_until_ns(now_ns() + PAUSE_NS)
             trace.facts[RGB_ENGINE] = float(fingerprint(request.images[0]))
 
     return handle
