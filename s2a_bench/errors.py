@@ -10,6 +10,7 @@ S2AError
 │   └── ModelError       a model file is missing, damaged or of the wrong kind
 ├── TransportError       a request did not make its way
 │   ├── RequestFailed    the server refused or broke off this one request; the next may succeed
+│   │   ├── Busy         too many requests wait for the engine
 │   │   └── MessagesLost the middleware lost messages of this request
 │   ├── PortInUse        a server cannot bind its address
 │   └── ServerDied       the server's process is gone
@@ -60,6 +61,10 @@ class RequestFailed(TransportError):
         """Keep the message, and how long the server asked to wait, if it did."""
         super().__init__(message)
         self.retry_after_s = retry_after_s
+
+
+class Busy(RequestFailed):
+    """Too many requests wait for the engine."""
 
 
 class MessagesLost(RequestFailed):

@@ -13,7 +13,7 @@ import signal
 import sys
 from collections.abc import Generator
 from dataclasses import dataclass
-from threading import Lock, Thread
+from threading import Thread
 from typing import Any
 
 from s2a_bench.clock import now_ns
@@ -22,36 +22,38 @@ from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
 from s2a_bench.trace import RESIDUAL, Trace
-from s2a_bench.transport import Handler, Wiring, open_server
+from s2a_bench.transport import Wiring, open_server
+from s2a_bench.transport.turns import MAX_WAITING, Queued, Turn
 from s2a_bench.types import Request, Token
 
 
-def engine_handler(engine: Engine, *, pixels: bool = True) -> Handler:
+def engine_handler(engine: Engine, *, pixels: bool = True, max_waiting: int = MAX_WAITING) -> Queued:
     """Make the handler that lets one request at a time into the engine and marks `queue` and `inference`.
 
-    With ``pixels`` it also tells the checksum of the picture, once all tokens are on their way.
+    At most ``max_waiting`` requests wait. With ``pixels`` it also tells the checksum of the picture, once all tokens
+    are on their way and the engine is free.
     """
-    free = Lock()
 
-    def handle(request: Request, trace: Trace) -> Generator[Token, None, None]:
+    def answer(request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
         trace.mark(RESIDUAL)
-        if not free.acquire(blocking=False):
-            free.acquire()
-            trace.mark("queue")
+        tokens = engine.generate(request)
         try:
-            for token in engine.generate(request):
+            for token in tokens:
                 now = now_ns()
+                turn.alive_ns = now
                 if not trace.token_ns:
                     trace.marks.append(("inference", now))
                 trace.token_ns.append(now)
                 yield token
             trace.facts.update(engine.facts)
         finally:
-            free.release()
+            if isinstance(tokens, Generator):
+                tokens.close()
+            turn.leave()
         if pixels and len(request.images) == 1:
             trace.facts[RGB_ENGINE] = float(fingerprint(request.images[0]))
 
-    return handle
+    return Queued(answer, max_waiting)
 
 
 @dataclass(frozen=True, slots=True)

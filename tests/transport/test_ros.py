@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack
-from threading import Event, Lock, Thread
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client, open_server
 from s2a_bench.transport.ros.camera import CAMERA
+from s2a_bench.transport.turns import Queued
 from s2a_bench.types import Frame, Request, Token
 
 
@@ -104,21 +105,16 @@ def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, told: 
 
 
 def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, told: Wiring[Any]) -> None:
-    free, go, started, both = Lock(), Event(), Event(), Event()
+    go, started = Event(), Event()
 
     def handler(request: Request, trace: Trace) -> Generator[Token, None, None]:
-        trace.mark(RESIDUAL)
-        if not free.acquire(blocking=False):
-            both.set()
-            free.acquire()
-            trace.mark("queue")
         started.set()
         assert go.wait(20)
         trace.mark("inference")
-        free.release()
         yield Token(0, request.id)
 
-    serve(stack, told, handler)
+    queued = Queued.around(handler)
+    serve(stack, told, queued)
     clients = [connect(stack, told) for _ in range(2)]
     traces: dict[str, Any] = {}
 
@@ -129,7 +125,9 @@ def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, told: Wir
     threads[0].start()
     assert started.wait(20)
     threads[1].start()
-    assert both.wait(20), "the second request never reached the handler while the first was in it"
+    deadline = now_ns() + 20_000_000_000
+    while not queued.turns.waiting:
+        assert now_ns() < deadline, "the second request never joined the queue"
     go.set()
     for thread in threads:
         thread.join(20)

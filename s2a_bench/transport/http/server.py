@@ -10,10 +10,8 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
-from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterator
-from contextlib import closing, suppress
-from itertools import chain
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from typing import Any, Literal
 
 import uvicorn
@@ -21,19 +19,26 @@ from fastapi import FastAPI
 from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, Response, StreamingResponse
+from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel
+from starlette.requests import ClientDisconnect
 
-from s2a_bench.errors import EngineError, PortInUse, RequestFailed, S2AError
+from s2a_bench.errors import Busy, EngineError, PortInUse, RequestFailed, S2AError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.http import own
+from s2a_bench.transport.http.answer import Answer
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.pictures import decoded
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.transport.turns import Queued
+from s2a_bench.types import Frame, Request
 
 KEEP_ALIVE_S = 3600
 """A client that waits for its turn in an interleaved run keeps its connection."""
+
+
+STUCK_S = 120
+"""Silence of an answer under way after which /health says so: a long prompt on a small board takes its time."""
 
 
 class ImageUrl(BaseModel):
@@ -84,8 +89,12 @@ def _received(app: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[No
                 trace.mark("network")
             return event
 
-        with suppress(asyncio.CancelledError):  # uvicorn cancels what is under way when it stops: no error of ours
-            await app(scope, timed_receive, send)
+        try:
+            with suppress(asyncio.CancelledError, ClientDisconnect):  # uvicorn cancels what is under way when it stops
+                await app(scope, timed_receive, send)
+        finally:
+            if answer := scope["state"].get("answer"):
+                answer.abandon()  # whatever was raised, wherever: the engine is free again
 
     return wrapped
 
@@ -93,9 +102,12 @@ def _received(app: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[No
 def application(handler: Handler) -> FastAPI:
     """Build the application: chat completions in three variants, and what tools expect beside them."""
     app = FastAPI(title="s2a-bench", docs_url=None, redoc_url=None)
+    queued = Queued.around(handler)
 
     @app.exception_handler(S2AError)
     async def refuse(_: HttpRequest, error: S2AError) -> Response:
+        if isinstance(error, Busy):
+            return _error(503, str(error), {"Retry-After": f"{error.retry_after_s:.0f}"})
         return _error(500 if isinstance(error, EngineError) else 400, str(error))
 
     @app.exception_handler(RequestValidationError)
@@ -104,8 +116,12 @@ def application(handler: Handler) -> FastAPI:
         return _error(422, f"{'.'.join(str(step) for step in first['loc'])}: {first['msg']}")
 
     @app.get("/health")
-    def health() -> dict[str, str]:
-        return {"status": "ok"}
+    async def health() -> Response:
+        silent_s = queued.turns.silent_s()
+        if silent_s > STUCK_S:
+            said = f"the answer under way has shown no sign of life for {silent_s:.0f} s"
+            return JSONResponse({"status": "stuck", "reason": said}, 503)
+        return JSONResponse({"status": "ok"})
 
     @app.get("/v1/models")
     def models() -> dict[str, Any]:
@@ -113,34 +129,33 @@ def application(handler: Handler) -> FastAPI:
 
     @app.post(own.PATHS[own.AS_DEPLOYED])
     def as_deployed(body: ChatRequest, http_request: HttpRequest) -> Response:
-        trace: Trace = http_request.state.trace
-        trace.mark("json_parse")
-        return _answer(handler, body.model_dump(), trace, own.STANDARD)
+        http_request.state.trace.mark("json_parse")
+        return _answer(queued, body.model_dump(), http_request, own.STANDARD)
 
     async def best_effort(http_request: HttpRequest) -> Response:
         body = await http_request.body()
-        return await run_in_threadpool(_answer_json, handler, body, http_request.state.trace)
+        return await run_in_threadpool(_answer_json, queued, body, http_request)
 
     async def binary(http_request: HttpRequest) -> Response:
         body = await http_request.body()
-        return await run_in_threadpool(_answer_binary, handler, body, http_request)
+        return await run_in_threadpool(_answer_binary, queued, body, http_request)
 
     app.add_route(own.PATHS[own.BEST_EFFORT], best_effort, methods=["POST"])
     app.add_route(own.PATHS[own.BINARY], binary, methods=["POST"])
     return app
 
 
-def _answer_json(handler: Handler, body: bytes, trace: Trace) -> Response:
+def _answer_json(queued: Queued, body: bytes, http_request: HttpRequest) -> Response:
     """Answer a JSON body that nobody has validated."""
     try:
         fields = own.FAST.loads(body)
     except ValueError as error:
         raise RequestFailed(f"the body is no JSON: {error}") from error
-    trace.mark("json_parse")
-    return _answer(handler, fields, trace, own.FAST)
+    http_request.state.trace.mark("json_parse")
+    return _answer(queued, fields, http_request, own.FAST)
 
 
-def _answer_binary(handler: Handler, body: bytes, http_request: HttpRequest) -> Response:
+def _answer_binary(queued: Queued, body: bytes, http_request: HttpRequest) -> Response:
     """Answer a body that is the picture itself."""
     trace: Trace = http_request.state.trace
     try:
@@ -151,11 +166,12 @@ def _answer_binary(handler: Handler, body: bytes, http_request: HttpRequest) -> 
         raise RequestFailed(f"header {own.PARAMETERS_HEADER} should be an object whose prompt is text")
     trace.mark("json_parse")
     images = (decoded(http_request.headers.get("content-type", ""), body, trace),) if body else ()
-    return _respond(handler, fields, prompt, images, trace, own.FAST)
+    return _respond(queued, fields, prompt, images, http_request, own.FAST)
 
 
-def _answer(handler: Handler, fields: dict[str, Any], trace: Trace, codec: own.Codec) -> Response:
+def _answer(queued: Queued, fields: dict[str, Any], http_request: HttpRequest, codec: own.Codec) -> Response:
     """Decode the pictures of the messages and answer."""
+    trace: Trace = http_request.state.trace
     images: list[Frame] = []
     texts: list[str] = []
     try:
@@ -173,18 +189,19 @@ def _answer(handler: Handler, fields: dict[str, Any], trace: Trace, codec: own.C
         prompt = "\n".join(texts)
     except (ValueError, KeyError, TypeError) as error:  # binascii.Error is a ValueError
         raise RequestFailed(f"messages: {error!r}") from error
-    return _respond(handler, fields, prompt, tuple(images), trace, codec)
+    return _respond(queued, fields, prompt, tuple(images), http_request, codec)
 
 
 def _respond(
-    handler: Handler,
+    queued: Queued,
     fields: dict[str, Any],
     prompt: str,
     images: tuple[Frame, ...],
-    trace: Trace,
+    http_request: HttpRequest,
     codec: own.Codec,
 ) -> Response:
-    """Start the answer, so that a refusal still has its status code, then stream it or send it whole."""
+    """Join the queue, and begin if nobody is before us, so that a refusal still has its status code."""
+    trace: Trace = http_request.state.trace
     try:
         request = Request(
             id=str(fields.get("request_id") or "chatcmpl-0"),
@@ -196,97 +213,16 @@ def _respond(
         )
     except (ValueError, TypeError) as error:
         raise RequestFailed(f"max_tokens, seed: {error}") from error
-    tokens = handler(request, trace)
-    first = list(next_of(tokens))
-    if fields.get("stream"):
-        events = _events(request, chain(first, tokens), trace, codec)
-        return StreamingResponse(_relayed(events), media_type="text/event-stream")
-    whole = [*first, *tokens]
-    return JSONResponse(
-        {
-            "id": request.id,
-            "object": "chat.completion",
-            "model": "s2a",
-            "choices": [
-                {
-                    "index": 0,
-                    "message": {"role": "assistant", "content": "".join(token.text for token in whole)},
-                    "finish_reason": _finish_reason(request, len(whole)),
-                }
-            ],
-            "usage": _usage(trace, len(whole)),
-            "s2a": own.remote_json(trace.to_remote()),
-        }
-    )
+    answer = http_request.state.answer = Answer(queued, request, trace, codec, stream=bool(fields.get("stream")))
+    answer.begin()
+    return answer
 
 
-async def _relayed(events: Generator[bytes, None, None]) -> AsyncIterator[bytes]:
-    """Run an answer on one thread and yield what it has written since: a thread's turn a token would cost 50 us each.
-
-    When the client has gone, the answer ends at its next event, on its thread: ending may wait for the engine.
-    """
-    loop, written, waiting = asyncio.get_running_loop(), asyncio.Event(), deque[bytes]()
-    gone = False
-
-    def run() -> None:
-        with closing(events):
-            for event in events:
-                waiting.append(event)
-                if gone:
-                    return
-                loop.call_soon_threadsafe(written.set)
-
-    answer = asyncio.ensure_future(run_in_threadpool(run))
-    answer.add_done_callback(lambda _: written.set())
-    try:
-        while not answer.done() or waiting:
-            await written.wait()
-            written.clear()
-            if pieces := [waiting.popleft() for _ in range(len(waiting))]:
-                yield b"".join(pieces)
-        answer.result()
-    finally:
-        gone = True
-
-
-def next_of(tokens: Iterator[Token]) -> Iterator[Token]:
-    """Yield at most the next token."""
-    for token in tokens:
-        yield token
-        return
-
-
-def _events(request: Request, tokens: Iterator[Token], trace: Trace, codec: own.Codec) -> Generator[bytes, None, None]:
-    """Yield the server-sent events of an answer; an engine that fails on the way ends it with an error event."""
-    count = 0
-    try:
-        for token in tokens:
-            event = own.chunk(request.id, {"content": token.text})
-            event["choices"][0]["token"] = token.id
-            yield b"data: " + codec.dumps(event) + b"\n\n"
-            count += 1
-    except S2AError as error:
-        yield b"data: " + codec.dumps({"error": {"message": str(error), "type": type(error).__name__}}) + b"\n\n"
-        return
-    finish = own.chunk(request.id, {}, _finish_reason(request, count))
-    yield b"data: " + codec.dumps(finish) + b"\n\n"
-    remote = own.remote_json(trace.to_remote())
-    last = own.chunk(request.id, {}, usage=_usage(trace, count), s2a=remote)
-    yield b"data: " + codec.dumps(last) + b"\n\ndata: [DONE]\n\n"
-
-
-def _finish_reason(request: Request, count: int) -> str:
-    return "length" if count >= request.max_tokens else "stop"
-
-
-def _usage(trace: Trace, count: int) -> dict[str, int]:
-    prompt = int(trace.facts.get("prompt_n", 0))
-    return {"prompt_tokens": prompt, "completion_tokens": count, "total_tokens": prompt + count}
-
-
-def _error(status: int, message: str) -> Response:
+def _error(status: int, message: str, headers: dict[str, str] | None = None) -> Response:
     """Answer an error in OpenAI's form."""
-    return JSONResponse({"error": {"message": message, "type": "invalid_request_error", "code": status}}, status)
+    shown = message.encode(errors="backslashreplace").decode()
+    body = {"error": {"message": shown, "type": "invalid_request_error", "code": status}}
+    return JSONResponse(body, status, headers)
 
 
 class HttpServer:

@@ -203,6 +203,10 @@ class ActionFront:
             alone = self._active == 1
         return GenerateJob(self, packed, goal, trace, at_once=alone)  # from here on only `end` ends the goal
 
+    def refuse(self, packed: ServerGoal, why: str) -> None:  # noqa: ARG002 - a rejection has no words
+        """Reject a goal."""
+        packed.reject()
+
     def plot(self, goal_id: str, token: Token) -> None:
         """Publish a token for whoever plots, where that is wanted."""
         if self._plot is not None:
@@ -271,6 +275,10 @@ class GenerateJob:
             self._goal.feedback(token_feedback("".join(self._held), self._tokens[-1].id))
             self._held.clear()
             self._fed_ns = now_ns()
+
+    def unwanted(self) -> bool:
+        """Whether the goal was cancelled."""
+        return self._goal.cancel_requested
 
     def _stopped(self) -> bool:
         text = "".join(token.text for token in self._tokens)

@@ -2,22 +2,26 @@
 
 A front is one variant's way in. Its threads take turns in waiting for a request; the one that got it answers it
 while another waits, so that no request changes threads, and one that comes meanwhile waits for the engine (stage
-`queue`), not in the network.
+`queue`), not in the network. All fronts share one queue, which a request joins as it arrives.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import partial
 from threading import Event, Lock, Thread
 from typing import Any, Protocol
 
-from s2a_bench.trace import Trace
+from s2a_bench.errors import Busy
+from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros.action import ActionFront
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.topic import TopicFront
+from s2a_bench.transport.turns import Queued, Turn
 from s2a_bench.types import Request, Token
 
 
@@ -30,6 +34,10 @@ class Job(Protocol):
 
     def token(self, token: Token) -> bool:
         """Send a token; return whether more are wanted."""
+        ...
+
+    def unwanted(self) -> bool:
+        """Whether who asked is known to want no answer any more."""
         ...
 
     def end(self, error: str = "") -> None:
@@ -48,13 +56,17 @@ class Front(Protocol):
         """Unpack and prepare a request, marking each stage; None for what is none."""
         ...
 
+    def refuse(self, packed: Any, why: str) -> None:
+        """Tell who asked that the request is not taken."""
+        ...
+
     def interrupt(self) -> None:
         """Make `take` return, callable from any thread."""
         ...
 
 
-WORKERS = 4
-"""Threads a front: requests that can wait for the engine at a time, and one that receives."""
+IDLE_WORKERS = 2
+"""Threads of a front that wait for requests, one in the middleware; more are started while all others answer."""
 
 
 class RosServer:
@@ -63,7 +75,7 @@ class RosServer:
     def __init__(self, wiring: Wiring[RosOptions], handler: Handler) -> None:
         """Join the domain and create all topics; raises TransportError where another server answers already."""
         self.address = namespace_of(wiring)
-        self._handler = handler
+        self._queued = Queued.around(handler)
         refuse_company(wiring, self.address)
         self.middleware = join(wiring, "server")
         self._cache = CameraCache(self.middleware, self.address, wiring.options.qos)
@@ -75,14 +87,13 @@ class RosServer:
 
     def serve(self) -> None:
         """Serve until stopped."""
-        turns = [(front, Lock()) for front in self._fronts]
-        threads = [Thread(target=self._work, args=turn, daemon=True) for turn in turns for _ in range(WORKERS)]
+        crews = [_Crew(front, self._take, self._stopped) for front in self._fronts]
         self._cache.start()
-        for thread in threads:
-            thread.start()
+        for crew in crews:
+            crew.start()
         self._stopped.wait()
-        for thread in threads:
-            thread.join()
+        for crew in crews:
+            crew.join()
         self._cache.join()
         self.middleware.close()
 
@@ -97,29 +108,41 @@ class RosServer:
         """Say what carries the messages."""
         return self.middleware.describe()
 
-    def _work(self, front: Front, turn: Lock) -> None:
-        """Wait for a request when it is this thread's turn, and answer it while another thread waits."""
-        while not self._stopped.is_set():
-            job = packed = None  # gives the received bytes back before the next wait
-            try:
-                with turn:
-                    packed = front.take(POLL_S)
-                    trace = Trace()
-                    trace.mark("network")
-                job = front.job(packed, trace) if packed is not None else None
-                if job is not None:
-                    self._answer(job)
-            except Exception as error:  # noqa: BLE001 - a node stays up: the next request may fare better
-                said = f"request not answered: {error or type(error).__name__}"
-                print(said, file=sys.stderr, flush=True)  # noqa: T201 - a node's log
+    def _take(self, front: Front) -> Callable[[], None] | None:
+        """Wait for a request and give it its place in the queue; return what answers it."""
+        packed = front.take(POLL_S)
+        if packed is None:
+            return None
+        trace = Trace()
+        trace.mark("network")
+        try:
+            turn = self._queued.turns.join()
+        except Busy as error:
+            front.refuse(packed, str(error))
+            return None
+        return partial(self._answer_in, turn, front, packed, trace)
 
-    def _answer(self, job: Job) -> None:
+    def _answer_in(self, turn: Turn, front: Front, packed: Any, trace: Trace) -> None:
+        """Unpack a request, and answer it when its turn comes."""
+        try:
+            if (job := front.job(packed, trace)) is not None:
+                self._answer(job, turn)
+        finally:
+            turn.leave()
+
+    def _answer(self, job: Job, turn: Turn) -> None:
         """Answer one request; what goes wrong goes back to who asked."""
         if job.request is None or self._stopped.is_set():
             job.end("the server is stopping" if job.request else "")
             return
+        if not turn.come.done():
+            job.trace.mark(RESIDUAL)
+            if not turn.wait(lambda: job.unwanted() or self._stopped.is_set()):
+                job.end("the server is stopping" if self._stopped.is_set() else "")
+                return
+            job.trace.mark("queue")
         error = ""
-        tokens = self._handler(job.request, job.trace)
+        tokens = self._queued.answer(job.request, job.trace, turn)
         try:
             for token in tokens:
                 if self._stopped.is_set():
@@ -131,3 +154,52 @@ class RosServer:
         finally:
             tokens.close()
         job.end(error)
+
+
+class _Crew:
+    """The threads of one front: they take turns in waiting for a request, and there is always one left to wait."""
+
+    def __init__(self, front: Front, take: Callable[[Front], Callable[[], None] | None], stopped: Event) -> None:
+        self._front, self._take, self._stopped = front, take, stopped
+        self._lock, self._count = Lock(), Lock()
+        self._idle = 0
+        self._threads: list[Thread] = []
+
+    def start(self) -> None:
+        """Start the first threads."""
+        for _ in range(IDLE_WORKERS):
+            self._hire()
+
+    def join(self) -> None:
+        """Wait for all threads; none is hired any more once the first has ended."""
+        while self._threads:
+            self._threads.pop().join()
+
+    def _hire(self) -> None:
+        self._idle += 1
+        thread = Thread(target=self._work, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _work(self) -> None:
+        """Take requests when it is this thread's turn, and answer them while another thread waits."""
+        while not self._stopped.is_set():
+            answer = None  # gives the received bytes back before the next wait
+            try:
+                with self._lock:
+                    answer = self._take(self._front)
+                if answer is not None:
+                    self._busy(1)
+                    try:
+                        answer()
+                    finally:
+                        self._busy(-1)
+            except Exception as error:  # noqa: BLE001 - a node stays up: the next request may fare better
+                said = f"request not answered: {error or type(error).__name__}"
+                print(said, file=sys.stderr, flush=True)  # noqa: T201 - a node's log
+
+    def _busy(self, change: int) -> None:
+        with self._count:
+            self._idle -= change
+            if not self._idle and not self._stopped.is_set():
+                self._hire()

@@ -116,6 +116,11 @@ class TopicFront:
         trace.mark("cdr_parse")
         return TopicJob(self, message, trace, self._cache)
 
+    def refuse(self, packed: Any, why: str) -> None:
+        """Answer a request with an error only; raises TransportError for bytes that are no request."""
+        request_id = self._requests.unpack(packed).id
+        self.send(request_id, Token(0, "", -1), [marks_message(request_id, Trace().to_remote())], why)
+
     def send(self, request_id: str, token: Token, marks: list[Any], error: str = "") -> None:
         """Publish one token, or with marks the end of the answer."""
         self._tokens.send(
@@ -151,6 +156,10 @@ class TopicJob:
         self._front.send(self._id, token, [])
         self._sent += 1
         return True
+
+    def unwanted(self) -> bool:
+        """Whether the answer is not wanted any more, which this variant cannot tell."""
+        return False
 
     def end(self, error: str = "") -> None:
         """Publish the end of the answer, with the marks."""

@@ -1,0 +1,160 @@
+"""The queue in front of an engine: bounded, first come first served, one answer at a time.
+
+Every server has one `Queued` handler. Called, it waits for its turn on the caller's thread; a server whose threads must
+not wait (HTTP has a pool of 40) joins `turns` itself, waits as it likes for `Turn.come`, and then calls `answer`.
+Whoever joined must leave, whatever happens; leaving twice does no harm, and leaving while waiting gives the place up.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NotYet
+from contextlib import closing
+from threading import Lock
+from typing import TYPE_CHECKING, TypeAlias
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import Busy
+from s2a_bench.trace import RESIDUAL, Trace
+from s2a_bench.types import Request, Token
+
+if TYPE_CHECKING:
+    from s2a_bench.transport import Handler
+
+MAX_WAITING = 64
+RETRY_AFTER_S = 1.0
+POLL_S = 0.1
+"""How often one who waits is asked whether it still wants an answer."""
+
+
+class Turn:
+    """One request's place in the queue, then its time with the engine."""
+
+    __slots__ = ("_turns", "alive_ns", "come")
+
+    def __init__(self, turns: Turns) -> None:
+        """Take a place; only `Turns.join` does."""
+        self.come: Future[None] = Future()
+        """Done when it is this request's turn."""
+        self.come.set_running_or_notify_cancel()  # so that nobody can cancel it
+        self.alive_ns = 0
+        """When the answer last showed a sign of life, on CLOCK_MONOTONIC."""
+        self._turns = turns
+
+    def wait(self, gone: Callable[[], bool] = lambda: False) -> bool:
+        """Wait on this thread; return False if who asked was ``gone`` before its turn came."""
+        while True:
+            try:
+                self.come.result(POLL_S)
+            except NotYet:
+                if gone():
+                    return False
+            else:
+                return True
+
+    def start(self) -> None:
+        """Let it be this request's turn."""
+        self.alive()
+        self.come.set_result(None)
+
+    def alive(self) -> None:
+        """Note a sign of life."""
+        self.alive_ns = now_ns()
+
+    def leave(self) -> None:
+        """End the turn, or give up the place; may be called twice, from any thread."""
+        self._turns.leave(self)
+
+
+class Turns:
+    """The queue: one turn runs, at most ``max_waiting`` wait for theirs in the order of their arrival."""
+
+    def __init__(self, max_waiting: int = MAX_WAITING) -> None:
+        """Start idle."""
+        self._max_waiting = max_waiting
+        self._lock = Lock()
+        self._running: Turn | None = None
+        self._waiting: deque[Turn] = deque()
+
+    def join(self) -> Turn:
+        """Take the last place; raises Busy where as many as may are waiting."""
+        turn = Turn(self)
+        with self._lock:
+            if self._running is not None:
+                if len(self._waiting) >= self._max_waiting:
+                    waiting = f"{self._max_waiting} requests are waiting for the engine already"
+                    raise Busy(f"{waiting}; come again later", retry_after_s=RETRY_AFTER_S)
+                self._waiting.append(turn)
+                return turn
+            self._running = turn
+        turn.start()
+        return turn
+
+    def leave(self, turn: Turn) -> None:
+        """Take ``turn`` out and let the next one run if it ran."""
+        with self._lock:
+            if turn is not self._running:
+                if turn in self._waiting:
+                    self._waiting.remove(turn)
+                return
+            self._running = following = self._waiting.popleft() if self._waiting else None
+        if following is not None:
+            following.start()
+
+    @property
+    def waiting(self) -> int:
+        """Return how many wait."""
+        return len(self._waiting)
+
+    def silent_s(self) -> float:
+        """Return for how long the running answer has shown no sign of life; 0 where none runs."""
+        running = self._running
+        return (now_ns() - running.alive_ns) / 1e9 if running is not None and running.alive_ns else 0.0
+
+
+Answering: TypeAlias = "Callable[[Request, Trace, Turn], Generator[Token, None, None]]"
+"""What answers in its turn, and leaves as soon as the engine is free: what it does then, nobody waits for."""
+
+
+class Queued:
+    """A handler that answers one request at a time; `answer` is for who has its turn already."""
+
+    def __init__(self, answering: Answering, max_waiting: int = MAX_WAITING) -> None:
+        """Put a queue in front of ``answering``."""
+        self.turns = Turns(max_waiting)
+        self._answering = answering
+
+    @staticmethod
+    def around(handler: Handler) -> Queued:
+        """Return ``handler``, with a queue in front of it if it has none."""
+        if isinstance(handler, Queued):
+            return handler
+
+        def answering(request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
+            with closing(handler(request, trace)) as tokens:
+                for token in tokens:
+                    turn.alive()
+                    yield token
+
+        return Queued(answering)
+
+    def __call__(self, request: Request, trace: Trace) -> Generator[Token, None, None]:
+        """Wait for a turn and answer; raises Busy."""
+        turn = self.turns.join()
+        try:
+            if not turn.come.done():
+                trace.mark(RESIDUAL)
+                turn.wait()
+                trace.mark("queue")
+            yield from self.answer(request, trace, turn)
+        finally:
+            turn.leave()
+
+    def answer(self, request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
+        """Answer in a turn that has come, and leave it."""
+        try:
+            yield from self._answering(request, trace, turn)
+        finally:
+            turn.leave()

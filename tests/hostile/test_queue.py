@@ -1,0 +1,297 @@
+"""The queue in front of an engine: bounded, in the order of arrival, and never stuck."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import socket
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, contextmanager
+from threading import Event, Lock, Thread
+from typing import Any
+
+import httpx
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import Busy, EngineError, RequestFailed
+from s2a_bench.harness.serving import engine_handler
+from s2a_bench.inference import EngineConfig, open_engine
+from s2a_bench.testing.transport import ask, wiring
+from s2a_bench.trace import Trace, budget
+from s2a_bench.transport import Handler, open_client, open_server
+from s2a_bench.transport.http.own import PATHS
+from s2a_bench.transport.turns import Queued, Turn, Turns
+from s2a_bench.types import Request, Token
+
+CHAT = PATHS["as-deployed"]
+
+
+@contextmanager
+def serving(handler: Handler, name: str = "http") -> Iterator[str]:
+    """Serve for as long as the context lasts."""
+    with ExitStack() as stack:
+        server = open_server(wiring(name), handler)
+        thread = Thread(target=server.serve)
+        thread.start()
+        stack.callback(thread.join)
+        stack.callback(server.stop)
+        yield server.address
+
+
+def body(prompt: str = "go on", *, stream: bool = True, **more: Any) -> dict[str, Any]:
+    return {"messages": [{"role": "user", "content": prompt}], "stream": stream, **more}
+
+
+def until(met: Callable[[], bool], seconds: float = 20) -> None:
+    deadline = time.monotonic() + seconds
+    while not met():
+        assert time.monotonic() < deadline, "it did not come about"
+        time.sleep(0.005)
+
+
+class Gate:
+    """An answer that goes on for ever once `go` is set, and counts who came and who ended."""
+
+    def __init__(self) -> None:
+        self.go = Event()
+        self.began: list[str] = []
+        self.ended: list[str] = []
+
+    def __call__(self, request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        self.began.append(request.id)
+        try:
+            for index in range(100_000):
+                yield Token(index, "a")
+                self.go.wait(30)
+                time.sleep(0.001)
+        finally:
+            self.ended.append(request.id)
+
+
+class TestTurns:
+    def test_they_come_in_the_order_of_arrival(self) -> None:
+        turns = Turns()
+        queue = [turns.join() for _ in range(5)]
+        for index, turn in enumerate(queue):
+            assert [other.come.done() for other in queue[index:]] == [True] + [False] * (4 - index)
+            turn.leave()
+
+    def test_whoever_is_one_too_many_is_refused_at_once(self) -> None:
+        turns = Turns(max_waiting=2)
+        held = [turns.join() for _ in range(3)]
+        with pytest.raises(Busy, match="2 requests are waiting"):
+            turns.join()
+        held[1].leave()
+        turns.join()
+
+    def test_leaving_twice_lets_one_run_not_two(self) -> None:
+        turns = Turns()
+        first, second, third = (turns.join() for _ in range(3))
+        first.leave()
+        first.leave()
+        assert second.come.done()
+        assert not third.come.done()
+
+    def test_whoever_waits_and_goes_is_passed_over(self) -> None:
+        turns = Turns()
+        first, second, third = (turns.join() for _ in range(3))
+        assert not second.wait(lambda: True)
+        second.leave()
+        first.leave()
+        assert third.come.done()
+
+    def test_silence_is_that_of_the_running_answer(self) -> None:
+        turns = Turns()
+        assert turns.silent_s() == 0
+        turn = turns.join()
+        turn.alive_ns = now_ns() - 5_000_000_000
+        assert 5 <= turns.silent_s() < 6
+        turn.leave()
+        assert turns.silent_s() == 0
+
+    @pytest.mark.parametrize(
+        "fails", [EngineError("no"), ValueError("no"), UnicodeEncodeError("utf-8", "", 0, 1, "no")]
+    )
+    def test_whatever_is_raised_frees_the_engine(self, fails: Exception) -> None:
+        def failing(_request: Request, _trace: Trace, _turn: Turn) -> Generator[Token, None, None]:
+            yield Token(0, "a")
+            raise fails
+
+        queued = Queued(failing)
+        for _ in range(2):
+            with pytest.raises(type(fails)):
+                list(queued(Request("a", ""), Trace()))
+        assert queued.turns.join().come.done()
+
+
+class Slow:
+    """An engine that notes when requests end."""
+
+    def __init__(self) -> None:
+        self.facts: dict[str, float] = {}
+        self.ended: list[str] = []
+
+    def generate(self, request: Request) -> Iterator[Token]:
+        for index in range(request.max_tokens):
+            time.sleep(0.0005)
+            yield Token(index, "a")
+        self.ended.append(request.id)
+
+    def describe(self) -> dict[str, str | int | float | bool]:
+        return {}
+
+    def close(self) -> None:
+        pass
+
+
+class Accepting(Queued):
+    """A queue that notes in which order requests joined it."""
+
+    def __init__(self, inner: Queued) -> None:
+        super().__init__(inner.answer)
+        self.accepted: list[int] = []
+        join, lock = self.turns.join, Lock()
+        self.of: dict[str, int] = {}
+
+        def noting() -> Turn:
+            with lock:
+                turn = join()
+                self.accepted.append(id(turn))
+                self.kept.append(turn)
+                return turn
+
+        self.kept: list[Turn] = []
+        self.turns.join = noting  # type: ignore[method-assign]
+
+    def answer(self, request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
+        self.of[request.id] = id(turn)
+        yield from super().answer(request, trace, turn)
+
+
+@pytest.mark.parametrize("name", ["http/as-deployed", "http/binary", "ros/topic"])
+def test_requests_end_in_the_order_of_their_acceptance(name: str) -> None:
+    engine = Slow()
+    accepting = Accepting(engine_handler(engine, pixels=False))
+    queued = []
+
+    def many(number: int, address: str) -> None:
+        client = open_client(wiring(name, address))
+        lengths = random.Random(number)
+        try:
+            for turn in range(10):
+                request = Request(f"{number}-{turn}", "a", max_tokens=lengths.randint(1, 40))
+                tokens, trace = ask(client, request)
+                assert len(tokens) == request.max_tokens
+                queued.append("queue" in budget(trace.chain()).stages_ns)
+        finally:
+            client.close()
+
+    with serving(accepting, name) as address:
+        threads = [Thread(target=many, args=(number, address)) for number in range(5)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+    assert len(engine.ended) == 50
+    assert [accepting.of[name] for name in engine.ended] == accepting.accepted
+    assert sum(queued) > 25
+
+
+@pytest.mark.parametrize("stream", [True, False])
+def test_200_clients_at_once_are_answered_or_refused_and_none_hangs(stream: bool) -> None:
+    async def ask_all(url: str) -> list[int]:
+        limits = httpx.Limits(max_connections=None)
+        async with httpx.AsyncClient(timeout=60, limits=limits) as client:
+
+            async def one() -> int:
+                answer = await client.post(url, json=body(stream=stream, max_tokens=20))
+                if answer.status_code == 200 and stream:
+                    assert answer.text.endswith("data: [DONE]\n\n")
+                if answer.status_code == 503:
+                    assert answer.headers["retry-after"] == "1"
+                return answer.status_code
+
+            return await asyncio.gather(*(one() for _ in range(200)))
+
+    with serving(engine_handler(open_engine(EngineConfig(name="echo")))) as url:
+        statuses = asyncio.run(ask_all(url + CHAT))
+        assert set(statuses) <= {200, 503}
+        assert statuses.count(200) >= 65
+        assert httpx.post(url + CHAT, json=body(max_tokens=3)).status_code == 200
+
+
+def ask_and_go(url: str, *, stream: bool, request_id: str) -> socket.socket:
+    """Send a request over a socket of its own, and do not read."""
+    import json
+
+    host, port = url.removeprefix("http://").split(":")
+    data = json.dumps(body(stream=stream, request_id=request_id)).encode()
+    head = f"POST {CHAT} HTTP/1.1\r\nHost: a\r\nContent-Type: application/json\r\nContent-Length: {len(data)}\r\n\r\n"
+    connection = socket.create_connection((host, int(port)))
+    connection.sendall(head.encode() + data)
+    return connection
+
+
+@pytest.mark.parametrize("stream", [True, False])
+def test_an_answer_whose_client_has_gone_stops_and_a_waiter_who_has_gone_never_begins(stream: bool) -> None:
+    gate = Gate()
+    queued = Queued.around(gate)
+    with serving(queued) as url:
+        first = ask_and_go(url, stream=stream, request_id="first")
+        until(lambda: gate.began == ["first"])
+        waiting = ask_and_go(url, stream=stream, request_id="waiting")
+        until(lambda: queued.turns.waiting == 1)
+        last = ask_and_go(url, stream=stream, request_id="last")
+        until(lambda: queued.turns.waiting == 2)
+        waiting.close()
+        until(lambda: queued.turns.waiting == 1)
+        gate.go.set()
+        first.close()
+        until(lambda: gate.began == ["first", "last"])
+        assert gate.ended == ["first"]
+        last.close()
+        until(lambda: gate.ended == ["first", "last"])
+
+
+@pytest.mark.parametrize("stream", [True, False])
+def test_a_token_that_cannot_be_sent_frees_the_engine(stream: bool) -> None:
+    def surrogates(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        yield Token(0, "a")
+        yield Token(1, "\ud800")
+
+    queued = Queued.around(surrogates)
+    with serving(queued) as url:
+        for _ in range(3):
+            try:
+                httpx.post(url + CHAT, json=body(stream=stream), timeout=10)
+            except httpx.RemoteProtocolError:
+                assert stream  # broken off: its status was sent
+        until(queued.turns.join().come.done)
+
+
+def test_health_says_when_the_engine_is_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.transport.http.server.STUCK_S", 0.2)
+    gate = Gate()
+    with serving(gate) as url:
+        assert httpx.get(url + "/health").status_code == 200
+        connection = ask_and_go(url, stream=True, request_id="a")
+        until(lambda: httpx.get(url + "/health").status_code == 503)
+        assert "no sign of life" in httpx.get(url + "/health").json()["reason"]
+        gate.go.set()
+        connection.close()
+        until(lambda: httpx.get(url + "/health").status_code == 200)
+
+
+def test_a_ros_request_too_many_is_refused_at_once() -> None:
+    gate = Gate()
+    queued = Queued(Queued.around(gate)._answering, max_waiting=0)
+    with serving(queued, "ros/topic") as address:
+        clients = [open_client(wiring("ros/topic", address)) for _ in range(2)]
+        tokens = clients[0].request(Request("a", "a"), Trace())
+        next(iter(tokens))
+        with pytest.raises(RequestFailed, match="0 requests are waiting for the engine already"):
+            ask(clients[1], Request("b", "b"))
+        for client in clients:
+            client.close()
