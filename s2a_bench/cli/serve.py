@@ -6,7 +6,6 @@ import signal
 import sys
 from copy import copy
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import typer
@@ -106,7 +105,7 @@ def _read(path: Path, chosen: Transport[Any]) -> tuple[dict[str, Any], dict[str,
 
 def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
     """Serve until SIGINT or SIGTERM, then end cleanly with exit code 0."""
-    from s2a_bench.harness.serving import engine_handler
+    from s2a_bench.harness.serving import engine_handler, stop_soon
     from s2a_bench.inference import open_engine
     from s2a_bench.inference.replay import check_replay
     from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
@@ -123,7 +122,7 @@ def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
         def stop(*_: Any) -> None:
             for number in SIGNALS:  # a second one does not wait for the answer under way
                 signal.signal(number, signal.default_int_handler)
-            Thread(target=server.stop).start()  # not here: the signal may have interrupted a lock's holder
+            stop_soon(server)
 
         for number in SIGNALS:
             signal.signal(number, stop)

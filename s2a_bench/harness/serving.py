@@ -22,9 +22,13 @@ from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
 from s2a_bench.trace import RESIDUAL, Trace
-from s2a_bench.transport import Wiring, open_server
+from s2a_bench.transport import Server, Wiring, open_server
 from s2a_bench.transport.turns import MAX_WAITING, Queued, Turn
 from s2a_bench.types import Request, Token
+
+
+GRACE_S = 4.0
+"""Time to end after being told to; the engine may be in the middle of a long prompt."""
 
 
 def engine_handler(engine: Engine, *, pixels: bool = True, max_waiting: int = MAX_WAITING) -> Queued:
@@ -76,6 +80,19 @@ class ServerJob:
         return ServerJob(Wiring.from_json(fields["wiring"]), EngineConfig(**fields["engine"]), fields["tuned"])
 
 
+def stop_soon(server: Server) -> None:
+    """Stop a server without waiting; after `GRACE_S` the process ends whatever it is doing."""
+
+    def stop() -> None:
+        server.stop()
+        SystemClock().sleep_until_ns(now_ns() + round(GRACE_S * 1e9))
+        sys.stderr.write(f"not over {GRACE_S:g} s after being told to stop: broken off\n")
+        sys.stderr.flush()
+        os._exit(0)
+
+    Thread(target=stop, daemon=True).start()  # not here: a signal may have interrupted a lock's holder
+
+
 def main() -> int:
     """Run a server until standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the harness decides
@@ -99,10 +116,10 @@ def main() -> int:
 
     def stop_at_end_of_input() -> None:
         sys.stdin.read()
-        server.stop()
+        stop_soon(server)
 
     Thread(target=stop_at_end_of_input, daemon=True).start()
-    signal.signal(signal.SIGTERM, lambda *_: server.stop())
+    signal.signal(signal.SIGTERM, lambda *_: stop_soon(server))
     print(json.dumps(ready), file=answers, flush=True)
     server.serve()
     engine.close()

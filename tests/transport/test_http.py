@@ -152,8 +152,8 @@ def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: Reco
 @pytest.mark.parametrize(
     ("path", "body", "status", "message"),
     [
-        (dialect.PATHS["as-deployed"], b"{}", 422, "body.messages"),
-        (dialect.PATHS["as-deployed"], b"{", 422, "JSON"),
+        (dialect.PATHS["as-deployed"], b"{}", 400, "body.messages"),
+        (dialect.PATHS["as-deployed"], b"{", 400, "JSON"),
         (dialect.PATHS["best-effort"], b"{", 400, "no JSON"),
         (dialect.PATHS["best-effort"], b"{}", 400, "messages"),
         (dialect.PATHS["best-effort"], b'{"messages": [], "max_tokens": "many"}', 400, "max_tokens"),

@@ -11,7 +11,7 @@ import asyncio
 import errno
 import socket
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Any, Literal
 
 import uvicorn
@@ -20,7 +20,7 @@ from fastapi import Request as HttpRequest
 from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from pydantic import BaseModel
+from pydantic import BaseModel, StrictInt
 from starlette.requests import ClientDisconnect
 
 from s2a_bench.errors import Busy, EngineError, PortInUse, RequestFailed, S2AError
@@ -28,7 +28,9 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.http import own
 from s2a_bench.transport.http.answer import Answer
+from s2a_bench.transport.http.door import door
 from s2a_bench.transport.http.options import HttpOptions
+from s2a_bench.transport.limits import LIMITS, SEEDS, Limits, text, whole_number
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.turns import Queued
 from s2a_bench.types import Frame, Request
@@ -67,9 +69,9 @@ class ChatRequest(BaseModel):
 
     messages: list[Message]
     stream: bool = False
-    max_tokens: int = 32
+    max_tokens: StrictInt | None = None
     grammar: str = ""
-    seed: int = 0
+    seed: StrictInt | None = None
     request_id: str = "chatcmpl-0"
 
 
@@ -113,7 +115,7 @@ def application(handler: Handler) -> FastAPI:
     @app.exception_handler(RequestValidationError)
     async def invalid(_: HttpRequest, error: RequestValidationError) -> Response:
         first = error.errors()[0]
-        return _error(422, f"{'.'.join(str(step) for step in first['loc'])}: {first['msg']}")
+        return _error(400, f"{'.'.join(str(step) for step in first['loc'])}: {first['msg']}")
 
     @app.get("/health")
     async def health() -> Response:
@@ -202,17 +204,14 @@ def _respond(
 ) -> Response:
     """Join the queue, and begin if nobody is before us, so that a refusal still has its status code."""
     trace: Trace = http_request.state.trace
-    try:
-        request = Request(
-            id=str(fields.get("request_id") or "chatcmpl-0"),
-            prompt=prompt,
-            images=images,
-            max_tokens=int(fields.get("max_tokens") or 32),
-            grammar=str(fields.get("grammar") or ""),
-            seed=int(fields.get("seed") or 0),
-        )
-    except (ValueError, TypeError) as error:
-        raise RequestFailed(f"max_tokens, seed: {error}") from error
+    request = Request(
+        id=text("request_id", fields.get("request_id")) or "chatcmpl-0",
+        prompt=text("the prompt", prompt),
+        images=images,
+        max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, LIMITS.max_tokens, 32),
+        grammar=text("grammar", fields.get("grammar")),
+        seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
+    )
     answer = http_request.state.answer = Answer(queued, request, trace, codec, stream=bool(fields.get("stream")))
     answer.begin()
     return answer
@@ -225,10 +224,17 @@ def _error(status: int, message: str, headers: dict[str, str] | None = None) -> 
     return JSONResponse(body, status, headers)
 
 
+class _Server(uvicorn.Server):
+    """uvicorn without its signal handlers: whoever runs the server has some."""
+
+    def capture_signals(self) -> AbstractContextManager[None]:  # type: ignore[override]
+        return nullcontext()
+
+
 class HttpServer:
     """uvicorn on a socket that is bound before anything is promised."""
 
-    def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
+    def __init__(self, wiring: Wiring[HttpOptions], handler: Handler, limits: Limits = LIMITS) -> None:
         """Bind ``host:port`` of ``wiring.address`` (127.0.0.1 and any port without it); raises PortInUse."""
         host, _, port = (wiring.address or "127.0.0.1:0").rpartition(":")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -245,14 +251,14 @@ class HttpServer:
         config = uvicorn.Config(
             _received(application(handler)),
             loop="uvloop",
-            http="httptools",
+            http=door(limits),
             log_level="warning",
             access_log=False,
             lifespan="off",
             timeout_graceful_shutdown=1,
             timeout_keep_alive=KEEP_ALIVE_S,
         )
-        self._server = uvicorn.Server(config)
+        self._server = _Server(config)
 
     def describe(self) -> dict[str, str | int]:
         """Say what serves."""

@@ -16,6 +16,7 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Mark, Trace
+from s2a_bench.transport.limits import check_pixels
 from s2a_bench.transport.pictures import bgr_of, decoded, encoded, rgb_of
 from s2a_bench.types import Frame
 
@@ -44,6 +45,7 @@ def picture_of(message: Any, trace: Trace) -> Frame:
     """Turn a received image message into an RGB frame; its stamp is ROS time. Raises TransportError."""
     if hasattr(message, "format"):
         return replace(decoded(f"image/{message.format}", message.data, trace), stamp_ns=ros.stamp_of(message.header))
+    check_pixels(message.width, message.height)
     return rgb_of(ros.frame_of_image(message), trace)
 
 

@@ -1,0 +1,103 @@
+"""What a server of ours takes, in one place for all transports: more is refused before it costs memory or time."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, Final
+
+from s2a_bench.errors import RequestFailed
+
+MIB: Final = 1 << 20
+SEEDS: Final = (1 << 32) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The most that is taken of one request, and of all at once."""
+
+    body_bytes: int = 64 * MIB
+    header_bytes: int = 64 << 10
+    in_flight_bytes: int = 256 * MIB
+    """Of the bodies of all requests that are not answered yet."""
+    head_s: float = 10
+    """From the first byte of a request to the end of its headers."""
+    body_s: float = 120
+    """From the end of the headers to the end of the body."""
+    connections: int = 2048
+    pixels: int = 50_000_000
+    """Of a picture, read before it is decoded."""
+    max_tokens: int = 65_536
+
+
+LIMITS: Final = Limits()
+
+
+def whole_number(name: str, value: Any, least: int, most: int, default: int) -> int:
+    """Return a number that came from outside, or the default for None; raises RequestFailed for anything else."""
+    if value is None:
+        return default
+    if type(value) is not int or not least <= value <= most:
+        raise RequestFailed(f"{name} should be a whole number of {least} to {most}")
+    return value
+
+
+def text(name: str, value: Any, default: str = "") -> str:
+    """Return a text that came from outside, or the default for None; raises RequestFailed for what cannot be sent."""
+    if value is None:
+        return default
+    if not isinstance(value, str):
+        raise RequestFailed(f"{name} should be text")
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        raise RequestFailed(f"{name} is no Unicode text: it has half a surrogate pair") from None
+    return value
+
+
+def check_pixels(width: int, height: int) -> None:
+    """Raise RequestFailed for a picture of more pixels than are taken, or of none."""
+    if width <= 0 or height <= 0 or width * height > LIMITS.pixels:
+        raise RequestFailed(f"a picture of {width}x{height}; taken are 1 to {LIMITS.pixels} pixels")
+
+
+def check_encoded(data: memoryview) -> None:
+    """Raise RequestFailed for a file that is no JPEG or PNG, or of too many pixels, as its header says."""
+    size = _png_size(data) or _jpeg_size(data)
+    if size is None:
+        raise RequestFailed(f"{len(data)} bytes that are neither a JPEG nor a PNG")
+    check_pixels(*size)
+
+
+def _png_size(data: memoryview) -> tuple[int, int] | None:
+    """Read IHDR, which comes first (PNG, third edition, 5.6)."""
+    head = bytes(data[:24])
+    if not (head.startswith(b"\x89PNG\r\n\x1a\n") and head[12:16] == b"IHDR"):
+        return None
+    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:], "big")
+
+
+_MARKER = re.compile(rb"[^\xff]*\xff+([^\xff])", re.DOTALL)
+_SEGMENTS = 10_000
+"""More than any picture has before its frame header."""
+_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers of a JPEG's frame header (ITU T.81, table B.1)."""
+_ALONE = frozenset({0x00, 0x01, *range(0xD0, 0xD8)})
+"""Those that no length follows."""
+
+
+def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
+    """Read the first frame header (ITU T.81, B.2.2), skipping what libjpeg skips before a marker."""
+    if bytes(data[:2]) != b"\xff\xd8":
+        return None
+    at = 2
+    for _ in range(_SEGMENTS):
+        found = _MARKER.match(data, at)
+        if found is None or found.end() + 7 > len(data):
+            return None
+        marker, at = found[1][0], found.end()
+        if marker in _FRAME:
+            return int.from_bytes(data[at + 5 : at + 7], "big"), int.from_bytes(data[at + 3 : at + 5], "big")
+        if marker not in _ALONE:
+            at += max(2, int.from_bytes(data[at : at + 2], "big"))
+    return None
