@@ -15,6 +15,7 @@ from s2a_bench import extras
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, ModelError
 from s2a_bench.inference import EngineConfig, llama_log
+from s2a_bench.inference.grammar_limits import beyond_limits
 from s2a_bench.inference.llama_decode import GreedySampler, Sampler, TokenBatch, TokenBytes
 from s2a_bench.inference.llama_gbnf import GrammarSampler, grammar_error
 from s2a_bench.inference.llama_settings import FLASH_ATTENTION, KV_TYPES, SAMPLINGS
@@ -26,6 +27,10 @@ chat_format = extras.require("llama_cpp.llama_chat_format", "llama")
 
 _URL = "s2a-bench:image/{:04d}/"
 _MS_NS = 1_000_000
+
+
+_GRAMMARS = 64
+"""How many are remembered as checked: each can be a MiB."""
 
 
 class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the library has no types
@@ -236,7 +241,9 @@ class LlamaCppEngine:
                 )
         wrong = self._grammar_errors.get(request.grammar) if request.grammar else ""
         if wrong is None:
-            wrong = grammar_error(llama._model.vocab, request.grammar)  # noqa: SLF001
+            wrong = beyond_limits(request.grammar) or grammar_error(llama._model.vocab, request.grammar)  # noqa: SLF001
+            if len(self._grammar_errors) >= _GRAMMARS:
+                self._grammar_errors.clear()
             self._grammar_errors[request.grammar] = wrong
         if wrong:
             raise EngineError(f"llama: the grammar of request {request.id} is not valid GBNF: {wrong}")
