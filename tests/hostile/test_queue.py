@@ -75,7 +75,7 @@ class TestTurns:
         turns = Turns()
         queue = [turns.join() for _ in range(5)]
         for index, turn in enumerate(queue):
-            assert [other.come.done() for other in queue[index:]] == [True] + [False] * (4 - index)
+            assert [other.has_come for other in queue[index:]] == [True] + [False] * (4 - index)
             turn.leave()
 
     def test_whoever_is_one_too_many_is_refused_at_once(self) -> None:
@@ -91,8 +91,8 @@ class TestTurns:
         first, second, third = (turns.join() for _ in range(3))
         first.leave()
         first.leave()
-        assert second.come.done()
-        assert not third.come.done()
+        assert second.has_come
+        assert not third.has_come
 
     def test_whoever_waits_and_goes_is_passed_over(self) -> None:
         turns = Turns()
@@ -100,7 +100,7 @@ class TestTurns:
         assert not second.wait(lambda: True)
         second.leave()
         first.leave()
-        assert third.come.done()
+        assert third.has_come
 
     def test_silence_is_that_of_the_running_answer(self) -> None:
         turns = Turns()
@@ -123,7 +123,7 @@ class TestTurns:
         for _ in range(2):
             with pytest.raises(type(fails)):
                 list(queued(Request("a", ""), Trace()))
-        assert queued.turns.join().come.done()
+        assert queued.turns.join().has_come
 
 
 class Slow:
@@ -268,7 +268,7 @@ def test_a_token_that_cannot_be_sent_frees_the_engine(stream: bool) -> None:
                 httpx.post(url + CHAT, json=body(stream=stream), timeout=10)
             except httpx.RemoteProtocolError:
                 assert stream  # broken off: its status was sent
-        until(queued.turns.join().come.done)
+        until(lambda: queued.turns.silent_s() == 0)
 
 
 def test_health_says_when_the_engine_is_stuck(monkeypatch: pytest.MonkeyPatch) -> None:

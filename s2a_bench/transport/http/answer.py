@@ -39,7 +39,7 @@ class Answer(Response):
 
     def begin(self) -> bool:
         """Take the first token on this thread if it is this request's turn; raises what the engine raises."""
-        if self._turn.come.done():
+        if self._turn.has_come:
             self._on_thread = True
             self._first = list(next_of(self._tokens))
             self._on_thread = False
@@ -63,7 +63,9 @@ class Answer(Response):
         try:
             if self._first is None:
                 self._trace.mark(RESIDUAL)
-                await asyncio.wait({asyncio.wrap_future(self._turn.come), gone}, return_when=asyncio.FIRST_COMPLETED)
+                if self._turn.come is not None:
+                    come = asyncio.wrap_future(self._turn.come)
+                    await asyncio.wait({come, gone}, return_when=asyncio.FIRST_COMPLETED)
                 if self._gone:
                     return
                 self._trace.mark("queue")

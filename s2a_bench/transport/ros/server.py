@@ -135,7 +135,7 @@ class RosServer:
         if job.request is None or self._stopped.is_set():
             job.end("the server is stopping" if job.request else "")
             return
-        if not turn.come.done():
+        if not turn.has_come:
             job.trace.mark(RESIDUAL)
             if not turn.wait(lambda: job.unwanted() or self._stopped.is_set()):
                 job.end("the server is stopping" if self._stopped.is_set() else "")
