@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from threading import Thread
 from typing import Any
 
-from s2a_bench.clock import now_ns
+from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
 from s2a_bench.inference import Engine, EngineConfig, open_engine
@@ -25,7 +25,6 @@ from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Server, Wiring, open_server
 from s2a_bench.transport.turns import MAX_WAITING, Queued, Turn
 from s2a_bench.types import Request, Token
-
 
 GRACE_S = 4.0
 """Time to end after being told to; the engine may be in the middle of a long prompt."""

@@ -38,7 +38,7 @@ class Turn:
         """Take a place; only `Turns.join` does."""
         self.come: Future[None] | None = None
         """Done when it is this request's turn; None where it was at once, for a Future costs 30 us."""
-        self.alive_ns = 0
+        self.alive_ns = now_ns()
         """When the answer last showed a sign of life, on CLOCK_MONOTONIC."""
         self._turns = turns
 
@@ -88,16 +88,15 @@ class Turns:
         """Take the last place; raises Busy where as many as may are waiting."""
         turn = Turn(self)
         with self._lock:
-            if self._running is not None:
-                if len(self._waiting) >= self._max_waiting:
-                    waiting = f"{self._max_waiting} requests are waiting for the engine already"
-                    raise Busy(f"{waiting}; come again later", retry_after_s=RETRY_AFTER_S)
-                turn.come = Future()
-                turn.come.set_running_or_notify_cancel()  # so that nobody can cancel it
-                self._waiting.append(turn)
+            if self._running is None:
+                self._running = turn
                 return turn
-            self._running = turn
-        turn.start()
+            if len(self._waiting) >= self._max_waiting:
+                waiting = f"{self._max_waiting} requests are waiting for the engine already"
+                raise Busy(f"{waiting}; come again later", retry_after_s=RETRY_AFTER_S)
+            turn.come = Future()
+            turn.come.set_running_or_notify_cancel()  # so that nobody can cancel it
+            self._waiting.append(turn)
         return turn
 
     def leave(self, turn: Turn) -> None:
@@ -119,7 +118,7 @@ class Turns:
     def silent_s(self) -> float:
         """Return for how long the running answer has shown no sign of life; 0 where none runs."""
         running = self._running
-        return (now_ns() - running.alive_ns) / 1e9 if running is not None and running.alive_ns else 0.0
+        return (now_ns() - running.alive_ns) / 1e9 if running is not None else 0.0
 
 
 Answering: TypeAlias = "Callable[[Request, Trace, Turn], Generator[Token, None, None]]"
