@@ -57,8 +57,10 @@ def text(name: str, value: Any, default: str = "") -> str:
 
 def check_pixels(width: int, height: int) -> None:
     """Raise RequestFailed for a picture of more pixels than are taken, or of none."""
-    if width <= 0 or height <= 0 or width * height > LIMITS.pixels:
-        raise RequestFailed(f"a picture of {width}x{height}; taken are 1 to {LIMITS.pixels} pixels")
+    if width <= 0 or height <= 0:
+        raise RequestFailed(f"a picture of {width}x{height} is empty")
+    if width * height > LIMITS.pixels:
+        raise RequestFailed(f"a picture of {width}x{height}; at most {LIMITS.pixels} pixels are taken")
 
 
 def check_encoded(data: memoryview) -> None:

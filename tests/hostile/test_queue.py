@@ -293,5 +293,6 @@ def test_a_ros_request_too_many_is_refused_at_once() -> None:
         next(iter(tokens))
         with pytest.raises(RequestFailed, match="0 requests are waiting for the engine already"):
             ask(clients[1], Request("b", "b"))
+        gate.go.set()
         for client in clients:
             client.close()
