@@ -151,7 +151,7 @@ class Queued:
         """Wait for a turn and answer; raises Busy."""
         turn = self.turns.join()
         try:
-            if not turn.has_come:
+            if turn.come is not None:
                 trace.mark(RESIDUAL)
                 turn.wait()
                 trace.mark("queue")
