@@ -21,7 +21,7 @@ from s2a_bench.errors import S2AError
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
-from s2a_bench.trace import RESIDUAL, Trace
+from s2a_bench.trace import Trace
 from s2a_bench.transport import Server, Wiring, open_server
 from s2a_bench.transport.turns import MAX_WAITING, Queued, Turn
 from s2a_bench.types import Request, Token
@@ -38,7 +38,6 @@ def engine_handler(engine: Engine, *, pixels: bool = True, max_waiting: int = MA
     """
 
     def answer(request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
-        trace.mark(RESIDUAL)
         tokens = engine.generate(request)
         try:
             for token in tokens:
