@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -30,9 +31,14 @@ COMMANDS = dict(commands(typer.main.get_command(app)))
 EVERY = pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "s2a_bench", *arguments], capture_output=True, text=True, check=False, timeout=120
+        [sys.executable, "-m", "s2a_bench", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+        cwd=cwd,
     )
 
 
@@ -92,8 +98,8 @@ def test_the_version_is_printed() -> None:
         (["latency", "--llama-server", "/no/such/program"], "--llama-server: /no/such/program is no program"),
     ],
 )
-def test_wrong_use_is_one_line_and_code_two(arguments: list[str], message: str) -> None:
-    done = run(*arguments)
+def test_wrong_use_is_one_line_and_code_two(arguments: list[str], message: str, tmp_path: Path) -> None:
+    done = run(*arguments, cwd=tmp_path)
     assert done.returncode == 2
     lines = [line for line in done.stderr.splitlines() if line.startswith("error:")]
     assert len(lines) == 1, done.stderr
