@@ -128,8 +128,8 @@ def test_the_cell_of_a_lost_node_runs_again_where_the_board_is_then(cluster: Any
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (MEASURED.replace("orin", "nano"), "`ray`: no node offers nano (offered: orin); start Ray there with"),
-        (MEASURED.replace('board = ["orin"]', ""), "`ray`: cells that measure need a machine: add board"),
+        (MEASURED.replace("orin", "nano"), "--ray: no node offers nano (offered: orin); start Ray there with"),
+        (MEASURED.replace('board = ["orin"]', ""), "--ray: cells that measure need a machine: add board"),
     ],
 )
 def test_cells_that_no_node_can_take_are_refused(cluster: Any, tmp_path: Path, text: str, message: str) -> None:
