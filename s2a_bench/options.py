@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from s2a_bench.errors import UsageError
@@ -84,6 +85,17 @@ def group(options: type[Options], *, only: Iterable[str] = (), about: str = "") 
     return Field(default_factory=options, json_schema_extra={"only": list(only), "about": about})
 
 
+def group_of(field: FieldInfo) -> type[Options] | None:
+    """Return the class of a group of options; None for a field that is one option."""
+    kind = field.annotation
+    return kind if isinstance(kind, type) and issubclass(kind, Options) else None
+
+
+def extra_of(field: FieldInfo) -> Mapping[str, Any]:
+    """Return what `option` or `group` declared of a field besides what pydantic knows."""
+    return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+
+
 def places(options: type[Options]) -> dict[str, tuple[str, ...]]:
     """Return every name under which one option can be given, its field's and its flag's, and the path to its field.
 
@@ -91,13 +103,11 @@ def places(options: type[Options]) -> dict[str, tuple[str, ...]]:
     """
     found: dict[str, tuple[str, ...]] = {}
     for name, field in options.model_fields.items():
-        kind = field.annotation
-        if isinstance(kind, type) and issubclass(kind, Options):
-            found = {inner: (name, *path) for inner, path in places(kind).items()} | found
+        if inner := group_of(field):
+            found = {each: (name, *path) for each, path in places(inner).items()} | found
     for name, field in options.model_fields.items():
-        extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
-        if not (isinstance(field.annotation, type) and issubclass(field.annotation, Options)):
-            found |= {name: (name,), str(extra.get("flag") or name).replace("-", "_"): (name,)}
+        if group_of(field) is None:
+            found |= {name: (name,), str(extra_of(field).get("flag") or name).replace("-", "_"): (name,)}
     return found
 
 

@@ -66,9 +66,11 @@ class Flag:
 
 def flags_of(options: type[Options]) -> Iterator[Flag]:
     """Yield the flags of a configuration, those of a group in its place."""
+    from s2a_bench.options import extra_of, group_of
+
     for name, field in options.model_fields.items():
-        extra = _extra(field)
-        group = _group(field)
+        extra = extra_of(field)
+        group = group_of(field)
         if group is not None:
             only, about = extra.get("only"), extra.get("about", "")
             for flag in flags_of(group):
@@ -148,17 +150,6 @@ def _nested(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
             inner = inner.setdefault(group, {})
         inner[path[-1]] = value
     return found
-
-
-def _group(field: FieldInfo) -> type[Options] | None:
-    from s2a_bench.options import Options
-
-    found = field.annotation
-    return found if isinstance(found, type) and issubclass(found, Options) else None
-
-
-def _extra(field: FieldInfo) -> Mapping[str, Any]:
-    return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
 
 
 def _kind(annotation: Any) -> type:

@@ -54,8 +54,7 @@ def server_side(options: Options) -> tuple[tuple[str, Any], ...]:
 def sides(model: type[Options]) -> Iterator[tuple[str, str]]:
     """Yield every option with its side, "" the client's."""
     for name, field in model.model_fields.items():
-        extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
-        yield name, str(extra.get("side", ""))
+        yield name, str(base.extra_of(field).get("side", ""))
 
 
 def checked(model: type[O], values: Mapping[str, Any], owner: str) -> O:
