@@ -10,15 +10,13 @@ import numpy as np
 from s2a_bench.experiments import Compared, Metric, Shown, Subject, View
 from s2a_bench.stats import Summary, summary_of
 from s2a_bench.writers.as_json import frame, summaries
-from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.writers.csv_text import SUMMARY, csv_text, summary_values
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from s2a_bench.store.run import Run
-
-STATISTICS = ("n", "median", "mean", "sd", "p90", "p99")
 
 
 def plain_view(compared: Compared) -> View:
@@ -28,13 +26,16 @@ def plain_view(compared: Compared) -> View:
         cells = compared.subjects(run)
         notes = tuple(compared.origin(run))
         table = _table(run, compared, cells, notes)
-        rows = ((cell.name, metric.name, metric.unit, *_all(found)) for cell, metric, found in _found(compared, cells))
+        rows = (
+            (cell.name, metric.name, metric.unit, *summary_values(found))
+            for cell, metric, found in _found(compared, cells)
+        )
         return Shown(
             sentences=list(_sentences(compared, cells)),
             tables={"metrics": table},
             main=["metrics"],
             notes=notes,
-            csvs={"metrics.csv": csv_text(("cell", "metric", "unit", *STATISTICS), rows)},
+            csvs={"metrics.csv": csv_text(("cell", "metric", "unit", *SUMMARY), rows)},
             json=lambda: frame(run, [_json(compared, cell) for cell in cells], []),
         )
 
@@ -71,10 +72,6 @@ def _table(run: Run, compared: Compared, cells: list[Subject], notes: tuple[str,
 def _head(metric: Metric) -> str:
     unit = f" ({metric.unit})" if metric.unit else ""
     return f"{metric.title or metric.name}{unit}, {metric.statistic}"
-
-
-def _all(summary: Summary) -> tuple[object, ...]:
-    return tuple(getattr(summary, name) for name in STATISTICS)
 
 
 def _sentences(compared: Compared, cells: list[Subject]) -> Iterator[str]:

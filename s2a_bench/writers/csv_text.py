@@ -10,6 +10,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pandas as pd
 
+    from s2a_bench.stats import Summary
+
+SUMMARY = ("n", "median", "mean", "sd", "p90", "p99")
+"""The columns of a summary, in the order of every table."""
+
+
+def summary_values(summary: Summary) -> tuple[object, ...]:
+    """Return a summary's values in the order of `SUMMARY`."""
+    return tuple(getattr(summary, name) for name in SUMMARY)
+
 
 def csv_text(header: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> str:
     """Write rows as CSV; None is an empty field."""

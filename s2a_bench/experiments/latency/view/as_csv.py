@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratios, stages_present
 from s2a_bench.stats import summary_of
-from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.writers.csv_text import SUMMARY, csv_text, summary_values
 
 if TYPE_CHECKING:
-    from s2a_bench.stats import Summary
     from s2a_bench.store.run import Run
 
-_SUMMARY = ("n", "median", "mean", "sd", "p90", "p99")
 _METRICS = ("e2e_without_inference", "e2e", "ttft", "frame_age")
 
 
@@ -22,8 +20,8 @@ def csv_texts(run: Run) -> dict[str, str]:
     cells = cells_of(run)
     found = ratios(cells, run.bootstrap_seed)
     return {
-        "stages.csv": csv_text(("cell", "group", "stage", *_SUMMARY, "emulated"), _stages(cells)),
-        "summary.csv": csv_text(("cell", "metric", "errors", "warmups", *_SUMMARY, "emulated"), _summaries(cells)),
+        "stages.csv": csv_text(("cell", "group", "stage", *SUMMARY, "emulated"), _stages(cells)),
+        "summary.csv": csv_text(("cell", "metric", "errors", "warmups", *SUMMARY, "emulated"), _summaries(cells)),
         "ratios.csv": csv_text(
             ("metric", "of", "to", "value", "ci95_low", "ci95_high", "emulated"),
             (
@@ -39,7 +37,7 @@ def _stages(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
     for cell in cells:
         for stage in (*stages_present([cell]), "residual"):
             if summary := summary_of(cell.values_ms(stage)):
-                yield cell.name, cell.stages.get(stage, ""), stage, *_values(summary), cell.emulated
+                yield cell.name, cell.stages.get(stage, ""), stage, *summary_values(summary), cell.emulated
 
 
 def _summaries(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
@@ -49,10 +47,6 @@ def _summaries(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
         metrics |= {"itl_ms": cell.itl_ms(), "residual_share": cell.residual_shares()}
         found = {name: summary for name, values in metrics.items() if (summary := summary_of(values))}
         for name, summary in found.items():
-            yield cell.name, name, cell.errors, cell.warmups, *_values(summary), cell.emulated
+            yield cell.name, name, cell.errors, cell.warmups, *summary_values(summary), cell.emulated
         if not found:
-            yield cell.name, "", cell.errors, cell.warmups, 0, *[None] * (len(_SUMMARY) - 1), cell.emulated
-
-
-def _values(summary: Summary) -> tuple[object, ...]:
-    return tuple(getattr(summary, name) for name in _SUMMARY)
+            yield cell.name, "", cell.errors, cell.warmups, 0, *[None] * (len(SUMMARY) - 1), cell.emulated

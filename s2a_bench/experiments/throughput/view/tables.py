@@ -16,15 +16,13 @@ from s2a_bench.experiments.throughput.view.cells import (
     reference_values,
     speeds_of,
 )
-from s2a_bench.stats import Summary, summarise, summary_of
-from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.stats import summarise, summary_of
+from s2a_bench.writers.csv_text import SUMMARY, csv_text, summary_values
 from s2a_bench.writers.tables import ABSENT, TextTable, interval, mean_sd, number
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.latency.view.cells import Floats
     from s2a_bench.store.run import Run
-
-_SUMMARY = ("n", "median", "mean", "sd", "p90", "p99")
 
 
 def speed_table(run: Run) -> TextTable:
@@ -112,15 +110,15 @@ def throughput_csv(run: Run) -> dict[str, str]:
     """Return file name -> CSV text, every digit kept; what is absent has no row."""
     speeds = speeds_of(run)
     summaries = [
-        (speed.name, metric, *_values(summary), speed.cell.emulated)
+        (speed.name, metric, *summary_values(summary), speed.cell.emulated)
         for speed in speeds
         for metric, values in [*((name, speed.values(name)) for name in METRICS), ("itl_ms", speed.cell.itl_ms())]
         if (summary := summary_of(values))
     ]
     if reference := reference_values(run):
-        summaries.append((LLAMA_BENCH, RATIO_METRIC, *_values(summarise(reference)), False))
+        summaries.append((LLAMA_BENCH, RATIO_METRIC, *summary_values(summarise(reference)), False))
     positions = [
-        (speed.name, first, last, *_values(summarise(rates)), speed.cell.emulated)
+        (speed.name, first, last, *summary_values(summarise(rates)), speed.cell.emulated)
         for speed in speeds
         for (first, last), rates in speed.by_position().items()
     ]
@@ -129,8 +127,8 @@ def throughput_csv(run: Run) -> dict[str, str]:
         (RATIO_METRIC, of, to, ratio.value, ratio.low, ratio.high, emulated) for of, to, ratio in ratios_of(run, speeds)
     ]
     return {
-        "throughput.csv": csv_text(("cell", "metric", *_SUMMARY, "emulated"), summaries),
-        "positions.csv": csv_text(("cell", "first", "last", *_SUMMARY, "emulated"), positions),
+        "throughput.csv": csv_text(("cell", "metric", *SUMMARY, "emulated"), summaries),
+        "positions.csv": csv_text(("cell", "first", "last", *SUMMARY, "emulated"), positions),
         "ratios.csv": csv_text(("metric", "of", "to", "value", "ci95_low", "ci95_high", "emulated"), ratios),
     }
 
@@ -168,7 +166,3 @@ def _mean(values: Floats | None) -> str:
 def _median(values: Floats | None) -> str:
     summary = None if values is None else summary_of(values)
     return number(summary.median) if summary else ABSENT
-
-
-def _values(summary: Summary) -> tuple[object, ...]:
-    return tuple(getattr(summary, name) for name in _SUMMARY)

@@ -13,13 +13,12 @@ from s2a_bench.experiments.timeline.view.cells import (
     panels,
     timelines_of,
 )
-from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.writers.csv_text import SUMMARY, csv_text
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
-_SUMMARY = ("n", "median", "mean", "sd", "p90", "p99")
 _EXECUTION = ("start_s", "end_s", "stalls", "stall_s", "longest_stall_s", "start_regret", "end_regret")
 _WAITING = (
     "mean_queue_wait_s",
@@ -98,10 +97,10 @@ def timeline_csv(run: Run) -> dict[str, str]:
     for cell in timelines_of(run):
         for name, metric in METRICS.items():
             if found := cell.summary(name):
-                parts = ("n", "mean") if metric.kind == FLAG else _SUMMARY
-                values = (getattr(found, part) if part in parts else None for part in _SUMMARY)
+                parts = ("n", "mean") if metric.kind == FLAG else SUMMARY
+                values = (getattr(found, part) if part in parts else None for part in SUMMARY)
                 summaries.append((cell.about("cell"), name, *values))
-    return {"timelines.csv": csv_text(("cell", "metric", *_SUMMARY), summaries)}
+    return {"timelines.csv": csv_text(("cell", "metric", *SUMMARY), summaries)}
 
 
 def seconds(value: float) -> str:
