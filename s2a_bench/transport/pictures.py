@@ -42,17 +42,16 @@ def rgb_of(frame: Frame, trace: Trace) -> Frame:
         return frame
     try:
         if frame.encoding == "bgr8":
-            data = bgr_to_rgb(frame.data)
-            trace.mark("channel_swap")
+            stage, data = "channel_swap", bgr_to_rgb(frame.data)
         elif frame.encoding == "yuv422_yuy2":
-            data = yuyv_to_rgb(frame.data)
-            trace.mark("yuv_decode")
+            stage, data = "yuv_decode", yuyv_to_rgb(frame.data)
         else:
-            data = bgr_to_rgb(to_bgr(frame))
-            trace.mark("image_decode")
+            stage, data = "image_decode", bgr_to_rgb(to_bgr(frame))
     except ValueError as error:
         raise RequestFailed(f"a {frame.width}x{frame.height} {frame.encoding} picture cannot be: {error}") from error
-    return replace(frame, encoding="rgb8", data=data)
+    converted = replace(frame, encoding="rgb8", data=data)
+    trace.mark(stage)
+    return converted
 
 
 def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:

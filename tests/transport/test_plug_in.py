@@ -43,7 +43,7 @@ class ToyClient(LoopbackClient):
 class Toy(Transport[ToyOptions]):
     name = "toy"
     options = ToyOptions
-    stages: ClassVar[dict[str, str]] = {"greet": "pack"}
+    stages: ClassVar[dict[str, str]] = {"greet": "pack", "hand_over": "parse"}
     looks: ClassVar[dict[str, tuple[str, str]]] = {"": ("#123456", "-")}
     packages = ("pytest",)
     in_process = True

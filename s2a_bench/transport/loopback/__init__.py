@@ -13,6 +13,7 @@ class Loopback(Transport[Options]):
 
     name = "loopback"
     options = Options
+    stages = {"hand_over": "parse"}  # making of the request what the handler takes
     order = 100
     looks = {"": ("#009E73", ":")}
     compared_with = ()

@@ -60,8 +60,10 @@ class LoopbackClient:
         if server is None:
             raise ServerDied(f"no loopback server '{self._address}' in this process")
         images = tuple(rgb_of(bgr_of(frame, trace), trace) for frame in request.images)
+        handed = replace(request, images=images)
         served = Trace()
-        tokens = server.handler(replace(request, images=images), served)
+        trace.mark("hand_over")
+        tokens = server.handler(handed, served)
         try:
             for index, token in enumerate(tokens):
                 if not index:
