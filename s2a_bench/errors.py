@@ -7,7 +7,9 @@ S2AError
 ├── MissingExtra         a library that this needs is not installed
 ├── SourceError          a camera, video or image folder cannot deliver frames
 ├── EngineError          an engine cannot start or answer
-│   └── ModelError       a model file is missing, damaged or of the wrong kind
+│   ├── ModelError       a model file is missing, damaged or of the wrong kind
+│   ├── BadRequest       no engine like this can answer this request: its grammar, its pictures, its length
+│   └── Overdue          an answer takes longer than the server allows
 ├── TransportError       a request did not make its way
 │   ├── RequestFailed    the server refused or broke off this one request; the next may succeed
 │   │   ├── Busy         too many requests wait for the engine
@@ -48,6 +50,14 @@ class EngineError(S2AError):
 
 class ModelError(EngineError):
     """A model file is missing, damaged or of the wrong kind."""
+
+
+class BadRequest(EngineError):
+    """No engine like this can answer this request: its grammar, its pictures, its length."""
+
+
+class Overdue(EngineError):
+    """An answer takes longer than the server allows."""
 
 
 class TransportError(S2AError):

@@ -11,11 +11,12 @@ from typing import Any
 import typer
 from pydantic import create_model
 
-from s2a_bench.cli.adapter import command
+from s2a_bench.cli.adapter import command, flags_of
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Options, group, option, placed, places
 from s2a_bench.transport import TRANSPORTS, Transport, Wiring
+from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.options import sides
 from s2a_bench.transport.pipeline import one_pipeline
 
@@ -47,7 +48,7 @@ def _as_served(transport: Transport[Any]) -> type[Options]:
 
 
 def _config() -> type[Options]:
-    """Make the options of `serve`: the engine's, and a group of what each transport's server is told."""
+    """Make the options of `serve`: the engine's, a group of what each transport's server is told, and the limits."""
     fields: dict[str, Any] = {
         "pipeline": (
             str,
@@ -60,6 +61,7 @@ def _config() -> type[Options]:
     for name, each in TRANSPORTS.loaded():
         if told := _told(each):
             fields[name] = (_as_served(each), group(_as_served(each), only=told, about=f"{name}: "))
+    fields["limits"] = (Limits, group(Limits, about="limit: "))
     about = "TOML file with these flags as keys; a flag wins over it"
     return create_model("ServeConfig", __base__=Options, **fields, config=(Path | None, option(None, about)))
 
@@ -71,22 +73,24 @@ def _serve(config: Any) -> None:
     for other, _ in TRANSPORTS.loaded():
         if other != chosen.name and (given := [*getattr(config, other, Options()).given()]):
             raise UsageError(f"`{given[0]}` is no option of {chosen.name}; it has {', '.join(_told(chosen))}")
-    of_engine, of_transport = _read(config.config, chosen) if config.config else ({}, {})
+    of_engine, of_transport, of_limits = _read(config.config, chosen) if config.config else ({}, {}, {})
     flags = {name: getattr(own, name) for name in own.given()} if own else {}
     engine = {name: getattr(config.engine, name) for name in config.engine.given()}
+    limits = Limits(**{**of_limits, **{name: getattr(config.limits, name) for name in config.limits.given()}})
     pipeline = one_pipeline(config.pipeline, **{**chosen.serving, **of_transport, **flags})
-    _run(pipeline.wiring(chosen.bind(pipeline.options, ())), EngineConfig(**{**of_engine, **engine}))
+    _run(pipeline.wiring(chosen.bind(pipeline.options, ()), limits=limits), EngineConfig(**{**of_engine, **engine}))
 
 
-def _read(path: Path, chosen: Transport[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a file's options of the engine and of the transport; raises UsageError naming the key."""
+def _read(path: Path, chosen: Transport[Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Return a file's options of the engine, of the transport, and limits; raises UsageError naming the key."""
     try:
         whole = tomllib.loads(path.read_text())
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"`config`: cannot read {path}: {error}") from error
     except tomllib.TOMLDecodeError as error:
         raise UsageError(f"`config`: {path} is no TOML: {error}") from error
-    known = ["engine", *ENGINE[1:], *_told(chosen)]
+    limits = [name.replace("-", "_") for name in (flag.name for flag in flags_of(Limits))]
+    known = ["engine", *ENGINE[1:], *_told(chosen), *limits]
     values = {key.replace("-", "_"): value for key, value in whole.items()}
     for name, value in values.items():
         if name not in known:
@@ -95,12 +99,14 @@ def _read(path: Path, chosen: Transport[Any]) -> tuple[dict[str, Any], dict[str,
             raise UsageError(f"`config` {path}: {name} = {value} should be a number or a text")
     of_engine = placed(EngineConfig, {name: value for name, value in values.items() if name in places(EngineConfig)})
     of_transport = {name: value for name, value in values.items() if name in _told(chosen)}
+    of_limits = placed(Limits, {name: value for name, value in values.items() if name in limits})
     try:
         EngineConfig(**of_engine)
         chosen.options(**of_transport)
+        Limits(**of_limits)
     except UsageError as error:
         raise UsageError(f"`config` {path}: {error}") from error
-    return of_engine, of_transport
+    return of_engine, of_transport, of_limits
 
 
 def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
@@ -117,7 +123,7 @@ def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
         keep_large_blocks()
     engine = open_engine(config)
     try:
-        server = open_server(wiring, engine_handler(engine, pixels=False))
+        server = open_server(wiring, engine_handler(engine, pixels=False, limits=wiring.limits))
 
         def stop(*_: Any) -> None:
             for number in SIGNALS:  # a second one does not wait for the answer under way

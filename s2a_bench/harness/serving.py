@@ -23,18 +23,19 @@ from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Server, Wiring, open_server
-from s2a_bench.transport.turns import MAX_WAITING, Queued, Turn
+from s2a_bench.transport.limits import LIMITS, Limits
+from s2a_bench.transport.turns import Queued, Turn
 from s2a_bench.types import Request, Token
 
 GRACE_S = 4.0
 """Time to end after being told to; the engine may be in the middle of a long prompt."""
 
 
-def engine_handler(engine: Engine, *, pixels: bool = True, max_waiting: int = MAX_WAITING) -> Queued:
+def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMITS) -> Queued:
     """Make the handler that lets one request at a time into the engine and marks `queue` and `inference`.
 
-    At most ``max_waiting`` requests wait. With ``pixels`` it also tells the checksum of the picture, once all tokens
-    are on their way and the engine is free.
+    ``limits`` bound the queue and the time of an answer. With ``pixels`` it also tells the checksum of the picture,
+    once all tokens are on their way and the engine is free.
     """
 
     def answer(request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
@@ -42,7 +43,7 @@ def engine_handler(engine: Engine, *, pixels: bool = True, max_waiting: int = MA
         try:
             for token in tokens:
                 now = now_ns()
-                turn.alive_ns = now
+                turn.alive(now)
                 if not trace.token_ns:
                     trace.marks.append(("inference", now))
                 trace.token_ns.append(now)
@@ -55,7 +56,7 @@ def engine_handler(engine: Engine, *, pixels: bool = True, max_waiting: int = MA
         if pixels and len(request.images) == 1:
             trace.facts[RGB_ENGINE] = float(fingerprint(request.images[0]))
 
-    return Queued(answer, max_waiting)
+    return Queued(answer, limits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +102,7 @@ def main() -> int:
     try:
         keeps = job.tuned and keep_large_blocks()
         engine = open_engine(job.engine)
-        server = open_server(job.wiring, engine_handler(engine))
+        server = open_server(job.wiring, engine_handler(engine, limits=job.wiring.limits))
     except S2AError as error:
         print(json.dumps({"error": str(error), "kind": type(error).__name__}), file=answers, flush=True)
         return error.exit_code
@@ -109,6 +110,7 @@ def main() -> int:
         "address": server.address,
         "engine": engine.describe(),
         "transport": server.describe(),
+        "limits": job.wiring.limits.to_manifest(),
         "malloc_keeps_large_blocks": keeps,
     }
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import EngineError, ModelError
+from s2a_bench.errors import BadRequest, EngineError, ModelError
 from s2a_bench.inference import EngineConfig, llama_log
 from s2a_bench.inference.grammar_limits import beyond_limits
 from s2a_bench.inference.llama_decode import GreedySampler, Sampler, TokenBatch, TokenBytes
@@ -162,7 +162,7 @@ class LlamaCppEngine:
     def generate(self, request: Request) -> Iterator[Token]:
         """Yield one `Token` per token of the model; bytes of a character not yet complete come with its last token.
 
-        Raises EngineError for a bad grammar, pictures that are not ``rgb8``, and a request longer than the context.
+        Raises BadRequest for a bad grammar, pictures that are not ``rgb8``, and a request longer than the context.
         """
         llama = self._llama
         if llama is None:
@@ -215,12 +215,12 @@ class LlamaCppEngine:
             self._handler(llama=llama, messages=[{"role": "user", "content": content}], stream=True)
         except (ValueError, RuntimeError) as error:
             if "exceeds n_ctx" in str(error):
-                raise EngineError(self._too_long(request)) from error
+                raise BadRequest(self._too_long(request)) from error
             raise EngineError(f"llama: request {request.id} was refused: {llama_log.reason() or error}") from error
         finally:
             self._handler.frames = ()
         if len(llama.prompt) + request.max_tokens > llama.n_ctx():
-            raise EngineError(self._too_long(request, len(llama.prompt)))
+            raise BadRequest(self._too_long(request, len(llama.prompt)))
 
     def _too_long(self, request: Request, prompt_n: int | None = None) -> str:
         prompt = "the prompt alone is longer" if prompt_n is None else f"prompt of {prompt_n} tokens"
@@ -233,9 +233,9 @@ class LlamaCppEngine:
         """Refuse what llama.cpp would not survive: pictures that are not what they say, grammars it cannot read."""
         for frame in request.images:
             if frame.encoding != "rgb8":
-                raise EngineError(f"llama: request {request.id} has a {frame.encoding} picture; engines take rgb8")
+                raise BadRequest(f"llama: request {request.id} has a {frame.encoding} picture; engines take rgb8")
             if frame.data.shape != (frame.height, frame.width, 3) or frame.data.dtype != np.uint8:
-                raise EngineError(
+                raise BadRequest(
                     f"llama: request {request.id} has a picture of {frame.width}x{frame.height} whose data are "
                     f"{frame.data.dtype} of shape {frame.data.shape}"
                 )
@@ -246,7 +246,7 @@ class LlamaCppEngine:
                 self._grammar_errors.clear()
             self._grammar_errors[request.grammar] = wrong
         if wrong:
-            raise EngineError(f"llama: the grammar of request {request.id} is not valid GBNF: {wrong}")
+            raise BadRequest(f"llama: the grammar of request {request.id} is not valid GBNF: {wrong}")
 
     def describe(self) -> dict[str, str | int | float | bool]:
         """Return what answers; the first call hashes the files, which takes seconds for gigabytes."""

@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Protocol, TypeA
 
 from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
+from s2a_bench.transport.limits import LIMITS, Limits
 
 if TYPE_CHECKING:
     from s2a_bench.trace import Trace
@@ -126,18 +127,20 @@ class Wiring(Generic[O]):
     """The longest silence before a request counts as failed."""
     max_tokens: int = 512
     """The most tokens of a request that cannot say itself how many it wants."""
+    limits: Limits = LIMITS
+    """What a server takes."""
 
     def to_json(self) -> dict[str, Any]:
         """Return it as plain data."""
         told = {name: getattr(self, name) for name in ("transport", "variant", "address", "black_box")}
         told |= {"timeout_s": self.timeout_s, "max_tokens": self.max_tokens}
-        return {**told, "options": self.options.model_dump(mode="json")}
+        return {**told, "options": self.options.model_dump(mode="json"), "limits": self.limits.to_manifest()}
 
     @staticmethod
     def from_json(told: Mapping[str, Any]) -> Wiring[Any]:
         """Read what `to_json` returned."""
         options = TRANSPORTS[told["transport"]].options.model_validate(told["options"])
-        return Wiring(**{**told, "options": options})
+        return Wiring(**{**told, "options": options, "limits": Limits(**told["limits"])})
 
 
 @dataclass(frozen=True, slots=True)

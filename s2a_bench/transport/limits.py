@@ -1,33 +1,59 @@
-"""What a server of ours takes, in one place for all transports: more is refused before it costs memory or time."""
+"""What a server of ours takes, in one place for all transports: more is refused before it costs memory or time.
+
+`Limits` are options: flags of `serve`, handed to every server in its `Wiring`, recorded in the manifest of a run.
+"""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import Any, Final
 
 from s2a_bench.errors import RequestFailed
+from s2a_bench.options import Options, option
 
+KIB: Final = 1 << 10
 MIB: Final = 1 << 20
 SEEDS: Final = (1 << 32) - 1
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """The most that is taken of one request, and of all at once."""
+class Limits(Options):
+    """The most that is taken of one request, and of all at once, over every transport as far as it has such a thing."""
 
-    body_bytes: int = 64 * MIB
-    header_bytes: int = 64 << 10
-    in_flight_bytes: int = 256 * MIB
-    """Of the bodies of all requests that are not answered yet."""
-    head_s: float = 10
-    """From the first byte of a request to the end of its headers."""
-    body_s: float = 120
-    """From the end of the headers to the end of the body."""
-    connections: int = 2048
-    pixels: int = 50_000_000
-    """Of a picture, read before it is decoded."""
-    max_tokens: int = 65_536
+    body_mib: float = option(64.0, "largest body of a request, MiB", flag="max-body-mib", gt=0, le=MIB)
+    header_kib: float = option(64.0, "longest headers of a request, KiB", flag="max-header-kib", gt=0, le=MIB)
+    in_flight_mib: float = option(
+        256.0, "bodies of all requests that are not answered yet, MiB", flag="max-in-flight-mib", gt=0, le=MIB
+    )
+    connections: int = option(2048, "most connections at once", flag="max-connections", ge=1, le=MIB)
+    head_s: float = option(
+        10.0, "seconds from a request's first byte to the end of its headers", flag="header-timeout", gt=0, le=86_400
+    )
+    body_s: float = option(120.0, "seconds from there to the end of its body", flag="body-timeout", gt=0, le=86_400)
+    pixels: int = option(
+        50_000_000, "most pixels of a picture, read before it is decoded", flag="max-pixels", ge=1, le=2**31
+    )
+    waiting: int = option(64, "most requests that wait for the engine", flag="max-waiting", ge=0, le=MIB)
+    answer_tokens: int = option(
+        65_536, "most tokens that a request may ask for", flag="max-answer-tokens", ge=1, le=2**31 - 1
+    )
+    answer_s: float = option(
+        600.0, "seconds from a request's arrival to its last token", flag="answer-timeout", gt=0, le=86_400
+    )
+
+    @property
+    def body_bytes(self) -> int:
+        """Return the largest body in bytes."""
+        return round(self.body_mib * MIB)
+
+    @property
+    def header_bytes(self) -> int:
+        """Return the longest headers in bytes."""
+        return round(self.header_kib * KIB)
+
+    @property
+    def in_flight_bytes(self) -> int:
+        """Return in bytes what the bodies of all requests may be together."""
+        return round(self.in_flight_mib * MIB)
 
 
 LIMITS: Final = Limits()
@@ -55,20 +81,20 @@ def text(name: str, value: Any, default: str = "") -> str:
     return value
 
 
-def check_pixels(width: int, height: int) -> None:
+def check_pixels(width: int, height: int, limits: Limits) -> None:
     """Raise RequestFailed for a picture of more pixels than are taken, or of none."""
     if width <= 0 or height <= 0:
         raise RequestFailed(f"a picture of {width}x{height} is empty")
-    if width * height > LIMITS.pixels:
-        raise RequestFailed(f"a picture of {width}x{height}; at most {LIMITS.pixels} pixels are taken")
+    if width * height > limits.pixels:
+        raise RequestFailed(f"a picture of {width}x{height}; at most {limits.pixels} pixels are taken")
 
 
-def check_encoded(data: memoryview) -> None:
+def check_encoded(data: memoryview, limits: Limits) -> None:
     """Raise RequestFailed for a file that is no JPEG or PNG, or of too many pixels, as its header says."""
     size = _png_size(data) or _jpeg_size(data)
     if size is None:
         raise RequestFailed(f"{len(data)} bytes that are neither a JPEG nor a PNG")
-    check_pixels(*size)
+    check_pixels(*size, limits)
 
 
 def _png_size(data: memoryview) -> tuple[int, int] | None:

@@ -16,7 +16,7 @@ from s2a_bench.frames.convert import (
     yuyv_to_rgb,
 )
 from s2a_bench.trace import Trace
-from s2a_bench.transport.limits import check_encoded, check_pixels
+from s2a_bench.transport.limits import LIMITS, Limits, check_encoded, check_pixels
 from s2a_bench.types import Frame, Pixels
 
 JPEG_QUALITY = 90
@@ -71,18 +71,18 @@ def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
     return f"image/{payload}", data
 
 
-def decoded(media_type: str, data: bytes, trace: Trace) -> Frame:
+def decoded(media_type: str, data: bytes, trace: Trace, limits: Limits = LIMITS) -> Frame:
     """Turn received bytes into an ``rgb8`` frame; marks `image_decode` or `channel_swap`. Raises RequestFailed."""
     try:
         if media_type.startswith(RAW_MIME):
             facts = dict(part.split("=", 1) for part in media_type.split(";")[1:])
             width, height = int(facts["width"]), int(facts["height"])
-            check_pixels(width, height)
+            check_pixels(width, height, limits)
             pixels = np.frombuffer(data, np.uint8).reshape(height, width, 3)
             if facts["encoding"] != "bgr8":
                 raise ValueError(f"raw encoding '{facts['encoding']}' is not bgr8")
             return rgb_of(Frame(-1, 0, width, height, "bgr8", pixels), trace)
-        check_encoded(memoryview(data))
+        check_encoded(memoryview(data), limits)
         rgb = decode_image(data)
     except (ValueError, KeyError) as error:
         raise RequestFailed(f"the {len(data)} bytes sent as {media_type} are no such picture: {error}") from error

@@ -3,6 +3,7 @@
 Every server has one `Queued` handler. Called, it waits for its turn on the caller's thread; a server whose threads must
 not wait (HTTP has a pool of 40) joins `turns` itself, waits as it likes for `Turn.come`, and then calls `answer`.
 Whoever joined must leave, whatever happens; leaving twice does no harm, and leaving while waiting gives the place up.
+From its arrival a request has `Limits.answer_s`: then its wait, or its answer at the next token, ends with Overdue.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from threading import Lock
 from typing import TYPE_CHECKING, TypeAlias
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import Busy
+from s2a_bench.errors import Busy, Overdue
 from s2a_bench.trace import RESIDUAL, Trace
+from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.types import Request, Token
 
 if TYPE_CHECKING:
     from s2a_bench.transport import Handler
 
-MAX_WAITING = 64
 RETRY_AFTER_S = 1.0
 POLL_S = 0.1
 """How often one who waits is asked whether it still wants an answer."""
@@ -32,14 +33,17 @@ POLL_S = 0.1
 class Turn:
     """One request's place in the queue, then its time with the engine."""
 
-    __slots__ = ("_turns", "alive_ns", "come")
+    __slots__ = ("_answer_s", "_turns", "alive_ns", "come", "deadline_ns")
 
-    def __init__(self, turns: Turns) -> None:
+    def __init__(self, turns: Turns, answer_s: float) -> None:
         """Take a place; only `Turns.join` does."""
         self.come: Future[None] | None = None
         """Done when it is this request's turn; None where it was at once, for a Future costs 30 us."""
         self.alive_ns = now_ns()
         """When the answer last showed a sign of life, on CLOCK_MONOTONIC."""
+        self.deadline_ns = self.alive_ns + round(answer_s * 1e9)
+        """When the whole answer has to be over."""
+        self._answer_s = answer_s
         self._turns = turns
 
     @property
@@ -48,26 +52,38 @@ class Turn:
         return self.come is None or self.come.done()
 
     def wait(self, gone: Callable[[], bool] = lambda: False) -> bool:
-        """Wait on this thread; return False if who asked was ``gone`` before its turn came."""
+        """Wait on this thread; return False if who asked was ``gone`` before its turn came. Raises Overdue."""
         while self.come is not None:
             try:
                 self.come.result(POLL_S)
             except NotYet:
                 if gone():
                     return False
+                self.check(now_ns())
             else:
                 break
         return True
 
     def start(self) -> None:
         """Let it be this request's turn."""
-        self.alive()
+        self.alive_ns = now_ns()
         if self.come is not None:
             self.come.set_result(None)
 
-    def alive(self) -> None:
-        """Note a sign of life."""
-        self.alive_ns = now_ns()
+    def alive(self, at_ns: int) -> None:
+        """Note a sign of life; raises Overdue."""
+        self.alive_ns = at_ns
+        self.check(at_ns)
+
+    def check(self, at_ns: int) -> None:
+        """Raise Overdue after the deadline."""
+        if at_ns > self.deadline_ns:
+            doing = "waiting for the engine" if not self.has_come else "being answered"
+            raise Overdue(f"{self._answer_s:g} s after it came the request is still {doing}: the server gives it up")
+
+    def left_s(self) -> float:
+        """Return the time to the deadline."""
+        return max(0.0, (self.deadline_ns - now_ns()) / 1e9)
 
     def leave(self) -> None:
         """End the turn, or give up the place; may be called twice, from any thread."""
@@ -75,24 +91,24 @@ class Turn:
 
 
 class Turns:
-    """The queue: one turn runs, at most ``max_waiting`` wait for theirs in the order of their arrival."""
+    """The queue: one turn runs, at most ``limits.waiting`` wait for theirs in the order of their arrival."""
 
-    def __init__(self, max_waiting: int = MAX_WAITING) -> None:
+    def __init__(self, limits: Limits = LIMITS) -> None:
         """Start idle."""
-        self._max_waiting = max_waiting
+        self._limits = limits
         self._lock = Lock()
         self._running: Turn | None = None
         self._waiting: deque[Turn] = deque()
 
     def join(self) -> Turn:
         """Take the last place; raises Busy where as many as may are waiting."""
-        turn = Turn(self)
+        turn = Turn(self, self._limits.answer_s)
         with self._lock:
             if self._running is None:
                 self._running = turn
                 return turn
-            if len(self._waiting) >= self._max_waiting:
-                waiting = f"{self._max_waiting} requests are waiting for the engine already"
+            if len(self._waiting) >= self._limits.waiting:
+                waiting = f"{self._limits.waiting} requests are waiting for the engine already"
                 raise Busy(f"{waiting}; come again later", retry_after_s=RETRY_AFTER_S)
             turn.come = Future()
             turn.come.set_running_or_notify_cancel()  # so that nobody can cancel it
@@ -128,13 +144,13 @@ Answering: TypeAlias = "Callable[[Request, Trace, Turn], Generator[Token, None, 
 class Queued:
     """A handler that answers one request at a time; `answer` is for who has its turn already."""
 
-    def __init__(self, answering: Answering, max_waiting: int = MAX_WAITING) -> None:
+    def __init__(self, answering: Answering, limits: Limits = LIMITS) -> None:
         """Put a queue in front of ``answering``."""
-        self.turns = Turns(max_waiting)
+        self.turns = Turns(limits)
         self._answering = answering
 
     @staticmethod
-    def around(handler: Handler) -> Queued:
+    def around(handler: Handler, limits: Limits = LIMITS) -> Queued:
         """Return ``handler``, with a queue in front of it if it has none."""
         if isinstance(handler, Queued):
             return handler
@@ -142,13 +158,16 @@ class Queued:
         def answering(request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
             with closing(handler(request, trace)) as tokens:
                 for token in tokens:
-                    turn.alive()
+                    turn.alive(now_ns())
                     yield token
 
-        return Queued(answering)
+        return Queued(answering, limits)
 
     def __call__(self, request: Request, trace: Trace) -> Generator[Token, None, None]:
-        """Wait for a turn and answer; raises Busy. What taking a free turn costs, some 2 us, is the engine's time."""
+        """Wait for a turn and answer; raises Busy or Overdue.
+
+        What taking a free turn costs, some 2 us, is the engine's time.
+        """
         trace.mark(RESIDUAL)
         turn = self.turns.join()
         try:
@@ -163,6 +182,7 @@ class Queued:
         """Answer in a turn that has come, and leave it."""
         trace.mark(RESIDUAL)
         try:
+            turn.check(now_ns())
             yield from self._answering(request, trace, turn)
         finally:
             turn.leave()

@@ -79,6 +79,18 @@ def test_ros_answers_goals_and_publishes_tokens(start: Start, dds_domain: int, n
     assert process.wait(30) == 0
 
 
+def test_limits_are_flags_and_keys_of_the_file(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "limits.toml").write_text("max-answer-tokens = 4\nmax-body-mib = 0.01\n")
+    _, line = start(
+        "http", "--engine", "echo", "--port", "0", "--config", str(tmp_path / "limits.toml"), "--max-body-mib", "1"
+    )
+    url = line.split()[2].rstrip(";")
+    body = {"messages": [{"role": "user", "content": "a" * 100_000}], "max_tokens": 4}
+    assert httpx.post(url, json=body).status_code == 200
+    assert "whole number of 1 to 4" in httpx.post(url, json=body | {"max_tokens": 5}).json()["error"]["message"]
+    assert httpx.post(url, content=bytes((1 << 20) + 1)).status_code == 413
+
+
 def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -> None:
     (tmp_path / "node.toml").write_text('engine = "echo"\nnamespace = "/from_file"\nresult-timeout = 5\n')
     _, line = start("ros", "--config", str(tmp_path / "node.toml"), "--namespace", "/from_flag")
@@ -94,6 +106,9 @@ def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -
         ("threads = true", "threads = True should be a number"),
         ("= 1", "is no TOML"),
         ("max-tokens = 0", "max-tokens: 0 should be greater than or equal to 1"),
+        ("max-pixels = 0", "--max-pixels: 0 should be greater than or equal to 1"),
+        ('max-body-mib = "much"', "--max-body-mib: 'much' should be a valid number"),
+        ("max-waiting = true", "max_waiting = True should be a number"),
         ("result-timeout = inf", "result-timeout: inf should be less than or equal to 86400"),
     ],
 )

@@ -15,6 +15,7 @@ import time
 import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 
@@ -29,8 +30,7 @@ from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS
-from s2a_bench.transport.http.server import HttpServer
-from s2a_bench.transport.limits import LIMITS, Limits, check_encoded
+from s2a_bench.transport.limits import LIMITS, MIB, Limits, check_encoded
 from s2a_bench.types import Request
 
 CHAT = PATHS["as-deployed"]
@@ -42,8 +42,8 @@ HEAD = b"POST /v1/chat/completions HTTP/1.1\r\nHost: a\r\nContent-Type: applicat
 def serving(limits: Limits = LIMITS) -> Iterator[str]:
     """Serve echo for as long as the context lasts."""
     with ExitStack() as stack:
-        handler = engine_handler(open_engine(EngineConfig(name="echo")))
-        server = HttpServer(wiring("http"), handler, limits)
+        handler = engine_handler(open_engine(EngineConfig(name="echo")), limits=limits)
+        server = open_server(replace(wiring("http"), limits=limits), handler)
         thread = Thread(target=server.serve)
         thread.start()
         stack.callback(thread.join)
@@ -81,7 +81,7 @@ def test_a_number_that_is_none_is_refused(url: str, variant: str, name: str, val
 @variants
 def test_the_least_and_the_most_are_taken(url: str, variant: str) -> None:
     assert post(url, variant, '"max_tokens": 0').status_code == 400
-    assert post(url, variant, f'"max_tokens": {LIMITS.max_tokens + 1}').status_code == 400
+    assert post(url, variant, f'"max_tokens": {LIMITS.answer_tokens + 1}').status_code == 400
     whole = post(url, variant, f'"max_tokens": 1, "seed": {2**32 - 1}')
     assert whole.json()["usage"]["completion_tokens"] == 1
 
@@ -135,20 +135,20 @@ class TestPictures:
     )
     def test_a_bomb_is_refused_by_its_header(self, data: bytes) -> None:
         with pytest.raises(RequestFailed):
-            check_encoded(memoryview(data))
+            check_encoded(memoryview(data), LIMITS)
 
     @pytest.mark.parametrize("suffix", [".png", ".jpg"])
     @pytest.mark.parametrize("shape", [(48, 64, 3), (1, 1, 3), (48, 64)])
     @pytest.mark.parametrize("settings", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]])
     def test_a_picture_is_taken(self, suffix: str, shape: tuple[int, ...], settings: list[int]) -> None:
-        check_encoded(memoryview(cv2.imencode(suffix, np.zeros(shape, np.uint8), settings)[1]))
+        check_encoded(memoryview(cv2.imencode(suffix, np.zeros(shape, np.uint8), settings)[1]), LIMITS)
 
     @pytest.mark.parametrize("filler", [b"\0", b"\xff", b"\xff\xe0\x00\x02", b"\xff\0"])
     def test_a_header_without_end_costs_no_time(self, filler: bytes) -> None:
         data = b"\xff\xd8" + filler * (2**24 // len(filler))
         began = time.monotonic()
         with pytest.raises(RequestFailed, match="neither"):
-            check_encoded(memoryview(data))
+            check_encoded(memoryview(data), LIMITS)
         assert time.monotonic() - began < 1
 
     def test_a_bomb_costs_no_memory(self, url: str) -> None:
@@ -191,14 +191,14 @@ def reply(connection: socket.socket) -> tuple[int, str]:
 
 class TestDoor:
     def test_a_body_that_says_that_it_is_too_large_is_refused_unread(self) -> None:
-        with serving(Limits(body_bytes=1000)) as url, connect(url) as connection:
+        with serving(Limits(body_mib=1000 / MIB)) as url, connect(url) as connection:
             connection.sendall(HEAD + b"Content-Length: 1001\r\n\r\n")
             status, said = reply(connection)
             assert status == 413
             assert json.loads(said.split("\r\n\r\n")[1])["error"]["code"] == 413
 
     def test_a_body_that_does_not_say_is_counted(self) -> None:
-        with serving(Limits(body_bytes=1000)) as url, connect(url) as connection:
+        with serving(Limits(body_mib=1000 / MIB)) as url, connect(url) as connection:
             connection.sendall(HEAD + b"Transfer-Encoding: chunked\r\n\r\n" + b"100\r\n" + bytes(256) + b"\r\n")
             with contextlib.suppress(ConnectionError):
                 for _ in range(4):
@@ -234,7 +234,7 @@ class TestDoor:
             assert time.monotonic() - began < 4
 
     def test_bytes_under_way_are_counted_over_all_connections_and_given_back(self) -> None:
-        with serving(Limits(in_flight_bytes=10_000)) as url:
+        with serving(Limits(in_flight_mib=10_000 / MIB)) as url:
             half = HEAD + b"Content-Length: 9000\r\n\r\n" + b" " * 8000
             with connect(url) as first:
                 first.sendall(half)
@@ -265,7 +265,7 @@ class TestDoor:
                 time.sleep(0.3)
 
 
-@pytest.mark.parametrize("max_tokens", [0, LIMITS.max_tokens + 1, 2**32 - 1])
+@pytest.mark.parametrize("max_tokens", [0, LIMITS.answer_tokens + 1, 2**32 - 1])
 def test_a_ros_request_for_too_many_tokens_is_refused(max_tokens: int) -> None:
     server = open_server(wiring("ros/topic"), engine_handler(open_engine(EngineConfig(name="echo"))))
     thread = Thread(target=server.serve)

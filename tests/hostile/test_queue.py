@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from threading import Event, Lock, Thread
 from typing import Any
 
@@ -22,6 +23,7 @@ from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Handler, open_client, open_server
 from s2a_bench.transport.http.own import PATHS
+from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.turns import Queued, Turn, Turns
 from s2a_bench.types import Request, Token
 
@@ -29,10 +31,10 @@ CHAT = PATHS["as-deployed"]
 
 
 @contextmanager
-def serving(handler: Handler, name: str = "http") -> Iterator[str]:
+def serving(handler: Handler, name: str = "http", limits: Limits = LIMITS) -> Iterator[str]:
     """Serve for as long as the context lasts."""
     with ExitStack() as stack:
-        server = open_server(wiring(name), handler)
+        server = open_server(replace(wiring(name), limits=limits), handler)
         thread = Thread(target=server.serve)
         thread.start()
         stack.callback(thread.join)
@@ -79,7 +81,7 @@ class TestTurns:
             turn.leave()
 
     def test_whoever_is_one_too_many_is_refused_at_once(self) -> None:
-        turns = Turns(max_waiting=2)
+        turns = Turns(Limits(waiting=2))
         held = [turns.join() for _ in range(3)]
         with pytest.raises(Busy, match="2 requests are waiting"):
             turns.join()
@@ -286,7 +288,7 @@ def test_health_says_when_the_engine_is_stuck(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_ros_request_too_many_is_refused_at_once() -> None:
     gate = Gate()
-    queued = Queued(Queued.around(gate)._answering, max_waiting=0)
+    queued = Queued(Queued.around(gate)._answering, Limits(waiting=0))
     with serving(queued, "ros/topic") as address:
         clients = [open_client(wiring("ros/topic", address)) for _ in range(2)]
         tokens = clients[0].request(Request("a", "a"), Trace())

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from s2a_bench.errors import EngineError, ModelError
+from s2a_bench.errors import BadRequest, EngineError, ModelError
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.dummy import write_dummy
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
@@ -86,7 +86,7 @@ def test_a_bad_grammar_is_named_and_the_next_request_works(
     shared: LlamaCppEngine, grammar: str, reason: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     for _ in range(2):
-        with pytest.raises(EngineError, match=f"grammar of request r is not valid GBNF: .*{reason}"):
+        with pytest.raises(BadRequest, match=f"grammar of request r is not valid GBNF: .*{reason}"):
             ask(shared, grammar=grammar)
     assert ask(shared)
     assert capfd.readouterr() == ("", "")
@@ -139,22 +139,22 @@ def test_the_order_of_two_pictures_matters(shared: LlamaCppEngine) -> None:
 
 
 def test_pictures_of_another_encoding_are_refused(shared: LlamaCppEngine) -> None:
-    with pytest.raises(EngineError, match="bgr8 picture; engines take rgb8"):
+    with pytest.raises(BadRequest, match="bgr8 picture; engines take rgb8"):
         ask(shared, images=(replace(rgb_frame(), encoding="bgr8"),))
 
 
 def test_pictures_smaller_than_they_say_are_refused(shared: LlamaCppEngine) -> None:
-    with pytest.raises(EngineError, match=r"640x480 whose data are uint8 of shape \(48, 64, 3\)"):
+    with pytest.raises(BadRequest, match=r"640x480 whose data are uint8 of shape \(48, 64, 3\)"):
         ask(shared, images=(replace(rgb_frame(), width=640, height=480),))
 
 
 def test_a_request_longer_than_the_context_says_so(tiny: EngineConfig) -> None:
     engine = LlamaCppEngine(tiny.but(context=256))
-    with pytest.raises(EngineError, match=r"does not fit the context of 256 tokens \(the prompt alone"):
+    with pytest.raises(BadRequest, match=r"does not fit the context of 256 tokens \(the prompt alone"):
         ask(engine, "word " * 500)
-    with pytest.raises(EngineError, match=r"does not fit .* answer of up to 250\); shorten it or raise --context"):
+    with pytest.raises(BadRequest, match=r"does not fit .* answer of up to 250\); shorten it or raise --context"):
         ask(engine, max_tokens=250)
-    with pytest.raises(EngineError, match="the prompt alone"):
+    with pytest.raises(BadRequest, match="the prompt alone"):
         ask(engine, images=tuple(rgb_frame(index) for index in range(4)))
     assert ask(engine)
     engine.close()

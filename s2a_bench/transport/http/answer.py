@@ -15,6 +15,7 @@ from typing import Any
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, Response
 
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport.http import own
@@ -65,9 +66,11 @@ class Answer(Response):
                 self._trace.mark(RESIDUAL)
                 if self._turn.come is not None:
                     come = asyncio.wrap_future(self._turn.come)
-                    await asyncio.wait({come, gone}, return_when=asyncio.FIRST_COMPLETED)
+                    timeout = self._turn.left_s()
+                    await asyncio.wait({come, gone}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
                 if self._gone:
                     return
+                self._turn.check(now_ns())
                 self._trace.mark("queue")
                 await run_in_threadpool(self.begin)
             self._on_thread = True

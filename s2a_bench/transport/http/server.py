@@ -23,14 +23,14 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, StrictInt
 from starlette.requests import ClientDisconnect
 
-from s2a_bench.errors import Busy, EngineError, PortInUse, RequestFailed, S2AError
+from s2a_bench.errors import BadRequest, Busy, EngineError, Overdue, PortInUse, RequestFailed, S2AError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.http import own
 from s2a_bench.transport.http.answer import Answer
 from s2a_bench.transport.http.door import door
 from s2a_bench.transport.http.options import HttpOptions
-from s2a_bench.transport.limits import LIMITS, SEEDS, Limits, text, whole_number
+from s2a_bench.transport.limits import SEEDS, Limits, text, whole_number
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.turns import Queued
 from s2a_bench.types import Frame, Request
@@ -41,6 +41,10 @@ KEEP_ALIVE_S = 3600
 
 STUCK_S = 120
 """Silence of an answer under way after which /health says so: a long prompt on a small board takes its time."""
+
+
+STATUSES = ((Busy, 503), (Overdue, 504), (BadRequest, 400), (EngineError, 500))
+"""By what an error is, the first that fits; every other one is 400."""
 
 
 class ImageUrl(BaseModel):
@@ -101,16 +105,15 @@ def _received(app: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[No
     return wrapped
 
 
-def application(handler: Handler) -> FastAPI:
+def application(queued: Queued, limits: Limits) -> FastAPI:
     """Build the application: chat completions in three variants, and what tools expect beside them."""
     app = FastAPI(title="s2a-bench", docs_url=None, redoc_url=None)
-    queued = Queued.around(handler)
+    app.state.queued, app.state.limits = queued, limits
 
     @app.exception_handler(S2AError)
     async def refuse(_: HttpRequest, error: S2AError) -> Response:
-        if isinstance(error, Busy):
-            return _error(503, str(error), {"Retry-After": f"{error.retry_after_s:.0f}"})
-        return _error(500 if isinstance(error, EngineError) else 400, str(error))
+        headers = {"Retry-After": f"{error.retry_after_s:.0f}"} if isinstance(error, Busy) else None
+        return _error(next((status for kind, status in STATUSES if isinstance(error, kind)), 400), str(error), headers)
 
     @app.exception_handler(RequestValidationError)
     async def invalid(_: HttpRequest, error: RequestValidationError) -> Response:
@@ -132,32 +135,32 @@ def application(handler: Handler) -> FastAPI:
     @app.post(own.PATHS[own.AS_DEPLOYED])
     def as_deployed(body: ChatRequest, http_request: HttpRequest) -> Response:
         http_request.state.trace.mark("json_parse")
-        return _answer(queued, body.model_dump(), http_request, own.STANDARD)
+        return _answer(body.model_dump(), http_request, own.STANDARD)
 
     async def best_effort(http_request: HttpRequest) -> Response:
         body = await http_request.body()
-        return await run_in_threadpool(_answer_json, queued, body, http_request)
+        return await run_in_threadpool(_answer_json, body, http_request)
 
     async def binary(http_request: HttpRequest) -> Response:
         body = await http_request.body()
-        return await run_in_threadpool(_answer_binary, queued, body, http_request)
+        return await run_in_threadpool(_answer_binary, body, http_request)
 
     app.add_route(own.PATHS[own.BEST_EFFORT], best_effort, methods=["POST"])
     app.add_route(own.PATHS[own.BINARY], binary, methods=["POST"])
     return app
 
 
-def _answer_json(queued: Queued, body: bytes, http_request: HttpRequest) -> Response:
+def _answer_json(body: bytes, http_request: HttpRequest) -> Response:
     """Answer a JSON body that nobody has validated."""
     try:
         fields = own.FAST.loads(body)
     except ValueError as error:
         raise RequestFailed(f"the body is no JSON: {error}") from error
     http_request.state.trace.mark("json_parse")
-    return _answer(queued, fields, http_request, own.FAST)
+    return _answer(fields, http_request, own.FAST)
 
 
-def _answer_binary(queued: Queued, body: bytes, http_request: HttpRequest) -> Response:
+def _answer_binary(body: bytes, http_request: HttpRequest) -> Response:
     """Answer a body that is the picture itself."""
     trace: Trace = http_request.state.trace
     try:
@@ -167,11 +170,15 @@ def _answer_binary(queued: Queued, body: bytes, http_request: HttpRequest) -> Re
     if not (isinstance(fields, dict) and isinstance(prompt := fields.get("prompt", ""), str)):
         raise RequestFailed(f"header {own.PARAMETERS_HEADER} should be an object whose prompt is text")
     trace.mark("json_parse")
-    images = (decoded(http_request.headers.get("content-type", ""), body, trace),) if body else ()
-    return _respond(queued, fields, prompt, images, http_request, own.FAST)
+    images = (
+        (decoded(http_request.headers.get("content-type", ""), body, trace, http_request.app.state.limits),)
+        if body
+        else ()
+    )
+    return _respond(fields, prompt, images, http_request, own.FAST)
 
 
-def _answer(queued: Queued, fields: dict[str, Any], http_request: HttpRequest, codec: own.Codec) -> Response:
+def _answer(fields: dict[str, Any], http_request: HttpRequest, codec: own.Codec) -> Response:
     """Decode the pictures of the messages and answer."""
     trace: Trace = http_request.state.trace
     images: list[Frame] = []
@@ -187,15 +194,14 @@ def _answer(queued: Queued, fields: dict[str, Any], http_request: HttpRequest, c
                 media_type, text = own.split_data_uri(part["image_url"]["url"])
                 data = codec.from_base64(text)
                 trace.mark("base64_decode")
-                images.append(decoded(media_type, data, trace))
+                images.append(decoded(media_type, data, trace, http_request.app.state.limits))
         prompt = "\n".join(texts)
     except (ValueError, KeyError, TypeError) as error:  # binascii.Error is a ValueError
         raise RequestFailed(f"messages: {error!r}") from error
-    return _respond(queued, fields, prompt, tuple(images), http_request, codec)
+    return _respond(fields, prompt, tuple(images), http_request, codec)
 
 
 def _respond(
-    queued: Queued,
     fields: dict[str, Any],
     prompt: str,
     images: tuple[Frame, ...],
@@ -204,11 +210,12 @@ def _respond(
 ) -> Response:
     """Join the queue, and begin if nobody is before us, so that a refusal still has its status code."""
     trace: Trace = http_request.state.trace
+    queued, limits = http_request.app.state.queued, http_request.app.state.limits
     request = Request(
         id=text("request_id", fields.get("request_id")) or "chatcmpl-0",
         prompt=text("the prompt", prompt),
         images=images,
-        max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, LIMITS.max_tokens, 32),
+        max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, limits.answer_tokens, 32),
         grammar=text("grammar", fields.get("grammar")),
         seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
     )
@@ -234,7 +241,7 @@ class _Server(uvicorn.Server):
 class HttpServer:
     """uvicorn on a socket that is bound before anything is promised."""
 
-    def __init__(self, wiring: Wiring[HttpOptions], handler: Handler, limits: Limits = LIMITS) -> None:
+    def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
         """Bind ``host:port`` of ``wiring.address`` (127.0.0.1 and any port without it); raises PortInUse."""
         host, _, port = (wiring.address or "127.0.0.1:0").rpartition(":")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -249,9 +256,9 @@ class HttpServer:
             raise PortInUse(f"`port`: cannot bind {host}:{port}: {error.strerror}") from error
         self.address = "http://{}:{}".format(*self._socket.getsockname())
         config = uvicorn.Config(
-            _received(application(handler)),
+            _received(application(Queued.around(handler, wiring.limits), wiring.limits)),
             loop="uvloop",
-            http=door(limits),
+            http=door(wiring.limits),
             log_level="warning",
             access_log=False,
             lifespan="off",

@@ -177,7 +177,7 @@ class ActionFront:
         """Offer the action and create the topics."""
         namespace, options = namespace_of(wiring), wiring.options
         self.cache = cache
-        self.max_tokens = options.max_tokens or wiring.max_tokens
+        self.max_tokens = min(options.max_tokens or wiring.max_tokens, wiring.limits.answer_tokens)
         self.feedback_interval_ns = int(options.feedback_interval * 1e9)
         self._server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE, options.result_timeout)
         self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS)
@@ -242,7 +242,7 @@ class GenerateJob:
         try:
             self._started = at_once and goal.executing()
             trace.mark("accept")
-            images = tuple(picture_of(image, trace) for image in goal_images(message))
+            images = tuple(picture_of(image, trace, front.cache.limits) for image in goal_images(message))
         except Exception as error:  # noqa: BLE001 - the goal is accepted, so it has to end, whatever broke
             self._error = str(error) or type(error).__name__
             return

@@ -16,7 +16,7 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Mark, Trace
-from s2a_bench.transport.limits import check_pixels
+from s2a_bench.transport.limits import LIMITS, Limits, check_pixels
 from s2a_bench.transport.pictures import bgr_of, decoded, encoded, rgb_of
 from s2a_bench.types import Frame
 
@@ -41,11 +41,12 @@ def picture_message(frame: Frame, payload: str, offset_ns: int, trace: Trace) ->
     return ros.IMAGE, ros.image_message(bgr_of(frame, trace) if payload == "raw" else frame, stamp_ns, FRAME_ID)
 
 
-def picture_of(message: Any, trace: Trace) -> Frame:
+def picture_of(message: Any, trace: Trace, limits: Limits = LIMITS) -> Frame:
     """Turn a received image message into an RGB frame; its stamp is ROS time. Raises TransportError."""
     if hasattr(message, "format"):
-        return replace(decoded(f"image/{message.format}", message.data, trace), stamp_ns=ros.stamp_of(message.header))
-    check_pixels(message.width, message.height)
+        frame = decoded(f"image/{message.format}", message.data, trace, limits)
+        return replace(frame, stamp_ns=ros.stamp_of(message.header))
+    check_pixels(message.width, message.height, limits)
     return rgb_of(ros.frame_of_image(message), trace)
 
 
@@ -88,8 +89,9 @@ class CachedFrame:
 class CameraCache:
     """Keeps the newest frame of both camera topics, already as RGB, each topic on a thread of its own."""
 
-    def __init__(self, middleware: Middleware, namespace: str, qos: str) -> None:
+    def __init__(self, middleware: Middleware, namespace: str, qos: str, limits: Limits = LIMITS) -> None:
         """Subscribe; `start` starts the threads."""
+        self.limits = limits
         topics = ((CAMERA, ros.IMAGE), (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE))
         self._cameras = [middleware.subscription(namespace + topic, kind, CAMERA_QOS[qos]) for topic, kind in topics]
         self._threads = [Thread(target=self._watch, args=(camera,), daemon=True) for camera in self._cameras]
@@ -144,7 +146,7 @@ class CameraCache:
             count = self._count
         message = camera.unpack(packed)
         trace.mark("cdr_parse")
-        frame = picture_of(message, trace)
+        frame = picture_of(message, trace, self.limits)
         with self._lock:
             if self._newest is None or count > self._newest.count:
                 self._newest = CachedFrame(frame, trace.marks, count)

@@ -13,7 +13,7 @@ from functools import partial
 from threading import Event, Lock, Thread
 from typing import Any, Protocol
 
-from s2a_bench.errors import Busy
+from s2a_bench.errors import Busy, Overdue
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros.action import ActionFront
@@ -75,10 +75,10 @@ class RosServer:
     def __init__(self, wiring: Wiring[RosOptions], handler: Handler) -> None:
         """Join the domain and create all topics; raises TransportError where another server answers already."""
         self.address = namespace_of(wiring)
-        self._queued = Queued.around(handler)
+        self._queued = Queued.around(handler, wiring.limits)
         refuse_company(wiring, self.address)
         self.middleware = join(wiring, "server")
-        self._cache = CameraCache(self.middleware, self.address, wiring.options.qos)
+        self._cache = CameraCache(self.middleware, self.address, wiring.options.qos, wiring.limits)
         self._fronts: list[Front] = [
             TopicFront(self.middleware, self.address, self._cache),
             ActionFront(self.middleware, wiring, self._cache),
@@ -137,8 +137,12 @@ class RosServer:
             return
         if not turn.has_come:
             job.trace.mark(RESIDUAL)
-            if not turn.wait(lambda: job.unwanted() or self._stopped.is_set()):
-                job.end("the server is stopping" if self._stopped.is_set() else "")
+            try:
+                if not turn.wait(lambda: job.unwanted() or self._stopped.is_set()):
+                    job.end("the server is stopping" if self._stopped.is_set() else "")
+                    return
+            except Overdue as late:
+                job.end(str(late))
                 return
             job.trace.mark("queue")
         error = ""

@@ -11,7 +11,7 @@ from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.limits import LIMITS, whole_number
+from s2a_bench.transport.limits import whole_number
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
@@ -145,8 +145,9 @@ class TopicJob:
         self._error = ""
         self._sent = 0
         try:
-            whole_number("max_tokens", int(message.max_tokens), 1, LIMITS.max_tokens, 0)
-            images = tuple(picture_of(image, trace) for image in (*message.images, *message.compressed_images))
+            whole_number("max_tokens", int(message.max_tokens), 1, cache.limits.answer_tokens, 0)
+            pictures = (*message.images, *message.compressed_images)
+            images = tuple(picture_of(picture, trace, cache.limits) for picture in pictures)
         except S2AError as error:
             self._error = str(error)
             return
