@@ -226,6 +226,19 @@ class TestDoor:
             assert reply(connection)[0] in {408, 0}
             assert time.monotonic() - began < 4
 
+    def test_a_body_that_comes_after_the_answer_is_thrown_away(self) -> None:
+        with serving(Limits(in_flight_mib=1)) as url:
+            for _ in range(3):
+                with connect(url) as connection:
+                    connection.sendall(b"POST /nowhere HTTP/1.1\r\nHost: a\r\nContent-Length: 600000\r\n\r\n")
+                    time.sleep(0.2)
+                    with contextlib.suppress(ConnectionError):
+                        connection.sendall(b" " * 600_000)
+                    connection.sendall(b"GET /health HTTP/1.1\r\nHost: a\r\nConnection: close\r\n\r\n")
+                    status, said = reply(connection)
+                    assert status == 404
+                    assert said.endswith('{"status":"ok"}')
+
     def test_a_slow_body_ends(self) -> None:
         with serving(Limits(body_s=0.3)) as url, connect(url) as connection:
             connection.sendall(HEAD + b"Content-Length: 100\r\n\r\n{")

@@ -82,9 +82,11 @@ class Http(Transport[HttpOptions]):
         wanted = f"{options.host}:{options.port}"
         return f"{options.host}:0" if wanted in taken else wanted
 
-    def ready(self, wiring: Wiring[HttpOptions], address: str) -> str:  # noqa: ARG002 - the same for all
-        """Return where chats are completed."""
-        return f"serving at {address}/v1/chat/completions"
+    def ready(self, wiring: Wiring[HttpOptions], address: str) -> str:
+        """Return where chats are completed, and for whom."""
+        key, everybody = wiring.options.api_key_env, wiring.options.no_auth
+        whom = f" for who has the key in ${key}, /health for all" if key else " for all who reach it" * everybody
+        return f"serving at {address}/v1/chat/completions{whom}"
 
 
 HTTP = Http()

@@ -71,8 +71,8 @@ class Door(HttpToolsProtocol):
             self._refuse(413, f"the body is larger than {self.limits.body_bytes} bytes")
 
     def on_body(self, body: bytes) -> None:
-        """Count what comes, however long it said it would be."""
-        if self._refused:
+        """Count what comes, however long it said it would be; what comes after the answer is thrown away."""
+        if self._refused or not self._unanswered:
             return
         self._body_bytes += len(body)
         self._unanswered[-1] += len(body)

@@ -20,12 +20,16 @@ class HttpOptions(Options):
     connection: Literal["keep-alive", "per-request", "client-per-request"] = option(
         "keep-alive", "keep-alive, per-request (a new connection each), client-per-request (a new client object each)"
     )
-    host: str = option("127.0.0.1", "address that our server binds", side=SERVING)
+    host: str = option("127.0.0.1", "address that our server binds; others than this machine need a key", side=SERVING)
     port: int = option(0, "port of the server; 0: any free one", ge=0, le=65535, side=SERVER)
     url: str = option("", "a server that runs already (a black box)", side=SERVER)
     served_model: str = option("default", "the model's name at the url")
     dialect: str = option("", f"what the url speaks: {', '.join(DIALECTS)} [default: ask]")
-    api_key_env: str = option("", "NAME of the environment variable with the API key of the url")
+    api_key_env: str = option(
+        "", "NAME of the environment variable with the API key: of the url, or that our server wants", side=SERVER
+    )
+    no_auth: bool = option(False, "let everybody in who reaches the host, without a key", side=SERVING)
+    api_docs: bool = option(False, "also serve /openapi.json, /docs and /redoc", side=SERVING)
     extra_body: TextOrFile = option("", "JSON, or @FILE, merged into every request to the url (RFC 7396)")
     llama_server: Path | None = option(
         None, "start this llama.cpp server on the same model files (a black box)", side=SERVER
@@ -56,10 +60,12 @@ class HttpOptions(Options):
         return text
 
     def check(self) -> None:
-        """Refuse two servers, and what is about a server that is not there."""
+        """Refuse two servers, what is about a server that is not there, and a key that nobody needs."""
+        if self.no_auth and self.api_key_env:
+            raise UsageError("`no_auth` lets everybody in without the key of `api_key_env`; give one of them")
         if self.url and self.llama_server:
             raise UsageError("`url` and `llama_server` name two HTTP servers; give one of them")
-        for name in ("dialect", "api_key_env", "extra_body"):
+        for name in ("dialect", "extra_body"):
             if getattr(self, name) and not self.url:
                 raise UsageError(f"`{name}` is about a server that runs already; name it with `url`")
 

@@ -23,10 +23,11 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, StrictInt
 from starlette.requests import ClientDisconnect
 
-from s2a_bench.errors import BadRequest, Busy, EngineError, Overdue, PortInUse, RequestFailed, S2AError
+from s2a_bench.errors import BadRequest, Busy, EngineError, Overdue, PortInUse, RequestFailed, S2AError, UsageError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.http import own
+from s2a_bench.transport.http.access import key_for, keyed
 from s2a_bench.transport.http.answer import Answer
 from s2a_bench.transport.http.door import door
 from s2a_bench.transport.http.options import HttpOptions
@@ -105,9 +106,9 @@ def _received(app: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[No
     return wrapped
 
 
-def application(queued: Queued, limits: Limits) -> FastAPI:
+def application(queued: Queued, limits: Limits, *, documented: bool = False) -> FastAPI:
     """Build the application: chat completions in three variants, and what tools expect beside them."""
-    app = FastAPI(title="s2a-bench", docs_url=None, redoc_url=None)
+    app = FastAPI(title="s2a-bench", openapi_url="/openapi.json" if documented else None)  # /docs and /redoc follow it
     app.state.queued, app.state.limits = queued, limits
 
     @app.exception_handler(S2AError)
@@ -242,21 +243,30 @@ class HttpServer:
     """uvicorn on a socket that is bound before anything is promised."""
 
     def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
-        """Bind ``host:port`` of ``wiring.address`` (127.0.0.1 and any port without it); raises PortInUse."""
+        """Bind ``host:port`` of ``wiring.address`` (127.0.0.1 and any port without it); raises PortInUse.
+
+        Raises UsageError where others than this machine would need no key and nobody said so.
+        """
         host, _, port = (wiring.address or "127.0.0.1:0").rpartition(":")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind((host or "127.0.0.1", int(port)))
+            key = key_for(self._socket.getsockname()[0], wiring.options)
             self._socket.listen()  # only now is the port ours
+        except UsageError:
+            self._socket.close()
+            raise
         except OSError as error:
             self._socket.close()
             if error.errno == errno.EADDRINUSE:
                 raise PortInUse(f"`port`: {port} is in use on {host}; choose another, or 0 for any free one") from error
             raise PortInUse(f"`port`: cannot bind {host}:{port}: {error.strerror}") from error
         self.address = "http://{}:{}".format(*self._socket.getsockname())
+        queued = Queued.around(handler, wiring.limits)
+        app = application(queued, wiring.limits, documented=wiring.options.api_docs)
         config = uvicorn.Config(
-            _received(application(Queued.around(handler, wiring.limits), wiring.limits)),
+            keyed(_received(app), key),
             loop="uvloop",
             http=door(wiring.limits),
             log_level="warning",
