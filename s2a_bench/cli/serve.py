@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from copy import copy
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from pydantic import create_model
@@ -25,10 +24,12 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+if TYPE_CHECKING:
+    from s2a_bench.harness.processes import ServerProcess
+
 ENGINE = ("name", "model", "mmproj", "threads", "gpu_layers", "context", "profile", "gaps")
 """The engine's options that a server has flags for."""
 _NUMBER = EngineConfig.model_fields["threads"]
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def _told(transport: Transport[Any]) -> list[str]:
@@ -110,35 +111,21 @@ def _read(path: Path, chosen: Transport[Any]) -> tuple[dict[str, Any], dict[str,
 
 
 def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
-    """Serve until SIGINT or SIGTERM, then end cleanly with exit code 0."""
-    from s2a_bench.harness.serving import engine_handler, stop_soon
-    from s2a_bench.inference import open_engine
+    """Serve until SIGINT or SIGTERM, then end cleanly with exit code 0; a server that died is started again once."""
+    from s2a_bench.harness.serving import ServerJob
+    from s2a_bench.harness.supervisor import keep_serving
     from s2a_bench.inference.replay import check_replay
-    from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
-    from s2a_bench.transport import open_server
 
     check_replay(config)
-    limit_threads()
-    if TRANSPORTS[wiring.transport].tuned(wiring.options):
-        keep_large_blocks()
-    engine = open_engine(config)
-    try:
-        server = open_server(wiring, engine_handler(engine, pixels=False, limits=wiring.limits))
+    transport = TRANSPORTS[wiring.transport]
 
-        def stop(*_: Any) -> None:
-            for number in SIGNALS:  # a second one does not wait for the answer under way
-                signal.signal(number, signal.default_int_handler)
-            stop_soon(server)
-
-        for number in SIGNALS:
-            signal.signal(number, stop)
-        facts = engine.describe()
+    def ready(server: ServerProcess) -> None:
+        facts = server.facts["engine"]
         name = f"replay of {facts['profile']} (EMULATED)" if facts.get("emulated") else facts["engine"]
-        said = TRANSPORTS[wiring.transport].ready(wiring, server.address)
-        typer.echo(f"{said}; engine {name}; Ctrl-C ends it")
-        server.serve()
-    finally:
-        engine.close()
+        typer.echo(f"{transport.ready(wiring, server.address)}; engine {name}; Ctrl-C ends it")
+
+    job = ServerJob(wiring, config, tuned=transport.tuned(wiring.options), pixels=False)
+    keep_serving(job, ready, lambda line: typer.echo(line, err=True))
 
 
 serve = command(_serve, _config(), about="Serve a model until interrupted: over HTTP, as a ROS 2 node, or otherwise.")

@@ -35,13 +35,13 @@ STOP_TIMEOUT_S = 3.0
 class ServerProcess(ABC):
     """A child process that serves; use as a context manager."""
 
-    def __init__(self, name: str, command: list[str], log: Path) -> None:
-        """Start ``command``; whatever it prints goes to ``log``."""
+    def __init__(self, name: str, command: list[str], log: Path | None) -> None:
+        """Start ``command``; whatever it prints goes to ``log``, without one to this process's standard error."""
         self.name = name
         self.log = log
         self.address = ""
         self.facts: dict[str, Any] = {}
-        self._log: IO[bytes] = log.open("wb")
+        self._log: IO[bytes] | None = log.open("wb") if log else None
         self._process = subprocess.Popen(  # noqa: S603 - the command is ours or the user's own llama-server
             command,
             preexec_fn=_die_with_parent,  # noqa: PLW1509 - calls one C function, resolved before the fork
@@ -67,8 +67,8 @@ class ServerProcess(ABC):
         """Return whether the process still runs."""
         return self._process.poll() is None
 
-    def ends_within(self, timeout_s: float) -> bool:
-        """Give a process whose connections broke a moment to be seen as ended."""
+    def ends_within(self, timeout_s: float | None) -> bool:
+        """Give a process whose connections broke a moment to be seen as ended, or wait for the end of one (None)."""
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -78,9 +78,12 @@ class ServerProcess(ABC):
     def death(self) -> ServerDied:
         """Describe how the process ended, with the last line it wrote."""
         how = how_it_ended(self._process.poll(), self._cure)
+        died = f"the {self.name} server (pid {self.pid}) died, {how}"
+        if self.log is None:
+            return ServerDied(died)
         lines = self.log.read_text(errors="replace").strip().splitlines()
         last = f": {lines[-1][:200]}" if lines else ""
-        return ServerDied(f"the {self.name} server (pid {self.pid}) died, {how}{last}; its log is {self.log}")
+        return ServerDied(f"{died}{last}; its log is {self.log}")
 
     def stop(self) -> None:
         """Ask the process to stop, then make it; an impatient second Ctrl-C makes it at once."""
@@ -91,10 +94,9 @@ class ServerProcess(ABC):
             self._process.kill()
             self._process.wait()
         finally:
-            for pipe in (self._process.stdin, self._process.stdout):
+            for pipe in (self._process.stdin, self._process.stdout, self._log):
                 if pipe is not None:
                     pipe.close()
-            self._log.close()
 
     def _ask_to_stop(self) -> None:
         self._process.terminate()
@@ -109,7 +111,7 @@ class ServerProcess(ABC):
 class OwnServer(ServerProcess):
     """Our instrumented server."""
 
-    def __init__(self, name: str, job: ServerJob, log: Path) -> None:
+    def __init__(self, name: str, job: ServerJob, log: Path | None = None) -> None:
         """Start it and tell it its job."""
         super().__init__(name, [sys.executable, "-m", "s2a_bench.harness.serving"], log)
         assert self._process.stdin is not None  # noqa: S101 - opened as a pipe above
@@ -128,7 +130,8 @@ class OwnServer(ServerProcess):
         with DefaultSelector() as selector:
             selector.register(stdout, EVENT_READ)
             if not selector.select(READY_TIMEOUT_S):
-                raise ServerDied(f"the {self.name} server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
+                see = f"; see {self.log}" if self.log else ""
+                raise ServerDied(f"the {self.name} server was not ready after {READY_TIMEOUT_S:.0f} s{see}")
         line = stdout.readline()
         if not line:
             with suppress(subprocess.TimeoutExpired):  # dumping core, perhaps

@@ -61,22 +61,25 @@ def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMI
 
 @dataclass(frozen=True, slots=True)
 class ServerJob:
-    """What a server process is told: which pipeline, which engine, and whether memory is tuned."""
+    """What a server process is told: which pipeline, which engine, whether memory is tuned, pixels are checked."""
 
     wiring: Wiring[Any]
     engine: EngineConfig
     tuned: bool = True
+    pixels: bool = True
 
     def to_json(self) -> str:
         """Write as one line."""
-        told = {"wiring": self.wiring.to_json(), "engine": self.engine.model_dump(mode="json"), "tuned": self.tuned}
-        return json.dumps(told)
+        told = {"tuned": self.tuned, "pixels": self.pixels}
+        engine = self.engine.model_dump(mode="json")
+        return json.dumps({"wiring": self.wiring.to_json(), "engine": engine, **told})
 
     @staticmethod
     def from_json(line: str) -> ServerJob:
         """Read what `to_json` wrote."""
         fields: dict[str, Any] = json.loads(line)
-        return ServerJob(Wiring.from_json(fields["wiring"]), EngineConfig(**fields["engine"]), fields["tuned"])
+        wiring, engine = Wiring.from_json(fields.pop("wiring")), EngineConfig(**fields.pop("engine"))
+        return ServerJob(wiring, engine, **fields)
 
 
 def stop_soon(server: Server) -> None:
@@ -96,13 +99,16 @@ def main() -> int:
     """Run a server until standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the harness decides
     limit_threads()
-    job = ServerJob.from_json(sys.stdin.readline())
+    line = sys.stdin.readline()
+    if not line:  # who started this process has gone
+        return 0
+    job = ServerJob.from_json(line)
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints belongs in the log
     try:
         keeps = job.tuned and keep_large_blocks()
         engine = open_engine(job.engine)
-        server = open_server(job.wiring, engine_handler(engine, limits=job.wiring.limits))
+        server = open_server(job.wiring, engine_handler(engine, pixels=job.pixels, limits=job.wiring.limits))
     except S2AError as error:
         print(json.dumps({"error": str(error), "kind": type(error).__name__}), file=answers, flush=True)
         return error.exit_code

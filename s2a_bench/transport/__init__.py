@@ -120,7 +120,7 @@ class Wiring(Generic[O]):
     options: O
     """``options.payload`` is what travels, the transport's default filled in."""
     address: str = ""
-    """A client: where the server is. A server: what it should bind; empty: any."""
+    """A client: where the server is. A server: what it should bind, or the address that it had; empty: any."""
     black_box: bool = False
     """Whether the server is not ours, so that it sends no marks."""
     timeout_s: float = 300.0
@@ -129,10 +129,12 @@ class Wiring(Generic[O]):
     """The most tokens of a request that cannot say itself how many it wants."""
     limits: Limits = LIMITS
     """What a server takes."""
+    restarted: bool = False
+    """Whether a server takes the place of one that died, and of which the network may not know yet."""
 
     def to_json(self) -> dict[str, Any]:
         """Return it as plain data."""
-        told = {name: getattr(self, name) for name in ("transport", "variant", "address", "black_box")}
+        told = {name: getattr(self, name) for name in ("transport", "variant", "address", "black_box", "restarted")}
         told |= {"timeout_s": self.timeout_s, "max_tokens": self.max_tokens}
         return {**told, "options": self.options.model_dump(mode="json"), "limits": self.limits.to_manifest()}
 

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -89,6 +90,88 @@ def test_limits_are_flags_and_keys_of_the_file(start: Start, tmp_path: Path) -> 
     assert httpx.post(url, json=body).status_code == 200
     assert "whole number of 1 to 4" in httpx.post(url, json=body | {"max_tokens": 5}).json()["error"]["message"]
     assert httpx.post(url, content=bytes((1 << 20) + 1)).status_code == 413
+
+
+def child_of(process: subprocess.Popen[str]) -> int:
+    """The process that serves."""
+    return int(Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()[0])
+
+
+def ended(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().split()[2] == "Z"
+    except OSError:
+        return True
+
+
+def until(met: Callable[[], bool], seconds: float = 30) -> None:
+    deadline = time.monotonic() + seconds
+    while not met():
+        assert time.monotonic() < deadline, "it did not come about"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
+def test_a_server_that_died_is_started_again_once(start: Start, number: signal.Signals) -> None:
+    process, line = start("http", "--engine", "echo", "--port", "0")
+    url = line.split()[2].rstrip(";")
+    body = {"messages": [{"role": "user", "content": "hello robot"}], "max_tokens": 2}
+    assert process.stdout
+    assert process.stderr
+    os.kill(child_of(process), number)
+    assert f"died, killed by signal {number}; it is started again, once" in process.stderr.readline()
+    assert process.stdout.readline() == line
+    assert httpx.post(url, json=body).status_code == 200
+    os.kill(child_of(process), number)
+    assert process.wait(30) == 1
+    said = process.stderr.read().splitlines()
+    assert len(said) == 1
+    assert f"died, killed by signal {number}" in said[0]
+
+
+def test_a_ros_server_that_died_is_started_again_at_once(start: Start, dds_domain: int) -> None:
+    process, line = start("ros", "--engine", "echo", "--namespace", "/reborn", "--max-tokens", "5", *ONE_BY_ONE)
+    assert process.stdout
+    os.kill(child_of(process), signal.SIGKILL)
+    assert process.stdout.readline() == line
+    client = open_client(wiring("ros/action", "/reborn", domain_id=dds_domain))
+    try:
+        tokens, _ = ask(client, Request("a", "go to the kitchen", (yuyv_frame(),)))
+        assert len(tokens) == 5
+    finally:
+        client.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_its_process_ends_with_it(start: Start, number: signal.Signals) -> None:
+    process, _ = start("http", "--engine", "echo", "--port", "0")
+    child = child_of(process)
+    began = time.monotonic()
+    process.send_signal(number)
+    assert process.wait(30) == (-number if number == signal.SIGKILL else 0)
+    until(lambda: ended(child))
+    assert time.monotonic() - began < 10
+
+
+def test_a_signal_while_it_starts_leaves_nothing() -> None:
+    process = subprocess.Popen([sys.executable, "-m", "s2a_bench", "serve", "http", "--engine", "echo", "--port", "0"])
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    until(lambda: bool(children.read_text()))
+    child = child_of(process)
+    process.terminate()
+    assert process.wait(30) == 0
+    until(lambda: ended(child))
+
+
+def test_off_loopback_it_wants_a_key_or_to_be_told_that_there_is_none(start: Start) -> None:
+    command = [sys.executable, "-m", "s2a_bench", "serve", "http", "--engine", "echo", "--port", "0"]
+    strangers = ("--host", "0.0.0.0")  # noqa: S104 - what is tested
+    done = subprocess.run([*command, *strangers], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert "--host: others reach 0.0.0.0" in done.stderr
+    assert "--api-key-env, or let everybody in with --no-auth" in done.stderr
+    _, line = start("http", "--engine", "echo", "--port", "0", *strangers, "--no-auth")
+    assert "for all who reach it" in line
 
 
 def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -> None:

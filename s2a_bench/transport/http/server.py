@@ -243,11 +243,11 @@ class HttpServer:
     """uvicorn on a socket that is bound before anything is promised."""
 
     def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
-        """Bind ``host:port`` of ``wiring.address`` (127.0.0.1 and any port without it); raises PortInUse.
+        """Bind ``host:port`` of ``wiring.address`` or what `address` was, without it 127.0.0.1 and any port.
 
-        Raises UsageError where others than this machine would need no key and nobody said so.
+        Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
         """
-        host, _, port = (wiring.address or "127.0.0.1:0").rpartition(":")
+        host, _, port = (wiring.address.removeprefix("http://") or "127.0.0.1:0").rpartition(":")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

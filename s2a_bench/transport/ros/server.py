@@ -76,7 +76,8 @@ class RosServer:
         """Join the domain and create all topics; raises TransportError where another server answers already."""
         self.address = namespace_of(wiring)
         self._queued = Queued.around(handler, wiring.limits)
-        refuse_company(wiring, self.address)
+        if not wiring.restarted:
+            refuse_company(wiring, self.address)
         self.middleware = join(wiring, "server")
         self._cache = CameraCache(self.middleware, self.address, wiring.options.qos, wiring.limits)
         self._fronts: list[Front] = [
