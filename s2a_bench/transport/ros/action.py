@@ -30,7 +30,7 @@ from s2a_bench.transport import CameraSink, Wiring
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.transport.ros.wire import READER_QOS, TOKEN_QOS, marks_message, remote_of, token_message
+from s2a_bench.transport.ros.wire import READER_QOS, TOKEN_QOS, marks_message, readable, remote_of, token_message
 from s2a_bench.types import Request, Token
 
 ACTION = "/generate_response"
@@ -155,8 +155,8 @@ class GenerateClient:
         while self._marks is not None and now_ns() < deadline:
             packed = self._marks.take(POLL_S)
             if packed is not None:
-                marks = self._marks.unpack(packed)
-                if marks.id == goal_id:
+                marks = readable(self._marks, packed, trace)
+                if marks is not None and marks.id == goal_id:
                     trace.receive(remote_of(marks))
                     return
         raise RequestFailed("the server's marks did not arrive")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
@@ -20,9 +21,12 @@ from s2a_bench.transport.ros.wire import (
     REQUEST_QOS,
     TOKEN_QOS,
     marks_message,
+    plain,
+    readable,
     remote_of,
     request_message,
     token_message,
+    unguessable,
 )
 from s2a_bench.types import Request, Token
 
@@ -54,13 +58,15 @@ class TopicClient:
         for frame in request.images:
             type_name, message = picture_message(frame, self._wiring.options.payload, self._offset_ns, trace)
             images[type_name].append(message)
-        packed = self._publisher.pack(request_message(request, images[ros.IMAGE], images[ros.COMPRESSED_IMAGE]))
+        name = unguessable(request.id)
+        message = request_message(replace(request, id=name), images[ros.IMAGE], images[ros.COMPRESSED_IMAGE])
+        packed = self._publisher.pack(message)
         trace.mark("cdr_pack")
         self._publisher.send(packed)
         trace.facts["payload_bytes"] = len(packed)
         expected = 0
         while True:
-            token = self._next(request.id)
+            token = self._next(name, trace)
             if token.index != expected:
                 raise MessagesLost(
                     f"token {token.index} came instead of {expected}: messages were lost, or two servers answer"
@@ -76,14 +82,14 @@ class TopicClient:
         if token.error:
             raise RequestFailed(f"the server broke off: {token.error}")
 
-    def _next(self, request_id: str) -> Any:
-        """Wait for the next token of this request, dropping what belongs to others."""
+    def _next(self, name: str, trace: Trace) -> Any:
+        """Wait for the next token of this request, dropping what belongs to others and what is none."""
         deadline = now_ns() + int(self._wiring.timeout_s * 1e9)
         while now_ns() < deadline:
             packed = self._subscription.take(POLL_S)
             if packed is not None:
-                token = self._subscription.unpack(packed)
-                if token.id == request_id:
+                token = readable(self._subscription, packed, trace)
+                if token is not None and token.id == name:
                     return token
             elif not self._alive():
                 raise ServerDied("the server's process is gone")
@@ -152,7 +158,9 @@ class TopicJob:
             self._error = str(error)
             return
         images = images or cache.lend(trace)
-        self.request = Request(message.id, message.prompt, images, message.max_tokens, message.grammar, message.seed)
+        self.request = Request(
+            plain(message.id), message.prompt, images, message.max_tokens, message.grammar, message.seed
+        )
 
     def token(self, token: Token) -> bool:
         """Publish a token; return whether more are wanted, which this variant cannot tell."""

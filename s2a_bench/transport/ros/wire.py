@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from secrets import token_hex
+from typing import Any, Final
 
-from s2a_bench.ros import QoS
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import QoS, Subscription
 from s2a_bench.ros import messages as ros
-from s2a_bench.trace import Remote
+from s2a_bench.trace import Remote, Trace
 from s2a_bench.types import Request, Token
 
 REQUEST_QOS = QoS(depth=10)
@@ -19,6 +21,29 @@ READER_QOS = QoS(depth=0)
 
 TOKEN_QOS = QoS(depth=1000)
 """Our writers keep the last: one that keeps all blocks for as long as a reader does not read."""
+
+
+UNREADABLE: Final = "unreadable_n"
+"""Fact: messages of strangers that could not be read while this request was under way."""
+
+
+def unguessable(request_id: str) -> str:
+    """Return a name for a request that no other node can answer before it has heard it."""
+    return f"{request_id}#{token_hex(16)}"
+
+
+def plain(name: str) -> str:
+    """Return the id in what `unguessable` returned; any other name is an id."""
+    return name.rpartition("#")[0] or name
+
+
+def readable(subscription: Subscription, packed: Any, trace: Trace) -> Any | None:
+    """Unpack a message; None for bytes that are none, which are counted as a fact: they are not this request's."""
+    try:
+        return subscription.unpack(packed)
+    except TransportError:
+        trace.facts[UNREADABLE] = trace.facts.get(UNREADABLE, 0.0) + 1
+        return None
 
 
 def request_message(request: Request, images: Sequence[Any] = (), compressed_images: Sequence[Any] = ()) -> Any:

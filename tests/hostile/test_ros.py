@@ -1,0 +1,206 @@
+"""The ROS node and its client beside hostile company: garbage, guesses, bombs, and clients that go."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+import pytest
+
+from s2a_bench.errors import RequestFailed, S2AError
+from s2a_bench.harness.serving import engine_handler
+from s2a_bench.inference import EngineConfig, open_engine
+from s2a_bench.ros import Accepted, Feedback, Middleware, Rejected, Result, open_middleware
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.action import Status
+from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
+from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
+from s2a_bench.trace import Trace
+from s2a_bench.transport import open_client
+from s2a_bench.transport.limits import LIMITS, Limits
+from s2a_bench.transport.ros.camera import picture_of
+from s2a_bench.transport.ros.wire import READER_QOS, REQUEST_QOS, TOKEN_QOS, request_message, token_message
+from s2a_bench.transport.turns import Queued
+from s2a_bench.types import Request, Token
+from tests.hostile.test_deadline import SOON, Endless
+from tests.hostile.test_limits import png
+from tests.hostile.test_queue import Gate, serving, until
+
+NAMESPACE = "/s2a_bench"
+
+
+@pytest.fixture
+def stranger(dds_domain: int) -> Iterator[Middleware]:
+    """Another node in the domain."""
+    middleware = open_middleware(domain_id=dds_domain, node_name="/stranger")
+    try:
+        yield middleware
+    finally:
+        middleware.close()
+
+
+def next_of(client: Any, *kinds: type) -> Any:
+    """Wait for an event of one of ``kinds``."""
+    while not isinstance(event := client.next_event(20), kinds):
+        assert event is not None, f"no {kinds} came"
+    return event
+
+
+@pytest.fixture
+def goals(stranger: Middleware) -> Callable[[], Any]:
+    """Connect an action client to the server of the test."""
+
+    def connect() -> Any:
+        client = stranger.action_client(NAMESPACE + "/generate_response", GENERATE_RESPONSE)
+        assert client.wait_for_server(20)
+        return client
+
+    return connect
+
+
+def test_a_goal_too_many_is_rejected_at_once(goals: Callable[[], Any]) -> None:
+    gate = Gate()
+    queued = Queued.around(gate, Limits(waiting=1))
+    with serving(queued, "ros/action"):
+        client = goals()
+        packed = client.pack(generate_goal("go", []))
+        first, second = client.send(packed), None
+        until(lambda: gate.began == [first.hex()])
+        second = client.send(client.pack(generate_goal("go", [])))
+        until(lambda: queued.turns.waiting == 1)
+        third = client.send(client.pack(generate_goal("go", [])))
+        assert next_of(client, Rejected).goal_id == third
+        gate.go.set()
+        for goal_id in (first, second):
+            client.cancel(goal_id)
+        assert {next_of(client, Result).goal_id for _ in range(2)} == {first, second}
+        until(lambda: queued.turns.silent_s() == 0)
+
+
+def test_a_goal_cancelled_while_it_waits_leaves_the_queue(goals: Callable[[], Any]) -> None:
+    gate = Gate()
+    queued = Queued.around(gate)
+    with serving(queued, "ros/action"):
+        client = goals()
+        first = client.send(client.pack(generate_goal("go", [])))
+        until(lambda: gate.began == [first.hex()])
+        second = client.send(client.pack(generate_goal("go", [])))
+        next_of(client, Accepted)
+        until(lambda: queued.turns.waiting == 1)
+        client.cancel(second)
+        result = next_of(client, Result)
+        assert (result.goal_id, result.status) == (second, Status.CANCELED)
+        until(lambda: queued.turns.waiting == 0)
+        gate.go.set()
+        client.cancel(first)
+        assert next_of(client, Result).goal_id == first
+        assert gate.began == [first.hex()]
+
+
+def test_a_request_whose_client_has_gone_lives_to_its_deadline_only() -> None:
+    engine = Endless()
+    queued = engine_handler(engine, pixels=False, limits=SOON)
+    with serving(queued, "ros/topic", SOON) as address:
+        leaver, other = (open_client(wiring("ros/topic", address)) for _ in range(2))
+        next(iter(leaver.request(Request("a", "for ever", max_tokens=60_000), Trace())))
+        leaver.close()
+        until(lambda: engine.closed == 1)
+        assert len(ask(other, Request("b", "short", max_tokens=2))[0]) == 2
+        other.close()
+
+
+@pytest.mark.parametrize("variant", ["topic", "action"])
+def test_garbage_and_guesses_beside_the_tokens_are_skipped_and_counted(stranger: Middleware, variant: str) -> None:
+    topic, kind = ("/token", ros.TOKEN) if variant == "topic" else ("/marks", ros.MARKS)
+    with ExitStack() as stack:
+        address = stack.enter_context(serving(engine_handler(open_engine(EngineConfig(name="echo"))), f"ros/{variant}"))
+        client = open_client(wiring(f"ros/{variant}", address))
+        stack.callback(client.close)
+        publisher = stranger.publisher(NAMESPACE + topic, kind, TOKEN_QOS)
+        until(lambda: bool(publisher.matched()))
+        for garbage in (b"\0\1\0\0" + b"\xff" * 64, b"\0\1\0\0" + bytes(3), b"\0\1\0\0" + b"\x40\0\0\0" + b"a" * 8):
+            publisher.send(bytearray(garbage))
+        if variant == "topic":
+            forged = Token(0, "forged", 1)
+            for guess in ("a", "a#", "a#" + "0" * 32):
+                publisher.send(publisher.pack(token_message(guess, forged, last=True, error="forged")))
+        time.sleep(0.3)
+        tokens, trace = ask(client, Request("a", "go on", max_tokens=4))
+        assert "".join(token.text for token in tokens) == "go on go on"
+        assert trace.facts["unreadable_n"] == 3
+
+
+def test_the_name_of_a_request_on_the_topic_cannot_be_guessed(stranger: Middleware) -> None:
+    handler = Recorder(["x"])
+    with serving(handler, "ros/topic") as address:
+        heard = stranger.subscription(NAMESPACE + "/request", ros.REQUEST, READER_QOS)
+        client = open_client(wiring("ros/topic", address))
+        until(lambda: bool(heard.matched()))
+        for _ in range(2):
+            ask(client, Request("cell-1", "go"))
+        client.close()
+        names = [heard.unpack(heard.take(20)).id for _ in range(2)]
+    assert names[0] != names[1]
+    assert all(len(name) == len("cell-1#") + 32 for name in names)
+    assert [request.id for request in handler.requests] == ["cell-1", "cell-1"]
+
+
+def image(width: int, height: int, step: int, size: int, encoding: str = "bgr8") -> Any:
+    made = ros.image_message(yuyv_frame(), 0, "c")
+    made.width, made.height, made.step, made.encoding, made.data = width, height, step, encoding, np.zeros(size, "u1")
+    return made
+
+
+IMPOSSIBLE = [
+    image(0, 0, 0, 0),
+    image(64, 0, 192, 0),
+    image(2**32 - 1, 2**32 - 1, 2**32 - 1, 100),
+    image(50_000_001, 1, 150_000_003, 100),
+    image(64, 48, 192, 64 * 48 * 3 - 1),
+    image(64, 48, 191, 64 * 48 * 3),
+    image(64, 48, 2**32 - 1, 64 * 48 * 3),
+    image(64, 48, 0, 64 * 48 * 3),
+    image(64, 48, 192, 64 * 48 * 3, "16UC1"),
+    image(63, 48, 126, 63 * 48 * 2, "yuv422_yuy2"),
+    ros.compressed_image_message(np.frombuffer(png(30_000, 2000), np.uint8), 0, "c", "png"),
+    ros.compressed_image_message(np.frombuffer(b"\xff\xd8" + bytes(100), np.uint8), 0, "c"),
+    ros.compressed_image_message(np.zeros(0, np.uint8), 0, "c"),
+]
+
+
+@pytest.mark.parametrize("message", IMPOSSIBLE)
+def test_a_picture_that_cannot_be_is_refused_before_it_is_converted(message: Any) -> None:
+    with pytest.raises(S2AError):
+        picture_of(message, Trace(), LIMITS)
+
+
+def test_a_smaller_limit_is_the_server_s_own(stranger: Middleware) -> None:
+    small = Limits(pixels=1000, answer_tokens=3)
+    with serving(engine_handler(open_engine(EngineConfig(name="echo"))), "ros/topic", small) as address:
+        client = open_client(wiring("ros/topic", address))
+        try:
+            with pytest.raises(RequestFailed, match="64x48; at most 1000 pixels"):
+                ask(client, Request("a", "a", (yuyv_frame(),), max_tokens=1))
+            with pytest.raises(RequestFailed, match="max_tokens should be a whole number of 1 to 3"):
+                ask(client, Request("a", "a", max_tokens=4))
+        finally:
+            client.close()
+        bomb = ros.compressed_image_message(np.frombuffer(png(30_000, 30_000), np.uint8), 0, "c", "png")
+        requests = stranger.publisher(NAMESPACE + "/request", ros.REQUEST, REQUEST_QOS)
+        answers = stranger.subscription(NAMESPACE + "/token", ros.TOKEN, READER_QOS)
+        until(lambda: bool(requests.matched() and answers.matched()))
+        requests.send(requests.pack(request_message(Request("b", "a", max_tokens=1), (), [bomb])))
+        packed = answers.take(20)
+        assert "30000x30000" in answers.unpack(packed).error
+
+
+def test_a_goal_has_no_more_tokens_than_the_limit(goals: Callable[[], Any]) -> None:
+    small = Limits(answer_tokens=3)
+    with serving(engine_handler(open_engine(EngineConfig(name="echo")), limits=small), "ros/action", small):
+        client = goals()
+        client.send(client.pack(generate_goal("a b c d e f", [])))
+        assert client.unpack_result(next_of(client, Result).packed).response.text.split() == ["a", "b", "c"]
+        assert not isinstance(client.next_event(0.1), Feedback)
