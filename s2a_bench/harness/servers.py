@@ -15,10 +15,14 @@ from s2a_bench.harness.processes import PROGRAMS, OwnServer, ServerProcess
 from s2a_bench.harness.serving import ServerJob, engine_handler
 from s2a_bench.inference import open_engine
 from s2a_bench.transport import Program, Wiring, open_server
+from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import Pipeline
 
 LAST_MOMENT_S = 0.5
 """A process that was killed breaks its connections before it is seen as ended: on a busy machine, long before."""
+
+RUN_LIMITS = Limits(answer_s=86_400)
+"""In a run it is the client who says how long an answer may take: a slow model is a result."""
 
 
 @dataclass(slots=True)
@@ -82,13 +86,14 @@ class ServerSet:
         engine = open_engine(self._config.engine)
         self._stack.callback(engine.close)
         self._local_engine = engine.describe()
-        server = open_server(wiring, engine_handler(engine))
+        server = open_server(wiring, engine_handler(engine, limits=wiring.limits))
         self._stack.callback(server.stop)
         Thread(target=server.serve, daemon=True).start()
         return server.address
 
     def _wiring(self, pipeline: Pipeline, address: str) -> Wiring[Any]:
-        return pipeline.wiring(address, timeout_s=self._config.timeout_s, max_tokens=self._config.max_tokens)
+        told = {"timeout_s": self._config.timeout_s, "max_tokens": self._config.max_tokens}
+        return pipeline.wiring(address, limits=RUN_LIMITS, **told)
 
     def wiring(self, pipeline: Pipeline) -> Wiring[Any]:
         """Return what the client of a cell is told, its server being ready."""

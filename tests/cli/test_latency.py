@@ -174,7 +174,7 @@ def test_the_untuned_case_is_recorded_as_such(tmp_path: Path) -> None:
     run(*SMALL, "--transport", "ros", "--dds-tuning", "default", output=tmp_path)
     manifest = only_run(tmp_path).manifest
     assert manifest["tuning"] == {"dds": "default", "malloc_keeps_large_blocks": False, "process": True}
-    assert manifest["servers"]["ros"]["limits"]["answer_s"] == 600
+    assert manifest["servers"]["ros"]["limits"]["pixels"] == 50_000_000
     assert "FragmentSize" not in manifest["servers"]["ros"]["transport"]["configuration"]
 
 

@@ -39,7 +39,7 @@ def keyed(app: App, key: str) -> App:
             return
         message = "this server wants its key: Authorization: Bearer KEY"
         error = {"error": {"message": message, "type": "invalid_request_error", "code": 401}}
-        await JSONResponse(error, 401, {"WWW-Authenticate": "Bearer", "Connection": "close"})(scope, receive, send)
+        await JSONResponse(error, 401, {"WWW-Authenticate": "Bearer"})(scope, receive, send)
 
     return wrapped if key else app
 
