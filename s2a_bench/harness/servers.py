@@ -21,8 +21,8 @@ from s2a_bench.transport.pipeline import Pipeline
 LAST_MOMENT_S = 0.5
 """A process that was killed breaks its connections before it is seen as ended: on a busy machine, long before."""
 
-RUN_LIMITS = Limits(answer_s=86_400)
-"""In a run it is the client who says how long an answer may take: a slow model is a result."""
+RUN_LIMITS = Limits(answer_s=86_400, answer_tokens=1 << 20)
+"""In a run it is the client who says how long an answer may be and take: a slow model is a result."""
 
 
 @dataclass(slots=True)
