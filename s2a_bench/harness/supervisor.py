@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
+from s2a_bench.errors import ServerDied
 from s2a_bench.harness.processes import OwnServer, ServerProcess
 from s2a_bench.harness.serving import ServerJob
 
@@ -22,19 +23,16 @@ def keep_serving(job: ServerJob, ready: Callable[[ServerProcess], None], died: C
     for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)
     with suppress(KeyboardInterrupt):
-        address = _serve_once(job, ready, lambda line: died(f"{line}; it is started again, once"))
-        again = replace(job, wiring=replace(job.wiring, address=address, restarted=True))
-        _serve_once(again, ready, None)
+        address, death = _serve(job, ready)
+        died(f"{death}; it is started again, once")
+        _, death = _serve(replace(job, wiring=replace(job.wiring, address=address, restarted=True)), ready)
+        raise death
 
 
-def _serve_once(job: ServerJob, ready: Callable[[ServerProcess], None], died: Callable[[str], None] | None) -> str:
-    """Serve until the process ends and return the address; raises ServerDied where nobody wants to hear of it."""
+def _serve(job: ServerJob, ready: Callable[[ServerProcess], None]) -> tuple[str, ServerDied]:
+    """Serve until the process ends; return its address, and how it ended."""
     with OwnServer(job.wiring.transport, job) as server:
         server.wait_ready()
         ready(server)
         server.ends_within(None)
-        death = server.death()
-    if died is None:
-        raise death
-    died(str(death))
-    return server.address
+        return server.address, server.death()

@@ -16,7 +16,7 @@ To add a transport, write a package with a module like this, and offer its insta
             return ToyClient(wiring, alive)
 
         def server(self, wiring, handler):
-            from toy.server import ToyServer
+            from toy.server import ToyServer        # keeps what wiring.limits says
             return ToyServer(wiring, handler)
 
     TOY = Toy()

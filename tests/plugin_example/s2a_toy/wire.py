@@ -19,8 +19,8 @@ from s2a_bench.transport.pictures import bgr_of, rgb_of
 from s2a_bench.types import Frame, Request, Token
 
 LENGTH = struct.Struct("<I")
-LIMIT = 64 << 20
-"""Bytes of a message: what is longer is refused before it is read."""
+LIMIT = 1 << 20
+"""Bytes of a message of the server: what is longer is refused before it is read."""
 
 
 def send(connection: socket.socket, *parts: bytes | memoryview) -> None:
@@ -30,11 +30,11 @@ def send(connection: socket.socket, *parts: bytes | memoryview) -> None:
         connection.sendall(part)
 
 
-def receive(connection: socket.socket) -> memoryview:
+def receive(connection: socket.socket, limit: int = LIMIT) -> memoryview:
     """Return one message; raises EOFError where the peer has gone, ValueError for a length beyond the limit."""
     (length,) = LENGTH.unpack(_exactly(connection, LENGTH.size))
-    if length > LIMIT:
-        raise ValueError(f"a message of {length} bytes is longer than {LIMIT}")
+    if length > limit:
+        raise ValueError(f"a message of {length} bytes is longer than {limit}")
     return _exactly(connection, length)
 
 
@@ -122,7 +122,7 @@ class ToyServer:
     def __init__(self, wiring: Wiring[Any], handler: Handler) -> None:
         """Bind; raises PortInUse."""
         host, _, port = (wiring.address or "127.0.0.1:0").rpartition(":")
-        self._handler = handler
+        self._handler, self._limit = handler, wiring.limits.body_bytes
         try:
             self._listener = socket.create_server((host, int(port)))
         except OSError as error:
@@ -132,7 +132,7 @@ class ToyServer:
 
     def describe(self) -> dict[str, str | int]:
         """Return what serves."""
-        return {"server": "toy", "limit_bytes": LIMIT}
+        return {"server": "toy"}
 
     def serve(self) -> None:
         """Serve until stopped."""
@@ -154,7 +154,7 @@ class ToyServer:
     def _answer_all(self, connection: socket.socket) -> None:
         with connection, suppress(OSError, EOFError, ValueError):
             while True:
-                message = receive(connection)
+                message = receive(connection, self._limit)
                 trace = Trace()
                 trace.mark("network")
                 self._answer(connection, message, trace)
