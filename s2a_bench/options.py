@@ -114,15 +114,23 @@ def places(options: type[Options]) -> dict[str, tuple[str, ...]]:
 def placed(options: type[Options], given: Mapping[str, Any]) -> dict[str, Any]:
     """Return options, each given by one of its names, as the class takes them; unknown ones stay as they are."""
     known = places(options)
-    values: dict[str, Any] = {}
-    for name, value in given.items():
+
+    def place(name: str, value: Any) -> tuple[str, ...]:
         whole = name in options.model_fields and isinstance(value, (Options, dict))
-        *groups, last = (name,) if whole else known.get(name, (name,))
-        inner = values
+        return (name,) if whole else known.get(name, (name,))
+
+    return nested((place(name, value), value) for name, value in given.items())
+
+
+def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
+    """Return values, each with the path to its field, as a class of options takes them: groups as dictionaries."""
+    found: dict[str, Any] = {}
+    for (*groups, last), value in values:
+        inner = found
         for each in groups:
             inner = inner.setdefault(each, {})
         inner[last] = value
-    return values
+    return found
 
 
 def _line(error: ErrorDetails, options: type[Options]) -> str:
@@ -140,7 +148,7 @@ def _line(error: ErrorDetails, options: type[Options]) -> str:
     return f"`{field}`: {error['input']!r} {said}"
 
 
-def _listed(value: Any) -> Any:
+def listed(value: Any) -> tuple[Any, ...]:
     """Split text at commas, make a tuple of any other value, and keep each element once."""
     if isinstance(value, str):
         value = [part.strip() for part in value.split(",") if part.strip()]
@@ -193,7 +201,7 @@ def _sound(text: Any) -> Any:
     return text
 
 
-SEVERAL = BeforeValidator(_listed)
+SEVERAL = BeforeValidator(listed)
 """What makes a tuple of text with commas between its elements, each once."""
 
 Names = Annotated[tuple[str, ...], SEVERAL]

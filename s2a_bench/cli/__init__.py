@@ -12,14 +12,6 @@ from typing import Any, ClassVar
 import typer
 
 from s2a_bench import __version__
-from s2a_bench.cli import (
-    compare,
-    doctor,
-    model,
-    profile,
-    report,
-    sweep,
-)
 from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import Commands
 from s2a_bench.errors import S2AError
@@ -33,8 +25,22 @@ ParseError: Any = typer.BadParameter.__mro__[1]
 class TopCommands(Commands):
     """The commands below, and the experiments."""
 
-    lazy: ClassVar[dict[str, str]] = {"serve": "s2a_bench.cli.serve:serve"}
-    abouts: ClassVar[dict[str, str]] = {"serve": "Serve a model over HTTP, as a ROS 2 node, or over another transport."}
+    lazy: ClassVar[dict[str, tuple[str, str]]] = {
+        name: (f"s2a_bench.cli.{name}:{what}", about)
+        for name, what, about in (
+            ("compare", "compare", "Compare run B with run A: effect sizes with intervals, one test, gates for CI."),
+            ("doctor", "doctor", "Check this machine: a line for each finding, warnings with what mends them."),
+            ("model", "app", "Fetch, make and inspect model files."),
+            ("profile", "app", "Measure this machine as a hardware profile, and look at profiles."),
+            ("report", "report", "Make one page of runs, and their tables and figures for a paper. Measures nothing."),
+            ("serve", "serve", "Serve a model until interrupted: over HTTP, as a ROS 2 node, or otherwise."),
+            (
+                "sweep",
+                "sweep",
+                "Run a command for every cell of a grid; finished cells are kept, and it can go on later.",
+            ),
+        )
+    }
 
 
 app = typer.Typer(
@@ -46,12 +52,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-app.command("doctor")(doctor.doctor)
-app.command("sweep")(sweep.sweep)
-app.command("compare")(compare.compare)
-app.command("report")(report.report)
-app.add_typer(model.app, name="model", help="Fetch, make and inspect model files.")
-app.add_typer(profile.app, name="profile", help="Measure this machine as a hardware profile, and look at profiles.")
 
 
 @app.callback(invoke_without_command=True)

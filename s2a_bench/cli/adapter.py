@@ -46,11 +46,16 @@ class Flag:
         return self.name.upper() if self.argument else f"--{self.name}"
 
     @property
+    def several(self) -> bool:
+        """Whether it may be given more than once."""
+        return get_origin(self.kind) is list
+
+    @property
     def parameter(self) -> inspect.Parameter:
         """Return it as a parameter of the function that typer reads; None says that it was not given."""
         default = inspect.Parameter.empty if self.needed else None
         declared: Any = (
-            typer.Argument(metavar=self.spelled, help=self.about, show_default=False)
+            typer.Argument(metavar=self.spelled + "..." * self.several, help=self.about, show_default=False)
             if self.argument
             else typer.Option(self.spelled, help=self.about, show_default=False, hidden=self.hidden)
         )
@@ -82,11 +87,11 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
             yield Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument, hidden)
 
 
-def command(function: Callable[..., None], *options: type[Options], about: str) -> Callable[..., None]:
+def command(function: Callable[..., None], *options: type[Options], about: str = "") -> Callable[..., None]:
     """Return a function for typer that builds every class of ``options`` from its flags and calls ``function``.
 
     ``function`` gets one configuration a class, in order; its keyword-only parameters that are declared as typer has
-    them are flags too.
+    them are flags too. ``about`` is what ``--help`` says, where its declaration does not.
     """
     own = _keywords(function)
     flags = distinct([flag for each in options for flag in flags_of(each)], taken=own)
@@ -110,8 +115,14 @@ def distinct(flags: Sequence[Flag], taken: Iterable[str] = ()) -> list[Flag]:
 
 
 def build(options: type[Options], given: Mapping[str, Any]) -> Options:
-    """Return the configuration that a command's parameters make; raises UsageError naming the field."""
-    return options(**_nested({flag.path: given.get(flag.key) for flag in flags_of(options)}))
+    """Return the configuration that a command's parameters make, what is not given left to the defaults.
+
+    Raises UsageError naming the field.
+    """
+    from s2a_bench.options import nested
+
+    flags = flags_of(options)
+    return options(**nested((flag.path, given[flag.key]) for flag in flags if given.get(flag.key) is not None))
 
 
 @contextmanager
@@ -139,31 +150,18 @@ def _keywords(function: Callable[..., None]) -> dict[str, inspect.Parameter]:
     }
 
 
-def _nested(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
-    """Return what was given, by field, groups as dictionaries; what was not given is left to the defaults."""
-    found: dict[str, Any] = {}
-    for path, value in values.items():
-        if value is None:
-            continue
-        inner = found
-        for group in path[:-1]:
-            inner = inner.setdefault(group, {})
-        inner[path[-1]] = value
-    return found
-
-
 def _kind(annotation: Any) -> type:
     """Return what typer should read: a plain type, or text."""
     if get_origin(annotation) in {Union, UnionType}:
         annotation = next(arg for arg in get_args(annotation) if arg is not NoneType)
-    return annotation if annotation in PLAIN else str
+    return annotation if annotation in PLAIN or get_origin(annotation) is list else str
 
 
 def _about(field: FieldInfo) -> str:
     """Return a field's help, with its default where the text does not speak of it."""
     about = field.description or ""
     default = field.get_default(call_default_factory=False)
-    if field.is_required() or "[default" in about or default is None or default is False or default in ("", ()):
+    if field.is_required() or "[default" in about or default is None or default is False or default in ("", (), []):
         return about
     values = default if isinstance(default, tuple) else (default,)
     return f"{about} [default: {','.join(f'{each:g}' if isinstance(each, float) else str(each) for each in values)}]"

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from s2a_bench.cli.options import listed
+from s2a_bench.cli.adapter import command
+from s2a_bench.cli.output import Json, print_json
 from s2a_bench.cli.output import console as open_console
-from s2a_bench.cli.output import print_json
-from s2a_bench.errors import UsageError
+from s2a_bench.report.compare.config import CompareConfig
 
 if TYPE_CHECKING:
     from s2a_bench.report.compare.gates import Judgement
@@ -21,26 +20,7 @@ TRIPPED = 3
 """Exit code where a gate trips."""
 
 
-def compare(
-    baseline: Annotated[str, typer.Argument(metavar="A", help="run folder; repeated launches with commas")],
-    other: Annotated[str, typer.Argument(metavar="B", help="what is compared with A: one folder, or as above")],
-    metric: Annotated[
-        list[str] | None,
-        typer.Option(help="METRIC or METRIC.STATISTIC (median, mean, p90, p99), with commas; or all [default: a few]"),
-    ] = None,
-    fail_if: Annotated[
-        list[str] | None,
-        typer.Option(help="gate, e.g. e2e.median>5%, tokens_per_s<-5%, ros/topic:e2e.p99>10%; may be repeated"),
-    ] = None,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="gates trip on the change itself, significant or not")
-    ] = False,
-    min_effect: Annotated[float, typer.Option(min=0, help="the smallest change that is called one, in per cent")] = 5.0,
-    unlike: Annotated[bool, typer.Option("--unlike", help="compare other machines, models or settings too")] = False,
-    output: Annotated[Path | None, typer.Option(help="folder for table, figure and JSON")] = None,
-    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
-) -> None:
-    """Compare run B with run A: effect sizes with intervals, one stated test, gates for CI (exit code 3)."""
+def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     from s2a_bench.report.compare.as_json import compare_json
     from s2a_bench.report.compare.comparison import compare as compare_runs
     from s2a_bench.report.compare.comparison import metrics_of, open_comparison, read_side, shown_metrics
@@ -50,19 +30,17 @@ def compare(
     from s2a_bench.report.compare.warnings import warnings_of
     from s2a_bench.writers.terminal import lay_out
 
-    gates = [read_gate(text) for text in fail_if or ()]
-    if strict and not gates:
-        raise UsageError("--strict: there is no gate; add --fail-if")
-    sides = [read_side(text, name) for name, text in (("A", baseline), ("B", other))]
-    compared = open_comparison(*sides, unlike=unlike, least=min_effect / 100)
-    names = [name for text in metric or () for name in listed(text)]
+    gates = [read_gate(text) for text in config.fail_if]
+    sides = [read_side(text, name) for name, text in (("A", config.baseline), ("B", config.other))]
+    compared = open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
+    names = config.metrics
     compared = compare_runs(compared, metrics_of(compared, names) if names else shown_metrics(compared))
-    judgements = judge(compared, gates, strict=strict)
+    judgements = judge(compared, gates, strict=config.strict)
     found = warnings_of(compared)
     whole = compare_json(compared, judgements, found)
     for warning in found:
         _say(f"note [{warning.code}]: {warning.message}; {warning.advice}")
-    written = write_comparison(output, compared, whole) if output else []
+    written = write_comparison(config.output, compared, whole) if config.output else []
     if json_:
         print_json(whole)
     else:
@@ -75,7 +53,7 @@ def compare(
 
 
 def _gate_code(judgements: Sequence[Judgement]) -> int:
-    """Return what the gates found, and return the exit code: a tripped gate before one that cannot be judged."""
+    """Print what the gates found, and return the exit code: a tripped gate before one that cannot be judged."""
     from s2a_bench.report.compare import gates as compare_gates
     from s2a_bench.report.compare.tables import change_text
 
@@ -90,3 +68,6 @@ def _gate_code(judgements: Sequence[Judgement]) -> int:
 
 def _say(line: str) -> None:
     print(line, file=sys.stderr)  # noqa: T201 - the command line's own output
+
+
+compare = command(_compare, CompareConfig)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
+
+from s2a_bench.cli.adapter import command
+from s2a_bench.cli.output import Json, print_json
+from s2a_bench.machine.doctor.config import DoctorConfig
 
 if TYPE_CHECKING:
     from s2a_bench.machine.doctor import Finding
@@ -16,22 +17,19 @@ if TYPE_CHECKING:
 STYLES = {"state": "green", "advice": "cyan", "warning": "yellow", "error": "bold red"}
 
 
-def doctor(
-    output: Annotated[Path, typer.Option(help="folder for run folders, whose disk is looked at")] = Path("results"),
-    strict: Annotated[bool, typer.Option("--strict", help="exit with 1 on warnings too")] = False,
-    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
-) -> int:
-    """Check this machine: state, advice, warnings (with the command that mends them) and errors, one line each."""
+def _doctor(config: DoctorConfig, *, json_: Json = False) -> None:
     from s2a_bench.machine.doctor import LEVELS, Machine, examine, worst
 
-    findings = examine(replace(Machine(), output=output), all_checks())
+    findings = examine(replace(Machine(), output=config.output), all_checks())
     if json_:
-        json.dump(_as_json(findings), sys.stdout, indent=2, ensure_ascii=False)
-        sys.stdout.write("\n")
+        print_json(_as_json(findings))
     else:
         _show(findings)
-    limit = "warning" if strict else "error"
-    return int(LEVELS.index(worst(findings)) >= LEVELS.index(limit))
+    limit = "warning" if config.strict else "error"
+    raise typer.Exit(int(LEVELS.index(worst(findings)) >= LEVELS.index(limit)))
+
+
+doctor = command(_doctor, DoctorConfig)
 
 
 def all_checks() -> dict[str, str]:

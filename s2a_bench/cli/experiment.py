@@ -11,8 +11,8 @@ import typer
 from typer.core import TyperGroup
 
 from s2a_bench.cli.adapter import build, command, flags_named
+from s2a_bench.cli.output import Json, print_json
 from s2a_bench.cli.output import console as open_console
-from s2a_bench.cli.output import print_json
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS
 
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from s2a_bench.options import Options
     from s2a_bench.store.run import Run
 
+PLAIN: dict[str, Any] = {"rich_markup_mode": None, "pretty_exceptions_enable": False, "add_completion": False}
+"""How our commands look."""
+
 
 class Commands(TyperGroup):
     """The commands of one group: those by hand, those in ``lazy``, and the experiments.
@@ -30,10 +33,8 @@ class Commands(TyperGroup):
     """
 
     group: ClassVar[str] = ""
-    lazy: ClassVar[Mapping[str, str]] = {}
-    """Name of a command -> its function, as "module:attribute"."""
-    abouts: ClassVar[Mapping[str, str]] = {}
-    """What the list of commands says of those in ``lazy`` that are dear to import."""
+    lazy: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    """Name of a command -> its function or group, as "module:attribute", and what its help says."""
 
     @property
     def _experiments(self) -> dict[str, str]:
@@ -48,25 +49,28 @@ class Commands(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command, made from its declaration when it is first asked for."""
         found = super().get_command(ctx, cmd_name)
-        if found is None and (function := self._function(cmd_name)) is not None:
-            single = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False, add_completion=False)
-            single.command(cmd_name)(function)
-            found = self.commands[cmd_name] = typer.main.get_command(single)
+        if found is None and (made := self._made(cmd_name)) is not None:
+            if not isinstance(made, typer.Typer):
+                single = typer.Typer(**PLAIN)
+                single.command(cmd_name, help=self.lazy.get(cmd_name, ("", None))[1])(made)
+                made = single
+            found = self.commands[cmd_name] = typer.main.get_command(made)
+            found.name = cmd_name
         return found
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """List every command with its sentence, without importing what experiments are made of."""
         mine = {name: command for command, name in self._experiments.items()}
         abouts = {mine[name]: experiment.about for name, experiment in EXPERIMENTS.loaded() if name in mine}
-        abouts |= self.abouts
+        abouts |= {name: about for name, (_, about) in self.lazy.items()}
         for name in {*self.list_commands(ctx)}.difference(mine.values(), abouts):
             abouts[name] = self.get_command(ctx, name).get_short_help_str(limit=150)
         with formatter.section("Commands"):
             formatter.write_dl(sorted(abouts.items()))
 
-    def _function(self, name: str) -> Any:
+    def _made(self, name: str) -> Any:
         if name in self.lazy:
-            return resolve_name(self.lazy[name])
+            return resolve_name(self.lazy[name][0])
         return command_of(EXPERIMENTS[self._experiments[name]]) if name in self._experiments else None
 
 
@@ -92,7 +96,7 @@ def command_of(experiment: Experiment) -> Callable[..., None]:
         data_only: Annotated[
             bool, typer.Option("--data-only", help="write no tables and figures into the run folder")
         ] = False,
-        json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
+        json_: Json = False,
     ) -> None:
         asked = view[0].model_dump() if view else {}
         _run(experiment, config, output, asked, data_only=data_only, as_json=json_)

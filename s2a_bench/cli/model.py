@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from s2a_bench import extras
-from s2a_bench.cli.adapter import with_flags
-from s2a_bench.cli.experiment import Commands
+from s2a_bench.cli.adapter import command, with_flags
+from s2a_bench.cli.experiment import PLAIN, Commands
+from s2a_bench.cli.output import Json, print_json
 from s2a_bench.cli.output import console as open_console
-from s2a_bench.cli.output import print_json
+from s2a_bench.inference.files_config import DummyConfig, FetchConfig, InfoConfig
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -30,49 +30,18 @@ class ModelCommands(Commands):
 
 
 app = typer.Typer(
-    cls=ModelCommands, no_args_is_help=True, help="Fetch model files, write dummy ones, say what is in them."
+    cls=ModelCommands, no_args_is_help=True, help="Fetch model files, write dummy ones, say what is in them.", **PLAIN
 )
 
 
-class Size(str, Enum):
-    """Values of --size."""
-
-    tiny = "tiny"
-    full = "full"
-
-
-class Quant(str, Enum):
-    """Values of --quant."""
-
-    f16 = "f16"
-    q8_0 = "q8_0"
-    q4_0 = "q4_0"
-
-
-@app.callback()
-def model() -> None:
-    """Fetch model files, write dummy ones, say what is in them."""
-
-
-@app.command()
-def fetch(
-    what: Annotated[str, typer.Argument(metavar="NAME", help="minicpm-v-2.6, or ORG/REPO:FILE")],
-    quant: Annotated[
-        str | None, typer.Option(help="quantisation of the language model, as Q8_0  [default: Q4_K_M]")
-    ] = None,
-    mmproj: Annotated[
-        str | None, typer.Option(help="the repository's vision tower to fetch too  [default: the known one, or none]")
-    ] = None,
-    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
-) -> None:
-    """Fetch a model from the hub: resumed where it broke off, checked against the hub's SHA-256."""
+def _fetch(config: FetchConfig, *, json_: Json = False) -> None:
     from s2a_bench.inference.fetch import fetch as fetch_files
     from s2a_bench.inference.fetch import wanted
     from s2a_bench.inference.gguf_file import read_header
 
     for module in ("huggingface_hub", "gguf"):
         extras.need(module, "model")
-    want = wanted(what, quant, mmproj)
+    want = wanted(config.what, config.quant, config.mmproj)
     with _bytes_bar() as bar:
         tasks: dict[str, TaskID] = {}
 
@@ -84,14 +53,14 @@ def fetch(
         done = fetch_files(want, show)
     for file in done.files:
         read_header(file.path, "model fetch")
-    command = _latency_command(done)
+    latency = _latency_command(done)
     if json_:
-        print_json(_fetched_json(done, command))
+        print_json(_fetched_json(done, latency))
         return
     for file in done.files:
         typer.echo(file.path)
-    if command:
-        typer.echo(command)
+    if latency:
+        typer.echo(latency)
 
 
 def _latency_command(done: Fetched) -> str | None:
@@ -111,32 +80,25 @@ def _latency_command(done: Fetched) -> str | None:
     return join(["s2a-bench", "latency", "--model", str(files.model.path), "--mmproj", str(files.mmproj.path)])
 
 
-def _fetched_json(done: Fetched, command: str | None) -> dict[str, Any]:
+def _fetched_json(done: Fetched, latency: str | None) -> dict[str, Any]:
     files = [
         {"path": str(file.path), "bytes": file.nbytes, "sha256": file.sha256, "resumed_at": file.resumed_at}
         for file in done.files
     ]
     facts = {"endpoint": done.endpoint, "repository": done.repository, "commit": done.commit, "files": files}
-    return {"schema": SCHEMA, "command": "model fetch", **facts} | ({"latency": command} if command else {})
+    return {"schema": SCHEMA, "command": "model fetch", **facts} | ({"latency": latency} if latency else {})
 
 
-@app.command()
-def info(
-    what: Annotated[str, typer.Argument(metavar="FILE", help="a GGUF file, or minicpm-v-2.6 once it is fetched")],
-    hash_: Annotated[
-        bool, typer.Option("--hash", help="compute the SHA-256; else it is shown where it is known already")
-    ] = False,
-    json_: Annotated[bool, typer.Option("--json", help="one JSON object on standard output")] = False,
-) -> None:
-    """Say what is in a GGUF file: shapes, types, vision tower, vocabulary, chat template, licence, hash."""
+def _info(config: InfoConfig, *, json_: Json = False) -> None:
     from s2a_bench.cli.model_text import as_json, renderables
     from s2a_bench.inference.fetch_names import HUB_MODELS, fetched
     from s2a_bench.inference.gguf_info import describe
     from s2a_bench.inference.models import remembered_sha256, sha256
 
+    what = config.what
     known = what in HUB_MODELS and not Path(what).is_file()
     paths = fetched(what, "model info") if known else (Path(what),)
-    found = [(describe(path, "model info"), sha256(path) if hash_ else remembered_sha256(path)) for path in paths]
+    found = [(describe(path, "model info"), sha256(path) if config.hash else remembered_sha256(path)) for path in paths]
     if json_:
         files = [as_json(facts, hash_known) for facts, hash_known in found]
         print_json({"schema": SCHEMA, "command": "model info", "files": files})
@@ -155,30 +117,27 @@ def _bytes_bar(*, disable: bool = False) -> Progress:
     return Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), disable=disable)
 
 
-@app.command()
-def dummy(
-    size: Annotated[Size, typer.Option(help="tiny: 13 MB, for tests; full: the shapes of MiniCPM-V 2.6")] = Size.tiny,
-    quant: Annotated[
-        Quant | None, typer.Option(help="type of the language model's weights  [default: f16 (tiny), q4_0 (full)]")
-    ] = None,
-    output: Annotated[Path | None, typer.Option(help="folder to write to  [default: the user's cache folder]")] = None,
-    force: Annotated[bool, typer.Option("--force", help="write the files again if they are there")] = False,
-) -> None:
-    """Write dummy weights: MiniCPM-V 2.6's architecture with random numbers, to measure speed without a download."""
+def _dummy(config: DummyConfig) -> None:
     from s2a_bench.inference.dummy import dummy_files, write_dummy
     from s2a_bench.inference.models import dummy_folder
 
-    kind = quant or (Quant.q4_0 if size is Size.full else Quant.f16)
-    folder = output or dummy_folder(size.value)
-    files = dummy_files(folder, size.value, kind.value)
-    if force or not (files.model.is_file() and files.mmproj.is_file()):
-        with _bytes_bar(disable=size is Size.tiny) as bar:
+    folder = config.output or dummy_folder(config.size)
+    files = dummy_files(folder, config.size, config.kind)
+    if config.force or not (files.model.is_file() and files.mmproj.is_file()):
+        with _bytes_bar(disable=config.size == "tiny") as bar:
             task = bar.add_task("write", total=None)
-            write_dummy(
-                folder,
-                size.value,
-                kind.value,
-                progress=lambda done, total: bar.update(task, completed=done, total=total),
-            )
+
+            def show(done: int, total: int) -> None:
+                bar.update(task, completed=done, total=total)
+
+            write_dummy(folder, config.size, config.kind, progress=show)
     typer.echo(files.model)
     typer.echo(files.mmproj)
+
+
+for _name, _function, _config, _about in (
+    ("fetch", _fetch, FetchConfig, "Fetch a model from the hub: resumed, and checked against the hub's SHA-256."),
+    ("info", _info, InfoConfig, "Say what is in a GGUF file: shapes, types, vision tower, vocabulary, licence, hash."),
+    ("dummy", _dummy, DummyConfig, "Write weights of random numbers in MiniCPM-V 2.6's shapes, to measure speed with."),
+):
+    app.command(_name)(command(_function, _config, about=_about))

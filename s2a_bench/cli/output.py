@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from s2a_bench.cli.options import WIDTH
+import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+WIDTH = 100
+"""Columns of the tables where the output is no terminal."""
+
+Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output")]
 
 
 def print_json(whole: dict[str, Any]) -> None:

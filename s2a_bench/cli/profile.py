@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from s2a_bench.cli.adapter import with_flags
-from s2a_bench.cli.experiment import Commands
+from s2a_bench.cli.adapter import command, with_flags
+from s2a_bench.cli.experiment import PLAIN, Commands
+from s2a_bench.cli.output import Json, print_json
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.profile_capture.config import CaptureConfig
+from s2a_bench.store.manifest import plain
 
 if TYPE_CHECKING:
     from s2a_bench.boards.profile import Profile
 
 
 class ProfileCommands(Commands):
-    """The commands below, and the one that measures."""
+    """The commands below."""
 
-    lazy: ClassVar[dict[str, str]] = {"capture": "s2a_bench.cli.profile_capture:capture"}
     group = "profile"
 
 
-app = typer.Typer(cls=ProfileCommands, no_args_is_help=True, rich_markup_mode=None, add_completion=False)
+ABOUT = "Measure this machine as a hardware profile, and look at profiles."
+app = typer.Typer(cls=ProfileCommands, no_args_is_help=True, help=ABOUT, **PLAIN)
 
 SCHEMA = "s2a-bench-profile/1"
 """Of `--json`; described by ``docs/schema/s2a-bench-profile-1.json``."""
-
-Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output")]
 
 
 @app.command("list")
@@ -166,5 +165,38 @@ def distances(profile: Profile) -> str:
 def print_profiles(command: str, profiles: list[dict[str, Any]], **more: Any) -> None:
     """Print the one object of ``--json``."""
     whole = {"schema": SCHEMA, "command": f"profile {command}", **more, "profiles": profiles}
-    json.dump(whole, sys.stdout, indent=2, ensure_ascii=False, allow_nan=False, default=str)
-    sys.stdout.write("\n")
+    print_json(plain(whole))
+
+
+def _capture(
+    config: CaptureConfig,
+    *,
+    output: Annotated[Path, typer.Option(help="folder for the file")] = Path("profiles"),
+    force: Annotated[bool, typer.Option("--force", help="replace a profile of this name")] = False,
+    json_: Json = False,
+) -> None:
+    from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.experiments.profile_capture.run import capture, make_room, write_profile
+
+    path = output / f"{config.name}.toml"
+    make_room(path, force=force)
+    with RunProgress() as progress:
+        tables = capture(config, progress)
+        for warning in tables["capture"]["warnings"]:
+            progress.say(f"warning: {warning}")
+    profile = write_profile(tables, path, force=force)
+    if json_:
+        print_profiles("capture", [facts_of(profile, path)])
+        return
+    typer.echo(line_of(profile))
+    typer.echo(f"gaps: {profile.facts['fit']['family']}, the nearest of {distances(profile)}")
+    typer.echo(f"profile: {path}")
+
+
+app.command("capture")(
+    command(
+        _capture,
+        CaptureConfig,
+        about="Measure this machine: rate, time to first token and every gap between tokens, for others to replay.",
+    )
+)

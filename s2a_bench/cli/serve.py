@@ -128,4 +128,4 @@ def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
     keep_serving(job, ready, lambda line: typer.echo(line, err=True))
 
 
-serve = command(_serve, _config(), about="Serve a model until interrupted: over HTTP, as a ROS 2 node, or otherwise.")
+serve = command(_serve, _config())

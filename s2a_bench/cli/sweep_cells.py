@@ -21,11 +21,11 @@ def command_of(name: str, key: str = "command") -> Command:
     """Describe a command; raises UsageError for one that cannot be swept."""
     from s2a_bench.sweep import Command
 
-    known = sorted({*EXPERIMENTS}.intersection(_commands()))
+    known = sorted(each for each in EXPERIMENTS if " " not in each)
     if name not in known:
         raise UsageError(f"{key}: '{name}' is none of {', '.join(known)}")
     flags: dict[str, Any] = {}
-    for parameter in _commands()[name].params:
+    for parameter in _command(name).params:
         if parameter.param_type_name == "argument":
             flags[parameter.name] = "argument"
             continue
@@ -40,7 +40,7 @@ def run(argv: Sequence[str]) -> None:
     from s2a_bench.cli import ParseError
 
     try:
-        _commands()[argv[0]].main(args=list(argv[1:]), prog_name=f"s2a-bench {argv[0]}", standalone_mode=False)
+        _command(argv[0]).main(args=list(argv[1:]), prog_name=f"s2a-bench {argv[0]}", standalone_mode=False)
     except ParseError as error:
         raise UsageError(error.format_message()) from error
 
@@ -50,18 +50,18 @@ def _check(name: str, argv: Sequence[str]) -> bool:
     from s2a_bench.cli import ParseError
 
     try:
-        given = _commands()[name].make_context(name, list(argv)).params
+        given = _command(name).make_context(name, list(argv)).params
     except ParseError as error:
         raise UsageError(error.format_message()) from error
     return config_of(EXPERIMENTS[name], given).virtual
 
 
 @cache
-def _commands() -> dict[str, Any]:
-    """Return the commands as the parser has them."""
+def _command(name: str) -> Any:
+    """Return a command as the parser has it."""
     from typer.main import get_command
 
     from s2a_bench.cli import app
 
     group: Any = get_command(app)
-    return {name: group.get_command(None, name) for name in group.list_commands(None)}
+    return group.get_command(None, name)

@@ -1,11 +1,11 @@
-"""Sweeps on the terminal and as JSON: what would run, and how it went."""
+"""Sweeps on the terminal: what would run, and how it went."""
 
 from __future__ import annotations
 
 import json
 import shlex
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
@@ -57,64 +57,6 @@ def print_sweep(sweep: Sweep) -> None:
         f"{len(cells) - len(failed)} of {len(cells)} cells finished on {hosts}", markup=False, highlight=False
     )
     console.print(f"sweep folder: {sweep.path}", markup=False, highlight=False, soft_wrap=True)
-
-
-def plan_json(cells: Sequence[Cell], expected: Expected, environment: dict[str, Any]) -> dict[str, Any]:
-    """Return what would run as the ``--json`` object."""
-    time = {"source": expected.source}
-    return {
-        "schema": "s2a-bench/1",
-        "command": "sweep",
-        "environment": environment,
-        "expected": time if expected.seconds is None else {"s": expected.seconds, **time},
-        "cells": [
-            {
-                "cell": cell.name,
-                "repeat": cell.repeat,
-                "state": "planned",
-                "virtual": cell.virtual,
-                "board": cell.board or None,
-                "settings": cell.settings,
-                "argv": list(cell.argv),
-                "config_hash": cell.config_hash,
-            }
-            for cell in cells
-        ],
-        "ratios": [],
-        "warnings": [],
-    }
-
-
-def sweep_json(sweep: Sweep) -> dict[str, Any]:
-    """Return how a sweep went as the ``--json`` object."""
-    return {
-        "schema": "s2a-bench/1",
-        "command": "sweep",
-        "run": str(sweep.path),
-        "state": sweep.manifest["state"],
-        "environment": sweep.manifest["environment"],
-        "cells": [
-            {
-                "cell": row["cell"],
-                "repeat": int(row["repeat"]),
-                "attempt": int(row["attempt"]),
-                "state": row["state"],
-                "error": row["error"] or None,
-                "virtual": bool(row["virtual"]),
-                "board": row["board"] or None,
-                "host": row["host"],
-                "settings": json.loads(row["settings"]),
-                "argv": json.loads(row["argv"]),
-                "config_hash": row["config_hash"],
-                "run": str(sweep.path / row["folder"]) if row["folder"] else None,
-                "started": row["started"],
-                "wall_s": float(row["wall_s"]),
-            }
-            for row in sweep.cells.to_dict("records")
-        ],
-        "ratios": [],
-        "warnings": [],
-    }
 
 
 def duration(seconds: float) -> str:

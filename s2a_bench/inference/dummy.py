@@ -12,18 +12,17 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from s2a_bench import extras
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference.dummy_vocab import Vocab, make_vocab
 from s2a_bench.inference.dummy_weights import Kind, Tensor
+from s2a_bench.inference.files_config import Quant, Size
 
 if TYPE_CHECKING:
     from gguf import GGUFWriter
 
-Size: TypeAlias = Literal["tiny", "full"]
-Quant: TypeAlias = Literal["f16", "q8_0", "q4_0"]
 Progress: TypeAlias = Callable[[int, int], None]
 """Called with (bytes written, bytes in all)."""
 

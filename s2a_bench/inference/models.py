@@ -11,8 +11,9 @@ from pathlib import Path
 
 from s2a_bench.errors import ModelError
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.dummy import Quant, Size, dummy_files, write_dummy
+from s2a_bench.inference.dummy import dummy_files, write_dummy
 from s2a_bench.inference.fetch_names import HUB_MODELS, fetched
+from s2a_bench.inference.files_config import Quant, Size
 from s2a_bench.inference.gguf_file import GgufHeader, read_header
 
 CACHE_VARIABLE = "S2A_BENCH_CACHE"

@@ -18,7 +18,8 @@ from typing import get_args
 from s2a_bench.errors import EngineError
 from s2a_bench.exits import how_it_ended
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.dummy import Quant, write_dummy
+from s2a_bench.inference.dummy import write_dummy
+from s2a_bench.inference.files_config import Quant
 
 CHILD = [sys.executable, "-m", "s2a_bench.inference.smoke"]
 """The process that may die; it gets a folder for the dummies."""

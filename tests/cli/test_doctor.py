@@ -10,8 +10,10 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from typer.testing import CliRunner
 
-from s2a_bench.cli import doctor
+from s2a_bench.cli import app
+from s2a_bench.cli.doctor import all_checks
 from s2a_bench.machine import doctor as bench
 from s2a_bench.machine.doctor import Finding, Level
 from s2a_bench.machine.resources.rows import RESOURCES
@@ -48,7 +50,7 @@ def s2a_bench(*arguments: str, code: int = 0, **environ: str) -> subprocess.Comp
 def test_every_line_is_one_check_with_its_level() -> None:
     *lines, counts = s2a_bench("doctor", ROS_DOMAIN_ID="7").stdout.splitlines()
     seen = [line.split()[1] for line in lines]
-    assert seen == [code for code in doctor.all_checks() if code in seen]
+    assert seen == [code for code in all_checks() if code in seen]
     assert {line.split()[0] for line in lines} <= {"state", "advice", "warning"}
     assert sum(int(part.split()[0]) for part in counts.split(",")) == len(lines)
     assert any("domain 7, loopback only" in line for line in lines)
@@ -78,14 +80,13 @@ def test_an_error_is_exit_code_one_with_the_way_out() -> None:
 @pytest.mark.parametrize(
     ("level", "plain", "strict"), [("state", 0, 0), ("advice", 0, 0), ("warning", 0, 1), ("error", 1, 1)]
 )
-def test_the_exit_code_is_the_severitys(
-    level: Level, plain: int, strict: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_exit_code_is_the_severitys(level: Level, plain: int, strict: int, monkeypatch: pytest.MonkeyPatch) -> None:
     found = [Finding("disk", "state", "room"), Finding("load", level, "busy", "wait")]
     monkeypatch.setattr(bench, "examine", lambda _machine, _checks: found)
-    assert doctor.doctor() == plain
-    assert doctor.doctor(strict=True) == strict
-    assert f"{level:8}load  busy -> wait" in capsys.readouterr().out.splitlines()
+    for flags, code in (([], plain), (["--strict"], strict)):
+        assert CliRunner().invoke(app, ["doctor", *flags]).exit_code == code
+    shown = CliRunner().invoke(app, ["doctor"]).stdout
+    assert f"{level:8}load  busy -> wait" in shown.splitlines()
 
 
 def run_folder(tmp_path: Path) -> Run:

@@ -33,7 +33,7 @@ def error_of(done: subprocess.CompletedProcess[str]) -> str:
         (["fetch", "gpt"], "model fetch: 'gpt' is neither minicpm-v-2.6 nor ORG/REPO:FILE"),
         (["fetch", "a/b:c.gguf", "--quant", "Q8_0"], "--quant Q8_0: goes with minicpm-v-2.6"),
         (["info"], "Missing argument 'FILE'"),
-        (["dummy", "--quant", "q2"], "'--quant'"),
+        (["dummy", "--quant", "q2"], "--quant: 'q2' should be 'f16'"),
     ],
 )
 def test_wrong_use_is_one_line_and_code_two(arguments: list[str], message: str) -> None:

@@ -4,7 +4,7 @@ import pytest
 from typer.testing import CliRunner
 
 from s2a_bench.cli.model import app
-from s2a_bench.errors import ModelError
+from s2a_bench.errors import ModelError, UsageError
 
 
 def test_it_prints_the_two_paths_and_writes_once_unless_forced(tmp_path: Path) -> None:
@@ -29,7 +29,8 @@ def test_the_default_folder_is_the_cache(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_an_unknown_size_is_wrong_usage() -> None:
-    assert CliRunner().invoke(app, ["dummy", "--size", "huge"]).exit_code == 2
+    result = CliRunner().invoke(app, ["dummy", "--size", "huge"])
+    assert isinstance(result.exception, UsageError)
 
 
 def test_a_folder_that_cannot_be_written_is_raised_as_a_typed_error(tmp_path: Path) -> None:

@@ -23,7 +23,8 @@ from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.tables import execution_table, timeline_csv
 from s2a_bench.report.page.chapters import MOST_CHAPTERS, read_chapters
-from s2a_bench.report.page.files import Outputs, make_report, write_report
+from s2a_bench.report.page.config import ReportConfig
+from s2a_bench.report.page.files import make_report, write_report
 from s2a_bench.report.page.lanes import panels_of, ticks_of
 from s2a_bench.report.page.plots import inline
 from s2a_bench.store.requests import SampleRow
@@ -90,7 +91,7 @@ def computed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def page_of(*paths: Path, against_paper: bool = False) -> str:
     output = paths[0].parent / "page.html"
     report = make_report(read_chapters(paths, against_paper=against_paper), against_paper=against_paper)
-    assert write_report(report, Outputs(output)) == [output]
+    assert write_report(report, ReportConfig(runs=paths, output=output)) == [output]
     return output.read_text()
 
 
@@ -349,26 +350,20 @@ def test_what_a_report_wrote_may_be_replaced_and_nothing_else(tmp_path: Path, co
     page, other = tmp_path / "page.html", tmp_path / "mine.html"
     report = make_report(read_chapters([computed], against_paper=False), against_paper=False)
     for _ in range(2):
-        Outputs(page, markdown=tmp_path / "page.md").check()
-        write_report(report, Outputs(page, markdown=tmp_path / "page.md"))
+        write_report(report, ReportConfig(runs=[computed], output=page, markdown=tmp_path / "page.md"))
     other.write_text("<html>mine</html>")
-    for outputs, flag in (
-        (Outputs(other), "--output"),
-        (Outputs(tmp_path), "--output"),
-        (Outputs(markdown=other), "--markdown"),
-        (Outputs(latex=other), "--latex"),
-        (Outputs(csv=other), "--csv"),
-    ):
-        with pytest.raises(UsageError, match=flag):
-            outputs.check()
+    wrong = {"output": other, "markdown": other, "latex": other, "csv": other}
+    for field, path in (*wrong.items(), ("output", tmp_path)):
+        with pytest.raises(UsageError, match=f"`{field}`"):
+            ReportConfig(runs=[computed], **{field: path})
     assert other.read_text() == "<html>mine</html>"
 
 
 def test_files_lie_in_a_folder_a_run(tmp_path: Path, computed: Path, make_run: MakeRun) -> None:
     runs = [computed, make_run(n=2).path]
     report = make_report(read_chapters(runs, against_paper=True), against_paper=True)
-    outputs = Outputs(latex=tmp_path / "tex", csv=tmp_path / "csv", markdown=tmp_path / "all.md")
-    written = {str(path.relative_to(tmp_path)) for path in write_report(report, outputs)}
+    config = ReportConfig(runs=runs, latex=tmp_path / "tex", csv=tmp_path / "csv", markdown=tmp_path / "all.md")
+    written = {str(path.relative_to(tmp_path)) for path in write_report(report, config)}
     one, other = (path.name for path in runs)
     assert {f"tex/{one}/timelines.tex", f"tex/{one}/timeline.pdf", f"tex/{other}/stages.tex"} <= written
     assert {"tex/report.tex", "tex/claims.tex", "csv/claims.csv", f"csv/{other}/ratios.csv", "all.md"} <= written
@@ -431,7 +426,7 @@ def test_the_latex_compiles(tmp_path: Path, computed: Path, make_run: MakeRun) -
             pytest.skip(f"TeX has no {package}")
     odd = shutil.copytree(computed, tmp_path / "50 % of_a #run {x}")
     report = make_report(read_chapters([odd, make_run(n=3).path], against_paper=True), against_paper=True)
-    write_report(report, Outputs(latex=tmp_path / "tex"))
+    write_report(report, ReportConfig(runs=[odd], latex=tmp_path / "tex"))
     texts = [to_siunitx(table, long=long) for table in tables_of(make_run) for long in (False, True)]
     (tmp_path / "tex" / "hard.tex").write_text(document(HOSTILE, texts))
     for name in ("report", "hard"):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from s2a_bench.errors import StoreError, UsageError
+from s2a_bench.errors import StoreError
 from s2a_bench.report.claims.verdicts import Judged, claim_table, judge_claims
 from s2a_bench.report.page.chapters import mixed_machines
 from s2a_bench.report.page.page import GENERATOR, render, tally
@@ -18,32 +18,12 @@ from s2a_bench.writers.tables import to_markdown
 
 if TYPE_CHECKING:
     from s2a_bench.report.page import Chapter
+    from s2a_bench.report.page.config import ReportConfig
     from s2a_bench.report.page.plots import Drawn
 
 _MARK = f"<!-- {GENERATOR} -->"
-_HEAD_CHARS = 4096
-"""Where a file says who made it."""
 _LONG_ROWS = 30
 """A page of a paper holds no more."""
-
-
-@dataclass(frozen=True, slots=True)
-class Outputs:
-    """Where everything goes; None: it is not wanted."""
-
-    page: Path | None = None
-    latex: Path | None = None
-    csv: Path | None = None
-    markdown: Path | None = None
-
-    def check(self) -> None:
-        """Refuse, before any work, to write over what no report wrote; raises UsageError naming the flag."""
-        for flag, path in (("--output", self.page), ("--markdown", self.markdown)):
-            if path is not None:
-                _check_file(flag, path)
-        for flag, path in (("--latex", self.latex), ("--csv", self.csv)):
-            if path is not None and path.exists() and not path.is_dir():
-                raise UsageError(f"{flag}: {path} is a file; name a folder")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,21 +41,21 @@ def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
     return Report(chapters, judged, mixed_machines(chapters))
 
 
-def write_report(report: Report, outputs: Outputs) -> list[Path]:
+def write_report(report: Report, config: ReportConfig) -> list[Path]:
     """Write what is wanted and return the files; figures are drawn once. Raises StoreError."""
     drawn = {}
-    if outputs.page or outputs.latex:
+    if config.page or config.latex:
         for chapter in report.chapters:
-            drawn[chapter.name] = draw(chapter.name, chapter.content.figures, pdf=outputs.latex is not None)
+            drawn[chapter.name] = draw(chapter.name, chapter.content.figures, pdf=config.latex is not None)
     texts: dict[Path, str | bytes] = {}
-    if outputs.page:
-        texts[outputs.page] = render(report.chapters, drawn, report.judged, report.caveats)
-    if outputs.latex:
-        texts |= {outputs.latex / name: text for name, text in _latex(report, drawn)}
-    if outputs.csv:
-        texts |= {outputs.csv / name: text for name, text in _csv(report)}
-    if outputs.markdown:
-        texts[outputs.markdown] = _markdown(report)
+    if config.page:
+        texts[config.page] = render(report.chapters, drawn, report.judged, report.caveats)
+    if config.latex:
+        texts |= {config.latex / name: text for name, text in _latex(report, drawn)}
+    if config.csv:
+        texts |= {config.csv / name: text for name, text in _csv(report)}
+    if config.markdown:
+        texts[config.markdown] = _markdown(report)
     for path, text in texts.items():
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,20 +63,6 @@ def write_report(report: Report, outputs: Outputs) -> list[Path]:
         except OSError as error:
             raise StoreError(f"cannot write {path}: {error.strerror}; name another place") from error
     return list(texts)
-
-
-def _check_file(flag: str, path: Path) -> None:
-    if path.is_dir():
-        raise UsageError(f"{flag}: {path} is a folder; name a file")
-    if not path.exists():
-        return
-    try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            ours = GENERATOR in file.read(_HEAD_CHARS)
-    except OSError as error:
-        raise UsageError(f"{flag}: cannot read {path}: {error.strerror}; name another file") from error
-    if not ours:
-        raise UsageError(f"{flag}: {path} is there, and s2a-bench report did not write it; name another file")
 
 
 def _latex(report: Report, drawn: dict[str, dict[str, Drawn]]) -> Iterator[tuple[str, str | bytes]]:

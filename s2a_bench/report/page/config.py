@@ -1,0 +1,56 @@
+"""Which runs a report is of, and what it writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from s2a_bench.errors import UsageError
+from s2a_bench.options import Options, option
+
+_HEAD_CHARS = 4096
+"""Where a file says who made it."""
+
+
+class ReportConfig(Options):
+    """Runs, and where everything about them goes; None: it is not wanted."""
+
+    runs: list[Path] = option(..., "run folders, or the folder of a sweep; several side by side", argument=True)
+    output: Path | None = option(None, "the page, one HTML file [default: report.html, if nothing else is asked for]")
+    latex: Path | None = option(None, "folder for LaTeX tables (booktabs, siunitx) and figures as PDF")
+    csv: Path | None = option(None, "folder for CSV tables with every digit")
+    markdown: Path | None = option(None, "all tables as one Markdown file")
+    against: str = option("", "paper: put the paper's claims beside ours, each with a verdict and its evidence")
+
+    @property
+    def page(self) -> Path | None:
+        """Return where the page goes."""
+        return self.output if self.output or self.latex or self.csv or self.markdown else Path("report.html")
+
+    def check(self) -> None:
+        """Refuse, before any work, to write over what no report wrote; raises UsageError naming the field."""
+        if self.against not in {"", "paper"}:
+            raise UsageError(
+                f"`against`: '{self.against}' should be paper; two runs are compared with s2a-bench compare"
+            )
+        for name, path in (("output", self.page), ("markdown", self.markdown)):
+            if path is not None:
+                _check_file(f"`{name}`", path)
+        for name, path in (("latex", self.latex), ("csv", self.csv)):
+            if path is not None and path.exists() and not path.is_dir():
+                raise UsageError(f"`{name}`: {path} is a file; name a folder")
+
+
+def _check_file(field: str, path: Path) -> None:
+    from s2a_bench.report.page.page import GENERATOR
+
+    if path.is_dir():
+        raise UsageError(f"{field}: {path} is a folder; name a file")
+    if not path.exists():
+        return
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            ours = GENERATOR in file.read(_HEAD_CHARS)
+    except OSError as error:
+        raise UsageError(f"{field}: cannot read {path}: {error.strerror}; name another file") from error
+    if not ours:
+        raise UsageError(f"{field}: {path} is there, and s2a-bench report did not write it; name another file")

@@ -1,0 +1,108 @@
+"""Sweeps as ``--json`` objects: what would run, and how it went."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from s2a_bench.store.manifest import plain
+from s2a_bench.store.schema import SCHEMA
+
+if TYPE_CHECKING:
+    from s2a_bench.store.sweep import Sweep
+    from s2a_bench.sweep import Cell
+    from s2a_bench.sweep.timing import Expected
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Setting:
+    cell: Annotated[str, {"pattern": "^[0-9]{4,}$"}]
+    repeat: Annotated[int, {"minimum": 1}]
+    virtual: Annotated[bool, {"description": "True where it is computed, not measured."}]
+    board: Annotated[str | None, {"description": "The machine that the cell asks for.", "minLength": 1}]
+    settings: Annotated[dict[str, Any], {"description": "By flag, without the dashes."}]
+    argv: Annotated[list[str], {"minItems": 1}]
+    config_hash: Annotated[str, {"pattern": "^[0-9a-f]{16}$"}]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannedCell(_Setting):
+    """One setting, one time, as a dry run lists it."""
+
+    state: Literal["planned"] = "planned"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweptCell(_Setting):
+    """One setting, one time; the latest attempt at it."""
+
+    attempt: Annotated[int, {"minimum": 1}]
+    state: Literal["finished", "failed"]
+    error: Annotated[str | None, {"minLength": 1}]
+    host: str
+    run: Annotated[
+        str | None, {"description": "The cell's run folder; null where it did not come to have one.", "minLength": 1}
+    ]
+    started: str
+    wall_s: Annotated[float, {"minimum": 0}]
+
+
+def plan_json(cells: Sequence[Cell], expected: Expected, environment: dict[str, Any]) -> dict[str, Any]:
+    """Return what would run as the ``--json`` object."""
+    time = {"source": expected.source}
+    planned = [
+        PlannedCell(
+            cell=cell.name,
+            repeat=cell.repeat,
+            virtual=cell.virtual,
+            board=cell.board or None,
+            settings=cell.settings,
+            argv=list(cell.argv),
+            config_hash=cell.config_hash,
+        )
+        for cell in cells
+    ]
+    return {
+        "schema": SCHEMA,
+        "command": "sweep",
+        "environment": environment,
+        "expected": time if expected.seconds is None else {"s": expected.seconds, **time},
+        "cells": plain(planned),
+        "ratios": [],
+        "warnings": [],
+    }
+
+
+def sweep_json(sweep: Sweep) -> dict[str, Any]:
+    """Return how a sweep went as the ``--json`` object."""
+    cells = [
+        SweptCell(
+            cell=row["cell"],
+            repeat=int(row["repeat"]),
+            attempt=int(row["attempt"]),
+            state=row["state"],
+            error=row["error"] or None,
+            virtual=bool(row["virtual"]),
+            board=row["board"] or None,
+            host=row["host"],
+            settings=json.loads(row["settings"]),
+            argv=json.loads(row["argv"]),
+            config_hash=row["config_hash"],
+            run=str(sweep.path / row["folder"]) if row["folder"] else None,
+            started=row["started"],
+            wall_s=float(row["wall_s"]),
+        )
+        for row in sweep.cells.to_dict("records")
+    ]
+    return {
+        "schema": SCHEMA,
+        "command": "sweep",
+        "run": str(sweep.path),
+        "state": sweep.manifest["state"],
+        "environment": sweep.manifest["environment"],
+        "cells": plain(cells),
+        "ratios": [],
+        "warnings": [],
+    }
