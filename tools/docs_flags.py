@@ -1,7 +1,8 @@
 """Write the flag tables of docs/*.md from the declarations: `.venv/bin/python tools/docs_flags.py`.
 
 A table stands between `<!-- flags: COMMAND -->` and `<!-- /flags -->`. `timeline Live` has only the flags of the class
-Live, which the configuration is derived from, `timeline -Live` all others.
+Live, which the configuration is derived from or has as a group, `timeline -Live` all others; `throughput -latency` has
+the flags that latency has not, or has otherwise.
 """
 
 from __future__ import annotations
@@ -15,26 +16,49 @@ from typer.main import get_command
 
 from s2a_bench.cli import app
 from s2a_bench.experiments import EXPERIMENTS
+from s2a_bench.options import Options, group_of
 
 DOCS = Path(__file__).parent.parent / "docs"
 TABLE = re.compile(r"(<!-- flags: (\S+)(?: (-?)(\w+))? -->\n).*?(<!-- /flags -->)", re.DOTALL)
 DEFAULT = re.compile(r" ?\[default: ([^\]]*)\]")
+COMMA = re.compile(r", *")
+PREFIX = re.compile(r"^--live: ")
+"""What the help of a group's flags begins with, and its table has above it."""
 
 
 def table(command: str, without: str = "", group: str = "") -> str:
     """Return the table of a command's flags."""
+    rows = flags(command)
+    chosen = [row for name, row in rows.items() if _belongs(command, name, row, group) is not bool(without)]
+    return "\n".join(["| flag | default | meaning |", "|---|---|---|", *chosen])
+
+
+def flags(command: str) -> dict[str, str]:
+    """Return the row of every flag and argument that is not hidden, by the parameter's name."""
     commands: Any = get_command(app)
-    config = resolve_name(EXPERIMENTS[command].config)
-    chosen = next((set(base.model_fields) for base in config.__mro__ if base.__name__ == group), set())
-    lines = ["| flag | default | meaning |", "|---|---|---|"]
+    rows = {}
     for parameter in commands.get_command(None, command).params:
-        if not group or (parameter.name.partition("__")[0] in chosen) is not bool(without):
-            about = (parameter.help or "").removeprefix(f"--{group.lower()}: ")
+        if not getattr(parameter, "hidden", False):
+            about = PREFIX.sub("", parameter.help or "")
             default = DEFAULT.search(about)
             given = default[1] if default else "" if parameter.default in (None, False) else str(parameter.default)
             meaning = DEFAULT.sub("", about).replace("|", "\\|")
-            lines.append(f"| `{parameter.opts[0]}` | {given.replace(',', ', ')} | {meaning} |")
-    return "\n".join(lines)
+            name = parameter.metavar if parameter.param_type_name == "argument" else parameter.opts[0]
+            rows[parameter.name] = f"| `{name}` | {COMMA.sub(', ', given)} | {meaning} |"
+    return rows
+
+
+def _belongs(command: str, name: str, row: str, group: str) -> bool:
+    """Whether a flag is of a group: a class of options, or another command."""
+    if not group:
+        return True
+    if group in EXPERIMENTS:
+        return row in flags(group).values()
+    config = resolve_name(EXPERIMENTS[command].config)
+    field = name.partition("__")[0]
+    bases = {base.__name__: base.model_fields for base in config.__mro__ if issubclass(base, Options)}
+    inner = field in config.model_fields and group_of(config.model_fields[field])
+    return field in bases.get(group, ()) or bool(inner and inner.__name__ == group)
 
 
 def written(text: str) -> str:

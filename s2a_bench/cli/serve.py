@@ -43,6 +43,7 @@ def _as_served(transport: Transport[Any]) -> type[Options]:
     for name, default in transport.serving.items():
         field = copy(transport.options.model_fields[name])
         field.default = default
+        field.description = (field.description or "").partition(" [default")[0]
         fields[name] = (field.annotation, field)
     made: type[Options] = create_model(transport.options.__name__, __base__=transport.options, **fields)
     return made

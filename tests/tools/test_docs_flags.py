@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 
 import pytest
@@ -30,3 +31,22 @@ def test_a_table_can_be_of_one_group_or_of_the_others() -> None:
     assert "| `--n-skills` | 8 | N, skills a plan; several with commas |" in others.splitlines()
     assert "`--warmup`" not in others
     assert "`--output`" in others
+
+
+def test_a_table_can_be_of_what_another_command_has_otherwise() -> None:
+    lines = docs_flags.table("throughput", "-", "latency").splitlines()
+    assert "| `--runs` | 10, quick: 3 | requests a cell |" in lines
+    assert not [line for line in lines if "`--prompt`" in line or "`--wire`" in line]
+
+
+def test_a_group_within_a_configuration_is_left_out_or_alone() -> None:
+    live, others = docs_flags.table("ccrb", "", "Asked"), docs_flags.table("ccrb", "-", "Asked")
+    assert "| `--pace` | the model's own | hold the answer back to so many tokens/s |" in live.splitlines()
+    assert "`--rear-gap`" in others
+    assert "`--rear-gap`" not in live
+
+
+def test_no_table_of_flags_is_by_hand() -> None:
+    for page in sorted((ROOT / "docs").glob("*.md")):
+        by_hand = docs_flags.TABLE.sub("", page.read_text(encoding="utf-8"))
+        assert not re.search(r"^\| (flag|option) +\|", by_hand, re.MULTILINE), page.name
