@@ -1,8 +1,8 @@
 """Write docs/schema/*.json from the classes that ``--json`` objects are made of.
 
 `.venv/bin/python tools/schema.py`. A dataclass becomes an object without further keys, its docstring the description;
-`Annotated[type, {...}]` adds bounds and descriptions. Of s2a-bench-1.json the frame, the metrics of timelines and the
-cells of the experiments that declare a class for them (`Experiment.cell`) are written; the rest stays as it stands.
+`Annotated[type, {...}]` adds bounds and descriptions; a field with a default may be absent. Of s2a-bench-1.json the
+cells (`Experiment.cell`), ratios, warnings and what else is a class are written; the frame stays as it stands.
 """
 
 from __future__ import annotations
@@ -12,16 +12,15 @@ import inspect
 import json
 import re
 import types
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from s2a_bench.experiments import EXPERIMENTS
-from s2a_bench.experiments.timeline.metrics import METRICS, TimelineMetric
+from s2a_bench.experiments.ccrb.view.cell import CcrbStudy
+from s2a_bench.experiments.throughput.view.cell import Reference
 from s2a_bench.report.compare.as_json import CompareJson
-from s2a_bench.stats import Summary
 from s2a_bench.store.manifest import RunWarning
-from s2a_bench.trace import GROUPS
+from s2a_bench.sweep.as_json import PlannedCell, SweptCell
 from s2a_bench.writers.as_json import RatioJson
 
 FOLDER = Path(__file__).parent.parent / "docs/schema"
@@ -45,7 +44,7 @@ class Parts:
         if hint in PLAIN:
             return {"type": PLAIN[hint]}
         if dataclasses.is_dataclass(hint):
-            name = re.sub(r"(?<!^)(?=[A-Z])", "_", hint.__name__).lower()  # type: ignore[union-attr]
+            name = _name(hint)
             self.defs.setdefault(name, self.object(hint))
             return {"$ref": f"#/$defs/{name}"}
         if origin is Literal:
@@ -70,8 +69,24 @@ class Parts:
             "type": "object",
             "required": [field.name for field in fields if field.default is dataclasses.MISSING],
             "additionalProperties": False,
-            "properties": {field.name: self.of(hints[field.name]) for field in fields},
+            "properties": {field.name: _there(self.of(hints[field.name]), field) for field in fields},
         }
+
+
+def _name(cls: Any) -> str:
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+
+
+def _there(schema: dict[str, Any], field: dataclasses.Field[Any]) -> dict[str, Any]:
+    """Return the schema of a field where it is there: without null, if that says that it is absent."""
+    if field.default is not None:
+        return schema
+    if isinstance(schema.get("type"), list):
+        return schema | {"type": next(kind for kind in schema["type"] if kind != "null")}
+    if "oneOf" not in schema:
+        return schema
+    (inner,) = [each for each in schema["oneOf"] if each != {"type": "null"}]
+    return {name: value for name, value in schema.items() if name != "oneOf"} | inner
 
 
 def compare_schema() -> dict[str, Any]:
@@ -85,31 +100,13 @@ def compare_schema() -> dict[str, Any]:
 def frame_schema() -> dict[str, Any]:
     """Return the schema of what the measuring commands print, with what is declared in the place of what was there."""
     whole: dict[str, Any] = json.loads((FOLDER / "s2a-bench-1.json").read_text(encoding="utf-8"))
+    cells = [cell for name in EXPERIMENTS.built_in() if (cell := EXPERIMENTS[name].cell_class())]
+    named = {"ratio": RatioJson, "warning": RunWarning} | {_name(each): each for each in (*cells, Reference, CcrbStudy)}
     parts = Parts()
-    whole["$defs"] |= {
-        "summary": parts.object(Summary),
-        "ratio": parts.object(RatioJson),
-        "warning": parts.object(RunWarning),
-    }
-    whole["$defs"]["latency_cell"]["properties"]["groups_ms"]["propertyNames"]["enum"] = list(GROUPS)
-    whole["$defs"]["timeline_cell"] = with_metrics(whole["$defs"]["timeline_cell"], METRICS)
-    for name in EXPERIMENTS.built_in():
-        if cell := EXPERIMENTS[name].cell_class():
-            whole["$defs"][f"{name}_cell"] = parts.object(cell)
-    whole["$defs"] |= {name: part for name, part in parts.defs.items() if name not in whole["$defs"]}
-    return whole
-
-
-def with_metrics(cell: dict[str, Any], metrics: Mapping[str, TimelineMetric]) -> dict[str, Any]:
-    """Return a cell with its metrics as their table has them; its other keys stay.
-
-    A metric that goes leaves its entry, to be taken out by hand.
-    """
-    about = {name: entry for name, entry in cell["properties"].items() if name not in metrics}
-    needed = [name for name in cell["required"] if name not in metrics]
-    needed += [name for name, metric in metrics.items() if not metric.optional]
-    properties = about | {name: metric.schema for name, metric in metrics.items()}
-    return {**cell, "required": needed, "properties": properties}
+    made = {name: parts.object(each) for name, each in named.items()}
+    made["sweep_cell"] = parts.of(PlannedCell | SweptCell)
+    kept = {name: whole["$defs"][name] for name in ("level", "check")}
+    return whole | {"$defs": kept | made | parts.defs}
 
 
 def _head(name: str, title: str) -> dict[str, Any]:

@@ -31,7 +31,7 @@ class _Setting:
 class PlannedCell(_Setting):
     """One setting, one time, as a dry run lists it."""
 
-    state: Literal["planned"] = "planned"
+    state: Literal["planned"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +56,7 @@ def plan_json(cells: Sequence[Cell], expected: Expected, environment: dict[str, 
         PlannedCell(
             cell=cell.name,
             repeat=cell.repeat,
+            state="planned",
             virtual=cell.virtual,
             board=cell.board or None,
             settings=cell.settings,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, make_dataclass
+from types import NoneType
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
 from s2a_bench.stats import Ratio, summary_of
 from s2a_bench.store.manifest import plain
@@ -41,6 +42,36 @@ def frame(run: Run, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], *
         **more,
         "warnings": run.manifest.get("warnings", []),
     }
+
+
+def present(cell: Any) -> dict[str, Any]:
+    """Return a declared cell as plain data; a field whose default is None is an absent key where it has no value."""
+    optional = {each.name for each in fields(cell) if each.default is None}
+    return {name: value for name, value in plain(cell).items() if value is not None or name not in optional}
+
+
+def cell_of_row(
+    name: str,
+    about: str,
+    row: type,
+    *,
+    without: Sequence[str],
+    own: Mapping[str, Any],
+) -> type:
+    """Return the class of a cell with the fields of a row, ``without`` some, and some of its ``own``.
+
+    What a row may lack is an absent key.
+    """
+    hints = {key: hint for key, hint in get_type_hints(row, include_extras=True).items() if key not in without}
+    made: list[Any] = [
+        (key, hint, field(default=None)) if _may_lack(hint) else (key, hint) for key, hint in hints.items()
+    ]
+    return make_dataclass(name, [*made, *own.items()], namespace={"__doc__": about}, frozen=True, kw_only=True)
+
+
+def _may_lack(hint: Any) -> bool:
+    """Whether a type allows None."""
+    return NoneType in get_args(get_args(hint)[0] if get_origin(hint) is Annotated else hint)
 
 
 def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
+from s2a_bench.plan.skillset import GAPS
+from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
+from s2a_bench.store.bounds import Count, Facts, Many, NonNegative, Positive, about
 from s2a_bench.store.schema import Table
+
+Impact = Annotated[float, Facts(minimum=LEAST_IMPACT_MPS)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,47 +25,50 @@ class RolloutRow:
     took what it took.
     """
 
-    cell: str
+    cell: Annotated[str, {"minLength": 1}]
     study: str
     draw: int
-    policy: str
+    policy: Annotated[str, {"minLength": 1}]
     board: str
     title: str
-    emulated: bool
-    simulator: str
-    follower: str
-    gap_behaviour: str
+    emulated: Annotated[bool, about("True where no model answered.")]
+    simulator: Annotated[str, {"enum": ["longitudinal", "embedded", "carla"]}]
+    follower: Annotated[str, {"enum": ["careful", "idm"]}]
+    gap_behaviour: Annotated[str, {"enum": list(GAPS)}]
     reflex: bool
     lane_change: bool
     tokens_per_s: float
-    prompt_s: float | None
-    tokens_per_skill: int
-    n_skills: int
-    t_nom_s: float
-    speed_mps: float
-    plan_decel_mps2: float
-    front_gap_m: float
-    lead_decel_mps2: float
-    rear_gap_m: float
-    reaction_s: float
+    prompt_s: Annotated[NonNegative | None, about("c; absent with --live: a model took what it took.")]
+    tokens_per_skill: Many
+    n_skills: Annotated[Many, about("A lane change included.")]
+    t_nom_s: NonNegative
+    speed_mps: Annotated[Positive, about("v0.")]
+    plan_decel_mps2: NonNegative
+    front_gap_m: NonNegative
+    lead_decel_mps2: NonNegative
+    rear_gap_m: NonNegative
+    reaction_s: NonNegative
     start_ns: int
     end_ns: int
-    stalls: int
+    stalls: Count
     stall_ns: int
     deadline_ns: int
-    late: bool | None
-    outcome: str
-    impact_speed_mps: float | None
-    front_impact_mps: float | None
-    rear_impact_mps: float | None
-    min_front_gap_m: float
-    min_rear_gap_m: float | None
-    min_front_ttc_s: float | None
-    min_rear_ttc_s: float | None
-    required_decel_mps2: float | None
-    rms_jerk: float | None = None
-    peak_jerk: float | None = None
-    sparc: float | None = None
+    late: Annotated[bool | None, about("s2a-ttc only: no stall-free start keeps the deadline.")]
+    outcome: Annotated[str, {"enum": ["none", "front", "rear", "both"]}]
+    impact_speed_mps: Annotated[Impact | None, about("Of the harder impact; absent without one.")]
+    front_impact_mps: Impact | None
+    rear_impact_mps: Impact | None
+    min_front_gap_m: NonNegative
+    min_rear_gap_m: NonNegative | None
+    min_front_ttc_s: Annotated[NonNegative | None, about("Absent where the cars never closed in.")]
+    min_rear_ttc_s: NonNegative | None
+    required_decel_mps2: Annotated[
+        NonNegative | None,
+        about("Greatest closing speed^2 / (2 gap) towards the lead; absent with a front impact."),
+    ]
+    rms_jerk: NonNegative | None = None
+    peak_jerk: NonNegative | None = None
+    sparc: Annotated[float | None, {"maximum": 0}] = None
 
 
 @dataclass(frozen=True, slots=True)

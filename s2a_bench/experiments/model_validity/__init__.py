@@ -8,5 +8,6 @@ EXPERIMENT = Experiment(
     config="s2a_bench.experiments.model_validity.config:ValidityConfig",
     run="s2a_bench.experiments.model_validity.run:run_validity",
     view="s2a_bench.experiments.model_validity.view:show",
+    cell="s2a_bench.experiments.model_validity.cell:ValidityCell",
     unit="answers",
 )

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments import Shown
+from s2a_bench.experiments.model_validity.cell import Tokens, ValidityCell
 from s2a_bench.experiments.model_validity.rows import VALIDITY
 from s2a_bench.policy.conformal import upper_bound
-from s2a_bench.writers.as_json import frame
+from s2a_bench.writers.as_json import frame, present
 from s2a_bench.writers.tables import ABSENT, DUMMY, Note, TextTable
 
 if TYPE_CHECKING:
@@ -122,28 +123,29 @@ def _arm(about: dict[str, Any], grammar: bool, rows: pd.DataFrame) -> Arm:
 
 def _cell(run: Run, arm: Arm) -> dict[str, Any]:
     """Return one cell; a share of nothing is an absent key."""
-    asked = run.manifest["configuration"]
-    found: dict[str, Any] = {
-        "format": arm.about["name"],
-        "wording": arm.about["wording"],
-        "example": arm.about["example"],
-        "tokens_per_skill": arm.about["tokens_per_skill"],
-        "skill_set": arm.about["skill_set"],
-        "n_skills": asked["n_skills"],
-        "grammar": arm.grammar,
-        "emulated": False,
-        "dummy": bool(run.manifest["model"]["dummy"]),
-        "answers": arm.answers,
-        "cut": arm.cut,
-        "lines": arm.valid.of,
-        "skills": arm.valid.count,
-        "as_ordered": arm.as_ordered.count,
-        "problems": arm.problems,
-    }
-    for name, share in (("share", arm.valid), ("as_ordered_share", arm.as_ordered)):
-        if share.interval is not None:
-            found |= {name: share.value, f"{name}_ci95": list(share.interval)}
-    return found
+    about = arm.about
+    cell = ValidityCell(
+        format=about["name"],
+        wording=about["wording"],
+        example=about["example"],
+        tokens_per_skill=Tokens(**about["tokens_per_skill"]),
+        skill_set=about["skill_set"],
+        n_skills=run.manifest["configuration"]["n_skills"],
+        grammar=arm.grammar,
+        emulated=False,
+        dummy=bool(run.manifest["model"]["dummy"]),
+        answers=arm.answers,
+        cut=arm.cut,
+        lines=arm.valid.of,
+        skills=arm.valid.count,
+        problems=arm.problems,
+        share=arm.valid.value,
+        share_ci95=arm.valid.interval,
+        as_ordered=arm.as_ordered.count,
+        as_ordered_share=arm.as_ordered.count / arm.answers,
+        as_ordered_share_ci95=arm.as_ordered.interval,
+    )
+    return present(cell)
 
 
 def _names(arm: Arm) -> tuple[str, str]:

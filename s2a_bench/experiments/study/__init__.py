@@ -8,6 +8,7 @@ EXPERIMENT = Experiment(
     config="s2a_bench.experiments.study.config:StudyConfig",
     run="s2a_bench.experiments.study.run:run_study",
     view="s2a_bench.experiments.study.view:show",
+    cell="s2a_bench.experiments.study.view:StudyCell",
     unit="cells",
     commands="study-*",
 )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
+from s2a_bench.store.bounds import Count, Fraction, Many, NonNegative, Positive, about
 from s2a_bench.store.schema import Table
 
 
@@ -18,30 +19,32 @@ class StudyRow:
     95 % Clopper-Pearson interval. Nothing in a study is measured: the plans are drawn.
     """
 
-    study: str
+    study: Annotated[str, {"enum": ["targets", "frontier", "drift", "misfit"]}]
     policy: str
-    tokens_per_s: float
-    prompt_s: float
-    tokens_per_skill: int
-    n_skills: int
-    t_nom_s: float
-    rho: float
-    family: str
-    condition: str
-    block: int
-    caution: float | None
-    calibration_plans: int
-    plans: int
-    stalled: int
-    p_any_stall: float
-    p_any_stall_high: float
-    start_s: float
-    end_s: float
-    start_regret: float
+    tokens_per_s: Positive
+    prompt_s: Annotated[NonNegative, about("c: from the request to the start of decoding.")]
+    tokens_per_skill: Annotated[Many, about("L, the delimiter included.")]
+    n_skills: Many
+    t_nom_s: Positive
+    rho: Annotated[Positive, about("L / R / T_nom.")]
+    family: Annotated[str, about("Distribution of the gaps.")]
+    condition: Annotated[str, about("What else was varied; calibrated: lambda as calibration chose it.")]
+    block: Annotated[Count, about("Which stretch of a sequence of plans.")]
+    caution: Annotated[
+        NonNegative | None, about("lambda; absent where whole plans are waited for, or the policy knows none.")
+    ]
+    calibration_plans: Count
+    plans: Many
+    stalled: Count
+    p_any_stall: Fraction
+    p_any_stall_high: Annotated[Fraction, about("Upper end of the two-sided 95 % Clopper-Pearson interval.")]
+    start_s: NonNegative
+    end_s: NonNegative
+    start_regret: Annotated[NonNegative, about("Mean of max(0, s_1 - S0) / S0.")]
     signed_start_regret: float
-    start_regret_of_wait: float
-    end_regret: float
-    end_regret_of_wait: float
+    start_regret_of_wait: Annotated[NonNegative | None, about("Over t_N - S0; absent where t_N = S0 in every plan.")]
+    end_regret: Annotated[float, about("Mean of (e_N - E) / E with E = S0 + P_N.")]
+    end_regret_of_wait: float | None
 
 
 STUDY_CELLS: Final[Table[StudyRow]] = Table("studies", StudyRow)

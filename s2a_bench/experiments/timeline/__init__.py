@@ -8,6 +8,7 @@ EXPERIMENT = Experiment(
     config="s2a_bench.experiments.timeline.config:TimelineConfig",
     run="s2a_bench.experiments.timeline.run:run_timeline",
     view="s2a_bench.experiments.timeline.view:show",
+    cell="s2a_bench.experiments.timeline.view.cell:TimelineCell",
     view_options="s2a_bench.experiments.timeline.view:Asked",
     compared="s2a_bench.experiments.timeline.view.compared:COMPARED",
     unit="timelines",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.ccrb.metrics import MARGINS, OUTCOMES
+from s2a_bench.experiments.ccrb.view.cell import ORDERINGS
 from s2a_bench.experiments.ccrb.view.outcomes import (
     Share,
     cells_of,
@@ -26,16 +27,6 @@ from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, number
 if TYPE_CHECKING:
     from s2a_bench.experiments import Metric
     from s2a_bench.store.run import Run
-
-ORDERINGS = {
-    "paper": "the paper's ordering",
-    "wait_worse": "wait worse than stream",
-    "wait_better": "wait better",
-    "naive_worse": "naive worse than stream",
-    "naive_better": "naive better",
-    "naive_rear_worse": "naive worse behind",
-    "naive_rear_better": "naive better behind",
-}
 
 
 def outcome_table(run: Run) -> TextTable:

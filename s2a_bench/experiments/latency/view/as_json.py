@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from s2a_bench.experiments.latency.view.cell import LatencyCell
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, groups_present, ratios, stages_present
-from s2a_bench.writers.as_json import frame, ratio_entry, summaries
+from s2a_bench.writers.as_json import frame, present, ratio_entry, summaries
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
@@ -17,7 +18,7 @@ def latency_json(run: Run) -> dict[str, Any]:
     found = ratios(cells, run.bootstrap_seed)
     return frame(
         run,
-        [{**about_cell(cell, run), **_cell(cell)} for cell in cells],
+        [_cell(cell, run) for cell in cells],
         [ratio_entry(f"{metric}_ms", cell.name, base.name, ratio) for metric, cell, base, ratio in found],
     )
 
@@ -30,27 +31,28 @@ def about_cell(cell: Cell, run: Run) -> dict[str, Any]:
         **cell.about,
         "profile": model.get("profile"),
         "emulated": cell.emulated,
-        **({"dummy": model["dummy"]} if "dummy" in model else {}),
+        "dummy": model.get("dummy"),
         "n": cell.n,
         "errors": cell.errors,
         "warmups": cell.warmups,
     }
 
 
-def _cell(cell: Cell) -> dict[str, Any]:
+def _cell(cell: Cell, run: Run) -> dict[str, Any]:
     """Return one cell's numbers; a metric that no sample has is an absent key."""
-    alone = [cell]
-    whole: dict[str, Any] = {
-        "residual_flagged": cell.flagged(),
-        "stages_ms": summaries((stage, cell.values_ms(stage)) for stage in stages_present(alone)),
-        "groups_ms": summaries((group, cell.group_ms(group)) for group in groups_present(alone)),
-    }
     metrics = ("e2e", "e2e_without_inference", "ttft", "frame_age")
-    whole |= summaries((f"{metric}_ms", cell.values_ms(metric)) for metric in metrics)
-    return whole | summaries(
-        [
-            ("itl_ms", cell.itl_ms()),
-            ("token_delay_ms", cell.token_delay_ms()),
-            ("residual_share", cell.residual_shares()),
-        ]
+    numbers = [
+        *((f"{metric}_ms", cell.values_ms(metric)) for metric in metrics),
+        ("itl_ms", cell.itl_ms()),
+        ("token_delay_ms", cell.token_delay_ms()),
+        ("residual_share", cell.residual_shares()),
+    ]
+    return present(
+        LatencyCell(
+            **about_cell(cell, run),
+            residual_flagged=cell.flagged(),
+            stages_ms=summaries((stage, cell.values_ms(stage)) for stage in stages_present([cell])),
+            groups_ms=summaries((group, cell.group_ms(group)) for group in groups_present([cell])),
+            **summaries(numbers),
+        )
     )

@@ -6,17 +6,30 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from functools import partial
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from s2a_bench.experiments import Shown
-from s2a_bench.experiments.study.rows import STUDY_CELLS
+from s2a_bench.experiments.study.rows import STUDY_CELLS, StudyRow
 from s2a_bench.experiments.study.view.tables import study_of, study_tables
 from s2a_bench.experiments.study.view.targets import ONLINE, Target
-from s2a_bench.writers.as_json import frame
+from s2a_bench.store.bounds import Positive, about
+from s2a_bench.writers.as_json import cell_of_row, frame
 from s2a_bench.writers.csv_text import frame_csv
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
+
+
+StudyCell = cell_of_row(
+    "StudyCell",
+    "Plans drawn from one world, decided by one policy.",
+    StudyRow,
+    without=("tokens_per_s",),
+    own={
+        "rate_tokens_per_s": Positive,
+        "emulated": Annotated[Literal[True], about("Plans are drawn from models of the arrivals.")],
+    },
+)
 
 
 def show(run: Run, **_: Any) -> Shown:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from s2a_bench.experiments.latency.view.as_json import about_cell
+from s2a_bench.experiments.throughput.view.cell import Position, Reference, ThroughputCell
 from s2a_bench.experiments.throughput.view.cells import (
     LLAMA_BENCH,
     METRICS,
@@ -17,7 +18,7 @@ from s2a_bench.experiments.throughput.view.cells import (
     reference_values,
     speeds_of,
 )
-from s2a_bench.writers.as_json import frame, ratio_entry, summaries
+from s2a_bench.writers.as_json import frame, present, ratio_entry, summaries
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
@@ -28,24 +29,32 @@ def throughput_json(run: Run) -> dict[str, Any]:
     speeds = speeds_of(run)
     ratios = [ratio_entry(RATIO_METRIC, of, to, ratio) for of, to, ratio in ratios_of(run, speeds)]
     more = {"reference": _reference(run)} if reference_values(run) else {}
-    return frame(run, [{**about_cell(speed.cell, run), **_numbers(speed)} for speed in speeds], ratios, **more)
+    return frame(run, [_cell(speed, run) for speed in speeds], ratios, **more)
 
 
-def _numbers(speed: Speed) -> dict[str, Any]:
+def _cell(speed: Speed, run: Run) -> dict[str, Any]:
     """Return one cell's numbers; a metric that no request has is an absent key."""
-    positions = [
-        {"first": first, "last": last, **summaries([(RATIO_METRIC, rates)])}
-        for (first, last), rates in speed.by_position().items()
-    ]
     metrics = [*((metric, speed.values(metric)) for metric in METRICS), ("itl_ms", speed.cell.itl_ms())]
-    return {"t_eval": "engine" if speed.told else "client", **summaries(metrics), "positions": positions}
+    return present(
+        ThroughputCell(
+            **about_cell(speed.cell, run),
+            t_eval="engine" if speed.told else "client",
+            **summaries(metrics),
+            positions=[
+                Position(first, last, **summaries([(RATIO_METRIC, rates)]))
+                for (first, last), rates in speed.by_position().items()
+            ],
+        )
+    )
 
 
 def _reference(run: Run) -> dict[str, Any]:
     """Return what llama-bench said, beside the command that was run."""
-    return {
-        "program": LLAMA_BENCH,
-        "command": run.manifest.get("reference", {}).get("command", []),
-        "depths": reference_depths(run),
-        **summaries([(RATIO_METRIC, np.asarray(reference_values(run)))]),
-    }
+    return present(
+        Reference(
+            LLAMA_BENCH,
+            run.manifest.get("reference", {}).get("command", []),
+            reference_depths(run),
+            **summaries([(RATIO_METRIC, np.asarray(reference_values(run)))]),
+        )
+    )

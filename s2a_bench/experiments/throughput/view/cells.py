@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of
 from s2a_bench.experiments.throughput.rows import REFERENCE
@@ -41,7 +41,7 @@ METRICS = (
 RATIO_METRIC = "decode_tokens_per_s"
 """What cells and the reference are compared by."""
 
-LLAMA_BENCH = "llama-bench"
+LLAMA_BENCH: Final = "llama-bench"
 """How the reference is called where cells are listed."""
 
 _SAMPLE = ("request_id", "block", "ttft_ns", "facts")
