@@ -15,9 +15,8 @@ from s2a_bench.boards.gaps import Bursty, Gaps, Lognormal, Markov, Recorded
 from s2a_bench.experiments.study.config import Cell, StudyConfig
 from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.to_rows import study_row
-from s2a_bench.experiments.study.worlds import TOKEN_CV, World, generator
-from s2a_bench.policy.conformal import GRID, calibrate
-from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.experiments.study.worlds import TOKEN_CV, World, calibrated
+from s2a_bench.policy.conformal import GRID
 from s2a_bench.policy.stream_to_act import QuantileStart, StreamToAct
 
 PLANS: Final = 4000
@@ -54,16 +53,11 @@ def cells(config: StudyConfig) -> Sequence[Cell]:
 
 def cell(config: StudyConfig, world: World) -> list[StudyRow]:
     """Try every lambda on the same plans, for the elastic rule and the one that never stretches."""
-    rng = generator(config.seed, config.name, world)
-    calibration = world.draw(rng, config.calibration_plans)
-    assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
-    prior = GapPrior.fit(calibration.token_s)
-    plans = world.draw(rng, config.plans or PLANS)
+    policy, plans = calibrated(config, world, PLANS)
     cautions = (*GRID, math.inf)
     found = [
-        study_row(config.name, world, kind(prior, caution), plans, calibration_plans=config.calibration_plans)
+        study_row(config.name, world, kind(policy.prior, caution), plans, calibration_plans=config.calibration_plans)
         for kind in (StreamToAct, QuantileStart)
         for caution in cautions
     ]
-    chosen = cautions.index(calibrate(StreamToAct(prior), calibration, config.epsilon).caution)
-    return [*found, replace(found[chosen], condition=CALIBRATED)]
+    return [*found, replace(found[cautions.index(policy.caution)], condition=CALIBRATED)]

@@ -13,10 +13,7 @@ from typing import Final
 from s2a_bench.experiments.study.config import Cell, StudyConfig
 from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.to_rows import study_row
-from s2a_bench.experiments.study.worlds import World, generator
-from s2a_bench.policy.conformal import calibrate
-from s2a_bench.policy.estimator import GapPrior
-from s2a_bench.policy.stream_to_act import StreamToAct
+from s2a_bench.experiments.study.worlds import World, calibrated
 
 PLANS: Final = 4000
 SKILLS: Final = (-4, -2, -1, 0, 1, 2, 4)
@@ -36,12 +33,7 @@ def cells(config: StudyConfig) -> Sequence[Cell]:
 
 def cell(config: StudyConfig, world: World) -> list[StudyRow]:
     """Try each wrong belief on the same plans."""
-    rng = generator(config.seed, config.name, world)
-    calibration = world.draw(rng, config.calibration_plans)
-    assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
-    policy = StreamToAct(GapPrior.fit(calibration.token_s))
-    policy = replace(policy, caution=calibrate(policy, calibration, config.epsilon).caution)
-    plans = world.draw(rng, config.plans or PLANS)
+    policy, plans = calibrated(config, world, PLANS)
     shape, prior = world.shape, policy.prior
     tried = [
         *((f"N {more:+d}", policy, replace(shape, n_skills=shape.n_skills + more)) for more in SKILLS),

@@ -8,7 +8,6 @@ of the result, and whether it was reached, is `view.targets`' to say.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import Final
@@ -16,10 +15,8 @@ from typing import Final
 from s2a_bench.experiments.study.config import Cell, StudyConfig
 from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.to_rows import study_row
-from s2a_bench.experiments.study.worlds import World, generator
-from s2a_bench.policy.conformal import calibrate
-from s2a_bench.policy.estimator import GapPrior
-from s2a_bench.policy.stream_to_act import MeanStart, QuantileStart, StreamToAct
+from s2a_bench.experiments.study.worlds import World, calibrated
+from s2a_bench.policy.stream_to_act import MeanStart, QuantileStart
 from s2a_bench.policy.wait_then_act import WaitThenAct
 
 PLANS: Final = 5000
@@ -40,11 +37,6 @@ def cells(config: StudyConfig) -> Sequence[Cell]:
 
 def setting(config: StudyConfig, world: World) -> list[StudyRow]:
     """Calibrate in one setting and judge stream-to-act there, beside the simpler rules."""
-    rng = generator(config.seed, config.name, world)
-    calibration = world.draw(rng, config.calibration_plans)
-    assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
-    policy = StreamToAct(GapPrior.fit(calibration.token_s))
-    policy = replace(policy, caution=calibrate(policy, calibration, config.epsilon).caution)
-    plans = world.draw(rng, config.plans or PLANS)
+    policy, plans = calibrated(config, world, PLANS)
     policies = (policy, QuantileStart(policy.prior), MeanStart(policy.prior), WaitThenAct())
     return [study_row(config.name, world, each, plans, calibration_plans=config.calibration_plans) for each in policies]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,10 +12,14 @@ import numpy as np
 from s2a_bench.boards.gaps import Gaps, Lognormal
 from s2a_bench.policy import Plans, PlanShape, Timing
 from s2a_bench.policy.arrivals import fragments
+from s2a_bench.policy.conformal import calibrate
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy.stream_to_act import StreamToAct
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from s2a_bench.experiments.study.config import StudyConfig
     from s2a_bench.policy import Floats
 
 LEAST, MOST = 0.8, 1.5
@@ -88,6 +92,19 @@ def recorded_plans(recordings: Sequence[ArrayLike], shape: PlanShape, rng: np.ra
     count = shape.n_skills * int(shape.tokens_per_skill)
     long_enough = [np.asarray(token_s, dtype=np.float64)[:count] for token_s in recordings if np.size(token_s) >= count]
     return with_skills(np.stack(long_enough, axis=1) if long_enough else np.empty((count, 0)), shape, rng)
+
+
+def calibrated(config: StudyConfig, world: World, plans: int) -> tuple[StreamToAct, Plans]:
+    """Return stream-to-act with prior and lambda from calibration plans of a world, and other plans, as many as asked.
+
+    ``plans`` is the study's own number, where none was asked for.
+    """
+    rng = generator(config.seed, config.name, world)
+    calibration = world.draw(rng, config.calibration_plans)
+    assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
+    policy = StreamToAct(GapPrior.fit(calibration.token_s))
+    policy = replace(policy, caution=calibrate(policy, calibration, config.epsilon).caution)
+    return policy, world.draw(rng, config.plans or plans)
 
 
 def generator(seed: int, *key: object) -> np.random.Generator:
