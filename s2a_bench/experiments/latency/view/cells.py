@@ -97,16 +97,25 @@ class Cell:
         """Count the samples whose residual is too large a share."""
         return int((self.residual_shares() > RESIDUAL_LIMIT).sum())
 
+    @property
+    def answers(self) -> pd.DataFrame:
+        """Return the tokens of the samples that count, request by request in order, with two times of each in ns.
+
+        ``gap_ns`` since the token before, as the client saw both, none of the first; ``delay_ns`` since it left the
+        engine.
+        """
+        tokens = self.tokens[self.tokens["request_id"].isin(self.good["request_id"])]
+        tokens = tokens.sort_values(["request_id", "index"])
+        gap_ns = tokens.groupby("request_id")["client_ns"].diff()
+        return tokens.assign(gap_ns=gap_ns, delay_ns=tokens["client_ns"] - tokens["engine_ns"])
+
     def itl_ms(self) -> Floats:
         """Return the times between a token and the next as the client saw them, of all requests, in ms."""
-        tokens = self.tokens[self.tokens["request_id"].isin(self.good["request_id"])]
-        ordered = tokens.sort_values(["request_id", "index"])
-        return _numbers(ordered.groupby("request_id")["client_ns"].diff()) / _NS_PER_MS
+        return numbers_ms(self.answers["gap_ns"])
 
     def token_delay_ms(self) -> Floats:
         """Return the times from a token's leaving the engine to the client's seeing it, of all requests, in ms."""
-        tokens = self.tokens[self.tokens["request_id"].isin(self.good["request_id"])]
-        return numbers_ms(tokens["client_ns"] - tokens["engine_ns"])
+        return numbers_ms(self.answers["delay_ns"])
 
     def by_block(self, metric: str) -> dict[int, list[float]]:
         """Return the values of a metric in ms by the block in which they were taken."""

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from s2a_bench.experiments import Compared, Metric, Subject, by_name
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note, numbers_ms
 from s2a_bench.trace import GROUPS
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from s2a_bench.experiments import Rows
     from s2a_bench.experiments.latency.view.cells import Floats
     from s2a_bench.store.run import Run
@@ -36,7 +34,7 @@ def origin_of(run: Run) -> list[str]:
 
 def token_rows(cell: Cell, name: str) -> Rows | None:
     """Return the rows of one of `TOKEN_METRICS`, else None."""
-    return _TOKEN_ROWS[name](cell) if name in _TOKEN_ROWS else None
+    return _per_request(cell, _TOKEN_COLUMNS[name]) if name in _TOKEN_COLUMNS else None
 
 
 def singles(values: Floats) -> Rows:
@@ -57,20 +55,14 @@ def _rows(cell: Cell, name: str) -> Rows:
     return singles(cell.values_ms(name))
 
 
-def _per_request(cell: Cell, values: Callable[[pd.DataFrame], pd.Series[float]]) -> Rows:
-    """Return what is derived from each request's tokens, a row a request that has any."""
-    tokens = cell.tokens[cell.tokens["request_id"].isin(cell.good["request_id"])].sort_values(["request_id", "index"])
-    found: dict[str, Floats] = {
-        str(request): np.asarray(values(mine).dropna(), dtype=np.float64) / 1e6
-        for request, mine in tokens.groupby("request_id", sort=False)
-    }
+def _per_request(cell: Cell, column: str) -> Rows:
+    """Return a time of each request's tokens in ms, a row a request that has any."""
+    tokens = cell.answers.groupby("request_id", sort=False)[column]
+    found = {str(request): numbers_ms(values) for request, values in tokens}
     return [found[request] for request in cell.good["request_id"] if found.get(request, _NOTHING).size]
 
 
-_TOKEN_ROWS: Final[Mapping[str, Callable[[Cell], Rows]]] = {
-    "itl": lambda cell: _per_request(cell, lambda tokens: tokens["client_ns"].diff()),
-    "token_delay": lambda cell: _per_request(cell, lambda tokens: tokens["client_ns"] - tokens["engine_ns"]),
-}
+_TOKEN_COLUMNS: Final = {"itl": "gap_ns", "token_delay": "delay_ns"}
 _NOTHING: Final = np.empty(0)
 _GROUP: Final = "group."
 

@@ -89,10 +89,9 @@ class Speed:
 
         The gap before token i belongs to the bin of i; token 0 has none.
         """
-        tokens = self.cell.tokens[self.cell.tokens["request_id"].isin(self.cell.good["request_id"])]
-        ordered = tokens.sort_values(["request_id", "index"])
-        gaps = ordered.assign(gap=ordered.groupby("request_id")["client_ns"].diff(), bin=ordered["index"] // BIN)
-        spent = gaps.dropna(subset="gap").groupby(["bin", "request_id"])["gap"].agg(["sum", "size"])
+        answers = self.cell.answers
+        gaps = answers.assign(bin=answers["index"] // BIN).dropna(subset="gap_ns")
+        spent = gaps.groupby(["bin", "request_id"])["gap_ns"].agg(["sum", "size"])
         spent = spent[spent["sum"] > 0].reset_index()
         found: dict[tuple[int, int], Floats] = {}
         for place in sorted({int(place) for place in spent["bin"]}):
