@@ -12,12 +12,15 @@ import inspect
 import json
 import re
 import types
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.ccrb.view.cell import CcrbStudy
+from s2a_bench.experiments.profile_capture.as_json import Board, ProfileJson
 from s2a_bench.experiments.throughput.view.cell import Reference
+from s2a_bench.inference.files_json import Fetched, Info
 from s2a_bench.report.compare.as_json import CompareJson
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.sweep.as_json import PlannedCell, SweptCell
@@ -99,14 +102,31 @@ def compare_schema() -> dict[str, Any]:
 
 def frame_schema() -> dict[str, Any]:
     """Return the schema of what the measuring commands print, with what is declared in the place of what was there."""
-    whole: dict[str, Any] = json.loads((FOLDER / "s2a-bench-1.json").read_text(encoding="utf-8"))
     cells = [cell for name in EXPERIMENTS.built_in() if (cell := EXPERIMENTS[name].cell_class())]
-    named = {"ratio": RatioJson, "warning": RunWarning} | {_name(each): each for each in (*cells, Reference, CcrbStudy)}
+    named: dict[str, Any] = {"ratio": RatioJson, "warning": RunWarning}
+    named |= {_name(each): each for each in (*cells, Reference, CcrbStudy)}
+    named["sweep_cell"] = PlannedCell | SweptCell
+    return _redefined("s2a-bench-1", named, kept=("level", "check"))
+
+
+def profile_schema() -> dict[str, Any]:
+    """Return the schema of `profile ... --json`."""
+    return _redefined("s2a-bench-profile-1", {"board": Board, "profile": ProfileJson})
+
+
+def model_schema() -> dict[str, Any]:
+    """Return the schema of `model fetch --json` and `model info --json`."""
+    return _redefined("s2a-bench-model-1", {"fetched": Fetched, "info": Info})
+
+
+def _redefined(name: str, named: dict[str, Any], kept: Sequence[str] = ()) -> dict[str, Any]:
+    """Return a schema whose definitions are written anew, but for ``kept`` ones; its frame stays as it stands."""
+    whole: dict[str, Any] = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
     parts = Parts()
-    made = {name: parts.object(each) for name, each in named.items()}
-    made["sweep_cell"] = parts.of(PlannedCell | SweptCell)
-    kept = {name: whole["$defs"][name] for name in ("level", "check")}
-    return whole | {"$defs": kept | made | parts.defs}
+    made = {
+        key: parts.object(each) if dataclasses.is_dataclass(each) else parts.of(each) for key, each in named.items()
+    }
+    return whole | {"$defs": {key: whole["$defs"][key] for key in kept} | made | parts.defs}
 
 
 def _head(name: str, title: str) -> dict[str, Any]:
@@ -125,7 +145,12 @@ def _either(found: list[dict[str, Any]]) -> dict[str, Any]:
     return {"oneOf": found}
 
 
-SCHEMAS = {"s2a-bench-compare-1.json": compare_schema, "s2a-bench-1.json": frame_schema}
+SCHEMAS = {
+    "s2a-bench-compare-1.json": compare_schema,
+    "s2a-bench-1.json": frame_schema,
+    "s2a-bench-profile-1.json": profile_schema,
+    "s2a-bench-model-1.json": model_schema,
+}
 
 
 def text_of(schema: dict[str, Any]) -> str:

@@ -81,17 +81,17 @@ def _latency_command(done: Fetched) -> str | None:
 
 
 def _fetched_json(done: Fetched, latency: str | None) -> dict[str, Any]:
-    files = [
-        {"path": str(file.path), "bytes": file.nbytes, "sha256": file.sha256, "resumed_at": file.resumed_at}
-        for file in done.files
-    ]
+    from s2a_bench.inference.files_json import fetched_json
+
+    files = [fetched_json(file) for file in done.files]
     facts = {"endpoint": done.endpoint, "repository": done.repository, "commit": done.commit, "files": files}
     return {"schema": SCHEMA, "command": "model fetch", **facts} | ({"latency": latency} if latency else {})
 
 
 def _info(config: InfoConfig, *, json_: Json = False) -> None:
-    from s2a_bench.cli.model_text import as_json, renderables
+    from s2a_bench.cli.model_text import renderables
     from s2a_bench.inference.fetch_names import HUB_MODELS, fetched
+    from s2a_bench.inference.files_json import info_json
     from s2a_bench.inference.gguf_info import describe
     from s2a_bench.inference.models import remembered_sha256, sha256
 
@@ -100,7 +100,7 @@ def _info(config: InfoConfig, *, json_: Json = False) -> None:
     paths = fetched(what, "model info") if known else (Path(what),)
     found = [(describe(path, "model info"), sha256(path) if config.hash else remembered_sha256(path)) for path in paths]
     if json_:
-        files = [as_json(facts, hash_known) for facts, hash_known in found]
+        files = [info_json(facts, hash_known) for facts, hash_known in found]
         print_json({"schema": SCHEMA, "command": "model info", "files": files})
         return
     console = open_console()

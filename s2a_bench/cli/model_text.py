@@ -1,8 +1,7 @@
-"""How `model info` shows a GGUF file: text and tables for people, one object for machines."""
+"""How `model info` shows a GGUF file to people: text and tables."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -12,19 +11,6 @@ if TYPE_CHECKING:
 
 _TEMPLATE_CHARACTERS = 300
 _CONTROL_TOKENS = 24
-
-
-def as_json(info: GgufInfo, sha256: str | None) -> dict[str, Any]:
-    """Return the facts as JSON takes them; what the file does not hold is an absent key."""
-    facts = {key: value for key, value in asdict(info).items() if value is not None}
-    facts["path"] = str(info.path)
-    facts["bytes"] = facts.pop("nbytes")
-    for part in (*facts["types"], *facts["groups"]):
-        part["bytes"] = part.pop("nbytes")
-    if info.vocabulary is not None:
-        special = {role: {"id": at, "text": text} for role, (at, text) in info.vocabulary.special.items()}
-        facts["vocabulary"]["special"] = special
-    return facts | ({"sha256": sha256} if sha256 else {})
 
 
 def renderables(info: GgufInfo, sha256: str | None) -> list[RenderableType]:

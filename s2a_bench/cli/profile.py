@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,6 +12,7 @@ from s2a_bench.cli.experiment import PLAIN, Commands
 from s2a_bench.cli.output import Json, print_json
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.profile_capture.as_json import is_dummy, profile_json, ttft_s
 from s2a_bench.experiments.profile_capture.config import CaptureConfig
 from s2a_bench.store.manifest import plain
 
@@ -41,7 +41,7 @@ def list_(json_: Json = False) -> None:
 
     found = _readable()
     if json_:
-        print_profiles("list", [facts_of(profile, path) for profile, path in found])
+        print_profiles("list", [profile_json(profile, path) for profile, path in found])
         return
     table = Table(box=None, pad_edge=False)
     for header in ("name", "board", "origin"):
@@ -50,8 +50,8 @@ def list_(json_: Json = False) -> None:
         table.add_column(header, justify="right", no_wrap=True)
     table.add_column("gaps")
     for profile, _ in found:
-        ttft = f"{_ttft_s(profile):.3g}" + (" (assumed)" if "prompt_s" in profile.assumed else "")
-        origin = profile.origin + (", dummy" if _dummy(profile) else "")
+        ttft = f"{ttft_s(profile):.3g}" + (" (assumed)" if "prompt_s" in profile.assumed else "")
+        origin = profile.origin + (", dummy" if is_dummy(profile) else "")
         row = (profile.name, profile.title, origin, f"{profile.tokens_per_s:.3g}", ttft, _gaps(profile, full=False))
         table.add_row(*map(Text, row))
     open_console().print(table)
@@ -66,7 +66,7 @@ def show(name: Annotated[str, typer.Argument(help="a name of 'profile list', or 
     path = find_profile(name)
     profile = read_profile(path)
     if json_:
-        print_profiles("show", [facts_of(profile, path)])
+        print_profiles("show", [profile_json(profile, path)])
         return
     typer.echo(line_of(profile))
     typer.echo(f"file: {path}")
@@ -89,7 +89,7 @@ def match(json_: Json = False) -> None:
     board = board_facts()
     found = [(profile, path) for profile, path in _readable() if matches(profile, board)]
     if json_:
-        same = [{**facts_of(profile, path), "differences": differences(profile, board)} for profile, path in found]
+        same = [profile_json(profile, path, differences(profile, board)) for profile, path in found]
         print_profiles("match", same, board=board)
     else:
         kind = ", ".join(str(board[key]) for key in ("model", "gpu", "cpu") if key in board)
@@ -116,25 +116,8 @@ def _readable() -> list[tuple[Profile, Path]]:
     return found
 
 
-def facts_of(profile: Profile, path: Path) -> dict[str, Any]:
-    """Return a profile as plain data; the recording as its length."""
-    from s2a_bench.boards.gaps import to_table
-
-    plain = {key: value for key, value in asdict(profile).items() if key not in {"trace_s", "gaps"}}
-    rest = {"file": str(path), "ttft_s": _ttft_s(profile), "dummy": _dummy(profile), "recorded": len(profile.trace_s)}
-    return {**plain, **rest, "gaps": to_table(profile.gaps)}
-
-
-def _ttft_s(profile: Profile) -> float:
-    return profile.prompt_s + 1 / profile.tokens_per_s
-
-
-def _dummy(profile: Profile) -> bool:
-    return profile.facts.get("model", {}).get("dummy") is True
-
-
 def _origin(profile: Profile) -> str:
-    return profile.origin + (", dummy weights" if _dummy(profile) else "")
+    return profile.origin + (", dummy weights" if is_dummy(profile) else "")
 
 
 def _gaps(profile: Profile, *, full: bool = True) -> str:
@@ -152,7 +135,7 @@ def line_of(profile: Profile) -> str:
     """Say in one line what a profile is."""
     return (
         f"{profile.name}: {profile.title}, {profile.tokens_per_s:.4g} tokens/s, first token after "
-        f"{_ttft_s(profile):.3g} s ({_origin(profile)})"
+        f"{ttft_s(profile):.3g} s ({_origin(profile)})"
     )
 
 
@@ -186,7 +169,7 @@ def _capture(
             progress.say(f"warning: {warning}")
     profile = write_profile(tables, path, force=force)
     if json_:
-        print_profiles("capture", [facts_of(profile, path)])
+        print_profiles("capture", [profile_json(profile, path)])
         return
     typer.echo(line_of(profile))
     typer.echo(f"gaps: {profile.facts['fit']['family']}, the nearest of {distances(profile)}")

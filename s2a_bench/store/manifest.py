@@ -61,6 +61,12 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
+def present(value: Any) -> dict[str, Any]:
+    """Return a dataclass as `plain` data; a field whose default is None is an absent key where it has no value."""
+    items = ((item, getattr(value, item.name)) for item in dataclasses.fields(value))
+    return {item.name: plain(inner) for item, inner in items if inner is not None or item.default is not None}
+
+
 def write(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Write the manifest; a reader sees the old one or the new one, never half of one."""
     path, part = folder / NAME, folder / f"{NAME}.part"

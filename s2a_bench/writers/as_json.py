@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, make_dataclass
+from dataclasses import asdict, dataclass, field, make_dataclass
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -42,12 +42,6 @@ def frame(run: Run, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], *
         **more,
         "warnings": run.manifest.get("warnings", []),
     }
-
-
-def present(cell: Any) -> dict[str, Any]:
-    """Return a declared cell as plain data; a field whose default is None is an absent key where it has no value."""
-    optional = {each.name for each in fields(cell) if each.default is None}
-    return {name: value for name, value in plain(cell).items() if value is not None or name not in optional}
 
 
 def cell_of_row(

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from s2a_bench.cli.model import app
-from s2a_bench.cli.model_text import as_json, renderables
+from s2a_bench.cli.model_text import renderables
 from s2a_bench.errors import ModelError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.dummy import SHAPES, write_dummy
 from s2a_bench.inference.dummy_vocab import SPECIAL
+from s2a_bench.inference.files_json import info_json
 from s2a_bench.inference.gguf_file import read_array, read_header
 from s2a_bench.inference.gguf_info import describe
 from s2a_bench.inference.models import sha256
@@ -211,6 +212,6 @@ def test_any_damage_to_the_header_is_a_model_error_or_a_header(
     with suppress(ModelError):  # and nothing else
         info = describe(path, FLAG)
         assert info.nbytes == path.stat().st_size
-        told = json.loads(json.dumps(as_json(info, None)))
+        told = json.loads(json.dumps(info_json(info, None)))
         jsonschema.validate(told, SCHEMA["$defs"]["info"] | {"$defs": SCHEMA["$defs"]})
         renderables(info, None)

@@ -13,7 +13,8 @@ from s2a_bench.experiments import Shown
 from s2a_bench.experiments.model_validity.cell import Tokens, ValidityCell
 from s2a_bench.experiments.model_validity.rows import VALIDITY
 from s2a_bench.policy.conformal import upper_bound
-from s2a_bench.writers.as_json import frame, present
+from s2a_bench.store.manifest import present
+from s2a_bench.writers.as_json import frame
 from s2a_bench.writers.tables import ABSENT, DUMMY, Note, TextTable
 
 if TYPE_CHECKING:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.latency.view.cell import LatencyCell
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, groups_present, ratios, stages_present
-from s2a_bench.writers.as_json import frame, present, ratio_entry, summaries
+from s2a_bench.store.manifest import present
+from s2a_bench.writers.as_json import frame, ratio_entry, summaries
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run

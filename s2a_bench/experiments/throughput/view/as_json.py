@@ -18,7 +18,8 @@ from s2a_bench.experiments.throughput.view.cells import (
     reference_values,
     speeds_of,
 )
-from s2a_bench.writers.as_json import frame, present, ratio_entry, summaries
+from s2a_bench.store.manifest import present
+from s2a_bench.writers.as_json import frame, ratio_entry, summaries
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run

@@ -1,0 +1,75 @@
+"""Profiles and boards as the ``--json`` objects of `profile`, and their schema, hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from s2a_bench.boards.gaps import FAMILIES, to_table
+from s2a_bench.boards.profile import Profile
+from s2a_bench.store.bounds import Count, Facts, Many, NonNegative, Positive, about
+from s2a_bench.store.manifest import present
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """This board; what cannot be read is absent."""
+
+    model: Annotated[str | None, about("From the device tree.")] = None
+    gpu: str | None = None
+    cpu: str | None = None
+    cores: Annotated[Many, about("That this process may use.")]
+    memory_bytes: int | None = None
+    power_mode: str | None = None
+    governor: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProfileJson:
+    """One board running one model."""
+
+    name: str
+    title: str
+    file: str
+    origin: Literal["paper", "measured"]
+    tokens_per_s: Positive
+    prompt_s: NonNegative
+    prompt_cv: NonNegative
+    rate_cv: NonNegative
+    ttft_s: Annotated[NonNegative, about("prompt_s + 1 / tokens_per_s.")]
+    gaps: Annotated[dict[str, Any], Facts(required=["family"], properties={"family": {"enum": list(FAMILIES)}})]
+    recorded: Annotated[Count, about("How many gaps the recording holds; 0: there is none.")]
+    assumed: Annotated[list[str], about("Keys whose values nobody measured.")]
+    dummy: Annotated[bool, about("Whether the model's weights were dummies.")]
+    facts: Annotated[dict[str, dict[str, Any]], about("The file's free tables.")]
+    differences: Annotated[
+        list[str] | None, about("match: in which state the profile's board was and this one is not.")
+    ] = None
+
+
+def profile_json(profile: Profile, path: Path, differences: list[str] | None = None) -> dict[str, Any]:
+    """Return a profile as plain data; the recording as its length."""
+    same = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_cv", "rate_cv", "facts")
+    return present(
+        ProfileJson(
+            **{name: getattr(profile, name) for name in same},
+            file=str(path),
+            ttft_s=ttft_s(profile),
+            gaps=to_table(profile.gaps),
+            recorded=len(profile.trace_s),
+            assumed=list(profile.assumed),
+            dummy=is_dummy(profile),
+            differences=differences,
+        )
+    )
+
+
+def ttft_s(profile: Profile) -> float:
+    """Return the mean time to first token."""
+    return profile.prompt_s + 1 / profile.tokens_per_s
+
+
+def is_dummy(profile: Profile) -> bool:
+    """Whether the model's weights were dummies."""
+    return profile.facts.get("model", {}).get("dummy") is True
