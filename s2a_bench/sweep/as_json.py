@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from s2a_bench.store.manifest import plain
 from s2a_bench.store.schema import SCHEMA
+from s2a_bench.writers.as_json import frame
 
 if TYPE_CHECKING:
     from s2a_bench.store.sweep import Sweep
@@ -55,13 +56,10 @@ def plan_json(cells: Sequence[Cell], expected: Expected, environment: dict[str, 
     planned = [
         PlannedCell(
             cell=cell.name,
-            repeat=cell.repeat,
             state="planned",
-            virtual=cell.virtual,
             board=cell.board or None,
-            settings=cell.settings,
             argv=list(cell.argv),
-            config_hash=cell.config_hash,
+            **{name: getattr(cell, name) for name in ("repeat", "virtual", "settings", "config_hash")},
         )
         for cell in cells
     ]
@@ -78,32 +76,19 @@ def plan_json(cells: Sequence[Cell], expected: Expected, environment: dict[str, 
 
 def sweep_json(sweep: Sweep) -> dict[str, Any]:
     """Return how a sweep went as the ``--json`` object."""
-    cells = [
-        SweptCell(
-            cell=row["cell"],
-            repeat=int(row["repeat"]),
-            attempt=int(row["attempt"]),
-            state=row["state"],
-            error=row["error"] or None,
-            virtual=bool(row["virtual"]),
-            board=row["board"] or None,
-            host=row["host"],
-            settings=json.loads(row["settings"]),
-            argv=json.loads(row["argv"]),
-            config_hash=row["config_hash"],
-            run=str(sweep.path / row["folder"]) if row["folder"] else None,
-            started=row["started"],
-            wall_s=float(row["wall_s"]),
-        )
-        for row in sweep.cells.to_dict("records")
-    ]
-    return {
-        "schema": SCHEMA,
-        "command": "sweep",
-        "run": str(sweep.path),
-        "state": sweep.manifest["state"],
-        "environment": sweep.manifest["environment"],
-        "cells": plain(cells),
-        "ratios": [],
-        "warnings": [],
-    }
+    return frame(sweep, [plain(_cell(sweep, row)) for row in sweep.cells.to_dict("records")], [])
+
+
+def _cell(sweep: Sweep, row: Mapping[Any, Any]) -> SweptCell:
+    return SweptCell(
+        **{name: row[name] for name in ("cell", "state", "host", "config_hash", "started")},
+        repeat=int(row["repeat"]),
+        attempt=int(row["attempt"]),
+        error=row["error"] or None,
+        virtual=bool(row["virtual"]),
+        board=row["board"] or None,
+        settings=json.loads(row["settings"]),
+        argv=json.loads(row["argv"]),
+        run=str(sweep.path / row["folder"]) if row["folder"] else None,
+        wall_s=float(row["wall_s"]),
+    )

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from s2a_bench.store.run import Run
+    from s2a_bench.store.sweep import Sweep
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,7 @@ class RatioJson:
     ci95: tuple[float, float] | None
 
 
-def frame(run: Run, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+def frame(run: Run | Sweep, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
     """Return what the objects of all commands share, around a command's own cells."""
     return {
         "schema": SCHEMA,

@@ -7,6 +7,7 @@ parsed, as arrivals are those of parsed skills; the set-points that the ego driv
 from __future__ import annotations
 
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,6 @@ from s2a_bench.experiments.timeline.live.asks import Ask
 from s2a_bench.experiments.timeline.live.asks import prepare as prepare_policy
 from s2a_bench.experiments.timeline.live.link import Link, word
 from s2a_bench.experiments.timeline.rows import SKILLS
-from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
 from s2a_bench.plan import Parser
@@ -92,17 +92,7 @@ def _hear(config: CcrbConfig, ask: Ask, link: Link, prior: GapPrior | None) -> P
     request_id = measured.sample.request_id
     link.writer.update(request={"request_id": request_id, "requested_ns": requested_ns})
     times = config.scenario.durations
-    setting = Setting(
-        board="",
-        title=f"live {link.cell.name}",
-        tokens_per_s=float(f"{link.rate or 0.0:.4g}"),
-        prompt_s=None,
-        tokens_per_skill=ask.tokens_per_skill,
-        n_skills=ask.n_skills,
-        t_nom_s=times.nominal_s,
-        mode="live",
-        emulated=link.emulated,
-    )
+    setting = replace(link.setting(ask), t_nom_s=times.nominal_s)
 
     def column(at_ns: list[int]) -> Floats:
         return (np.array(at_ns, dtype=np.float64)[:, np.newaxis] - requested_ns) / 1e9

@@ -13,6 +13,7 @@ from s2a_bench.errors import S2AError, TransportError, UsageError
 from s2a_bench.experiments.timeline.config import TimelineConfig
 from s2a_bench.experiments.timeline.live.asks import Ask, asks_of, prior_of
 from s2a_bench.experiments.timeline.live.config import in_paper_format, requests_of
+from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.frames import FrameSource
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.plan import RequestsConfig
@@ -30,6 +31,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, open_client
 from s2a_bench.types import Request, Token
 
+MODE = "live"
 LATE = 1.05
 """An answer that takes so many times what the pace allows was not paced, but slow."""
 
@@ -173,6 +175,20 @@ class Link:
         if measured.fatal is not None:
             raise measured.fatal
         return measured
+
+    def setting(self, ask: Ask) -> Setting:
+        """Return the setting of what was asked, at the rate that was seen."""
+        return Setting(
+            board="",
+            title=f"live {self.cell.name}",
+            tokens_per_s=float(f"{self.rate or 0.0:.4g}"),
+            prompt_s=None,
+            tokens_per_skill=ask.tokens_per_skill,
+            n_skills=ask.n_skills,
+            t_nom_s=ask.t_nom_s,
+            mode=MODE,
+            emulated=self.emulated,
+        )
 
     def saw(self, token_ns: Sequence[int]) -> None:
         """Learn the rate from an answer if nobody set it, and warn where the model was slower."""

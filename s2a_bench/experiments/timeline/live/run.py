@@ -18,7 +18,6 @@ from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, k
 from s2a_bench.experiments.timeline.live.asks import Ask, prepare
 from s2a_bench.experiments.timeline.live.link import Link, word
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.machine import environment
@@ -33,8 +32,6 @@ from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.runtime.record import Record
 from s2a_bench.store.requests import TOKENS, samples_table
 from s2a_bench.store.run import RunWriter
-
-MODE = "live"
 
 
 def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
@@ -127,21 +124,8 @@ class _Live:
         """Keep what the policies made of one plan."""
         token_ns = max((record.token_ns for record in records), key=len)
         self.link.saw(token_ns)
-        setting = self._setting(ask, self.link.rate or 0.0)
+        setting = self.link.setting(ask)
         self.link.warnings += keep(self.link.writer, setting, plan, request_id, policies, records)
-
-    def _setting(self, ask: Ask, rate: float) -> Setting:
-        return Setting(
-            board="",
-            title=f"live {self.link.cell.name}",
-            tokens_per_s=float(f"{rate:.4g}"),
-            prompt_s=None,
-            tokens_per_skill=ask.tokens_per_skill,
-            n_skills=ask.n_skills,
-            t_nom_s=ask.t_nom_s,
-            mode=MODE,
-            emulated=self.link.emulated,
-        )
 
     def _remarks(self) -> str:
         """Return what is not as it seems."""
