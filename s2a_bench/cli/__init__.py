@@ -34,11 +34,7 @@ class TopCommands(Commands):
             ("profile", "app", "Measure this machine as a hardware profile, and look at profiles."),
             ("report", "report", "Make one page of runs, and their tables and figures for a paper. Measures nothing."),
             ("serve", "serve", "Serve a model until interrupted: over HTTP, as a ROS 2 node, or otherwise."),
-            (
-                "sweep",
-                "sweep",
-                "Run a command for every cell of a grid; finished cells are kept, and it can go on later.",
-            ),
+            ("sweep", "sweep", "Run a command for every cell of a grid; what is done is kept, and it can go on."),
         )
     }
 
