@@ -76,7 +76,7 @@ class Run:
 
         shown = self._shown
         if f"{name}.csv" in shown.csvs:
-            return pd.read_csv(io.StringIO(shown.csvs[f"{name}.csv"]))
+            return pd.read_csv(io.StringIO(shown.csvs[f"{name}.csv"].text(self._run.origins)))
         if name not in shown.tables:
             raise UsageError(f"a {self.manifest['command']} run has no table '{name}', only {', '.join(self.tables)}")
         table = shown.tables[name]

@@ -21,6 +21,7 @@ from s2a_bench.experiments.ccrb.view.cell import CcrbStudy
 from s2a_bench.experiments.profile_capture.as_json import Board, ProfileJson
 from s2a_bench.experiments.throughput.view.cell import Reference
 from s2a_bench.inference.files_json import Fetched, Info
+from s2a_bench.provenance import Origins
 from s2a_bench.report.compare.as_json import CompareJson
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.sweep.as_json import PlannedCell, SweptCell
@@ -103,7 +104,7 @@ def compare_schema() -> dict[str, Any]:
 def frame_schema() -> dict[str, Any]:
     """Return the schema of what the measuring commands print, with what is declared in the place of what was there."""
     cells = [cell for name in EXPERIMENTS.built_in() if (cell := EXPERIMENTS[name].cell_class())]
-    named: dict[str, Any] = {"ratio": RatioJson, "warning": RunWarning}
+    named: dict[str, Any] = {"ratio": RatioJson, "warning": RunWarning, "origins": Origins}
     named |= {_name(each): each for each in (*cells, Reference, CcrbStudy)}
     named["sweep_cell"] = PlannedCell | SweptCell
     return _redefined("s2a-bench-1", named, kept=("level", "check"))

@@ -33,3 +33,13 @@ class Profile:
     """Board, model, power mode, environment: the file's tables as they are."""
     rate_cv: float = 0.0
     """Spread of the rate from one answer to the next; studies use it, a replay keeps its rate."""
+
+    @property
+    def dummy(self) -> bool:
+        """Whether it was captured from a model with dummy weights."""
+        return self.facts.get("model", {}).get("dummy") is True
+
+    @property
+    def weights(self) -> str:
+        """Return what the model's weights were, as `Provenance` has it."""
+        return "dummy" if self.dummy else "real"

@@ -138,7 +138,7 @@ def present(run: Run, shown: Shown, progress: RunProgress, *, as_json: bool) -> 
     console = open_console()
     for name in shown.tables if shown.printed is None else shown.printed:
         console.print(lay_out(shown.narrow.get(name) or shown.tables[name]))
-    for note in shown.notes:
+    for note in (*shown.notes, run.origins.line):
         console.print(note, markup=False, highlight=False)
     for name in shown.files:
         if (run.path / name).exists():

@@ -12,7 +12,7 @@ from s2a_bench.cli.experiment import PLAIN, Commands
 from s2a_bench.cli.output import Json, print_json
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.profile_capture.as_json import is_dummy, profile_json, ttft_s
+from s2a_bench.experiments.profile_capture.as_json import profile_json, ttft_s
 from s2a_bench.experiments.profile_capture.config import CaptureConfig
 from s2a_bench.store.manifest import plain
 
@@ -51,7 +51,7 @@ def list_(json_: Json = False) -> None:
     table.add_column("gaps")
     for profile, _ in found:
         ttft = f"{ttft_s(profile):.3g}" + (" (assumed)" if "prompt_s" in profile.assumed else "")
-        origin = profile.origin + (", dummy" if is_dummy(profile) else "")
+        origin = profile.origin + (", dummy" if profile.dummy else "")
         row = (profile.name, profile.title, origin, f"{profile.tokens_per_s:.3g}", ttft, _gaps(profile, full=False))
         table.add_row(*map(Text, row))
     open_console().print(table)
@@ -117,7 +117,7 @@ def _readable() -> list[tuple[Profile, Path]]:
 
 
 def _origin(profile: Profile) -> str:
-    return profile.origin + (", dummy weights" if is_dummy(profile) else "")
+    return profile.origin + (", dummy weights" if profile.dummy else "")
 
 
 def _gaps(profile: Profile, *, full: bool = True) -> str:

@@ -17,8 +17,9 @@ packages offer experiments as entry points of the group ``s2a_bench.experiments`
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from s2a_bench.options import Options
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import Run
+    from s2a_bench.writers.csv_text import CsvTable
     from s2a_bench.writers.tables import TextTable
 
 Better: TypeAlias = Literal["lower", "higher", "neither"]
@@ -76,8 +78,8 @@ class Shown:
     """What a run shows, each part by its file's name.
 
     ``main`` are the tables that stand open on the page, ``printed`` those on the terminal (None: all), ``narrow`` what
-    is printed in place of tables that are too wide for it, ``notes`` what is said below them. ``csvs`` are whole CSV
-    texts, ``figures`` are drawn when called, ``files`` write themselves into the run folder. ``json`` gives the
+    is printed in place of tables that are too wide for it, ``notes`` what is said below them. ``csvs`` are tables for
+    programs, ``figures`` are drawn when called, ``files`` write themselves into the run folder. ``json`` gives the
     ``--json`` object. ``lanes`` are timelines to look into.
     """
 
@@ -87,7 +89,7 @@ class Shown:
     printed: Sequence[str] | None = None
     narrow: Mapping[str, TextTable] = field(default_factory=dict)
     notes: Sequence[str] = ()
-    csvs: Mapping[str, str] = field(default_factory=dict)
+    csvs: Mapping[str, CsvTable] = field(default_factory=dict)
     figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     files: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
     json: Callable[[], dict[str, Any]] = dict
@@ -115,6 +117,12 @@ class Compared:
     origin: Callable[[Run], Sequence[str]]
     shown: tuple[str, ...]
     own: Callable[[Run], Iterable[Metric]] = lambda _: ()
+
+
+def _marked(build: Callable[[], Figure], line: str) -> Figure:
+    from s2a_bench.writers.figures import marked
+
+    return marked(build(), line)
 
 
 def by_name(metrics: Iterable[Metric]) -> dict[str, Metric]:
@@ -152,9 +160,15 @@ class Experiment:
         return folder
 
     def show(self, run: Run, **asked: Any) -> Shown:
-        """Return what one of its runs shows."""
+        """Return what one of its runs shows; every table and figure says where its numbers come from."""
         shown: Shown = resolve_name(self.view)(run, **asked)
-        return shown
+        line = run.origins.line
+        tables, narrow = (
+            {name: replace(table, provenance=table.provenance or line) for name, table in part.items()}
+            for part in (shown.tables, shown.narrow)
+        )
+        figures = {name: partial(_marked, build, line) for name, build in shown.figures.items()}
+        return replace(shown, tables=tables, narrow=narrow, figures=figures)
 
     def cell_class(self) -> type | None:
         """Return the class of a cell of its ``--json``; None where it is not declared."""

@@ -10,7 +10,7 @@ import numpy as np
 from s2a_bench.experiments import Compared, Metric, Shown, Subject, View
 from s2a_bench.stats import Summary, summary_of
 from s2a_bench.writers.as_json import frame, summaries
-from s2a_bench.writers.csv_text import SUMMARY, csv_text, summary_values
+from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def plain_view(compared: Compared) -> View:
             tables={"metrics": table},
             main=["metrics"],
             notes=notes,
-            csvs={"metrics.csv": csv_text(("cell", "metric", "unit", *SUMMARY), rows)},
+            csvs={"metrics.csv": CsvTable.of(("cell", "metric", "unit", *SUMMARY), rows)},
             json=lambda: frame(run, [_json(compared, cell) for cell in cells], []),
         )
 

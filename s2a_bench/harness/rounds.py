@@ -27,6 +27,7 @@ from s2a_bench.machine.doctor import Machine
 from s2a_bench.machine.resources.sampler import Sampler, open_sampler
 from s2a_bench.machine.tuning import is_allowed, keep_large_blocks, limit_threads
 from s2a_bench.progress import Progress
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.requests import FrameRow
 from s2a_bench.store.run import RunWriter
 from s2a_bench.trace import mark_cost_ns
@@ -138,7 +139,11 @@ def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunW
         sampler = stack.enter_context(open_sampler(config.sample_resources_hz, pids))
         sessions = list(_sessions(task, config, servers, sources, sampler, stack))
         asked = {session.cell.name: session.client.describe() for session in sessions}
-        writer.update(asked={name: how for name, how in asked.items() if how})
+        origins = {session.cell.name: servers.origin(session.cell) for session in sessions}
+        run = Provenance.of_engine(servers.model(facts))
+        writer.update(
+            asked={name: how for name, how in asked.items() if how}, provenance=Origins(run, origins).to_manifest()
+        )
         backoff = Backoff(SystemClock(), progress.stage)
         slots = [_slot(session, servers, writer, guard, backoff, sampler) for session in sessions]
         try:

@@ -14,6 +14,7 @@ from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.processes import PROGRAMS, OwnServer, ServerProcess
 from s2a_bench.harness.serving import ServerJob, engine_handler
 from s2a_bench.inference import open_engine
+from s2a_bench.provenance import NONE, Provenance
 from s2a_bench.transport import Program, Wiring, open_server
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import Pipeline
@@ -103,6 +104,13 @@ class ServerSet:
         """Return what the engine says about the model: the same in every server of ours."""
         described = [server["engine"] for server in facts.values() if "engine" in server]
         return next(iter(described), self._local_engine or {})
+
+    def origin(self, pipeline: Pipeline) -> Provenance:
+        """Return where a cell's numbers come from: what its engine says of itself; a server of others is unknown."""
+        process = self._servers[pipeline.server].process
+        if pipeline.transport.in_process:
+            return Provenance.of_engine(self._local_engine or {}, link=NONE)
+        return Provenance.of_engine(process.facts.get("engine", {}) if process else {})
 
     def alive(self, pipeline: Pipeline) -> Callable[[], bool]:
         """Return the question whether the server of a cell still runs."""

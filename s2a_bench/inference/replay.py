@@ -125,7 +125,7 @@ class ReplayEngine:
         return {
             "engine": "replay",
             "emulated": True,
-            "dummy": profile.facts.get("model", {}).get("dummy") is True,
+            "dummy": profile.dummy,
             "profile": profile.name,
             "title": profile.title,
             "origin": profile.origin,

@@ -8,7 +8,7 @@ such line feed is torn and is dropped when read. An empty field is null, in text
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,9 +35,9 @@ class CsvFile:
         if not self._end:
             self._write(",".join(columns) + "\n")
 
-    def append(self, table: Table[Row], rows: Iterable[Row]) -> None:
-        """Write rows in one system call."""
-        self._write("".join(",".join(map(_field, table.values(row))) + "\n" for row in rows))
+    def append(self, table: Table[Row], rows: Iterable[Row], provenance: Callable[[Row], str]) -> None:
+        """Write rows in one system call, each with its ``provenance``."""
+        self._write("".join(",".join(map(_field, table.values(row, provenance(row)))) + "\n" for row in rows))
 
     def close(self) -> None:
         """Close the file; may be called twice."""

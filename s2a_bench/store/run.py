@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from s2a_bench.errors import StoreError
+from s2a_bench.provenance import Origins
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.files import CsvFile, count_rows, read_csv, read_parquet, to_pandas, write_parquet
 from s2a_bench.store.requests import (
@@ -26,7 +27,7 @@ from s2a_bench.store.requests import (
     frames_table,
     samples_table,
 )
-from s2a_bench.store.schema import SCHEMA, Row, Table
+from s2a_bench.store.schema import PROVENANCE, SCHEMA, Row, Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,6 +49,7 @@ class RunWriter:
         self.path = path
         self._manifest = manifest
         self._finished = False
+        self._codes: dict[str, str] = {}
         manifests.write(path, manifest)
         self._files: dict[str, tuple[Table[Any], CsvFile]] = {}
         stages = manifest.get("stages", EARLIER_STAGES)
@@ -60,7 +62,8 @@ class RunWriter:
         """Make ``<root>/<UTC time>-<command>-<host>`` and open the files of ``tables``, those of requests unless told.
 
         Others open at their first row. ``manifest`` may bring ``stages`` (stage -> group, which samples get columns
-        for), ``argv``, ``configuration``, ``environment``, ``warnings``, ``seeds`` and more.
+        for), ``provenance`` (`Origins.to_manifest`), ``argv``, ``configuration``, ``environment``, ``warnings``,
+        ``seeds`` and more.
         Raises StoreError, naming ``--output``, where the folder cannot be made.
         """
         host = socket.gethostname()
@@ -114,7 +117,16 @@ class RunWriter:
         """Append rows to a table in one write; the first call creates its file."""
         if table.name not in self._files:
             self._files[table.name] = table, CsvFile(self.path / f"{table.name}.csv", table.columns)
-        self._files[table.name][1].append(table, rows)
+        self._files[table.name][1].append(table, rows, self._provenance)
+
+    def _provenance(self, row: object) -> str:
+        """Return where a row's numbers come from: what it says itself, its cell's engine told, or the run's."""
+        if own := getattr(row, PROVENANCE, ""):
+            return str(own)
+        cell = getattr(row, "cell", "")
+        if cell not in self._codes:
+            self._codes[cell] = Origins.of_manifest(self._manifest).of_row(cell)
+        return self._codes[cell]
 
     def sample(self, row: SampleRow) -> None:
         """Append one sample."""
@@ -131,6 +143,7 @@ class RunWriter:
     def update(self, **facts: Any) -> None:
         """Merge facts into the manifest (mappings key by key) and replace the file."""
         manifests.merge(self._manifest, facts)
+        self._codes.clear()
         manifests.write(self.path, self._manifest)
 
     def finish(self, state: str, error: str | None = None) -> None:
@@ -181,6 +194,11 @@ class Run:
         if table.name not in self.tables:
             self.tables[table.name] = _read(self.path, table)
         return self.tables[table.name]
+
+    @property
+    def origins(self) -> Origins:
+        """Return where its numbers come from."""
+        return Origins.of_manifest(self.manifest)
 
     @property
     def bootstrap_seed(self) -> int:

@@ -23,6 +23,9 @@ Value: TypeAlias = str | int | float | bool | None
 """One field as stored; None is null."""
 
 
+PROVENANCE: Final = "provenance"
+"""The last column of every table: where a row's numbers come from, in one word."""
+
 Row = TypeVar("Row")
 """The dataclass of a table's rows."""
 
@@ -42,21 +45,22 @@ class Table(Generic[Row]):
 
     @cached_property
     def columns(self) -> dict[str, Kind]:
-        """Return the columns in order: the row's fields, then the derived ones."""
+        """Return the columns in order: the row's fields, the derived ones, then where the numbers come from."""
         hints = get_type_hints(self.row)
-        return {name: _kind(hints[name]) for name in self._own} | self.derived
+        return {name: _kind(hints[name]) for name in self._own} | self.derived | {PROVENANCE: "string"}
 
     @cached_property
     def _own(self) -> tuple[str, ...]:
-        return tuple(item.name for item in fields(self.row))  # type: ignore[arg-type]  # a row is a dataclass
+        return tuple(item.name for item in fields(self.row) if item.name != PROVENANCE)  # type: ignore[arg-type]  # a row is a dataclass
 
-    def values(self, row: Row) -> Iterator[Value]:
+    def values(self, row: Row, provenance: str = "") -> Iterator[Value]:
         """Yield one value a column, the row's own fields first; lists and dicts become JSON text."""
         for name in self._own:
             yield _stored(getattr(row, name))
         derived = self.derive(row)
         for name in self.derived:
             yield _stored(derived.get(name))
+        yield provenance
 
 
 def _stored(value: Any) -> Value:

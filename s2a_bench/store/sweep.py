@@ -24,7 +24,7 @@ class CellRow:
 
     ``cell`` names the setting and ``repeat`` which time it ran. ``state`` is finished or failed, ``error`` why.
     ``board`` is the machine that the cell asked for, empty where any would do; ``host`` the one that it got.
-    ``folder`` is its run folder below the sweep's, empty where it did not come to have one.
+    ``folder`` is its run folder below the sweep's, empty where it did not come to have one, ``provenance`` that run's.
     """
 
     cell: str
@@ -41,6 +41,7 @@ class CellRow:
     folder: str
     started: str
     wall_s: float
+    provenance: str = ""
 
 
 CELLS: Final[Table[CellRow]] = Table("cells", CellRow)

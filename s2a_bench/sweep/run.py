@@ -184,6 +184,7 @@ class SweepRun:
             folder=str(kept.relative_to(self._writer.path)) if found is not None else "",
             started=outcome.started,
             wall_s=outcome.wall_s,
+            provenance=read_run(kept).origins.code if found is not None else "",
         )
         self._writer.append(CELLS, [row])
         self._latest[cell.key] = attempt, row.state

@@ -1,15 +1,19 @@
-"""Rows as CSV, every digit kept."""
+"""Rows as CSV, every digit kept, each with the provenance of its numbers."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from s2a_bench.store.schema import PROVENANCE
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from s2a_bench.provenance import Origins
     from s2a_bench.stats import Summary
 
 SUMMARY = ("n", "median", "mean", "sd", "p90", "p99")
@@ -21,16 +25,32 @@ def summary_values(summary: Summary) -> tuple[object, ...]:
     return tuple(getattr(summary, name) for name in SUMMARY)
 
 
-def csv_text(header: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> str:
-    """Write rows as CSV; None is an empty field."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(rows)
-    return out.getvalue()
+@dataclass(frozen=True, slots=True)
+class CsvTable:
+    """A table for programs; None is an empty field."""
 
+    header: tuple[str, ...]
+    rows: list[tuple[object, ...]]
 
-def frame_csv(rows: pd.DataFrame) -> str:
-    """Write a table's rows as CSV; what is missing is an empty field."""
-    whole = rows.astype(object).where(rows.notna(), None)
-    return csv_text(tuple(map(str, rows.columns)), whole.itertuples(index=False, name=None))
+    @classmethod
+    def of(cls, header: Iterable[str], rows: Iterable[Iterable[object]]) -> CsvTable:
+        """Keep a table's rows."""
+        return cls(tuple(header), [tuple(row) for row in rows])
+
+    @classmethod
+    def of_frame(cls, rows: pd.DataFrame) -> CsvTable:
+        """Keep the rows of a DataFrame; what is missing is an empty field."""
+        whole = rows.astype(object).where(rows.notna(), None)
+        return cls.of(map(str, rows.columns), whole.itertuples(index=False, name=None))
+
+    def text(self, origins: Origins) -> str:
+        """Write it; the last column says where a row's numbers come from: those of its ``cell``, or of the run."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        told = PROVENANCE in self.header  # a table of the store has it already
+        cell = self.header.index("cell") if "cell" in self.header else None
+        writer.writerow(self.header if told else (*self.header, PROVENANCE))
+        for row in self.rows:
+            code = origins.code if cell is None else origins.of_row(str(row[cell]))
+            writer.writerow(row if told else (*row, code))
+        return out.getvalue()

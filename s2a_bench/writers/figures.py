@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2a_bench.errors import StoreError
+from s2a_bench.provenance import ORIGIN
 from s2a_bench.writers.style import WIDTH_IN, paper_column
+from s2a_bench.writers.tables import required
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,14 +55,28 @@ def logarithmic(axes: Axes, spread: float) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
+def marked(figure: Figure, provenance: str) -> Figure:
+    """Write below a figure's title where its numbers come from, and return it; it grows by the lines' height."""
+    import textwrap
+
+    lines = textwrap.wrap(provenance, round(LINE_CHARS * figure.get_figwidth() / WIDTH_IN))
+    figure.set_figheight(figure.get_figheight() + 0.13 * len(lines))
+    figure.suptitle("\n".join((figure.get_suptitle(), *lines)), x=0.01, horizontalalignment="left")
+    return figure
+
+
 def save(folder: Path, builders: Mapping[str, Callable[[], Figure]]) -> list[Path]:
-    """Build each figure and write it as ``<name>.png`` and ``<name>.pdf``; raises StoreError where that fails."""
+    """Build each figure and write it as ``<name>.png`` and ``<name>.pdf``; raises StoreError where that fails.
+
+    Raises ValueError for a figure that does not say where its numbers come from.
+    """
     written = []
     try:
         folder.mkdir(exist_ok=True)
         for name, build in builders.items():
             with paper_column():
                 figure = build()
+                required(name, figure.get_suptitle().partition(ORIGIN)[1])
                 for suffix in ("png", "pdf"):
                     path = folder / f"{name}.{suffix}"
                     figure.savefig(path)

@@ -11,13 +11,14 @@ from s2a_bench.writers.tables import TextTable, to_latex, to_markdown
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
+    from s2a_bench.writers.csv_text import CsvTable
 
 
-def write_texts(run: Run, tables: Mapping[str, TextTable], csvs: Mapping[str, str]) -> list[Path]:
-    """Write ``tables/``: each table as .md and .tex, and CSV texts under their names; raises StoreError."""
+def write_texts(run: Run, tables: Mapping[str, TextTable], csvs: Mapping[str, CsvTable]) -> list[Path]:
+    """Write ``tables/``: each table as .md and .tex, and those for programs under their names; raises StoreError."""
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
     texts |= {f"{name}.tex": to_latex(table) for name, table in tables.items()}
-    texts |= csvs
+    texts |= {name: table.text(run.origins) for name, table in csvs.items()}
     folder = run.path / "tables"
     try:
         folder.mkdir(exist_ok=True)

@@ -57,8 +57,9 @@ PREAMBLE: Final = r"""\documentclass[a4paper,landscape]{article}
 
 
 def to_siunitx(table: TextTable, widths: Sequence[str] = (), *, long: bool = False) -> str:
-    r"""Write a table as a LaTeX ``table``, or a ``longtable`` over several pages; title and notes are the caption.
+    r"""Write a table as a LaTeX ``table``, or a ``longtable`` over several pages.
 
+    Title, notes and provenance are the caption.
     ``widths`` are those of columns of running text (``60mm``, empty for an ordinary one).
     """
     columns = list(zip(*table.rows, strict=True)) if table.rows else [()] * len(table.header)
@@ -68,7 +69,7 @@ def to_siunitx(table: TextTable, widths: Sequence[str] = (), *, long: bool = Fal
     ]
     names = (escape(name) for name in table.header)
     head = _row([name if place < table.left else f"{{{name}}}" for place, name in enumerate(names)])
-    caption = f"\\caption{{{' '.join(escape(text) for text in (table.title + '.', *table.notes))}}}"
+    caption = f"\\caption{{{' '.join(escape(text) for text in (table.title + '.', *table.footer))}}}"
     body = []
     for place, row in enumerate(table.rows):
         body += [r"\midrule"] if place in table.rules and place else []

@@ -41,7 +41,8 @@ class Note(str):
 class TextTable:
     """One table: ``left`` columns of names, then columns of numbers; ``rules`` are the rows that a line precedes.
 
-    ``notes`` are strings, or `Note` where they bear labels.
+    ``notes`` are strings, or `Note` where they bear labels. ``provenance`` says in one line where the numbers come
+    from (`Origins.line`); without it a table is not written to a file.
     """
 
     title: str
@@ -50,6 +51,19 @@ class TextTable:
     left: int
     rules: frozenset[int] = frozenset()
     notes: tuple[str, ...] = ()
+    provenance: str = ""
+
+    @property
+    def footer(self) -> tuple[str, ...]:
+        """Return notes and provenance; raises ValueError where nobody said where the numbers come from."""
+        return (*self.notes, required(self.title, self.provenance))
+
+
+def required(title: str, provenance: str) -> str:
+    """Return a provenance; raises ValueError where there is none: a bug of who made the table or figure."""
+    if not provenance:
+        raise ValueError(f"'{title}' does not say where its numbers come from; give it a provenance")
+    return provenance
 
 
 def number(value: float) -> str:
@@ -77,17 +91,21 @@ def to_markdown(table: TextTable) -> str:
     """Write a table as Markdown, its title and notes around it."""
     rule = ["---"] * table.left + ["---:"] * (len(table.header) - table.left)
     lines = ["| " + " | ".join(row) + " |" for row in (table.header, tuple(rule), *table.rows)]
-    return "\n".join([f"**{table.title}**", "", *lines, "", *table.notes]) + "\n"
+    return "\n".join([f"**{table.title}**", "", *lines, "", *table.footer]) + "\n"
 
 
 def to_latex(table: TextTable) -> str:
-    """Write a table as a LaTeX ``tabular`` for the package booktabs; title and notes are comments."""
-    lines = [f"% {note}" for note in (table.title, *table.notes)]
+    """Write a table as a LaTeX ``tabular`` for the package booktabs; title and notes are comments.
+
+    Where its numbers come from stands as its last line, which is printed with it.
+    """
+    lines = [f"% {note}" for note in (table.title, *table.footer)]
     lines += [f"\\begin{{tabular}}{{{'l' * table.left}{'r' * (len(table.header) - table.left)}}}", "\\toprule"]
     lines += [_latex_row(table.header), "\\midrule"]
     for place, row in enumerate(table.rows):
         lines += [*(["\\midrule"] if place in table.rules else []), _latex_row(row)]
-    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}"]) + "\n"
+    origin = f"\\par{{\\footnotesize {_latex(table.provenance)}}}"
+    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", origin]) + "\n"
 
 
 def _decimals(value: float) -> int:
@@ -100,7 +118,12 @@ def _decimals(value: float) -> int:
 
 def _latex_row(row: tuple[str, ...]) -> str:
     """Write one row of a LaTeX table."""
-    escapes = {"_": "\\_", "%": "\\%", "&": "\\&", "#": "\\#", "±": "$\\pm$", ">": "$>$", ABSENT: "--"}
-    texts = ("".join(escapes.get(char, char) for char in text) for text in row)
     # A booktabs row that opens with a bracket would be read as an option of the row before it.
+    texts = map(_latex, row)
     return " & ".join(f"{{{text}}}" if text.startswith("[") else text for text in texts) + " \\\\"
+
+
+def _latex(text: str) -> str:
+    """Write a text so that LaTeX sets it."""
+    escapes = {"_": "\\_", "%": "\\%", "&": "\\&", "#": "\\#", "±": "$\\pm$", ">": "$>$", ABSENT: "--"}
+    return "".join(escapes.get(char, char) for char in text)

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from itertools import product
 from pathlib import Path
@@ -241,7 +242,7 @@ def test_a_sweep_of_timelines_is_shown_as_the_one_run_that_it_amounts_to(tmp_pat
     folder = sweep_of(tmp_path / "sweeps", cells)
     whole = read_run(timeline(tmp_path, profiles=boards, tokens_per_skill=(6, 1)))
     overview, pooled = read_chapters([folder], against_paper=False)
-    assert pooled.content.tables["timelines"] == execution_table(whole)
+    assert pooled.content.tables["timelines"] == replace(execution_table(whole), provenance=whole.origins.line)
     assert pooled.content.csvs == timeline_csv(whole)
     assert panels_of(pooled.content.timelines) == panels_of(timelines_of(whole))
     assert len(overview.content.tables["cells"].rows) == 12
@@ -393,12 +394,13 @@ def test_numbers_are_left_to_siunitx() -> None:
         1,
         frozenset({1}),
         ("100 % & more",),
+        "Provenance: dummy.",
     )
     text = to_siunitx(table)
     assert r"\begin{tabular}{lS[table-format=1.2]S[table-format=2.1(2)]r}" in text
     assert r"a\_b & 1.25 & 10.5 \pm 0.25 & \num{3} [\num{1.5}, \num{4}] \\" in text
     assert r"c & {--} & 1 \pm 0 & \num{12}\% \\" in text
-    assert r"\caption{T\_nom. 100 \% \& more}" in text
+    assert r"\caption{T\_nom. 100 \% \& more Provenance: dummy.}" in text
     assert text.count(r"\midrule") == 2
     assert r"\begin{longtable}" in to_siunitx(table, long=True)
 
@@ -413,7 +415,7 @@ def test_no_text_is_a_command_to_latex(text: str) -> None:
 
 def tables_of(make_run: MakeRun) -> Iterator[TextTable]:
     rows: list[tuple[str, ...]] = [(HOSTILE, "1.5 ± 0.2"), ("[x]", ABSENT)]
-    yield TextTable(HOSTILE, (HOSTILE, "n"), rows, 1, notes=(HOSTILE, "λ ≥ 2 → ☃"))
+    yield TextTable(HOSTILE, (HOSTILE, "n"), rows, 1, notes=(HOSTILE, "λ ≥ 2 → ☃"), provenance=HOSTILE)
     (chapter,) = read_chapters([make_run(n=3).path], against_paper=True)
     yield from chapter.content.tables.values()
 

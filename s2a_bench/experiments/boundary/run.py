@@ -13,6 +13,7 @@ from s2a_bench.experiments.timeline.plans import gaps_of
 from s2a_bench.machine import environment
 from s2a_bench.policy.boundary import Grid, analytic, simulate
 from s2a_bench.policy.conformal import TOLERANCE_S
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
@@ -25,6 +26,10 @@ def run_boundary(config: BoundaryConfig, output: Path, progress: Progress) -> Pa
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
         "seeds": {"plans": config.seed},
+        "provenance": Origins(
+            Provenance.computed(),
+            {board.name: Provenance.computed(board.name, board.weights) for board in config.boards},
+        ).to_manifest(),
         "boards": [
             {"name": board.name, "title": board.title, "origin": board.origin, "tokens_per_s": board.tokens_per_s}
             for board in config.boards

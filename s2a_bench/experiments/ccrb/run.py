@@ -15,6 +15,7 @@ from s2a_bench.experiments.ccrb.studies import pieces, studies, study_rows
 from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.experiments.timeline.to_rows import token_rows
 from s2a_bench.machine import environment
+from s2a_bench.provenance import Origins
 from s2a_bench.scenario import simulator
 from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import RunWriter
@@ -38,6 +39,7 @@ def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
             "environment": environment.collect(),
             "seeds": {"plans": config.seed},
             "boards": [{name: getattr(board, name) for name in _BOARD}],
+            "provenance": Origins(board.provenance).to_manifest(),
         }
         if config.openscenario is not None:
             from s2a_bench.scenario.ccrb.openscenario import write_openscenario

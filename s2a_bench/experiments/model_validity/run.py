@@ -14,6 +14,7 @@ from s2a_bench.inference.models import resolve
 from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.machine import environment
 from s2a_bench.plan import Cost, Format, SkillSet, arms, load_skills, prompt, score
+from s2a_bench.provenance import NONE, Origins, Provenance
 from s2a_bench.store.run import RunWriter
 from s2a_bench.types import Request
 
@@ -72,7 +73,8 @@ def run_validity(config: ValidityConfig, output: Path, progress: Progress) -> Pa
         progress.opened(writer.path)
         progress.stage("loading the model")
         with closing(open_engine(chosen)) as engine:
-            writer.update(model=engine.describe())
+            told = engine.describe()
+            writer.update(model=told, provenance=Origins(Provenance.of_engine(told, link=NONE)).to_manifest())
             progress.expect(len(asks) * 2 * config.answers)
             for ask in asks:
                 progress.stage(f"{ask.name}: {ask.format.name}")

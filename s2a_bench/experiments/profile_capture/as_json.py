@@ -59,7 +59,7 @@ def profile_json(profile: Profile, path: Path, differences: list[str] | None = N
             gaps=to_table(profile.gaps),
             recorded=len(profile.trace_s),
             assumed=list(profile.assumed),
-            dummy=is_dummy(profile),
+            dummy=profile.dummy,
             differences=differences,
         )
     )
@@ -68,8 +68,3 @@ def profile_json(profile: Profile, path: Path, differences: list[str] | None = N
 def ttft_s(profile: Profile) -> float:
     """Return the mean time to first token."""
     return profile.prompt_s + 1 / profile.tokens_per_s
-
-
-def is_dummy(profile: Profile) -> bool:
-    """Whether the model's weights were dummies."""
-    return profile.facts.get("model", {}).get("dummy") is True

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from s2a_bench.experiments.study.config import Cell, StudyConfig
 from s2a_bench.experiments.study.rows import STUDY_CELLS, StudyRow
 from s2a_bench.machine import environment
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ def run_study(config: StudyConfig, output: Path, progress: Progress) -> Path:
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
         "seeds": {"study": config.seed},
+        "provenance": Origins(Provenance.computed()).to_manifest(),
         "warnings": [warning.to_manifest() for warning in config.warnings()],
     }
     with RunWriter.create(output, f"study-{config.name}", manifest, (STUDY_CELLS,)) as writer:

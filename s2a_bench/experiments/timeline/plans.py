@@ -11,6 +11,7 @@ from s2a_bench.boards.gaps import Constant, Gaps, Lognormal, Recorded, from_tabl
 from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.config import NO_JITTER
+from s2a_bench.provenance import NONE, Provenance
 
 if TYPE_CHECKING:
     from s2a_bench.policy import Floats
@@ -35,6 +36,13 @@ class Board:
     gaps: Gaps
     prompt_cv: float = 0.0
     rate_cv: float = 0.0
+    weights: str = NONE
+    """Of the model that the rate was measured with: real, dummy; none for a bare rate."""
+
+    @property
+    def provenance(self) -> Provenance:
+        """Return where numbers come from that are computed with its tokens."""
+        return Provenance.computed(self.name or self.title, self.weights)
 
     @property
     def even(self) -> bool:
@@ -65,6 +73,7 @@ def board_of_profile(profile: Profile, jitter: str, prompt_s: float | None) -> B
         gaps=gaps,
         prompt_cv=profile.prompt_cv if jitter == AS_PROFILE else 0.0,
         rate_cv=profile.rate_cv if jitter == AS_PROFILE and not recorded else 0.0,
+        weights=profile.weights,
     )
 
 

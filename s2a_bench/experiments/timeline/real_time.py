@@ -15,7 +15,7 @@ from s2a_bench.experiments.timeline.policies import draw, learn
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.to_rows import KEPT_PLANS, Setting
 from s2a_bench.experiments.timeline.traces import recordings
-from s2a_bench.experiments.timeline.virtual import board_facts, calibration_warnings, finite
+from s2a_bench.experiments.timeline.virtual import board_facts, calibration_warnings, finite, origins_of
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.machine import environment
 from s2a_bench.plan import Call, Durations, Skill
@@ -80,6 +80,7 @@ def run_real_time(config: TimelineConfig, output: Path, progress: Progress) -> P
         "environment": environment.collect(),
         "seeds": {"plans": config.seed},
         "boards": [board_facts(board) for board in config.boards],
+        "provenance": origins_of(config, work).to_manifest(),
     }
     with RunWriter.create(output, "timeline", manifest, (TIMELINES, SKILLS, TOKENS)) as writer, quick_switching():
         progress.opened(writer.path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline
 from s2a_bench.experiments.timeline.traces import recordings
 from s2a_bench.machine import environment
 from s2a_bench.policy.conformal import Calibration
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import RunWriter
@@ -36,6 +37,7 @@ def run_virtual(config: TimelineConfig, output: Path, progress: Progress) -> Pat
         "environment": environment.collect(),
         "seeds": {"plans": config.seed},
         "boards": [board_facts(board) for board in config.boards],
+        "provenance": origins_of(config, work).to_manifest(),
     }
     with RunWriter.create(output, "timeline", manifest, (TIMELINES, SKILLS, TOKENS)) as writer:
         progress.opened(writer.path)
@@ -71,6 +73,17 @@ def _compute(
         writer.append(TIMELINES, rows)
         writer.append(SKILLS, skill_rows(rows[0].cell, plans, schedule, request_ids))
     return known.calibration
+
+
+def origins_of(config: TimelineConfig, work: Sequence[tuple[Board, Setting]]) -> Origins:
+    """Return where the numbers of each timeline come from: its board's tokens."""
+    clock = {setting.mode: "virtual" if setting.mode == "virtual" else "monotonic" for _, setting in work}
+    cells = {
+        name: replace(board.provenance, clock=clock[setting.mode])
+        for board, setting in work
+        for name in (setting.name, *(f"{setting.name}/{policy}" for policy in config.chosen))
+    }
+    return Origins(next(iter(cells.values()), Provenance()), cells)
 
 
 def board_facts(board: Board) -> dict[str, Any]:

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from s2a_bench.provenance import Origins
+
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
@@ -14,6 +16,9 @@ _MACHINE: Final = ("cpu", "machine", "board", "cores", "affinity", "governor", "
 
 _MODEL: Final = ("engine", "dummy", "model_sha256", "mmproj_sha256", "profile", "gaps")
 """Facts that make it another model, or none: emulated is not measured, dummy weights are no model."""
+
+_ORIGIN: Final = ("engine", "weights", "tokens", "link", "clock")
+"""What of the provenance must be the same; the model's files are compared by their hashes."""
 
 _PASSING: Final = ("host", "clock_id", "load", "gpus", "packages", "memory_bytes")
 """Facts of the environment that say nothing about likeness, or that are looked at more closely."""
@@ -47,6 +52,7 @@ def differences(baseline: Run, other: Run) -> list[Difference]:
         *_of("", *(_gpus(facts, "name") for facts in machines), fatal=True),
         *_of("tuning ", *(_tuning(manifest) for manifest in sides), fatal=True),
         *_of("model ", *({name: facts[name] for name in _MODEL if name in facts} for facts in models), fatal=True),
+        *_of("provenance ", *(_origin(manifest) for manifest in sides), fatal=True),
         *_of("", *(_rest(facts, (*_MACHINE, *_PASSING)) for facts in machines), fatal=False),
         *_of("", *(_gpus(facts, "driver") for facts in machines), fatal=False),
         *_of("package ", *(facts.get("packages", {}) for facts in machines), fatal=False),
@@ -76,6 +82,12 @@ def _tuning(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """Return whether the measuring process was tuned; a library's caller may not want that."""
     tuned = (manifest.get("tuning") or {}).get("process")
     return {} if tuned is None else {"process": "tuned" if tuned else "not tuned"}
+
+
+def _origin(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """Return where the numbers come from; nothing of a folder from before that was written down."""
+    every = Origins.of_manifest(manifest).every if "provenance" in manifest else ()
+    return {name: ", ".join(dict.fromkeys(getattr(each, name) for each in every)) for name in _ORIGIN if every}
 
 
 def _gpus(facts: Mapping[str, Any], key: str) -> dict[str, Any]:

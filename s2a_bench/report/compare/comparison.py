@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UnlikeRuns, UsageError
 from s2a_bench.experiments import EXPERIMENTS, Compared, Metric, Subject, by_name, experiment_of
+from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.compare.alike import Difference, differences, in_words
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.stats.change import Change, change_between, holm
@@ -75,6 +76,11 @@ class ComparedRuns:
     def launches(self) -> bool:
         """Return whether launches were repeated on both sides, so that they are what the test goes by."""
         return len(self.baseline) > 1 and len(self.other) > 1
+
+    @property
+    def origins(self) -> Origins:
+        """Return where the numbers of both sides come from."""
+        return joined(run.origins for run in (*self.baseline, *self.other))
 
     @property
     def command(self) -> str:

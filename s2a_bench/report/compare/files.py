@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from s2a_bench.errors import StoreError
 from s2a_bench.report.compare.figure import build_forest
 from s2a_bench.report.compare.tables import compare_csv, compare_table
+from s2a_bench.writers.figures import marked
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import to_latex, to_markdown
 
@@ -34,6 +35,7 @@ def write_comparison(folder: Path, compared: ComparedRuns, whole: Mapping[str, A
         with paper_column():
             figure = build_forest(compared)
             if figure:
+                marked(figure, compared.origins.line)
                 for suffix in ("png", "pdf"):
                     written.append(folder / f"compare.{suffix}")
                     figure.savefig(written[-1])

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.report.compare.comparison import LEVEL
 from s2a_bench.stats.batches import BATCHES
-from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
@@ -27,7 +27,15 @@ def compare_table(compared: ComparedRuns) -> TextTable:
             rows.append((_title(one), *[""] * (len(_HEADER) - 1)))
         rows.append((one.pair.name, *_row(one)))
         last = one.name
-    return TextTable(f"{compared.command}: B against A", _HEADER, rows, 1, frozenset(rules - {0}), notes(compared))
+    return TextTable(
+        f"{compared.command}: B against A",
+        _HEADER,
+        rows,
+        1,
+        frozenset(rules - {0}),
+        notes(compared),
+        compared.origins.line,
+    )
 
 
 def notes(compared: ComparedRuns) -> tuple[str, ...]:
@@ -53,7 +61,7 @@ def compare_csv(compared: ComparedRuns) -> str:
     header = ("cell", "metric", "statistic", "unit", "n_baseline", "n_other", "baseline", "other", "ratio", "ratio_low",
               "ratio_high", "difference", "difference_low", "difference_high", "superiority", "superiority_low",
               "superiority_high", "p", "p_holm", "verdict")  # fmt: skip
-    return csv_text(header, (_full(one) for one in compared.comparisons))
+    return CsvTable.of(header, (_full(one) for one in compared.comparisons)).text(compared.origins)
 
 
 def percent(share: float) -> str:

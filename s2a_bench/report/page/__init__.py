@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.experiments.timeline.view.cells import Timelines
     from s2a_bench.store.run import Run
+    from s2a_bench.writers.csv_text import CsvTable
     from s2a_bench.writers.tables import TextTable
 
 
@@ -18,13 +19,13 @@ if TYPE_CHECKING:
 class Content:
     """What a command's run shows: sentences, tables and figures by their files' names, and timelines to look into.
 
-    ``csvs`` are whole CSV texts by file name. ``main`` are the tables that stand open on the page, in that order.
+    ``csvs`` are tables for programs by file name. ``main`` are the tables that stand open on the page, in that order.
     """
 
     summary: Sequence[str] = ()
     tables: Mapping[str, TextTable] = field(default_factory=dict)
     main: Sequence[str] = ()
-    csvs: Mapping[str, str] = field(default_factory=dict)
+    csvs: Mapping[str, CsvTable] = field(default_factory=dict)
     figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     timelines: Sequence[Timelines] = ()
 

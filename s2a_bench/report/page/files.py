@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2a_bench.errors import StoreError
+from s2a_bench.provenance import joined
 from s2a_bench.report.claims.verdicts import Judged, claim_table, judge_claims
 from s2a_bench.report.page.chapters import mixed_machines
 from s2a_bench.report.page.page import GENERATOR, render, tally
 from s2a_bench.report.page.plots import draw
-from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.latex import document, escape, to_siunitx
 from s2a_bench.writers.tables import to_markdown
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from s2a_bench.report.page import Chapter
     from s2a_bench.report.page.config import ReportConfig
     from s2a_bench.report.page.plots import Drawn
+    from s2a_bench.writers.tables import TextTable
 
 _MARK = f"<!-- {GENERATOR} -->"
 _LONG_ROWS = 30
@@ -69,7 +71,7 @@ def _latex(report: Report, drawn: dict[str, dict[str, Drawn]]) -> Iterator[tuple
     r"""Yield every table as .tex and figure as .pdf by its path, and a report.tex that shows all of them."""
     parts = []
     if report.judged:
-        table = claim_table(report.judged)
+        table = _claims(report)
         yield "claims.tex", to_siunitx(table, ("22mm", "62mm", "22mm", "130mm"), long=True)
         parts.append(r"\input{claims}")
     for chapter in report.chapters:
@@ -93,17 +95,24 @@ def _csv(report: Report) -> Iterator[tuple[str, str]]:
             (each.verdict, each.claim.where, each.claim.text, each.claim.run, " ".join(each.evidence))
             for each in report.judged
         ]
-        yield "claims.csv", csv_text(("verdict", "where", "claim", "run", "evidence"), rows)
+        origins = joined(chapter.run.origins for chapter in report.chapters)
+        yield "claims.csv", CsvTable.of(("verdict", "where", "claim", "run", "evidence"), rows).text(origins)
     for chapter in report.chapters:
-        for name, text in chapter.content.csvs.items():
-            yield f"{chapter.name}/{name}", text
+        for name, table in chapter.content.csvs.items():
+            yield f"{chapter.name}/{name}", table.text(chapter.run.origins)
+
+
+def _claims(report: Report) -> TextTable:
+    """Lay out the verdicts, with where the numbers of the judged runs come from."""
+    origins = joined(chapter.run.origins for chapter in report.chapters)
+    return replace(claim_table(report.judged), provenance=origins.line)
 
 
 def _markdown(report: Report) -> str:
     """Return everything but the figures as one Markdown text."""
     parts = [_MARK, *(f"> {caveat}" for caveat in report.caveats)]
     if report.judged:
-        parts += [f"## The paper's claims\n\n{tally(report.judged)}.", to_markdown(claim_table(report.judged))]
+        parts += [f"## The paper's claims\n\n{tally(report.judged)}.", to_markdown(_claims(report))]
     for chapter in report.chapters:
         parts.append(f"## {chapter.title}")
         parts += [f"> {caveat}" for caveat in chapter.caveats]

@@ -86,7 +86,7 @@ def _view(chapter: Chapter, figures: dict[str, Drawn]) -> dict[str, Any]:
         "folder": str(chapter.run.path),
         "state": manifest.get("state", "unknown"),
         "started": when(manifest),
-        "labels": labels_of(content.tables.values()),
+        "labels": list(dict.fromkeys((*chapter.run.origins.labels, *labels_of(content.tables.values())))),
         "summary": content.summary,
         "caveats": chapter.caveats,
         "warnings": manifest.get("warnings", []),

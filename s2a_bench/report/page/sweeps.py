@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.latency.view.cells import cells_of, engine_note
 from s2a_bench.experiments.latency.view.tables import TITLES
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
+from s2a_bench.provenance import joined
 from s2a_bench.report.page import Content
 from s2a_bench.stats import summary_of
 from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import Run
-from s2a_bench.writers.csv_text import frame_csv
+from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.tables import ABSENT, TextTable, mean_sd, number
 
 if TYPE_CHECKING:
@@ -40,7 +42,9 @@ def overview(sweep: Sweep, runs: Runs) -> Content:
     tables = {"cells": cell_table(sweep)}
     if measured := measured_table(runs):
         tables = {"overview": measured, **tables}
-    csvs = {"cells.csv": frame_csv(sweep.cells)}
+    line = joined(run.origins for _, run in runs).line
+    tables = {name: replace(table, provenance=line) for name, table in tables.items()}
+    csvs = {"cells.csv": CsvTable.of_frame(sweep.cells)}
     return Content(said, tables, ["overview"] if measured else [], csvs)
 
 
@@ -119,6 +123,7 @@ def _joined(sweep: Sweep, runs: Sequence[Run]) -> Run:
     manifest["calibrations"] = {
         name: found for run in runs for name, found in (run.manifest.get("calibrations") or {}).items()
     }
+    manifest["provenance"] = joined(run.origins for run in runs).to_manifest()
     return Run(sweep.path, manifest, tables)
 
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.figure import Figure
 
+from s2a_bench.experiments.boundary import EXPERIMENT
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.run import rows, run_boundary
-from s2a_bench.experiments.boundary.view import show
 from s2a_bench.experiments.boundary.view.figure import build_boundary
 from s2a_bench.experiments.boundary.view.tables import board_table, boundary_csv, disagreements, line_table
 from s2a_bench.store.run import Run, read_run
@@ -112,7 +112,10 @@ def test_the_title_says_whose_rates_are_marked(even: Run) -> None:
 
 
 def test_the_figure_is_written_as_png_and_pdf(even: Run) -> None:
-    assert [path.name for path in save(even.path / "figures", show(even).figures)] == ["boundary.png", "boundary.pdf"]
+    assert [path.name for path in save(even.path / "figures", EXPERIMENT.show(even).figures)] == [
+        "boundary.png",
+        "boundary.pdf",
+    ]
 
 
 def test_tables_give_the_formula_and_the_first_rate_that_passed(even: Run) -> None:
@@ -127,6 +130,6 @@ def test_tables_give_the_formula_and_the_first_rate_that_passed(even: Run) -> No
 
 
 def test_the_csv_holds_every_point(even: Run) -> None:
-    lines = boundary_csv(even)["boundary.csv"].splitlines()
-    assert lines[0] == "duration,duration_s,tokens_per_skill,tokens_per_s,board,stall_free,plans,p_stall"
+    lines = boundary_csv(even)["boundary.csv"].text(even.origins).splitlines()
+    assert lines[0] == "duration,duration_s,tokens_per_skill,tokens_per_s,board,stall_free,plans,p_stall,provenance"
     assert len(lines) == 1 + 424

@@ -10,7 +10,7 @@ from matplotlib.patches import Rectangle
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments.files import write_shown
-from s2a_bench.experiments.latency.view import show
+from s2a_bench.experiments.latency import EXPERIMENT
 from s2a_bench.experiments.latency.view.figures import (
     build_distribution,
     build_latency_bars,
@@ -160,7 +160,7 @@ def test_no_text_is_clipped_or_smaller_than_seven_points(
 
 def test_png_and_pdf_are_written_below_the_run(make_run: MakeRun) -> None:
     run = make_run(n=3)
-    write_shown(run, show(run, against="paper"))
+    write_shown(run, EXPERIMENT.show(run, against="paper"))
     paths = sorted((run.path / "figures").iterdir())
     names = ["distribution", "latency_bars", "stage_breakdown"]
     assert [path.name for path in paths] == [f"{name}.{suffix}" for name in names for suffix in ("pdf", "png")]
@@ -172,7 +172,7 @@ def test_png_and_pdf_are_written_below_the_run(make_run: MakeRun) -> None:
 
 def test_without_samples_there_are_no_figures(make_run: MakeRun) -> None:
     run = make_run({})
-    write_shown(run, show(run))
+    write_shown(run, EXPERIMENT.show(run))
     assert not (run.path / "figures").exists()
 
 
@@ -180,13 +180,13 @@ def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun) -> None:
     run = make_run(n=1)
     (run.path / "figures").write_text("")
     with pytest.raises(StoreError, match=r"cannot write .*figures"):
-        write_shown(run, show(run))
+        write_shown(run, EXPERIMENT.show(run))
 
 
 def test_drawing_leaves_no_global_state(make_run: MakeRun) -> None:
     before = dict(mpl.rcParams)
     run = make_run(n=1)
-    write_shown(run, show(run))
+    write_shown(run, EXPERIMENT.show(run))
     assert dict(mpl.rcParams) == before
 
 

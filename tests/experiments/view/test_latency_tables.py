@@ -11,6 +11,7 @@ from rich.console import Console
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments.files import write_shown
+from s2a_bench.experiments.latency import EXPERIMENT
 from s2a_bench.experiments.latency.view import show
 from s2a_bench.experiments.latency.view.as_csv import csv_texts
 from s2a_bench.experiments.latency.view.tables import group_table, stage_table, summary_table
@@ -124,7 +125,8 @@ def test_a_black_box_is_absent_where_its_inference_is_unknown(make_run: MakeRun,
 
 
 def test_markdown_and_latex_are_tables(make_run: MakeRun) -> None:
-    table = stage_table(make_run(HAND, n=4, spread=0))
+    run = make_run(HAND, n=4, spread=0)
+    table = replace(stage_table(run), provenance=run.origins.line)
     markdown = to_markdown(table).splitlines()
     assert markdown[0] == "**Stages in ms: median (mean ± sd)**"
     assert markdown[2:5] == [
@@ -136,19 +138,23 @@ def test_markdown_and_latex_are_tables(make_run: MakeRun) -> None:
     assert r"\begin{tabular}{llrr}" in latex
     assert r"encode & image\_encode & 3.00 (3.00 $\pm$ 0.00) & -- \\" in latex
     assert latex.count(r"\midrule") == 2
-    assert latex.endswith("\\bottomrule\n\\end{tabular}\n")
+    assert latex.endswith(
+        "\\end{tabular}\n\\par{\\footnotesize Provenance: engine UNKNOWN (the server does not tell).}\n"
+    )
     # Nothing outside comments that LaTeX would take for something else.
     body = [line for line in latex.splitlines() if not line.startswith("%")]
     assert not any(char in line.replace(r"\_", "").replace(r"\%", "") for line in body for char in f"_%#±{NONE}")
 
 
 def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -> None:
-    texts = csv_texts(make_run(HAND, n=4, spread=0))
+    run = make_run(HAND, n=4, spread=0)
+    texts = {name: table.text(run.origins) for name, table in csv_texts(run).items()}
     stages = list(csv.DictReader(io.StringIO(texts["stages.csv"])))
     ros = {row["stage"]: row for row in stages if row["cell"] == "ros/topic"}
     assert list(ros) == ["capture", "cdr_pack", "network", "inference", "return", "residual"]
     assert ros["cdr_pack"] == {
         "cell": "ros/topic",
+        "provenance": "unknown/unknown/unknown",
         "group": "pack",
         "stage": "cdr_pack",
         "n": "4",
@@ -169,7 +175,8 @@ def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -
     }
     ratio = next(csv.DictReader(io.StringIO(texts["ratios.csv"])))
     assert ratio["emulated"] == "False"
-    for text in csv_texts(make_run(HAND, n=4, engine="replay")).values():
+    for table in csv_texts(make_run(HAND, n=4, engine="replay")).values():
+        text = table.text(run.origins)
         assert {row["emulated"] for row in csv.DictReader(io.StringIO(text))} == {"True"}
     assert (ratio["of"], ratio["to"], float(ratio["value"])) == ("http/as-deployed", "ros/topic", 26 / 4.5124)
 
@@ -178,13 +185,13 @@ def test_a_cell_in_which_everything_failed_is_in_the_summary(
     make_run: MakeRun, make_row: Callable[..., SampleRow]
 ) -> None:
     run = make_run({}, extra=(make_row("ros/topic", {"capture": 1}, 1, error="lost"),))
-    assert csv_texts(run)["summary.csv"].splitlines()[1] == "ros/topic,,1,0,0,,,,,,False"
+    assert csv_texts(run)["summary.csv"].rows == [("ros/topic", "", 1, 0, 0, *[None] * 5, False)]
     assert summary_table(run).rows == [("ros/topic", "0", "1", NONE, NONE, NONE, NONE)]
 
 
 def test_the_files_are_written_below_the_run(make_run: MakeRun) -> None:
     run = make_run(n=3)
-    write_shown(run, replace(show(run), figures={}))
+    write_shown(run, replace(EXPERIMENT.show(run), figures={}))
     paths = [*(run.path / "tables").iterdir()]
     assert sorted(path.name for path in paths) == [
         "ratios.csv",
@@ -204,7 +211,7 @@ def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun) -> None:
     run = make_run(n=1)
     (run.path / "tables").write_text("")
     with pytest.raises(StoreError, match=r"cannot write .*tables"):
-        write_shown(run, show(run))
+        write_shown(run, EXPERIMENT.show(run))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6])

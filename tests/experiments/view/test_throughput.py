@@ -17,8 +17,8 @@ from matplotlib.patches import Rectangle
 
 from s2a_bench.experiments.files import write_shown
 from s2a_bench.experiments.paper import paper_throughput
+from s2a_bench.experiments.throughput import EXPERIMENT
 from s2a_bench.experiments.throughput.rows import REFERENCE, ReferenceRow
-from s2a_bench.experiments.throughput.view import show
 from s2a_bench.experiments.throughput.view.as_json import throughput_json
 from s2a_bench.experiments.throughput.view.cells import BIN, Speed, ratios_of, speeds_of
 from s2a_bench.experiments.throughput.view.figures import (
@@ -31,7 +31,6 @@ from s2a_bench.experiments.throughput.view.figures import (
 from s2a_bench.experiments.throughput.view.tables import position_table, speed_table, throughput_csv, throughput_tables
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.writers.files import write_texts
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.terminal import lay_out
 
@@ -210,13 +209,14 @@ def test_the_tables_fit_a_terminal_and_are_written(make: Make) -> None:
     notes = " ".join(tables["throughput"].notes)
     assert "Dummy weights." in notes
     assert "llama-bench decodes behind 42 tokens" in notes
-    names = {path.name for path in write_texts(run, tables, throughput_csv(run))}
+    write_shown(run, EXPERIMENT.show(run))
+    names = {path.name for path in (run.path / "tables").iterdir()}
     assert {"throughput.md", "throughput.tex", "throughput.csv", "gaps.md", "positions.csv", "ratios.csv"} <= names
 
 
 def test_the_csv_keeps_every_digit(make: Make) -> None:
     run = make({"in-process": [7] * 3}, n=1)
-    rows = list(csv.DictReader(io.StringIO(throughput_csv(run)["throughput.csv"])))
+    rows = list(csv.DictReader(io.StringIO(throughput_csv(run)["throughput.csv"].text(run.origins))))
     found = {row["metric"]: row["median"] for row in rows}
     assert float(found["decode_tokens_per_s"]) == 3 / 0.021
     assert found["itl_ms"] == "7.0"
@@ -263,7 +263,7 @@ def test_one_late_burst_does_not_hide_the_rates(make: Make) -> None:
 
 def test_the_figures_are_written_and_none_without_rates(make: Make) -> None:
     run = make({"in-process": [10.0] * 40, "http/as-deployed": [1.0] * 40})
-    write_shown(run, show(run, against="paper"))
+    write_shown(run, EXPERIMENT.show(run, against="paper"))
     names = sorted(path.name for path in (run.path / "figures").iterdir())
     assert names == [
         f"{name}.{suffix}" for name in ("gaps", "positions", "throughput_bars") for suffix in ("pdf", "png")

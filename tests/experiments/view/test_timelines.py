@@ -13,18 +13,18 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from s2a_bench.experiments.timeline import EXPERIMENT
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows, token_rows
 from s2a_bench.experiments.timeline.view.as_json import timelines_json
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.chrome_trace import TRACE, to_trace, write_trace
-from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours, timeline_figures
+from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours
 from s2a_bench.experiments.timeline.view.tables import (
     execution_table,
     seconds,
     skill_table,
     timeline_csv,
-    timeline_tables,
 )
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
@@ -166,7 +166,7 @@ def test_requests_of_their_own_have_their_tokens_in_their_lanes(live: Run) -> No
 
 
 def test_figures_are_written_as_png_and_pdf(computed: Run) -> None:
-    written = save(computed.path / "figures", timeline_figures(computed))
+    written = save(computed.path / "figures", EXPERIMENT.show(computed).figures)
     assert [path.name for path in written] == ["timeline.png", "timeline.pdf"]
     assert all(path.stat().st_size > 5000 for path in (computed.path / "figures").iterdir())
 
@@ -255,17 +255,17 @@ def test_the_skill_table_names_calls_and_stalls(live: Run) -> None:
 
 
 def test_every_table_is_whole_markdown(computed: Run) -> None:
-    for table in timeline_tables(computed).values():
+    for table in EXPERIMENT.show(computed).tables.values():
         lines = [line for line in to_markdown(table).splitlines() if line.startswith("|")]
         assert len({line.count("|") for line in lines}) == 1
         assert len(lines) == len(table.rows) + 2
 
 
 def test_csv_keeps_every_digit_and_leaves_out_what_is_absent(computed: Run) -> None:
-    lines = timeline_csv(computed)["timelines.csv"].splitlines()
-    assert "orin/L6/N8/T1/naive,stall_s,1,1.75,1.75,,1.75,1.75" in lines
+    lines = timeline_csv(computed)["timelines.csv"].text(computed.origins).splitlines()
+    assert f"orin/L6/N8/T1/naive,stall_s,1,1.75,1.75,,1.75,1.75,{computed.origins.code}" in lines
     (share,) = [line for line in lines if line.startswith("orin/L6/N8/T1/naive,p_any_stall")]
-    assert share == "orin/L6/N8/T1/naive,p_any_stall,1,,1.0,,,"
+    assert share == f"orin/L6/N8/T1/naive,p_any_stall,1,,1.0,,,,{computed.origins.code}"
 
 
 def test_json_has_no_key_for_what_a_live_run_does_not_know(live: Run) -> None:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.view.cell import BoundaryCell
+from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.as_json import frame
-from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.tables import ABSENT, EMULATED, PAPERS, Note, TextTable, number
 
 if TYPE_CHECKING:
@@ -79,10 +80,10 @@ def boundary_tables(run: Run) -> dict[str, TextTable]:
     return {"boundary": line_table(run), "boards": board_table(run)}
 
 
-def boundary_csv(run: Run) -> dict[str, str]:
-    """Return file name -> CSV text: every point of the plane and of the boards."""
+def boundary_csv(run: Run) -> dict[str, CsvTable]:
+    """Return file name -> CSV table: every point of the plane and of the boards."""
     names = ("duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall")
-    return {"boundary.csv": csv_text(names, run.table(BOUNDARY)[list(names)].itertuples(index=False, name=None))}
+    return {"boundary.csv": CsvTable.of(names, run.table(BOUNDARY)[list(names)].itertuples(index=False, name=None))}
 
 
 def boundary_json(run: Run) -> dict[str, Any]:
@@ -110,7 +111,7 @@ def disagreements(run: Run) -> int:
 
 
 def _cells(run: Run) -> Iterator[dict[str, Any]]:
-    for row in run.table(BOUNDARY).to_dict("records"):
+    for row in run.table(BOUNDARY).drop(columns=PROVENANCE).to_dict("records"):
         rate, board = row.pop("tokens_per_s"), row.pop("board")
         rho = row["tokens_per_skill"] / rate / row["duration_s"]
         named: dict[str, Any] = {str(name): value for name, value in row.items()}

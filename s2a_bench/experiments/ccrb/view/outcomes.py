@@ -10,6 +10,7 @@ from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
 from s2a_bench.scenario.ccrb.words import PAPER
 from s2a_bench.store.requests import TOKENS
+from s2a_bench.store.schema import PROVENANCE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -121,7 +122,7 @@ def _cell(row: dict[Any, Any]) -> dict[str, Any]:
     import pandas as pd
 
     plain = {str(name): value for name, value in row.items() if not pd.isna(value)}
-    for name in ("study", "draw", "title"):
+    for name in ("study", "draw", "title", PROVENANCE):
         plain.pop(name, None)
     for name in _TIMES:
         plain[f"{name}_s"] = plain.pop(f"{name}_ns") / 1e9

@@ -21,7 +21,7 @@ from s2a_bench.experiments.ccrb.view.sentences import origin_notes
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.words import ORDERING, SAID, law, operating_point
 from s2a_bench.writers.as_json import frame
-from s2a_bench.writers.csv_text import csv_text
+from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, number
 
 if TYPE_CHECKING:
@@ -85,8 +85,8 @@ def ccrb_tables(run: Run) -> dict[str, TextTable]:
     return {**tables, "margins": margin_table(run), "outcomes": outcome_table(run)}
 
 
-def ccrb_csv(run: Run) -> dict[str, str]:
-    """Return file name -> CSV text: the shares of the studies; the roll-outs are in rollouts.csv."""
+def ccrb_csv(run: Run) -> dict[str, CsvTable]:
+    """Return file name -> CSV table: the shares of the studies; the roll-outs are in rollouts.csv."""
     rows: list[tuple[Any, ...]] = []
     for study in ("phase", "random"):
         if has(run, study):
@@ -96,7 +96,9 @@ def ccrb_csv(run: Run) -> dict[str, str]:
                     share = share_of(scenes, name)
                     interval = share.interval if study == "random" else (None, None)
                     rows.append((study, gap, name, share.k, share.n, share.value, *interval))
-    return {"orderings.csv": csv_text(("study", "gap_behaviour", "ordering", "k", "n", "share", "low", "high"), rows)}
+    return {
+        "orderings.csv": CsvTable.of(("study", "gap_behaviour", "ordering", "k", "n", "share", "low", "high"), rows)
+    }
 
 
 def ccrb_json(run: Run) -> dict[str, Any]:

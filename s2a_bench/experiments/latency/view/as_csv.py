@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratios, stages_present
 from s2a_bench.stats import summary_of
-from s2a_bench.writers.csv_text import SUMMARY, csv_text, summary_values
+from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 _METRICS = ("e2e_without_inference", "e2e", "ttft", "frame_age")
 
 
-def csv_texts(run: Run) -> dict[str, str]:
-    """Return file name -> CSV text: stages.csv, summary.csv, ratios.csv; times in ms, what is absent has no row."""
+def csv_texts(run: Run) -> dict[str, CsvTable]:
+    """Return file name -> CSV table: stages.csv, summary.csv, ratios.csv; times in ms, what is absent has no row."""
     cells = cells_of(run)
     found = ratios(cells, run.bootstrap_seed)
     return {
-        "stages.csv": csv_text(("cell", "group", "stage", *SUMMARY, "emulated"), _stages(cells)),
-        "summary.csv": csv_text(("cell", "metric", "errors", "warmups", *SUMMARY, "emulated"), _summaries(cells)),
-        "ratios.csv": csv_text(
+        "stages.csv": CsvTable.of(("cell", "group", "stage", *SUMMARY, "emulated"), _stages(cells)),
+        "summary.csv": CsvTable.of(("cell", "metric", "errors", "warmups", *SUMMARY, "emulated"), _summaries(cells)),
+        "ratios.csv": CsvTable.of(
             ("metric", "of", "to", "value", "ci95_low", "ci95_high", "emulated"),
             (
                 (f"{metric}_ms", of.name, to.name, ratio.value, ratio.low, ratio.high, of.emulated or to.emulated)

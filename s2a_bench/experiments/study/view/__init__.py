@@ -13,8 +13,9 @@ from s2a_bench.experiments.study.rows import STUDY_CELLS, StudyRow
 from s2a_bench.experiments.study.view.tables import study_of, study_tables
 from s2a_bench.experiments.study.view.targets import ONLINE, Target
 from s2a_bench.store.bounds import Positive, about
+from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.as_json import cell_of_row, frame
-from s2a_bench.writers.csv_text import frame_csv
+from s2a_bench.writers.csv_text import CsvTable
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
@@ -40,7 +41,7 @@ def show(run: Run, **_: Any) -> Shown:
         tables=tables,
         main=list(tables),
         notes=list(dict.fromkeys(note for table in tables.values() for note in table.notes)),
-        csvs={f"{study.name}.csv": frame_csv(run.table(STUDY_CELLS))},
+        csvs={f"{study.name}.csv": CsvTable.of_frame(run.table(STUDY_CELLS))},
         figures={study.name: partial(resolve_name(study.figure), run)},
         json=partial(study_json, run),
     )
@@ -72,6 +73,7 @@ def _cells(run: Run) -> Iterator[dict[str, Any]]:
     """Yield a cell a row; what a row does not have is an absent key."""
     import pandas as pd
 
-    for row in run.table(STUDY_CELLS).to_dict("records"):
+    for row in run.table(STUDY_CELLS).drop(columns=PROVENANCE).to_dict("records"):
         row["rate_tokens_per_s"] = row.pop("tokens_per_s")
-        yield {str(name): value for name, value in row.items() if not pd.isna(value)} | {"emulated": True}
+        known = {str(name): value for name, value in row.items() if not pd.isna(value)}
+        yield known | {"emulated": True}

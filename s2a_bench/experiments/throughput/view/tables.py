@@ -17,7 +17,7 @@ from s2a_bench.experiments.throughput.view.cells import (
     speeds_of,
 )
 from s2a_bench.stats import summarise, summary_of
-from s2a_bench.writers.csv_text import SUMMARY, csv_text, summary_values
+from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.tables import ABSENT, TextTable, interval, mean_sd, number
 
 if TYPE_CHECKING:
@@ -106,8 +106,8 @@ def throughput_tables(run: Run) -> dict[str, TextTable]:
     return tables
 
 
-def throughput_csv(run: Run) -> dict[str, str]:
-    """Return file name -> CSV text, every digit kept; what is absent has no row."""
+def throughput_csv(run: Run) -> dict[str, CsvTable]:
+    """Return file name -> CSV table, every digit kept; what is absent has no row."""
     speeds = speeds_of(run)
     summaries = [
         (speed.name, metric, *summary_values(summary), speed.cell.emulated)
@@ -127,9 +127,9 @@ def throughput_csv(run: Run) -> dict[str, str]:
         (RATIO_METRIC, of, to, ratio.value, ratio.low, ratio.high, emulated) for of, to, ratio in ratios_of(run, speeds)
     ]
     return {
-        "throughput.csv": csv_text(("cell", "metric", *SUMMARY, "emulated"), summaries),
-        "positions.csv": csv_text(("cell", "first", "last", *SUMMARY, "emulated"), positions),
-        "ratios.csv": csv_text(("metric", "of", "to", "value", "ci95_low", "ci95_high", "emulated"), ratios),
+        "throughput.csv": CsvTable.of(("cell", "metric", *SUMMARY, "emulated"), summaries),
+        "positions.csv": CsvTable.of(("cell", "first", "last", *SUMMARY, "emulated"), positions),
+        "ratios.csv": CsvTable.of(("metric", "of", "to", "value", "ci95_low", "ci95_high", "emulated"), ratios),
     }
 
 

@@ -24,6 +24,7 @@ from s2a_bench.inference import need_engine
 from s2a_bench.inference.models import resolve
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.progress import Progress
+from s2a_bench.provenance import Origins
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
@@ -118,6 +119,7 @@ class Link:
         self.writer.update(
             servers=facts,
             model=self.facts,
+            provenance=Origins(self.servers.origin(self.cell)).to_manifest(),
             live={
                 "transport": self.cell.name,
                 "engine": self.facts.get("engine", "unknown"),

@@ -13,7 +13,7 @@ from s2a_bench.experiments.timeline.view.cells import (
     panels,
     timelines_of,
 )
-from s2a_bench.writers.csv_text import SUMMARY, csv_text
+from s2a_bench.writers.csv_text import SUMMARY, CsvTable
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
@@ -91,8 +91,8 @@ def timeline_tables(run: Run) -> dict[str, TextTable]:
     }
 
 
-def timeline_csv(run: Run) -> dict[str, str]:
-    """Return file name -> CSV text in long form, every digit kept, times in s; what is absent has no row."""
+def timeline_csv(run: Run) -> dict[str, CsvTable]:
+    """Return file name -> CSV table in long form, every digit kept, times in s; what is absent has no row."""
     summaries = []
     for cell in timelines_of(run):
         for name, metric in METRICS.items():
@@ -100,7 +100,7 @@ def timeline_csv(run: Run) -> dict[str, str]:
                 parts = ("n", "mean") if metric.kind == FLAG else SUMMARY
                 values = (getattr(found, part) if part in parts else None for part in SUMMARY)
                 summaries.append((cell.about("cell"), name, *values))
-    return {"timelines.csv": csv_text(("cell", "metric", *SUMMARY), summaries)}
+    return {"timelines.csv": CsvTable.of(("cell", "metric", *SUMMARY), summaries)}
 
 
 def seconds(value: float) -> str:
