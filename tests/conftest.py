@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import signal
 from collections.abc import Iterator
 
 import pytest
@@ -28,6 +29,13 @@ def dds_domain() -> int:
     for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "CYCLONEDDS_URI"):
         os.environ.pop(name, None)
     return domain
+
+
+@pytest.fixture(scope="session", autouse=True)
+def interrupts_reach_the_processes_of_tests() -> None:
+    """Undo what a shell does to background jobs: a process that inherits an ignored SIGINT cannot be interrupted."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)
