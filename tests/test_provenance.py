@@ -16,7 +16,8 @@ from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.provenance import Origins, Provenance, joined
 from s2a_bench.report.compare.alike import differences
 from s2a_bench.report.page.chapters import read_chapters
-from s2a_bench.report.page.files import Outputs, make_report, write_report
+from s2a_bench.report.page.config import ReportConfig
+from s2a_bench.report.page.files import make_report, write_report
 from s2a_bench.store.run import Run, RunWriter, read_run
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.figures import new_figure, save
@@ -125,7 +126,10 @@ def test_every_table_csv_figure_page_and_json_of_every_experiment_has_it(name: s
     assert shown.json()["provenance"] == stored.origins.to_manifest()
     chapters = read_chapters([run.path], against_paper=False)
     page, csvs = tmp_path / "page.html", tmp_path / "csv"
-    write_report(make_report(chapters, against_paper=False), Outputs(page=page, csv=csvs, latex=tmp_path / "tex"))
+    write_report(
+        make_report(chapters, against_paper=False),
+        ReportConfig(runs=[run.path], output=page, csv=csvs, latex=tmp_path / "tex"),
+    )
     assert line.removesuffix(".") in page.read_text()
     for path in csvs.rglob("*.csv"):
         assert PROVENANCE in path.read_text().partition("\n")[0], path

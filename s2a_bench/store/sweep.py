@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.errors import StoreError
+from s2a_bench.provenance import Origins, joined
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.store.schema import Table
 
@@ -60,6 +61,11 @@ class Sweep:
     manifest: dict[str, Any]
     attempts: pd.DataFrame
     cells: pd.DataFrame
+
+    @property
+    def origins(self) -> Origins:
+        """Return where the numbers of its finished cells come from."""
+        return joined(run.origins for _, run in self.runs())
 
     def runs(self) -> Iterator[tuple[dict[str, Any], Run]]:
         """Yield the settings and the run of every finished cell, in the cells' order."""

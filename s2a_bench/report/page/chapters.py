@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.errors import StoreError
-from s2a_bench.provenance import joined
 from s2a_bench.report.compare.alike import differences
 from s2a_bench.report.page import Chapter, Content
 from s2a_bench.report.page.contents import content_of
@@ -103,7 +102,7 @@ def _unfinished(manifest: Mapping[str, Any]) -> Iterator[str]:
 def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
     """Yield the overview, runs that are computed as one, and the others one by one."""
     manifest, runs = sweep.manifest, list(sweep.runs())
-    head = Run(sweep.path, {**manifest, "provenance": joined(run.origins for _, run in runs).to_manifest()})
+    head = Run(sweep.path, {**manifest, "provenance": sweep.origins.to_manifest()})
     copy = sweep.path / "sweep.toml"
     attached = {copy.name: copy.read_text(encoding="utf-8")} if copy.is_file() else {}
     caveats = list(_unfinished(manifest))

@@ -42,7 +42,7 @@ def overview(sweep: Sweep, runs: Runs) -> Content:
     tables = {"cells": cell_table(sweep)}
     if measured := measured_table(runs):
         tables = {"overview": measured, **tables}
-    line = joined(run.origins for _, run in runs).line
+    line = sweep.origins.line
     tables = {name: replace(table, provenance=line) for name, table in tables.items()}
     csvs = {"cells.csv": CsvTable.of_frame(sweep.cells)}
     return Content(said, tables, ["overview"] if measured else [], csvs)
