@@ -216,6 +216,10 @@ class Transport(Generic[O]):
         """Return the address of a server that somebody else runs, or nothing."""
         return ""
 
+    def cache_hits(self, wiring: Wiring[O]) -> Mapping[str, float]:  # noqa: ARG002 - for subclasses
+        """Return counter -> hits of its caches that a server has counted so far, as far as it tells; asked twice."""
+        return {}
+
     def program(self, options: O) -> Program | None:  # noqa: ARG002 - for subclasses
         """Return somebody else's server that the run should start, if that is wanted."""
         return None

@@ -33,7 +33,7 @@ def test_a_refused_sample_is_one_row_with_its_error_and_is_not_sent_again(more: 
         return [head("429 Too Many Requests", "application/json", *more), Cloud().refusal(429, "slow down")]
 
     with serving(busy) as url:
-        cell = one_pipeline("http/as-deployed", url=url, dialect="openai")
+        cell = one_pipeline("http/as-deployed", url=url, dialect="openai", served_model="m")
         client = open_client(cell.wiring(url))
         source = open_source("synthetic", 64, 48, fps=30.0, seed=0)
         session = Session(cell, client, RequestFeed(source, preencoded=False), RequestsConfig())

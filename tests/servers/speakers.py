@@ -298,8 +298,8 @@ class Gemini:
         ((turn,), settings) = body["contents"], body["generationConfig"]
         assert turn["role"] == "user"
         *images, text = turn["parts"]
-        assert all(image["inlineData"]["mimeType"] in {"image/jpeg", "image/png"} for image in images)
-        frames = tuple(picture(image["inlineData"]["data"]) for image in images)
+        assert all(image["inline_data"]["mime_type"] in {"image/jpeg", "image/png"} for image in images)
+        frames = tuple(picture(image["inline_data"]["data"]) for image in images)
         return Request("", text["text"], frames, settings["maxOutputTokens"], "", settings["seed"])
 
     def _chunk(self, parts: list[dict[str, Any]], usage: dict[str, int], **more: Any) -> bytes:
@@ -345,7 +345,10 @@ def answering(speaker: Speaker, handler: Handler) -> Reply:
             tokens = handler(speaker.read(received), Trace())
             first = list(next_of(tokens))
         except (AssertionError, EngineError, KeyError, ValueError) as error:
-            yield head("400 Bad Request", "application/json") + speaker.refusal(400, str(error))
+            if speaker.dialect == Tgi.dialect:  # its stream has begun, whatever comes of it
+                yield head(kind=speaker.kind) + speaker.error(str(error))
+            else:
+                yield head("400 Bad Request", "application/json") + speaker.refusal(400, str(error))
             return
         said: list[Token] = []
         yield kept_head(speaker.kind)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from threading import Event
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, UsageError
+from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.frames.convert import decode_image, encode_png, to_bgr
 from s2a_bench.testing.transport import Connect, Recorder, TransportSuite, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
@@ -19,14 +20,16 @@ from s2a_bench.transport import Client, Handler, Wiring, open_client
 from s2a_bench.transport.http.dialects import DIALECTS
 from s2a_bench.types import Request, Token
 from tests.servers.sockets import CLOSE, Received, Reply, chunk, head, kept_head, serving
-from tests.servers.speakers import SPEAKERS, Cloud, Gemini, LlamaServer, Ollama, Speaker, answering
+from tests.servers.speakers import SPEAKERS, Cloud, Gemini, LlamaServer, Ollama, Speaker, Tgi, answering
 
 GO_TO = [Token(0, "go", 11), Token(1, "_to", 12)]
 Pieces = list[bytes]
 
 
 def route(speaker: Speaker, url: str, **more: object) -> Wiring[Any]:
-    fields = {"payload": "png", "dialect": speaker.dialect, **more}
+    """A route that leaves nothing to be asked first."""
+    fields = {"payload": "png", "dialect": speaker.dialect, "served_model": "default", **more}
+    url += "/v1beta" if fields["dialect"] == "gemini" else ""
     return wiring("http/as-deployed", url=url, **fields)  # type: ignore[arg-type]
 
 
@@ -107,8 +110,15 @@ FACTS = {
     "llama-server": {"prompt_n": 9, "cache_n": 3, "prompt_ms": 97.5, "predicted_n": 2, "predicted_ms": 2.0}
     | {"thinking_n": 0},
     "vllm": {"prompt_n": 8, "cache_n": 4, "predicted_n": 2, "thinking_n": 0}
-    | {"first_token_ms": 31.5, "predicted_ms": 80.0, "queue_ms": 0.25, "mean_itl_ms": 8.0},
-    "ollama": {"prompt_n": 8, "predicted_n": 2}
+    | {
+        "end_n": 1,
+        "predicted_steps": 1,
+        "first_token_ms": 31.5,
+        "predicted_ms": 80.0,
+        "queue_ms": 0.25,
+        "mean_itl_ms": 8.0,
+    },
+    "ollama": {"prompt_with_cached_n": 8, "predicted_n": 2}
     | {"total_ms": 150.0, "load_ms": 10.0, "prompt_ms": 100.0, "predicted_ms": 30.0, "outside_model_ms": 10.0},
     "tgi": {"prompt_n": 8, "predicted_n": 2},
     "gemini": {"prompt_n": 8, "predicted_n": 2},
@@ -367,8 +377,8 @@ class TestKeys:
         ("ollama", "/api/chat", "/api/chat"),
         ("tgi", "", "/generate_stream"),
         ("tgi", "/generate_stream", "/generate_stream"),
-        ("gemini", "", "/v1beta/models/a%2Fb:streamGenerateContent?alt=sse"),
         ("gemini", "/v1beta/", "/v1beta/models/a%2Fb:streamGenerateContent?alt=sse"),
+        ("gemini", "/v1", "/v1/models/a%2Fb:streamGenerateContent?alt=sse"),
         ("openvla", "", "/act"),
         ("openvla", "/act", "/act"),
     ],
@@ -441,7 +451,7 @@ def test_both_variants_say_the_same(speaker: Speaker) -> None:
         handler = Recorder(["x"])
         handlers.append(handler)
         with serving(answering(speaker, handler)) as url:
-            client = open_client(wiring(f"http/{variant}", url=url, payload="png", dialect=speaker.dialect))
+            client = open_client(replace(route(speaker, url), variant=variant))
             ask(client, Request("a", "Grüße", (yuyv_frame(),), max_tokens=3, seed=5))
             client.close()
     (first,), (second,) = (handler.requests for handler in handlers)
@@ -451,3 +461,108 @@ def test_both_variants_say_the_same(speaker: Speaker) -> None:
 
 def test_every_dialect_is_tested_here_or_in_a_module_of_its_own() -> None:
     assert set(DIALECTS) == {speaker.dialect for speaker in SPEAKERS} | {"s2a", "openvla"}
+
+
+def listing(path: str, body: str, chat: Reply) -> Reply:
+    """A server with one list of models, and nothing else beside its chat."""
+
+    def reply(received: Received) -> Iterable[bytes]:
+        if received.method == "POST":
+            return chat(received)
+        found = received.path == path
+        return [head("200 OK" if found else "404 Not Found", "application/json"), body.encode() if found else b"{}"]
+
+    return reply
+
+
+class TestWhatAServerHas:
+    """Model and version of the API are what the server says, unless told."""
+
+    def described(self, reply: Reply, **options: Any) -> dict[str, str]:
+        with serving(reply) as url:
+            client = open_client(wiring("http/as-deployed", url=url, **options))
+            client.close()
+            return {name: told.removeprefix(url) for name, told in client.describe().items()}
+
+    @pytest.mark.parametrize("dialect", ["openai", "vllm", "ollama", ""])
+    def test_the_first_model_of_the_list_is_asked(self, dialect: str) -> None:
+        seen: list[Received] = []
+        speaker = Ollama() if dialect == "ollama" else Cloud()
+
+        def chat(received: Received) -> Pieces:
+            seen.append(received)
+            return answer(speaker)
+
+        reply = listing("/v1/models", '{"data":[{"id":"qwen-vl","owned_by":"x"},{"id":"other"}]}', chat)
+        with serving(reply) as url:
+            client = open_client(wiring("http/as-deployed", url=url, dialect=dialect))
+            ask(client, Request("a", "plan"))
+            client.close()
+        assert client.describe()["model"] == "qwen-vl"
+        assert seen[0].json["model"] == "qwen-vl"
+
+    @pytest.mark.parametrize("body", ["", "[]", '{"data":[]}', '{"data":[{"id":7}]}', '{"data":null}', "[" * 100_000])
+    def test_a_list_that_makes_no_sense_is_no_list(self, body: str) -> None:
+        assert "model" not in self.described(listing("/v1/models", body, lambda _: []), dialect="openai")
+
+    def test_a_model_that_is_named_is_not_looked_for(self) -> None:
+        reply = listing("/v1/models", '{"data":[{"id":"other"}]}', lambda _: [])
+        assert "model" not in self.described(reply, dialect="openai", served_model="mine")
+
+    @pytest.mark.parametrize("version", ["/v1beta", "/v1"])
+    def test_gemini_is_asked_in_the_version_that_is_there(self, version: str) -> None:
+        models = (
+            '{"models":[{"name":"models/embed","supportedGenerationMethods":["embedContent"]},{"name":"models/g"}]}'
+        )
+        told = self.described(listing(f"{version}/models", models, lambda _: []), dialect="gemini")
+        assert told["url"] == f"{version}/models/g:streamGenerateContent?alt=sse"
+        assert told["model"] == "g"
+
+    def test_a_gateway_lists_its_models_as_openai_does_and_speaks_geminis_usual_version(self) -> None:
+        reply = listing("/v1/models", '{"data":[{"id":"gpt"}]}', lambda _: [])
+        assert self.described(reply, dialect="gemini")["url"] == "/v1beta/models/gpt:streamGenerateContent?alt=sse"
+
+    def test_a_dead_server_is_told_before_flags_are_judged(self) -> None:
+        with pytest.raises(ServerDied, match=r"nothing answers at http://127\.0\.0\.1:9/v1/models"):
+            open_client(wiring("http/as-deployed", url="http://127.0.0.1:9"))
+
+
+@pytest.mark.parametrize(
+    ("status", "said_"),
+    [
+        ("400 Bad Request", "Invalid model name passed in model=default"),
+        ("404 Not Found", "The model `default` does not exist."),
+        ("500 Oops", 'model "default" not found, try pulling it first'),
+    ],
+)
+def test_a_model_that_is_not_there_has_its_hint_whatever_the_status(status: str, said_: str) -> None:
+    pieces = [head(status, "application/json"), Cloud().refusal(int(status[:3]), said_)]
+    with pytest.raises(RequestFailed, match=r"name a model that it has with `served_model` \(now 'default'\)"):
+        said(Cloud(), pieces)
+    with pytest.raises(RequestFailed, match="`served_model`"):
+        said(Cloud(), [head(), Cloud().error(said_)])
+
+
+def test_an_overloaded_tgi_says_so_in_its_stream_and_has_the_advice_of_a_429() -> None:
+    refusal = b'data:{"error":"Model is overloaded","error_type":"overloaded"}\n\n'
+    with pytest.raises(RequestFailed, match="Model is overloaded; it wants fewer requests: see its quota"):
+        said(Tgi(), [head(kind=Tgi().kind), refusal])
+
+
+@pytest.mark.parametrize("speaker", [Cloud(), Gemini()], ids=lambda one: one.dialect)
+def test_a_usage_of_zeros_is_absent_and_noted(speaker: Speaker) -> None:
+    nothing = {
+        "openai": b'data: {"choices":[],"usage":{"prompt_tokens":0,"completion_tokens":0,"total_tokens":0}}\n\n',
+        "gemini": b'data: {"usageMetadata":{"promptTokenCount":0,"candidatesTokenCount":0}}\n\n',
+    }[speaker.dialect]
+    pieces = [head(kind=speaker.kind), b"" if speaker.dialect == "gemini" else speaker.token(GO_TO[0])]
+    pieces += [b'data: {"candidates":[{"content":{"parts":[{"text":"go"}]}}]}\n\n'] if not pieces[1] else []
+    _, trace = said(speaker, [*pieces, nothing, speaker.bare_closing(GO_TO)])
+    assert not {"prompt_n", "predicted_n"} & set(trace.facts)
+    assert trace.facts["usage_zero"] == 1
+
+
+def test_llama_servers_own_rate_says_how_many_steps_its_time_covers() -> None:
+    timings = {"prompt_ms": 1.0, "predicted_n": 6, "predicted_ms": 1.8, "predicted_per_second": 2777.7778}
+    event = DIALECTS["llama-server"]().event({"choices": [], "timings": timings})
+    assert event.facts["predicted_steps"] == 5

@@ -82,7 +82,7 @@ def test_our_own_server_is_known_by_its_url_and_keeps_its_marks(url: str) -> Non
     client = open_client(wiring("http/as-deployed", url=url))
     _, trace = ask(client, Request("a", "plan"))
     client.close()
-    assert client.describe() == {"url": url + "/v1/chat/completions", "dialect": "s2a"}
+    assert client.describe() == {"url": url + "/v1/chat/completions", "dialect": "s2a", "model": "s2a"}
     assert set(budget(trace.chain()).stages_ns) == {"json_pack", "network", "json_parse", "inference", "return"}
 
 

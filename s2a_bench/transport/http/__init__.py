@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from s2a_bench.errors import UsageError
 from s2a_bench.transport import Client, Handler, Program, Server, Transport, Wiring
@@ -72,6 +72,13 @@ class Http(Transport[HttpOptions]):
     def foreign(self, options: HttpOptions) -> str:
         """Return the URL that a user gave."""
         return options.url
+
+    def cache_hits(self, wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
+        """Return the counters of cache hits that a black box tells by its metrics."""
+        from s2a_bench.transport.credentials import read_key
+        from s2a_bench.transport.http.detect import cache_hits
+
+        return cache_hits(wiring.address, read_key(wiring.options.api_key_env)) if wiring.black_box else {}
 
     def program(self, options: HttpOptions) -> Program | None:
         """Return llama.cpp's server where its program is named."""

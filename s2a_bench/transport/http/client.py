@@ -20,12 +20,13 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.credentials import read_key
 from s2a_bench.transport.http import own
-from s2a_bench.transport.http.detect import body_of, detected
-from s2a_bench.transport.http.dialects import OWN, Event, Picture, open_dialect
+from s2a_bench.transport.http.detect import body_of, detected, getter
+from s2a_bench.transport.http.dialects import OWN, Dialect, Event, Picture, open_dialect
+from s2a_bench.transport.http.dialects.common import NO_MODEL
 from s2a_bench.transport.http.dialects.decoder import Decoder
 from s2a_bench.transport.http.merge import merged, read_patch
 from s2a_bench.transport.http.options import HttpOptions
-from s2a_bench.transport.http.refusals import refusal
+from s2a_bench.transport.http.refusals import advice_for, refusal
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Request, Token
 
@@ -40,30 +41,41 @@ class HttpClient:
         """Prepare to ask the server at ``wiring.address``; a black box of no known dialect is asked what it is."""
         self.camera = None
         self._wiring, self._options = wiring, wiring.options
-        self._model = wiring.options.served_model
         self._alive = alive
         self._codec = own.CODECS[wiring.variant]
         self._key = read_key(wiring.options.api_key_env)
         self._client = self._new_client() if wiring.options.connection != "client-per-request" else None
-        self._dialect = open_dialect(self._dialect_name())
-        self._url = self._dialect.url(wiring.address, self._model) if wiring.black_box else self._own_url()
+        self._dialect, self._url, self._model = self._met() if wiring.black_box else self._own()
+        self._options = wiring.options.model_copy(update={"served_model": self._model})  # for advice
         self._extra = read_patch(wiring.options.extra_body)
         self._headers = {"content-type": "application/json", **self._authorization()}
         if wiring.options.connection != "keep-alive":
             self._headers["connection"] = "close"
 
-    def _own_url(self) -> str:
-        return self._wiring.address.rstrip("/") + own.PATHS[self._wiring.variant]
+    def _own(self) -> tuple[Dialect, str, str]:
+        """Return dialect, URL and model of our own server."""
+        url = self._wiring.address.rstrip("/") + own.PATHS[self._wiring.variant]
+        return open_dialect(OWN), url, self._options.served_model or NO_MODEL
 
-    def _dialect_name(self) -> str:
-        """Return the dialect that the options name, our own server's, or what the server says."""
-        spoken = self._options.spoken
-        if spoken or not self._wiring.black_box:
-            return spoken or OWN
+    def _met(self) -> tuple[Dialect, str, str]:
+        """Return dialect, URL and model of a black box: as the options name them, else as the server says."""
+        spoken, base, model = self._options.spoken, self._wiring.address, self._options.served_model
+        with self._asking() as client:
+            if not spoken:
+                key = open_dialect("openai").authorization(self._key) if self._key else {}
+                spoken, first = detected(base, getter(client, key))
+                model = model or first or NO_MODEL
+            dialect = open_dialect(spoken)
+            key = dialect.authorization(self._key) if self._key else {}
+            base, model = dialect.met(base, model, getter(client, key))
+        return dialect, dialect.url(base, model), model
+
+    @contextmanager
+    def _asking(self) -> Iterator[httpx.Client]:
+        """Lend the kept client, or one for the moment."""
         client = self._client or self._new_client()
         try:
-            key = open_dialect("openai").authorization(self._key) if self._key else {}
-            return detected(self._wiring.address, client, key)
+            yield client
         finally:
             if client is not self._client:
                 client.close()
@@ -72,8 +84,9 @@ class HttpClient:
         return self._dialect.authorization(self._key) if self._key else {}
 
     def describe(self) -> dict[str, str]:
-        """Return who is asked, and how, for the manifest."""
-        return {"url": self._url, "dialect": self._dialect.name}
+        """Return who is asked, and how, for the manifest; the model where the server named it."""
+        found = {"model": self._model} if self._model not in {self._wiring.options.served_model, NO_MODEL} else {}
+        return {"url": self._url, "dialect": self._dialect.name, **found}
 
     def _new_client(self) -> httpx.Client:
         """Build the client; its TLS context alone takes about 20 ms, which is why it is normally built once."""
@@ -152,7 +165,8 @@ class HttpClient:
         first_ns, thinking_ns, thoughts, index, finished = 0, 0, 0, 0, False
         for event in self._events(response):
             if event.error:
-                raise RequestFailed(f"{self._url}: {event.error}")
+                advice = advice_for(event.status, event.error, self._options)
+                raise RequestFailed(f"{self._url}: {event.error}{'; ' if advice else ''}{advice}")
             if event.thinking:
                 thinking_ns = thinking_ns or now_ns()
                 thoughts += 1

@@ -1,31 +1,75 @@
-"""Which flavour of OpenAI's dialect a server speaks, asked once, before anything is measured."""
+"""What a server says of itself when nothing is measured: its dialect, its models, the hits of its caches."""
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import urlsplit, urlunsplit
 
 import httpx
 
 from s2a_bench.clock import now_ns
+from s2a_bench.errors import ServerDied
 from s2a_bench.transport.http.dialects import OWN
-from s2a_bench.transport.http.dialects.common import endpoint
+from s2a_bench.transport.http.dialects.common import NO_LIST, Get, first_model
 
 OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": OWN}
 """``owned_by`` of the first model -> dialect. Ollama says ``library``, clouds their names: plain OpenAI."""
+
+HITS = re.compile(r"^(\w+:\w*(?:hits|cached_tokens|tokens_cached)(?:_total)?)(?:\{.*\})? (\S+)", re.MULTILINE)
+"""A counter of cache hits: vLLM's of prefixes and pictures, SGLang's of prompt tokens."""
 
 PATIENCE_S = 5.0
 LIMIT = 1 << 20
 
 
-def detected(base: str, client: httpx.Client, headers: dict[str, str]) -> str:
-    """Ask for the list of models; whatever goes wrong means a plain server, and the first request will tell."""
-    url = endpoint(base.removesuffix("/chat/completions"), "/v1", "/models")
+def detected(base: str, get: Get) -> tuple[str, str]:
+    """Return a server's dialect and its first model, by its list of models; what makes no sense means a plain one.
+
+    Raises ServerDied where nothing answers.
+    """
+    owner, model = first_model(base, get)
+    return OWNERS.get(owner, "openai"), model
+
+
+def cache_hits(base: str, key: str = "") -> Mapping[str, float]:
+    """Return the counters of cache hits among a server's Prometheus metrics; nothing where it tells none."""
+    found: dict[str, float] = {}
+    try:
+        parts = urlsplit(base)
+        path = re.sub(r"/(v1|v1beta|api)(/.*)?$", "", parts.path.rstrip("/")) + "/metrics"
+        with httpx.Client(trust_env=parts.scheme == "https") as client:
+            headers = {"authorization": f"Bearer {key}"} if key else {}
+            text = _text(urlunsplit((parts.scheme, parts.netloc, path, "", "")), client, headers)
+        for name, value in HITS.findall(text):
+            found[name] = found.get(name, 0.0) + float(value)
+    except (*NO_LIST, ServerDied, httpx.HTTPError, httpx.InvalidURL):
+        return {}
+    return found
+
+
+def getter(client: httpx.Client, headers: dict[str, str]) -> Get:
+    """Return what asks for JSON at a URL, bounded in size and time."""
+
+    def get(url: str) -> Any:
+        try:
+            return json.loads(_text(url, client, headers))
+        except (httpx.HTTPError, httpx.InvalidURL) as error:
+            raise ValueError(str(error)) from error
+
+    return get
+
+
+def _text(url: str, client: httpx.Client, headers: dict[str, str]) -> str:
+    """Return what a GET answers; raises ServerDied where nothing does."""
     try:
         with client.stream("GET", url, headers=headers, timeout=PATIENCE_S) as response:
-            owner = json.loads(body_of(response, LIMIT, PATIENCE_S))["data"][0]["owned_by"]
-        return OWNERS.get(owner, "openai")
-    except (httpx.HTTPError, httpx.InvalidURL, ValueError, KeyError, IndexError, TypeError, RecursionError):
-        return "openai"
+            response.raise_for_status()
+            return body_of(response, LIMIT, PATIENCE_S)
+    except httpx.ConnectError as error:
+        raise ServerDied(f"nothing answers at {url}: {error}") from error
 
 
 def body_of(response: httpx.Response, limit: int, patience_s: float) -> str:

@@ -23,7 +23,7 @@ class HttpOptions(Options):
     host: str = option("127.0.0.1", "address that our server binds; others than this machine need a key", side=SERVING)
     port: int = option(0, "port of the server; 0: any free one", ge=0, le=65535, side=SERVER)
     url: str = option("", "a server that runs already (a black box)", side=SERVER)
-    served_model: str = option("default", "the model's name at the url")
+    served_model: str = option("", "the model's name at the url [default: the first that it lists]")
     dialect: str = option("", f"what the url speaks: {', '.join(DIALECTS)} [default: ask]")
     api_key_env: str = option(
         "", "NAME of the environment variable with the API key: of the url, or that our server wants", side=SERVER

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from datetime import datetime, timezone
 from email.utils import parsedate_to_datetime
 from typing import Any
@@ -12,6 +13,12 @@ import httpx
 from s2a_bench.errors import RequestFailed
 from s2a_bench.transport.http.dialects.decoder import error_in
 from s2a_bench.transport.http.options import HttpOptions
+
+NO_MODEL = re.compile(
+    r"\bmodel\b.{0,200}?(not found|not exist|n't exist)|model_not_found|(invalid|unknown|no such) model",
+    re.IGNORECASE | re.DOTALL,
+)
+"""How servers say, with any status, that they have no such model."""
 
 QUOTED = 200
 """Characters that are shown of a body that is no error object."""
@@ -29,15 +36,17 @@ def refusal(url: str, response: httpx.Response, body: str, options: HttpOptions,
         said += f" (as {kind} where {expected} belongs; see `dialect`)"
     wait_s = _retry_after_s(response, value)
     asked = f"; it asks to wait {wait_s:g} s" if wait_s else ""
-    advice = _advice(response, options)
+    advice = advice_for(response.status_code, said, options, moved=response.headers.get("location", ""))
     line = f"{url} answered {response.status_code}: {' '.join(said.split())}{asked}{'; ' if advice else ''}{advice}"
     return RequestFailed(line, retry_after_s=wait_s)
 
 
-def _advice(response: httpx.Response, options: HttpOptions) -> str:
-    """Return the way out for a status that has one."""
-    if response.is_redirect:
-        return f"it moved: give {response.headers.get('location', 'its new place')} to `url`"
+def advice_for(status: int, said: str, options: HttpOptions, *, moved: str = "") -> str:
+    """Return the way out for a status or for words that have one, or nothing."""
+    if httpx.codes.is_redirect(status):
+        return f"it moved: give {moved or 'its new place'} to `url`"
+    if NO_MODEL.search(said):
+        return f"name a model that it has with `served_model` (now '{options.served_model}')"
     key = f"the key in ${options.api_key_env} is not accepted"
     no_key = "name the environment variable that holds its key with `api_key_env`"
     return {
@@ -46,7 +55,7 @@ def _advice(response: httpx.Response, options: HttpOptions) -> str:
         404: f"see `url`, `dialect` and `served_model` (now '{options.served_model}')",
         413: "choose a smaller `size`, or `payload` jpeg",
         429: "it wants fewer requests: see its quota, or `runs`",
-    }.get(response.status_code, "")
+    }.get(status, "")
 
 
 def _retry_after_s(response: httpx.Response, body: Any) -> float | None:

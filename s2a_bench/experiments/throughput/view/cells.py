@@ -112,14 +112,17 @@ class Speed:
 
 
 def _metrics(facts: dict[str, float], events: int, span_s: float) -> dict[str, Any]:
-    """Derive one request's numbers; the server's own count of tokens is used where it tells one."""
-    tokens = int(facts.get("predicted_n") or events)
+    """Derive one request's numbers; the server's own count of tokens, its invisible last left out, where it tells one.
+
+    ``predicted_steps`` is a fact where the engine's own time covers other than ``predicted_n`` tokens (vLLM).
+    """
+    tokens = int((facts.get("predicted_n") or events) - facts.get("end_n", 0))
     found: dict[str, Any] = {"tokens": tokens, "events": events}
     if tokens > 1 and span_s > 0:
         found["decode_tokens_per_s"] = (tokens - 1) / span_s
     found["told"] = bool(facts.get("predicted_ms"))
     if found["told"]:
-        found["tokens_per_s"] = tokens / facts["predicted_ms"] * 1e3
+        found["tokens_per_s"] = facts.get("predicted_steps", tokens) / facts["predicted_ms"] * 1e3
     elif "decode_tokens_per_s" in found:
         found["tokens_per_s"] = found["decode_tokens_per_s"]
     if "prompt_ms" in facts:

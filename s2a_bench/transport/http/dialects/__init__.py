@@ -42,6 +42,8 @@ class Event:
     facts: dict[str, float] = field(default_factory=dict)
     remote: Remote | None = None
     error: str = ""
+    status: int = 0
+    """The HTTP status that the error would have had before the stream began, 0 if unknown."""
 
 
 class Framing(Protocol):
@@ -65,6 +67,10 @@ class Dialect(Protocol):
     payloads: tuple[str, ...]
     """How pictures can travel."""
     framing: Callable[[], Framing]
+
+    def met(self, base: str, model: str, get: Callable[[str], Any]) -> tuple[str, str]:
+        """Return the URL and the model to ask: as told, else as the server says; ``get`` returns the JSON at a URL."""
+        ...
 
     def url(self, base: str, model: str) -> str:
         """Return where to post, for the URL that a user gave."""

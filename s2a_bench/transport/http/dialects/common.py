@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 from urllib.parse import urlsplit, urlunsplit
 
 from s2a_bench.errors import UsageError
@@ -14,6 +15,15 @@ from s2a_bench.types import Frame, Pixels, Request
 
 TEMPERATURE, TOP_P = 0.7, 0.8
 """As our own llama engine samples."""
+
+Get: TypeAlias = Callable[[str], Any]
+"""Return the JSON at a URL; raises ValueError where there is none, ServerDied where nothing answers."""
+
+NO_MODEL = "default"
+"""What a server is asked for that names no model of its own."""
+
+NO_LIST = (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError)
+"""What reading a list of another form, or none, raises."""
 
 
 class Chat:
@@ -30,6 +40,10 @@ class Chat:
     def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
         """Encode as the payload says."""
         return encoded(frame, payload, trace)
+
+    def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
+        """Return the URL as it is, and the first model that the server lists unless one is told."""
+        return base, model or first_model(base, get)[1] or NO_MODEL
 
     def starts_with_headers(self, facts: dict[str, float]) -> bool:  # noqa: ARG002 - llama-server's tell
         """Most servers send their headers at some other moment."""
@@ -48,6 +62,15 @@ def endpoint(base: str, root: str, path: str, query: str = "") -> str:
     return urlunsplit((parts.scheme, parts.netloc, here, "&".join(filter(None, (parts.query, query))), ""))
 
 
+def first_model(base: str, get: Get) -> tuple[str, str]:
+    """Return by whom the first model on OpenAI's list is owned, and its name; empty where there is no such list."""
+    try:
+        first = get(endpoint(base.removesuffix("/chat/completions"), "/v1", "/models"))["data"][0]
+        return text_of(first.get("owned_by") or ""), text_of(first["id"])
+    except NO_LIST:
+        return "", ""
+
+
 def refuse_grammar(request: Request, name: str) -> None:
     """Raise UsageError for a grammar that the dialect has no field for."""
     if request.grammar:
@@ -61,6 +84,12 @@ def numbers(source: Any, names: dict[str, str], scale: float = 1.0) -> dict[str,
     """Return the numbers of a JSON object under our names, times ``scale``; what is missing or null stays absent."""
     found = source or {}
     return {ours: float(found[theirs]) * scale for theirs, ours in names.items() if found.get(theirs) is not None}
+
+
+def usage_of(source: Any, names: dict[str, str]) -> dict[str, float]:
+    """Return the counts of a usage object under our names; one of zeros alone tells nothing, which is noted."""
+    counts = numbers(source, names)
+    return {"usage_zero": 1.0} if counts and not any(counts.values()) else counts
 
 
 def text_of(value: Any) -> str:

@@ -64,7 +64,7 @@ class Decoder:
             value = self._loads(message)
             error = error_in(value)
             if error:
-                return Event(error=f"the server broke off: {error}")
+                return Event(error=f"the server broke off: {error}", status=status_in(value))
             event = self._dialect.event(value)
         except ODD as problem:
             start = message[:QUOTED].strip()
@@ -86,6 +86,21 @@ def error_in(value: Any) -> str:
     if isinstance(error, dict):
         error = error.get("message") or error
     return str(error) if error else ""
+
+
+ERROR_TYPES = {"overloaded": 429, "validation": 422, "generation": 424, "incomplete_generation": 500}
+"""TGI's ``error_type``, which comes in a stream with status 200, and the status of its other routes."""
+
+
+def status_in(value: Any) -> int:
+    """Return the HTTP status that an error object stands for, 0 if it does not say."""
+    if isinstance(value, list) and value:
+        value = value[0]
+    error = value.get("error")
+    code = error.get("code") if isinstance(error, dict) else value.get("code")
+    if isinstance(code, int) and 400 <= code < 600:  # noqa: PLR2004 - HTTP's errors
+        return code
+    return ERROR_TYPES.get(str(value.get("error_type")).lower(), 0)
 
 
 def _storable(event: Event) -> Event:

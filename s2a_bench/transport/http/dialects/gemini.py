@@ -7,13 +7,17 @@ from urllib.parse import quote
 
 from s2a_bench.transport.http.dialects import Event, Picture
 from s2a_bench.transport.http.dialects.common import (
+    NO_LIST,
+    NO_MODEL,
     TEMPERATURE,
     TOP_P,
     Chat,
+    Get,
     endpoint,
-    numbers,
+    first_model,
     refuse_grammar,
     text_of,
+    usage_of,
 )
 from s2a_bench.types import Request
 
@@ -23,6 +27,8 @@ USAGE = {
     "thoughtsTokenCount": "thinking_n",
     "cachedContentTokenCount": "cache_n",
 }
+VERSIONS = ("/v1beta", "/v1")
+"""Roots of the API, the usual one first."""
 COMPLETE = frozenset({"STOP", "MAX_TOKENS"})
 """Every other reason (SAFETY, RECITATION, ...) means that the answer was cut."""
 
@@ -32,9 +38,25 @@ class Gemini(Chat):
 
     name = "gemini"
 
+    def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
+        """Return the URL with the version that the server has, and the first model that it lists unless one is told."""
+        here = base.rstrip("/")
+        versions = [version for version in VERSIONS if here.endswith(version)]
+        if versions and model:
+            return base, model
+        for version in versions or VERSIONS:
+            root = here.removesuffix(version) + version
+            try:
+                names = [text_of(one["name"]) for one in get(f"{root}/models")["models"] if _answers(one)]
+                return root, model or names[0].removeprefix("models/")
+            except NO_LIST:
+                continue
+        return base, model or first_model(here.removesuffix("/v1beta"), get)[1] or NO_MODEL  # a gateway's list
+
     def url(self, base: str, model: str) -> str:
         """Return the route, which has the model in it."""
-        return endpoint(base, "/v1beta", f"/models/{quote(model, safe='')}:streamGenerateContent", "alt=sse")
+        root = next((version for version in VERSIONS if base.rstrip("/").endswith(version)), VERSIONS[0])
+        return endpoint(base, root, f"/models/{quote(model, safe='')}:streamGenerateContent", "alt=sse")
 
     def authorization(self, key: str) -> dict[str, str]:
         """Return Google's own header."""
@@ -43,7 +65,7 @@ class Gemini(Chat):
     def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:  # noqa: ARG002
         """Return one turn of the user; how much the model thinks is left to its default."""
         refuse_grammar(request, self.name)
-        inline = [{"inlineData": {"mimeType": picture.media_type, "data": picture.base64}} for picture in pictures]
+        inline = [{"inline_data": {"mime_type": picture.media_type, "data": picture.base64}} for picture in pictures]
         generation = {
             "maxOutputTokens": request.max_tokens,
             "temperature": TEMPERATURE,
@@ -70,7 +92,13 @@ class Gemini(Chat):
             return Event(error=f"the prompt was refused: {blocked}")
         if finish and finish not in COMPLETE:
             return Event(error=f"the answer was cut: {finish}")
-        facts = numbers(message.get("usageMetadata"), USAGE)
+        facts = usage_of(message.get("usageMetadata"), USAGE)
         if "prompt_n" in facts:  # evaluated, as llama.cpp counts them
             facts["prompt_n"] -= facts.get("cache_n", 0.0)
         return Event(said or None, -1, thought, finish, facts)
+
+
+def _answers(model: Any) -> bool:
+    """Whether a model of the list writes text; one that does not say might."""
+    methods = model.get("supportedGenerationMethods")
+    return not methods or "generateContent" in methods

@@ -17,7 +17,8 @@ from s2a_bench.transport.http.dialects.common import (
 from s2a_bench.transport.http.dialects.framing import JsonLines
 from s2a_bench.types import Request
 
-COUNTS = {"prompt_eval_count": "prompt_n", "eval_count": "predicted_n"}
+COUNTS = {"prompt_eval_count": "prompt_with_cached_n", "eval_count": "predicted_n"}
+"""Its count of the prompt holds the tokens that came from its cache, so it is not that of tokens evaluated."""
 DURATIONS = {
     "total_duration": "total_ms",
     "load_duration": "load_ms",

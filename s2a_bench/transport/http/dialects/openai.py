@@ -6,16 +6,19 @@ prompt cache off, and their names for a GBNF grammar.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 from uuid import uuid4
 
 from s2a_bench.transport.http import own as dialect
 from s2a_bench.transport.http.dialects import OWN, Event, Picture
-from s2a_bench.transport.http.dialects.common import Chat, endpoint, numbers, refuse_grammar, text_of
+from s2a_bench.transport.http.dialects.common import Chat, endpoint, numbers, refuse_grammar, text_of, usage_of
 from s2a_bench.types import Request
 
 TIMINGS = {name: name for name in ("cache_n", "prompt_n", "prompt_ms", "predicted_n", "predicted_ms")}
 """What of llama-server's ``timings`` is kept."""
+
+RATE = {"predicted_per_second": "rate"}
 
 METRICS = {
     "time_to_first_token_ms": "first_token_ms",
@@ -67,13 +70,16 @@ class OpenAI(Chat):
             return {}
         usage = message.get("usage") or {}
         facts = {
-            **numbers(usage, {"prompt_tokens": "prompt_n", "completion_tokens": "predicted_n"}),
+            **usage_of(usage, {"prompt_tokens": "prompt_n", "completion_tokens": "predicted_n"}),
             **numbers(usage.get("prompt_tokens_details"), {"cached_tokens": "cache_n"}),
             **numbers(usage.get("completion_tokens_details"), {"reasoning_tokens": "thinking_n"}),
         }
         if "prompt_n" in facts:  # evaluated, as llama.cpp counts them
             facts["prompt_n"] -= facts.get("cache_n", 0.0)
-        return {**facts, **numbers(message.get("metrics"), METRICS), **numbers(message.get("timings"), TIMINGS)}
+        timings = numbers(message.get("timings"), TIMINGS | RATE)
+        if rate := timings.pop("rate", 0.0):  # over n tokens or n - 1, as the build sees it
+            timings["predicted_steps"] = float(round(rate * timings.get("predicted_ms", 0.0) / 1e3))
+        return {**facts, **numbers(message.get("metrics"), METRICS), **timings}
 
     def starts_with_headers(self, facts: dict[str, float]) -> bool:
         """Tell a llama-server by its timings: it sends the headers when its slot starts."""
@@ -98,6 +104,20 @@ class Vllm(OpenAI):
         """Keep prefixes apart by a salt of the request's own, and ask for metrics, which some versions want."""
         grammar = {"structured_outputs": {"grammar": request.grammar}} if request.grammar else {}
         return {"cache_salt": uuid4().hex, "include_metrics": True, **grammar}
+
+    def event(self, message: Any) -> Event:
+        """Read one chunk.
+
+        An answer that ends by itself ends with a token that is counted and never shown; ``generation_time_ms`` is from
+        the first token to the last, that one included.
+        """
+        event = super().event(message)
+        facts = dict(event.facts)
+        if event.finish == "stop":
+            facts["end_n"] = 1.0
+        if "predicted_ms" in facts and "predicted_n" in facts:
+            facts["predicted_steps"] = facts["predicted_n"] - 1
+        return replace(event, facts=facts)
 
 
 class Own(OpenAI):

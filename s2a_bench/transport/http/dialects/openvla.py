@@ -15,7 +15,7 @@ from s2a_bench import extras
 from s2a_bench.frames.convert import bgr_to_rgb, to_bgr, yuyv_to_rgb
 from s2a_bench.trace import Trace
 from s2a_bench.transport.http.dialects import Event, Picture
-from s2a_bench.transport.http.dialects.common import Chat, endpoint, refuse_grammar
+from s2a_bench.transport.http.dialects.common import Chat, Get, endpoint, refuse_grammar
 from s2a_bench.transport.http.dialects.framing import WholeBody
 from s2a_bench.types import Frame, Pixels, Request
 
@@ -36,6 +36,10 @@ class OpenVla(Chat):
     payloads = ("raw",)
     framing = WholeBody
 
+    def met(self, base: str, model: str, get: Get) -> tuple[str, str]:  # noqa: ARG002 - a server has one model
+        """Ask for nothing."""
+        return base, model
+
     def url(self, base: str, model: str) -> str:  # noqa: ARG002 - a server has one model
         """Return the only route."""
         return endpoint(base, "", "/act")
@@ -52,7 +56,7 @@ class OpenVla(Chat):
         """Return what ``json_numpy.dumps`` makes of the array, and the instruction."""
         refuse_grammar(request, self.name)
         fields: dict[str, Any] = {"instruction": request.prompt}
-        if model != "default":
+        if model:
             fields["unnorm_key"] = model
         for picture in pictures[:1]:
             fields["image"] = {"__numpy__": picture.base64, "dtype": "|u1", "shape": picture.shape}

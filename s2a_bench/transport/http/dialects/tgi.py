@@ -9,6 +9,7 @@ from s2a_bench.transport.http.dialects.common import (
     TEMPERATURE,
     TOP_P,
     Chat,
+    Get,
     endpoint,
     numbers,
     refuse_grammar,
@@ -23,6 +24,10 @@ class Tgi(Chat):
     """The native route; the chat route is the dialect `openai`."""
 
     name = "tgi"
+
+    def met(self, base: str, model: str, get: Get) -> tuple[str, str]:  # noqa: ARG002 - a server has one model
+        """Ask for nothing."""
+        return base, model
 
     def url(self, base: str, model: str) -> str:  # noqa: ARG002 - a server has one model
         """Return the streaming route."""
