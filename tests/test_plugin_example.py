@@ -137,9 +137,8 @@ def test_its_policy_takes_its_parameter(command: Command) -> None:
 
 
 def test_its_dialect_is_known_by_name(command: Command) -> None:
-    done = command(
-        "latency", "--url", "http://127.0.0.1:9", "--dialect", "toy-chat", "--transport", "http", *SMALL, code=1
-    )
+    spoken = ["--dialect", "toy-chat", "--served-model", "toy"]
+    done = command("latency", "--url", "http://127.0.0.1:9", *spoken, "--transport", "http", *SMALL, code=1)
     assert "nothing answers at http://127.0.0.1:9/toy/chat" in done.stderr
 
 

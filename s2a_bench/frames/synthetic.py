@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.frames import check_size
@@ -22,12 +20,10 @@ if TYPE_CHECKING:
 
 PERIODS_S = (11.0, 7.0)
 """How long the window takes there and back, across and down; coprime, so the path closes after 77 s only."""
-BLACK, WHITE, GREY = 16, 235, 128
-"""Luma of the stamp's 0 and 1, and its chroma."""
 
 
 class SyntheticCamera:
-    """A window moving over a rendered scene: (h, w, 2) ``yuv422_yuy2``, every frame different.
+    """A window moving over a rendered scene: (h, w, 2) ``yuv422_yuy2``.
 
     The same size, ``fps`` and ``seed`` give the same frames. ``fps`` sets how far the window moves between two
     frames; read() never waits. The noise moves with the scene, where a sensor's would be new in every frame.
@@ -50,14 +46,13 @@ class SyntheticCamera:
         self._index = 0
 
     def read(self) -> Frame:
-        """Copy the next window out of the scene and stamp the frame's index on it; SourceError once closed."""
+        """Copy the next window out of the scene; SourceError once closed."""
         stamp_ns = now_ns()
         if self._scene is None:
             raise SourceError("`source`: the synthetic camera was closed, it has no more frames")
         index = self._index
         x, y = self._corner(index / self.fps)
         data = self._scene[y : y + self.height, x : x + self.width].copy()
-        _stamp(data, index)
         self._index += 1
         return Frame(index, stamp_ns, self.width, self.height, self.encoding, data)
 
@@ -69,14 +64,3 @@ class SyntheticCamera:
         """Return where the window's upper left corner is; x is even, so that pixel pairs stay whole."""
         across, down = (0.5 + 0.5 * math.sin(math.tau * t_s / period_s) for period_s in PERIODS_S)
         return round(across * self._room[0] / 2) * 2, round(down * self._room[1])
-
-
-def _stamp(data: Pixels, index: int) -> None:
-    """Write the index's lower 32 bits into the upper left 16x8 pixels: four rows of eight 2x2 cells, black or white.
-
-    Large enough to survive JPEG, so frames differ for the server too, even where the window moved by no pixel.
-    """
-    bits = np.unpackbits(np.frombuffer((index & 0xFFFFFFFF).to_bytes(4, "big"), np.uint8)).reshape(4, 8)
-    luma = np.where(bits, np.uint8(WHITE), np.uint8(BLACK))
-    data[:8, :16, 0] = luma.repeat(2, axis=0).repeat(2, axis=1)
-    data[:8, :16, 1] = GREY

@@ -91,6 +91,11 @@ class RequestsConfig(Options):
     prompt: TextOrFile = option(DEFAULT_PROMPT, "text, or @FILE [default: the paper's prompt]")
     grammar: Grammar = option("", "GBNF file that every answer obeys")
     seed: int = option(0, "seed of the order, the source and the sampling", ge=0, le=2**31 - 1)
+    nonce: str = option(
+        "",
+        "nonce of another run, to send its very pictures again [default: a new one]",
+        pattern="^[0-9A-Za-z_-]{0,64}$",
+    )
     timeout_s: float = option(300.0, "longest silence of a server, in seconds", flag="timeout", ge=0.1, le=86_400)
     sample_resources_hz: float = option(
         10.0,
@@ -205,6 +210,6 @@ class RequestsConfig(Options):
     def to_manifest(self) -> dict[str, Any]:
         """Return the settings as plain data, with what every pipeline came to be told."""
         told = {each.name: each.options.model_dump(mode="json", exclude_defaults=True) for each in self.pipelines}
-        own = self.model_dump(exclude={"quick"})
+        own = self.model_dump(exclude={"quick", "nonce"})  # the nonce stands with the seeds
         size = {"width": self.width, "height": self.height, "size": f"{self.width}x{self.height}"}
         return {**own, **size, "tuned": self.tuned, "engine": self.engine.to_manifest(), "pipelines": told}

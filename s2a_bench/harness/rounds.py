@@ -13,6 +13,7 @@ from s2a_bench import extras
 from s2a_bench.clock import SystemClock
 from s2a_bench.errors import TransportError
 from s2a_bench.frames import FrameSource, open_source
+from s2a_bench.frames.stamp import Stamped, new_nonce
 from s2a_bench.harness.backoff import Backoff
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
 from s2a_bench.harness.plan import RequestsConfig
@@ -48,6 +49,8 @@ class Task:
     command: str
     in_process: str = ""
     """What the command calls a cell whose server is in this process; empty: its own name."""
+    needs_model: bool = False
+    """Whether the command itself reads the model's files, whoever answers the requests."""
     others: Callable[[RequestsConfig, RunWriter, Sequence[Session]], Sequence[Slot]] = lambda *_: ()
     """Makes what else has a turn in every block; the config has the model files that were found."""
 
@@ -64,11 +67,13 @@ def run_requests(task: Task, config: RequestsConfig, output: Path, progress: Pro
     limit_threads()
     malloc_tuned = config.tuned and keep_large_blocks()
     with ExitStack() as stack:
+        config = config.model_copy(update={"nonce": config.nonce or new_nonce()})
         sources = _Sources(config, stack)
         manifest = _manifest(config, malloc_tuned=malloc_tuned)
         writer = stack.enter_context(RunWriter.create(output, task.command, manifest))
         progress.opened(writer.path)
-        if config.engine.name == "llama" and extras.installed("gguf"):  # else nobody here reads the files
+        needed = config.own_engine or config.starts_program or task.needs_model
+        if needed and config.engine.name == "llama" and extras.installed("gguf"):  # else nobody here reads the files
             config = _with_model(config, progress)
         _measure(task, config, sources, writer, progress)
         return writer.path
@@ -86,7 +91,7 @@ def _manifest(config: RequestsConfig, *, malloc_tuned: bool) -> dict[str, Any]:
         "configuration": config.to_manifest(),
         "stages": config.stages,
         "environment": environment.collect(config.packages),
-        "seeds": dict.fromkeys(("order", "sampling", "source", "bootstrap"), config.seed),
+        "seeds": {**dict.fromkeys(("order", "sampling", "source", "bootstrap"), config.seed), "nonce": config.nonce},
         "tuning": {
             "dds": "tuned" if config.tuned else "default",
             "malloc_keeps_large_blocks": malloc_tuned,
@@ -100,7 +105,10 @@ def _manifest(config: RequestsConfig, *, malloc_tuned: bool) -> dict[str, Any]:
 
 
 class _Sources:
-    """Frame sources: one a cell, with the same frames; a device can be opened only once and is shared."""
+    """Frame sources: one a cell, with the same frames; a device can be opened only once and is shared.
+
+    Cells of a server that is not ours differ in their stamps, as it may keep what it made of a picture.
+    """
 
     def __init__(self, config: RequestsConfig, stack: ExitStack) -> None:
         self._config = config
@@ -108,11 +116,11 @@ class _Sources:
         self._shared = config.source.startswith("v4l2")
         self._ready: FrameSource | None = self._new()  # what is wrong with a source shows before anything starts
 
-    def open(self) -> FrameSource:
-        """Return a source that nobody has yet, or the shared one."""
+    def open(self, user: str) -> FrameSource:
+        """Return a source that nobody has yet, or the shared one, its stamps those of ``user``."""
         source = self._ready or self._new()
         self._ready = source if self._shared else None
-        return source
+        return Stamped(source, f"{self._config.nonce}/{user}")
 
     def _new(self) -> FrameSource:
         config = self._config
@@ -129,8 +137,9 @@ def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunW
     before = Counters.read(watches_udp=watches_udp)
     guard = SampleGuard()
     with ExitStack() as stack:
-        progress.stage(f"starting {len(config.used)} servers")
         servers = ServerSet(config, stack, writer.path)
+        if servers.count:
+            progress.stage(f"starting {servers.count} server{'s' if servers.count > 1 else ''}")
         facts = servers.start()
         writer.update(
             servers=facts, model=servers.model(facts), warnings=[warning.to_manifest() for warning in warnings]
@@ -144,10 +153,12 @@ def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunW
         writer.update(
             asked={name: how for name, how in asked.items() if how}, provenance=Origins(run, origins).to_manifest()
         )
+        hits = servers.cache_hits()
         backoff = Backoff(SystemClock(), progress.stage)
         slots = [_slot(session, servers, writer, guard, backoff, sampler) for session in sessions]
         try:
             run_blocks(slots, task.others(config, writer, sessions), config, progress)
+            guard.see_hits(hits, servers.cache_hits())
             for session in sessions:
                 _write_frames(writer, session.frames(keep=0))
                 if not guard.successes(session.cell.name):
@@ -169,7 +180,7 @@ def _sessions(
     clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
     camera: Camera | None = None
     if config.mode == "stream":
-        camera = Camera(sources.open(), config.fps, on_frame=recorder.frame if recorder else None)
+        camera = Camera(sources.open("camera"), config.fps, on_frame=recorder.frame if recorder else None)
         camera.start()
         stack.callback(camera.stop)
     for cell in config.pipelines:
@@ -181,7 +192,9 @@ def _sessions(
             random = Random(config.seed)  # noqa: S311 - phases, not secrets
             feed = StreamFeed(camera, client.camera, int(1e9 / config.fps), random)
         else:
-            feed = RequestFeed(sources.open(), preencoded=cell.payload == "jpeg-preencoded")
+            feed = RequestFeed(
+                sources.open(cell.name if cell.black_box else ""), preencoded=cell.payload == "jpeg-preencoded"
+            )
         name = task.in_process if cell.transport.in_process and task.in_process else cell.name
         yield Session(replace(cell, name=name), client, feed, config, recorder, sampler)
 
@@ -219,6 +232,8 @@ def _slot(
         sampler.flush(writer)
         _write_frames(writer, session.frames())
         guard.see(measured.sample, measured.fingerprint)
+        if isinstance(measured.fatal, KeyboardInterrupt):
+            raise measured.fatal
         servers.raise_if_dead(session.cell, suspect=bool(measured.sample.error))
         if measured.fatal is not None:
             raise measured.fatal

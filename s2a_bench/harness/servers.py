@@ -47,6 +47,15 @@ class ServerSet:
         self._bound: dict[str, list[str]] = {}
         self._local_engine: dict[str, Any] | None = None
 
+    @property
+    def count(self) -> int:
+        """Return how many servers this run starts."""
+        return len({pipeline.server for pipeline in self._config.pipelines if not self._is_foreign(pipeline)})
+
+    @staticmethod
+    def _is_foreign(pipeline: Pipeline) -> bool:
+        return bool(pipeline.transport.foreign(pipeline.options))
+
     def start(self) -> dict[str, Any]:
         """Start all servers and wait until they are ready; return what they say about themselves."""
         for pipeline in self._config.pipelines:
@@ -99,6 +108,15 @@ class ServerSet:
     def wiring(self, pipeline: Pipeline) -> Wiring[Any]:
         """Return what the client of a cell is told, its server being ready."""
         return self._wiring(pipeline, self._servers[pipeline.server].address)
+
+    def cache_hits(self) -> dict[str, float]:
+        """Return counter -> hits of caches that the servers which are not ours have counted so far."""
+        asked = {pipeline.server: pipeline for pipeline in self._config.pipelines}
+        found: dict[str, float] = {}
+        for pipeline in asked.values():
+            for name, hits in pipeline.transport.cache_hits(self.wiring(pipeline)).items():
+                found[name] = found.get(name, 0.0) + hits
+        return found
 
     def model(self, facts: dict[str, Any]) -> dict[str, Any]:
         """Return what the engine says about the model: the same in every server of ours."""

@@ -22,6 +22,8 @@ from s2a_bench.types import Frame, Request, Token
 FATAL = (ServerDied, SourceError, UsageError, EngineError)
 """Errors after which the next request cannot succeed either."""
 
+INTERRUPTED = "Interrupted: somebody ended the run while this request was under way"
+
 
 @dataclass(frozen=True, slots=True)
 class Place:
@@ -34,15 +36,16 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """The rows of one request; ``fingerprint`` tells its picture from others, ``fatal`` ends the run.
+    """The rows of one request; ``fingerprint`` tells its picture from others.
 
-    ``retry_after_s`` is how long a server that refused asks to be left alone.
+    ``fatal`` ends the run: KeyboardInterrupt where somebody did while the request was under way. ``retry_after_s`` is
+    how long a server that refused asks to be left alone.
     """
 
     sample: SampleRow
     tokens: list[TokenRow]
     fingerprint: int
-    fatal: S2AError | None = None
+    fatal: S2AError | KeyboardInterrupt | None = None
     retry_after_s: float = 0.0
 
 
@@ -80,7 +83,8 @@ class Session:
         request_id = f"{self.cell.name}-{place.block}"
         seen: list[tuple[Token, int]] = []
         trace = Trace()
-        error, fatal, retry_after_s = "", None, 0.0
+        error, retry_after_s = "", 0.0
+        fatal: S2AError | KeyboardInterrupt | None = None
         started_ns = now_ns()
         self._sampler.edge()
         frame = self.feed.capture(trace)
@@ -94,6 +98,8 @@ class Session:
             fatal = failure if isinstance(failure, FATAL) else None
             if isinstance(failure, RequestFailed):
                 retry_after_s = failure.retry_after_s or 0.0
+        except KeyboardInterrupt as interrupt:
+            error, fatal = INTERRUPTED, interrupt
         self._sampler.edge()
         trace.facts.update(self._sampler.window(started_ns, now_ns()))
         if not error and not seen:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from s2a_bench.clock import realtime_offset_ns
 from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Finding, Machine, examine
 from s2a_bench.machine.doctor.robot import RMEM_WANTED
 from s2a_bench.store.manifest import RunWarning
@@ -91,13 +92,17 @@ class SampleGuard:
     _frames: dict[tuple[str, int], str] = field(default_factory=dict)
     _repeated: dict[str, int] = field(default_factory=dict)
     _cached: dict[str, int] = field(default_factory=dict)
+    _cached_share: float = 0.0
     _residual: dict[str, int] = field(default_factory=dict)
     _failed: dict[str, int] = field(default_factory=dict)
     _frames_lost: dict[str, int] = field(default_factory=dict)
     _in_a_row: dict[str, int] = field(default_factory=dict)
     _succeeded: dict[str, int] = field(default_factory=dict)
     _lost: dict[str, int] = field(default_factory=dict)
-    _headers: dict[str, int] = field(default_factory=dict)
+    _headers_early: dict[str, int] = field(default_factory=dict)
+    _headers_late: dict[str, int] = field(default_factory=dict)
+    _uncounted: dict[str, int] = field(default_factory=dict)
+    _hits: dict[str, int] = field(default_factory=dict)
     _last: dict[str, str] = field(default_factory=dict)
 
     def see(self, row: SampleRow, fingerprint: int) -> None:
@@ -109,18 +114,27 @@ class SampleGuard:
         self._in_a_row[row.cell] = self._in_a_row.get(row.cell, 0) + 1 if row.error else 0
         if row.error:
             self._last[row.cell] = row.error
-            _count(self._lost if row.error.startswith("MessagesLost") else self._failed, row.cell)
+            if row.error != INTERRUPTED:
+                _count(self._lost if row.error.startswith("MessagesLost") else self._failed, row.cell)
             return
         if row.cache_n:
             _count(self._cached, row.cell)
+            self._cached_share = max(self._cached_share, row.cache_n / (row.cache_n + (row.prompt_n or 0)))
         if not row.warmup:
             _count(self._succeeded, row.cell)
-        off_ms = abs(row.facts.get("headers_off_ms", 0.0))
-        if not row.warmup and off_ms > max(HEADERS_OFF_MS, HEADERS_OFF_SHARE * (row.server_prompt_ms or 0.0)):
-            _count(self._headers, row.cell)
+        if "usage_zero" in row.facts and row.prompt_n is None:
+            _count(self._uncounted, row.cell)
+        off_ms = row.facts.get("headers_off_ms", 0.0)
+        if not row.warmup and abs(off_ms) > max(HEADERS_OFF_MS, HEADERS_OFF_SHARE * (row.server_prompt_ms or 0.0)):
+            _count(self._headers_early if off_ms > 0 else self._headers_late, row.cell)
         share = budget(row.marks).residual_share
         if not row.warmup and share is not None and share > RESIDUAL_LIMIT:
             _count(self._residual, row.cell)
+
+    def see_hits(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
+        """Look at what servers count of their caches' hits before the run and after it."""
+        rises = {name: round(after[name] - before.get(name, 0.0)) for name in after}
+        self._hits.update({name: rise for name, rise in rises.items() if rise > 0})
 
     def failures_in_a_row(self, cell: str) -> int:
         """Count a cell's failures since its last success."""
@@ -141,14 +155,22 @@ class SampleGuard:
                 self._repeated,
                 "duplicate-frames",
                 "requests carried a picture that was sent before: a server's cache may have answered",
-                "use a longer video, more images or the synthetic source",
+                "a source that compresses by itself is not stamped: use a longer recording, or the synthetic source",
             ),
             *_told(
                 self._cached,
                 "prompt-cache",
-                "answers came partly from the server's prompt cache: time to first token is too good",
+                f"answers had up to {self._cached_share:.0%} of their prompt from the server's cache: time to first "
+                "token is too good",
                 "start llama-server with --no-cache-prompt --cache-ram 0, vLLM with --no-enable-prefix-caching; "
                 "where --dialect was given, leave it out: a server that is known is asked without its cache",
+            ),
+            *_told(
+                self._hits,
+                "server-cache",
+                "the server's metrics count hits of its caches during the run: times may be too good",
+                "see that nobody else asks it; leave --nonce out; start vLLM with --no-enable-prefix-caching and "
+                "--mm-processor-cache-gb 0",
             ),
             *_told(
                 self._residual,
@@ -157,10 +179,24 @@ class SampleGuard:
                 "look at the machine's load; single samples do no harm to a median",
             ),
             *_told(
-                self._headers,
+                self._headers_early,
                 "ingest-unsure",
-                "samples whose headers did not leave when the slot started, by the server's own prompt_ms",
-                "where it is most of them, this build sends headers at another moment: compare e2e, not ingest",
+                "samples whose headers left before the slot started, by the server's own prompt_ms: ingest is "
+                "too short, inference too long",
+                "where it is most of them, this build sends headers early: compare e2e, and prompt_ms for inference",
+            ),
+            *_told(
+                self._headers_late,
+                "ingest-unsure",
+                "samples whose headers left after the slot had started, by the server's own prompt_ms: ingest is "
+                "too long, inference too short",
+                "where it is most of them, this build sends headers late: compare e2e, and prompt_ms for inference",
+            ),
+            *_told(
+                self._uncounted,
+                "usage-zero",
+                "answers came with a usage of zero tokens: it is left out, and what is cached cannot be known",
+                "a gateway may drop the counts: ask the server behind it",
             ),
             *_told(
                 self._frames_lost,

@@ -346,16 +346,18 @@ def test_a_run_is_recorded_and_its_frames_are_a_source(tmp_path: Path, mode: str
     assert (only_run(tmp_path / "again").samples["error"] == "").all()
 
 
-def test_a_repeated_frame_is_a_warning(tmp_path: Path) -> None:
+def test_a_single_picture_is_another_one_in_every_sample_and_the_same_in_every_cell(tmp_path: Path) -> None:
     import cv2
     import numpy as np
 
     (tmp_path / "pictures").mkdir()
     cv2.imwrite(str(tmp_path / "pictures" / "one.png"), np.zeros((48, 64, 3), np.uint8))
-    said = run(
-        *SMALL, "--source", f"images:{tmp_path / 'pictures'}", "--transport", "http", output=tmp_path / "results"
-    ).stderr
-    assert "warning [duplicate-frames]" in said
+    source = ["--source", f"images:{tmp_path / 'pictures'}"]
+    said = run(*SMALL, *source, "--transport", "http", output=tmp_path / "results").stderr
+    assert "duplicate-frames" not in said
+    (folder,) = (tmp_path / "results").iterdir()
+    samples = read_run(folder).samples
+    assert samples["rgb_source"].nunique() == samples["block"].nunique() > 1
 
 
 @pytest.mark.slow

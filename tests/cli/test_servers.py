@@ -5,13 +5,18 @@ from __future__ import annotations
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from threading import Event
 
 import pytest
 
+from s2a_bench.store.run import read_run
 from s2a_bench.testing.transport import Recorder
+from s2a_bench.types import Token
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, LlamaServer, Ollama, answering
 
@@ -77,6 +82,60 @@ def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path:
     assert "waiting 0.01 s, as the server of http/best-effort asks" in done.stderr
     last = done.stderr.strip().splitlines()[-2:]
     assert any("failed 5 times in a row" in line and "answered 429: slow down" in line for line in last)
+
+
+def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: Path) -> None:
+    asked, under_way, over = 0, Event(), Event()
+    speaker = Cloud()
+
+    def reply(received: Received) -> Iterator[bytes]:
+        nonlocal asked
+        if received.method != "POST":
+            yield head("404 Not Found")
+            return
+        asked += 1
+        yield head(kind=speaker.kind) + speaker.token(Token(0, "go"))
+        if asked == 3:
+            under_way.set()
+            over.wait(60)
+        yield speaker.closing([Token(0, "go")])
+
+    command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, "--http", "as-deployed", "--output", str(tmp_path)]
+    with serving(reply) as url:
+        process = subprocess.Popen([*command, "--url", url], stderr=subprocess.PIPE, text=True)
+        assert under_way.wait(60)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+        over.set()
+    assert process.returncode == 130, said
+    (folder,) = tmp_path.iterdir()
+    run = read_run(folder)
+    assert run.manifest["state"] == "interrupted"
+    *before, last = run.samples["error"]
+    assert before == ["", ""]
+    assert last.startswith("Interrupted: somebody ended the run while this request was under way")
+    assert "failed-samples" not in said
+
+
+def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path) -> None:
+    reply = answering(Cloud(), Recorder(["go", "_to", "x"]))
+    command = [
+        sys.executable,
+        "-m",
+        "s2a_bench",
+        "throughput",
+        *SMALL,
+        "--http",
+        "as-deployed",
+        "--output",
+        str(tmp_path),
+    ]
+    with serving(reply) as url:
+        done = subprocess.run([*command, "--url", url], capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    said = " ".join(done.stdout.split())
+    assert "http/as-deployed: the server does not tell T_eval, so decode stands in for N / T_eval." in said
+    assert "the engine's own figure" not in said
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from s2a_bench.errors import UsageError
-from s2a_bench.frames.convert import decode_image, encode_jpeg, to_bgr
+from s2a_bench.frames.convert import encode_jpeg, to_bgr
 from s2a_bench.frames.synthetic import SyntheticCamera
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 from s2a_bench.types import Frame
@@ -23,12 +23,6 @@ def frames(count: int, width: int = 64, height: int = 48, *, step: int = 1, seed
     """Every ``step``-th frame of a new camera."""
     camera = SyntheticCamera("", width, height, seed=seed)
     return [camera.read() for _ in range(count * step)][::step]
-
-
-def stamped_index(luma: NDArray[np.uint8]) -> int:
-    """Read back the index from the upper left 16x8 pixels."""
-    cells = luma[:8, :16].reshape(4, 2, 8, 2).mean(axis=(1, 3))
-    return int.from_bytes(np.packbits(cells > 128).tobytes(), "big")
 
 
 def power_slope(luma: NDArray[np.uint8]) -> float:
@@ -50,18 +44,12 @@ def test_the_same_seed_gives_the_same_frames() -> None:
 
 
 def test_another_seed_gives_another_scene() -> None:
-    one, other = (frames(1, seed=seed)[0].data[8:] for seed in (3, 4))
+    one, other = (frames(1, seed=seed)[0].data for seed in (3, 4))
     assert np.mean(one != other) > 0.9
 
 
-def test_every_frame_differs_for_longer_than_the_path_is_long() -> None:
-    camera = SyntheticCamera("", 16, 16, fps=10)
-    # 800 frames at 10 fps are 80 s; the path repeats after 77 s
-    assert len({camera.read().data.tobytes() for _ in range(800)}) == 800
-
-
-def test_the_scene_moves_and_not_only_the_stamp() -> None:
-    first, _, later = (frame.data[8:] for frame in frames(3, step=5))
+def test_the_scene_moves() -> None:
+    first, _, later = (frame.data for frame in frames(3, step=5))
     assert np.mean(first != later) > 0.5
 
 
@@ -78,13 +66,7 @@ def test_a_higher_rate_moves_less_from_frame_to_frame() -> None:
     slow, fast = (SyntheticCamera("", 64, 48, fps=fps) for fps in (10, 30))
     at_slow = [slow.read() for _ in range(5)]
     at_fast = [fast.read() for _ in range(13)]
-    np.testing.assert_array_equal(at_slow[4].data[8:], at_fast[12].data[8:])
-
-
-def test_the_index_is_stamped_on_the_picture_and_survives_jpeg() -> None:
-    for frame in frames(8, step=37):
-        assert stamped_index(frame.data[..., 0]) == frame.index
-        assert stamped_index(decode_image(encode_jpeg(to_bgr(frame)))[..., 1]) == frame.index
+    np.testing.assert_array_equal(at_slow[4].data, at_fast[12].data)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -108,7 +90,7 @@ def test_power_falls_with_frequency_as_in_natural_pictures(seed: int) -> None:
 
 def test_contrast_is_neither_flat_nor_clipped() -> None:
     for seed in range(4):
-        luma, chroma = np.moveaxis(frames(1, 640, 480, seed=seed)[0].data[8:], -1, 0)
+        luma, chroma = np.moveaxis(frames(1, 640, 480, seed=seed)[0].data, -1, 0)
         assert 20 < luma.std() < 70
         assert np.mean((luma <= 16) | (luma >= 235)) < 0.05
         assert 3 < chroma.std() < 30
@@ -116,7 +98,7 @@ def test_contrast_is_neither_flat_nor_clipped() -> None:
 
 def test_chroma_lies_in_pairs_of_u_and_v() -> None:
     [frame] = frames(1, 640, 480)
-    u, v = frame.data[8:, 0::2, 1].astype(int), frame.data[8:, 1::2, 1].astype(int)
+    u, v = frame.data[:, 0::2, 1].astype(int), frame.data[:, 1::2, 1].astype(int)
     # neighbours of one kind are alike; U and V are not
     assert np.abs(np.diff(u, axis=1)).mean() < 2
     assert np.abs(u - v).mean() > 5
@@ -130,7 +112,7 @@ def test_odd_and_tiny_sizes_are_refused(size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("size", [(16, 16), (18, 200), (400, 17)])
 def test_small_and_long_sizes_work(size: tuple[int, int]) -> None:
-    assert len({frame.data.tobytes() for frame in frames(5, *size)}) == 5
+    assert len({frame.data.tobytes() for frame in frames(5, *size, step=20)}) > 1
 
 
 @pytest.mark.parametrize("fps", [0.0, -1.0, float("nan")])

@@ -9,6 +9,7 @@ import pytest
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import SourceError
 from s2a_bench.frames import open_source
+from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.feed import Camera, RequestFeed
 from s2a_bench.harness.pixels import fingerprint
 from s2a_bench.trace import Trace
@@ -105,7 +106,7 @@ def test_a_published_frame_has_its_stamp() -> None:
 
 
 def test_a_request_captures_its_own_frame() -> None:
-    feed = RequestFeed(open_source("synthetic", 64, 48), preencoded=False)
+    feed = RequestFeed(Stamped(open_source("synthetic", 64, 48), ""), preencoded=False)
     traces = [Trace(), Trace()]
     frames = [feed.capture(trace) for trace in traces]
     assert [frame.index for frame in frames] == [0, 1]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.harness.warnings import Counters, SampleGuard
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import Mark
@@ -37,6 +38,7 @@ def test_good_samples_raise_no_warning() -> None:
     [
         (row("b"), 1, "duplicate-frames"),
         (row("b", cache_n=7), 2, "prompt-cache"),
+        (row("b", facts={"usage_zero": 1.0}), 2, "usage-zero"),
         (row("b", marks=LOOSE), 2, "residual"),
         (row("b", facts={"frames_lost": 2.0}), 2, "lost-frames"),
         (row("b", facts={"headers_off_ms": -97.0}, server_prompt_ms=97.5), 2, "ingest-unsure"),
@@ -51,6 +53,29 @@ def test_each_warning_has_its_code(second: SampleRow, fingerprint: int, code: st
 @pytest.mark.parametrize(("off_ms", "prompt_ms"), [(-2.8, 97.5), (19.0, 5.0), (200.0, 1000.0)])
 def test_headers_that_fit_the_servers_own_time_are_no_warning(off_ms: float, prompt_ms: float) -> None:
     assert codes((row("a", facts={"headers_off_ms": off_ms}, server_prompt_ms=prompt_ms), 1)) == []
+
+
+@pytest.mark.parametrize(
+    ("off_ms", "says"), [(97.0, "ingest is too short, inference too long"), (-97.0, "ingest is too long, inference")]
+)
+def test_headers_at_another_moment_are_told_with_the_half_that_is_too_long(off_ms: float, says: str) -> None:
+    guard = SampleGuard()
+    guard.see(row("a", facts={"headers_off_ms": off_ms}, server_prompt_ms=97.5), 1)
+    (warning,) = guard.warnings()
+    assert says in warning.message
+
+
+def test_hits_that_servers_count_during_the_run_are_a_warning() -> None:
+    guard = SampleGuard()
+    guard.see_hits({"vllm:mm_cache_hits_total": 4.0, "b": 2.0}, {"vllm:mm_cache_hits_total": 4.0, "b": 2.0})
+    assert guard.warnings() == []
+    guard.see_hits({"vllm:mm_cache_hits_total": 4.0}, {"vllm:mm_cache_hits_total": 9.0, "new": 0.0})
+    (warning,) = guard.warnings()
+    assert (warning.code, "vllm:mm_cache_hits_total: 5" in warning.message) == ("server-cache", True)
+
+
+def test_an_interrupted_request_is_no_failed_one() -> None:
+    assert codes((row("a", error=INTERRUPTED, marks=[]), 1)) == []
 
 
 def test_the_same_picture_in_another_cell_is_no_duplicate() -> None:

@@ -55,7 +55,7 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
             "configuration": {**config.to_manifest(), "live": {**live.to_manifest(), "source": source.name}},
             "stages": requests.stages,
             "environment": environment.collect(requests.packages),
-            "seeds": {"sampling": requests.seed},
+            "seeds": {"sampling": requests.seed, "nonce": requests.nonce},
         }
         tables = (ROLLOUTS, TRAJECTORIES, SKILLS, samples_table(requests.stages), TOKENS)
         writer = stack.enter_context(RunWriter.create(output, "ccrb", manifest, tables))

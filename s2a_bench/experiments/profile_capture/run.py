@@ -20,6 +20,7 @@ from s2a_bench.errors import EngineError, StoreError, UsageError
 from s2a_bench.experiments.profile_capture.config import LEAST_GAPS, CaptureConfig
 from s2a_bench.frames import open_source
 from s2a_bench.frames.convert import bgr_to_rgb, to_bgr
+from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.warnings import Counters, before_run
 from s2a_bench.inference import Engine, EngineConfig, need_engine
 from s2a_bench.machine import environment
@@ -59,7 +60,7 @@ class Answer:
 def answers(engine: Engine, config: CaptureConfig) -> Iterator[Answer]:
     """Ask again and again, each time about a new picture and with a new seed, and yield the times."""
     with ExitStack() as stack:
-        source = open_source(config.source, *config.size, seed=config.seed)
+        source = Stamped(open_source(config.source, *config.size, seed=config.seed), "capture")
         stack.callback(source.close)
         number = 0
         while True:

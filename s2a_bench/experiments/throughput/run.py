@@ -27,4 +27,5 @@ def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -
 
     sampling = "greedy" if config.greedy else "model"
     requests = config.but(engine=config.engine.but(sampling=sampling))
-    return run_requests(Task("throughput", IN_PROCESS, others), requests, output, progress)
+    task = Task("throughput", IN_PROCESS, needs_model=config.reference is not None, others=others)
+    return run_requests(task, requests, output, progress)

@@ -35,6 +35,7 @@ class Live(Options):
     size: Size = option((640, 480), "--live: WIDTHxHEIGHT of the frames [default: 640x480]")
     url: str = option("", "--live: an HTTP server that runs already (a black box)")
     dialect: str = option("", "--live: what --url speaks [default: ask]")
+    nonce: str = option("", "--live: nonce of another run, to send its very pictures again [default: a new one]")
     no_grammar: bool = option(False, "--live: let the model write what it likes")
     warmup: int = option(1, "--live: answers before, which policies learn the rate from", ge=0)
     timeout_s: float = option(
@@ -60,6 +61,7 @@ def requests_of(config: TimelineConfig) -> RequestsConfig:
         runs=1,
         warmup=config.warmup,
         seed=config.seed,
+        nonce=config.nonce,
         timeout_s=config.timeout_s,
         sample_resources_hz=0,
     )

@@ -15,6 +15,7 @@ from s2a_bench.experiments.timeline.live.asks import Ask, asks_of, prior_of
 from s2a_bench.experiments.timeline.live.config import in_paper_format, requests_of
 from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.frames import FrameSource
+from s2a_bench.frames.stamp import Stamped, new_nonce
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.servers import ServerSet
@@ -81,7 +82,8 @@ def word(config: TimelineConfig, progress: Progress) -> tuple[RequestsConfig, li
         model, mmproj = resolve(requests.engine)
         requests = requests.but(engine=requests.engine.but(model=model, mmproj=mmproj))
     asks = asks_of(config, requests.engine.model)
-    return requests.but(max_tokens=max(ask.max_tokens for ask in asks)), asks
+    longest = max(ask.max_tokens for ask in asks)
+    return requests.but(max_tokens=longest, nonce=requests.nonce or new_nonce()), asks
 
 
 @dataclass
@@ -107,14 +109,15 @@ class Link:
         requests = self.requests
         (self.cell,) = requests.pipelines
         self.warnings += before_run(requests)
-        self.progress.stage(f"starting the {self.cell.transport.name} server")
         self.servers = ServerSet(requests, stack, self.writer.path)
+        if self.servers.count:
+            self.progress.stage(f"starting the {self.cell.transport.name} server")
         facts = self.servers.start()
         self.facts = self.servers.model(facts)
         with self.servers.death_explained(self.cell):
             client = open_client(self.servers.wiring(self.cell), self.servers.alive(self.cell))
         self.tee = stack.enter_context(closing(Tee(client)))
-        self.feed = RequestFeed(source, preencoded=self.cell.payload == "jpeg-preencoded")
+        self.feed = RequestFeed(Stamped(source, requests.nonce), preencoded=self.cell.payload == "jpeg-preencoded")
         self.rate = requests.engine.pace
         self.writer.update(
             servers=facts,
@@ -171,6 +174,8 @@ class Link:
             self.answers += not measured.sample.error
         self.writer.sample(measured.sample)
         self.writer.tokens(measured.tokens)
+        if isinstance(measured.fatal, KeyboardInterrupt):
+            raise measured.fatal
         self.servers.raise_if_dead(self.cell, suspect=measured.fatal is not None)
         if isinstance(measured.fatal, UsageError) and "grammar" in str(measured.fatal):
             raise UsageError(f"{measured.fatal} (here: `no_grammar`)") from measured.fatal

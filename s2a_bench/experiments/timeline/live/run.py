@@ -49,7 +49,7 @@ def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
             "configuration": {**config.to_manifest(), "engine": requests.to_manifest()["engine"]},
             "stages": requests.stages,
             "environment": environment.collect(requests.packages),
-            "seeds": {"sampling": requests.seed, "source": requests.seed},
+            "seeds": {"sampling": requests.seed, "source": requests.seed, "nonce": requests.nonce},
         }
         tables = (TIMELINES, SKILLS, samples_table(requests.stages), TOKENS)
         writer = stack.enter_context(RunWriter.create(output, "timeline", manifest, tables))

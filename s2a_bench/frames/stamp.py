@@ -1,0 +1,62 @@
+"""A stamp in the corner of every frame, so that no picture is ever sent twice: a server may keep what it made of one.
+
+The stamp is a hash of a nonce and the frame's index. A run draws a nonce of its own, and adds the name of the cell
+where a server is not ours; the same nonce gives the same pictures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from hashlib import blake2b
+from secrets import token_hex
+
+import numpy as np
+
+from s2a_bench.frames import FrameSource
+from s2a_bench.types import Frame
+
+SIDE = 8
+"""Cells of the stamp each way, a bit each; of 2x2 pixels, large enough to survive JPEG."""
+BLACK, WHITE, GREY = 16, 235, 128
+"""Luma of 0 and 1, and the chroma."""
+
+
+def new_nonce() -> str:
+    """Return a nonce that no other run has."""
+    return token_hex(8)
+
+
+class Stamped:
+    """A source whose frames are stamped in their upper left 16x16 pixels; compressed ones pass as they are."""
+
+    def __init__(self, source: FrameSource, nonce: str) -> None:
+        """Stamp the frames of ``source``, and close it when told to."""
+        self.name, self.encoding = source.name, source.encoding
+        self.width, self.height = source.width, source.height
+        self._source, self._nonce = source, nonce
+
+    def read(self) -> Frame:
+        """Return the next frame, stamped; raises SourceError."""
+        frame = self._source.read()
+        if frame.encoding in {"jpeg", "png"}:
+            return frame
+        if not frame.data.flags.writeable:
+            frame = replace(frame, data=frame.data.copy())
+        self._stamp(frame)
+        return frame
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
+
+    def _stamp(self, frame: Frame) -> None:
+        """Write the hash into the corner, as much of it as a smaller picture has room for."""
+        digest = blake2b(f"{self._nonce}/{frame.index}".encode(), digest_size=SIDE * SIDE // 8).digest()
+        bits = np.unpackbits(np.frombuffer(digest, np.uint8)).reshape(SIDE, SIDE)
+        corner = frame.data[: 2 * SIDE, : 2 * SIDE]
+        height, width = corner.shape[:2]
+        luma = np.where(bits, np.uint8(WHITE), np.uint8(BLACK)).repeat(2, 0).repeat(2, 1)[:height, :width]
+        if frame.encoding == "yuv422_yuy2":
+            corner[..., 0], corner[..., 1] = luma, GREY
+        else:
+            corner[...] = luma.reshape(height, width, *(1,) * (corner.ndim - 2))

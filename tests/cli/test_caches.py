@@ -1,0 +1,168 @@
+"""Servers that keep what they made of a picture: a second run is as slow as the first, and a hit is told."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from statistics import median
+from threading import Event
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from s2a_bench.testing.transport import Recorder
+from s2a_bench.types import Request, Token
+from tests.servers.sockets import Received, head, serving
+from tests.servers.speakers import Cloud, answering
+
+ROOT = Path(__file__).parent.parent.parent
+SMALL = ["--size", "64x48", "--runs", "4", "--warmup", "1", "--max-tokens", "3", "--data-only", "--json"]
+ENCODER_S = 0.1
+"""What the server below needs for a picture that it has not seen."""
+
+
+class Caching(Cloud):
+    """A server that keeps pictures by a hash of their pixels, as vLLM does; its metrics count the hits."""
+
+    def __init__(self) -> None:
+        self.seen: set[int] = set()
+        self.hits = 0
+        self.hit = False
+
+    def read(self, received: Received) -> Request:
+        request = super().read(received)
+        (image,) = request.images
+        key = hash(image.data.tobytes())
+        self.hit = key in self.seen
+        self.hits += self.hit
+        self.seen.add(key)
+        return request
+
+    def opening(self) -> bytes:
+        if not self.hit:
+            Event().wait(ENCODER_S)
+        return super().opening()
+
+    def usage(self, tokens: list[Token]) -> dict[str, Any]:
+        return {"usage": {"prompt_tokens": 12, "completion_tokens": len(tokens)}}
+
+
+@contextmanager
+def caching(server: Caching) -> Iterator[str]:
+    chat = answering(server, Recorder(["go", "_to"]))
+
+    def reply(received: Received) -> Any:
+        if received.path == "/metrics":
+            counted = (
+                f'# TYPE vllm:mm_cache_hits_total counter\nvllm:mm_cache_hits_total{{engine="0"}} {server.hits}.0\n'
+            )
+            return [head(kind="text/plain"), counted.encode()]
+        if received.path == "/v1/models":
+            return [head(kind="application/json"), b'{"data":[{"id":"first"},{"id":"second"}]}']
+        return chat(received)
+
+    with serving(reply) as url:
+        yield url
+
+
+def run(url: str, *arguments: str, output: Path) -> dict[str, Any]:
+    command = [sys.executable, "-m", "s2a_bench", "latency", "--transport", "http", "--url", url, *SMALL]
+    done = subprocess.run(
+        [*command, *arguments, "--output", str(output)], capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return {**json.loads(done.stdout), "said": done.stderr}
+
+
+def codes(result: dict[str, Any]) -> set[str]:
+    return {warning["code"] for warning in result["warnings"]}
+
+
+def typical(result: dict[str, Any]) -> float:
+    return float(median(cell["e2e_ms"]["median"] for cell in result["cells"]))
+
+
+@pytest.fixture(params=["synthetic", "images", "video"])
+def source(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Sources that start over, one of them a single picture."""
+    picture = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    if request.param == "images":
+        (tmp_path / "pictures").mkdir()
+        cv2.imwrite(str(tmp_path / "pictures" / "only.png"), picture)
+        return f"images:{tmp_path / 'pictures'}"
+    if request.param == "video":
+        path = tmp_path / "v.avi"
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+        writer.write(picture)
+        writer.release()
+        return f"video:{path}"
+    return "synthetic"
+
+
+@pytest.mark.slow
+def test_identical_runs_against_a_server_that_keeps_pictures_never_hit(source: str, tmp_path: Path) -> None:
+    server = Caching()
+    with caching(server) as url:
+        results = [run(url, "--source", source, output=tmp_path / "results") for _ in range(2)]
+    assert server.hits == 0
+    assert len(server.seen) == 2 * 2 * 5  # runs, variants, samples with warm-ups
+    for result in results:
+        assert not {"server-cache", "prompt-cache", "duplicate-frames"} & codes(result)
+        assert all(cell["e2e_ms"]["median"] >= ENCODER_S * 1e3 for cell in result["cells"])
+
+
+@pytest.mark.slow
+def test_the_nonce_of_a_run_repeats_its_pictures_and_the_guard_sees_the_hits(tmp_path: Path) -> None:
+    server = Caching()
+    with caching(server) as url:
+        first = run(url, output=tmp_path)
+        manifest = json.loads((Path(first["run"]) / "manifest.json").read_text())
+        again = run(url, "--nonce", manifest["seeds"]["nonce"], output=tmp_path)
+    assert len(server.seen) == server.hits == 10
+    assert "server-cache" in codes(again)
+    assert "vllm:mm_cache_hits_total: 10" in next(
+        w["message"] for w in again["warnings"] if w["code"] == "server-cache"
+    )
+    assert json.loads((Path(again["run"]) / "manifest.json").read_text())["seeds"] == manifest["seeds"]
+
+
+def test_a_server_that_is_not_ours_is_asked_for_its_first_model_and_nothing_of_ours_is_spoken_of(
+    tmp_path: Path,
+) -> None:
+    with caching(Caching()) as url:
+        result = run(url, "--http", "as-deployed", output=tmp_path)
+    asked = json.loads((Path(result["run"]) / "manifest.json").read_text())["asked"]["http/as-deployed"]
+    assert asked["model"] == "first"
+    assert not [word for word in ("dummy", "starting", "model's headers") if word in result["said"]]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("xllamacpp") is None, reason="xllamacpp, llama.cpp's server as a wheel, is not installed")
+def test_identical_runs_against_one_llama_server_never_hit(tmp_path: Path) -> None:
+    from s2a_bench.inference import EngineConfig
+    from s2a_bench.inference.models import resolve
+
+    program = [sys.executable, "-m", "tests.servers.wheel", *map(str, resolve(EngineConfig()))]
+    with subprocess.Popen(
+        program, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as server:
+        try:
+            assert server.stdout is not None
+            url = server.stdout.readline().strip()
+            told = ["--http", "as-deployed", "--size", "320x240", "--extra-body", '{"ignore_eos": true}']
+            first, second = (run(url, *told, output=tmp_path) for _ in range(2))
+            hit = run(url, *told, "--dialect", "openai", "--nonce", "n", output=tmp_path)
+            hit = run(url, *told, "--dialect", "openai", "--nonce", "n", output=tmp_path)
+        finally:
+            server.kill()
+    for result in (first, second):
+        assert not {"prompt-cache", "server-cache"} & codes(result)
+        assert typical(result) > typical(hit)  # some twenty times, on a machine that does nothing else
+    assert {"prompt-cache", "server-cache"} <= codes(hit)
