@@ -78,6 +78,8 @@ class Remote:
     frame_stamp_ns: int = -1
     frame_marks: list[Mark] = field(default_factory=list)
     facts: dict[str, float] = field(default_factory=dict)
+    provenance: dict[str, str] = field(default_factory=dict)
+    """Who answered, as `provenance.Provenance` has it; empty where the server does not tell."""
 
 
 class Trace:
@@ -87,7 +89,7 @@ class Trace:
     says about itself (llama.cpp's ``timings`` and the like); a client's ``remote`` what the server sent back.
     """
 
-    __slots__ = ("facts", "frame_marks", "frame_stamp_ns", "marks", "remote", "token_ns")
+    __slots__ = ("facts", "frame_marks", "frame_stamp_ns", "marks", "provenance", "remote", "token_ns")
 
     def __init__(self) -> None:
         """Start empty."""
@@ -97,6 +99,7 @@ class Trace:
         self.remote: Remote | None = None
         self.frame_stamp_ns = -1
         self.frame_marks: list[Mark] = []
+        self.provenance: dict[str, str] = {}
 
     def mark(self, stage: str) -> None:
         """Say that the time since the previous mark was spent in ``stage``; costs about 0.15 us."""
@@ -109,7 +112,8 @@ class Trace:
 
     def to_remote(self) -> Remote:
         """Return what a server sends back about this request."""
-        return Remote(clock_id(), self.marks, self.token_ns, self.frame_stamp_ns, self.frame_marks, self.facts)
+        frame = self.frame_stamp_ns, self.frame_marks
+        return Remote(clock_id(), self.marks, self.token_ns, *frame, self.facts, self.provenance)
 
     def chain(self) -> list[Mark]:
         """Join both sides' marks in order of time; the server's are left out if its clock is not ours."""

@@ -148,7 +148,7 @@ def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunW
         sampler = stack.enter_context(open_sampler(config.sample_resources_hz, pids))
         sessions = list(_sessions(task, config, servers, sources, sampler, stack))
         asked = {session.cell.name: session.client.describe() for session in sessions}
-        origins = {session.cell.name: servers.origin(session.cell) for session in sessions}
+        origins = {session.cell.name: session.origin for session in sessions}
         run = Provenance.of_engine(servers.model(facts))
         writer.update(
             asked={name: how for name, how in asked.items() if how}, provenance=Origins(run, origins).to_manifest()
@@ -196,7 +196,7 @@ def _sessions(
                 sources.open(cell.name if cell.black_box else ""), preencoded=cell.payload == "jpeg-preencoded"
             )
         name = task.in_process if cell.transport.in_process and task.in_process else cell.name
-        yield Session(replace(cell, name=name), client, feed, config, recorder, sampler)
+        yield Session(replace(cell, name=name), client, feed, config, recorder, sampler, servers.origin(cell))
 
 
 def run_blocks(slots: Sequence[Slot], others: Sequence[Slot], config: RequestsConfig, progress: Progress) -> None:
@@ -227,6 +227,7 @@ def _slot(
 
     def measure(place: Place) -> None:
         measured = session.measure(place)
+        keep_origin(writer, session.cell.name, session.origin)
         writer.sample(measured.sample)
         writer.tokens(measured.tokens)
         sampler.flush(writer)
@@ -243,6 +244,12 @@ def _slot(
         backoff.wait(session.cell.name, measured.retry_after_s)
 
     return measure
+
+
+def keep_origin(writer: RunWriter, cell: str, origin: Provenance) -> None:
+    """Write down who answers a cell's requests, where an answer told more than was known."""
+    if writer.manifest["provenance"]["cells"].get(cell) != origin.to_dict():
+        writer.update(provenance={"cells": {cell: origin.to_dict()}})
 
 
 def _write_frames(writer: RunWriter, rows: list[FrameRow]) -> None:

@@ -21,6 +21,7 @@ from s2a_bench.errors import S2AError
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
+from s2a_bench.provenance import Provenance
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Server, Wiring, open_server
 from s2a_bench.transport.limits import LIMITS, Limits
@@ -56,7 +57,7 @@ def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMI
         if pixels and len(request.images) == 1:
             trace.facts[RGB_ENGINE] = float(fingerprint(request.images[0]))
 
-    return Queued(answer, limits)
+    return Queued(answer, limits, Provenance.of_engine(engine.describe()).to_dict())
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.machine.resources.sampler import Sampler
+from s2a_bench.provenance import Provenance
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import Mark, Trace
 from s2a_bench.transport import Client
@@ -49,6 +50,7 @@ class Measured:
     retry_after_s: float = 0.0
 
 
+UNKNOWN_ORIGIN = Provenance()
 KEPT_FRAMES = 90
 """Frames kept until an answer may name them: three seconds at 30 Hz."""
 
@@ -64,8 +66,13 @@ class Session:
         config: RequestsConfig,
         recorder: RunRecorder | None = None,
         sampler: Sampler | None = None,
+        origin: Provenance = UNKNOWN_ORIGIN,
     ) -> None:
-        """Measure ``cell`` with an open client, recording what travels if there is a recorder."""
+        """Measure ``cell`` with an open client, recording what travels if there is a recorder.
+
+        ``origin`` is what is known of who answers; a server that tells in its answers knows better.
+        """
+        self.origin = origin
         self.cell = cell
         self.client = client
         self.feed = feed
@@ -123,6 +130,8 @@ class Session:
     ) -> Measured:
         """Turn what was seen into rows."""
         config, facts = self._config, trace.facts
+        if trace.remote is not None and trace.remote.provenance.get("engine"):
+            self.origin = replace(Provenance.from_dict(trace.remote.provenance), link=self.origin.link)
         streamed = self._streamed(trace, request_id)
         if streamed:
             index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index
@@ -143,7 +152,7 @@ class Session:
             variant=self.cell.variant,
             payload=self.cell.payload,
             connection=getattr(self.cell.options, "connection", ""),
-            engine=config.engine.name,
+            engine=self.origin.engine,
             mode=config.mode,
             size=f"{config.width}x{config.height}",
             block=place.block,

@@ -20,10 +20,11 @@ Tuning: TypeAlias = Literal["tuned", "default"]
 
 @dataclass(frozen=True, slots=True)
 class QoS:
-    """The quality of service settings ROS 2 users know; `depth` 0 keeps all."""
+    """The quality of service settings ROS 2 users know; `depth` 0 keeps all, `latched` is transient local."""
 
     depth: int = 10
     reliable: bool = True
+    latched: bool = False
 
 
 class Publisher(Protocol):

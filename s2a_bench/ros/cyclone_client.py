@@ -31,7 +31,7 @@ class CycloneActionClient:
         feedback, status = type_name + "_FeedbackMessage", STATUS_ARRAY
         feedback_qos = dds_qos(READER_QOS, f"typehash={ros.type_hash(feedback, version)};")
         self._feedback = RawReader(participant, f"rt{prefix}feedback", feedback, feedback_qos)
-        status_qos = dds_qos(QoS(depth=1), f"typehash={ros.type_hash(status)};", transient_local=True)
+        status_qos = dds_qos(QoS(depth=1, latched=True), f"typehash={ros.type_hash(status)};")
         self._status = RawReader(participant, f"rt{prefix}status", status, status_qos)
         """Not read: a goal's status comes with its result. ROS tools expect a client to subscribe."""
         # Readers are announced in order: a server that knows the reply readers below knows the feedback reader too.

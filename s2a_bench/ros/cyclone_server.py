@@ -87,7 +87,7 @@ class CycloneActionServer:
         self._feedback_type = type_name + "_FeedbackMessage"
         feedback_qos = dds_qos(FEEDBACK_QOS, f"typehash={ros.type_hash(self._feedback_type, version)};")
         self._feedback = RawWriter(participant, f"rt{prefix}feedback", self._feedback_type, feedback_qos)
-        status_qos = dds_qos(QoS(depth=1), f"typehash={ros.type_hash(STATUS_ARRAY)};", transient_local=True)
+        status_qos = dds_qos(QoS(depth=1, latched=True), f"typehash={ros.type_hash(STATUS_ARRAY)};")
         self._status = RawWriter(participant, f"rt{prefix}status", STATUS_ARRAY, status_qos)
         self._goals = Goals(int(result_timeout_s * 1e9))
         self._waiting: dict[bytes, list[tuple[int, int]]] = {}

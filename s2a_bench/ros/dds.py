@@ -108,15 +108,15 @@ def _raw_type(type_name: str) -> type:
     return dataclass(types.new_class(name, (IdlStruct,), {"typename": dds_type_name(type_name)}))
 
 
-def dds_qos(qos: QoS, user_data: str, *, transient_local: bool = False) -> Qos:
+def dds_qos(qos: QoS, user_data: str) -> Qos:
     """Translate to DDS as rmw_cyclonedds does."""
     reliability = Policy.Reliability.Reliable(FOREVER_NS) if qos.reliable else Policy.Reliability.BestEffort
     history = Policy.History.KeepLast(qos.depth) if qos.depth else Policy.History.KeepAll
-    lasting = (Policy.DurabilityService(0, history, -1, -1, -1),) if transient_local else ()
+    lasting = (Policy.DurabilityService(0, history, -1, -1, -1),) if qos.latched else ()
     return Qos(
         reliability,
         history,
-        Policy.Durability.TransientLocal if transient_local else Policy.Durability.Volatile,
+        Policy.Durability.TransientLocal if qos.latched else Policy.Durability.Volatile,
         *lasting,
         Policy.WriterDataLifecycle(autodispose=False),
         Policy.DataRepresentation(use_cdrv0_representation=True),

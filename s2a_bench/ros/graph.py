@@ -42,7 +42,7 @@ class NodeAnnouncement:
         self._writers: WeakKeyDictionary[RawWriter, Any] = WeakKeyDictionary()
         self._lock = Lock()
         user_data = f"typehash={ros.type_hash(PARTICIPANT_ENTITIES)};"
-        qos = dds_qos(QoS(depth=1), user_data, transient_local=True)
+        qos = dds_qos(QoS(depth=1, latched=True), user_data)
         self._writer = RawWriter(participant, "ros_discovery_info", PARTICIPANT_ENTITIES, qos)
         self.add()
 

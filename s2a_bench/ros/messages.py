@@ -29,6 +29,7 @@ CDR_HEADER = 4
 REQUEST = "s2a_msgs/msg/Request"
 TOKEN = "s2a_msgs/msg/Token"  # noqa: S105 - a type name
 MARKS = "s2a_msgs/msg/Marks"
+PROVENANCE = "s2a_msgs/msg/Provenance"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 

@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS
@@ -28,11 +28,14 @@ T = TypeVar("T")
 
 
 def qos_profile(qos: QoS) -> Any:
-    """Return rclpy's QoS profile; volatile, like ours."""
-    reliability = ReliabilityPolicy.RELIABLE if qos.reliable else ReliabilityPolicy.BEST_EFFORT
+    """Return rclpy's QoS profile."""
+    asked: dict[str, Any] = {
+        "reliability": ReliabilityPolicy.RELIABLE if qos.reliable else ReliabilityPolicy.BEST_EFFORT,
+        "durability": DurabilityPolicy.TRANSIENT_LOCAL if qos.latched else DurabilityPolicy.VOLATILE,
+    }
     if not qos.depth:
-        return QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=reliability)
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=qos.depth, reliability=reliability)
+        return QoSProfile(history=HistoryPolicy.KEEP_ALL, **asked)
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=qos.depth, **asked)
 
 
 class Inbox(Generic[T]):

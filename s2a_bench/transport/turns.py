@@ -9,7 +9,7 @@ From its arrival a request has `Limits.answer_s`: then its wait, or its answer a
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
 from contextlib import closing
@@ -144,9 +144,12 @@ Answering: TypeAlias = "Callable[[Request, Trace, Turn], Generator[Token, None, 
 class Queued:
     """A handler that answers one request at a time; `answer` is for who has its turn already."""
 
-    def __init__(self, answering: Answering, limits: Limits = LIMITS) -> None:
-        """Put a queue in front of ``answering``."""
+    def __init__(
+        self, answering: Answering, limits: Limits = LIMITS, provenance: Mapping[str, str] | None = None
+    ) -> None:
+        """Put a queue in front of ``answering``; ``provenance`` says who that is, and goes with every answer."""
         self.turns = Turns(limits)
+        self.provenance = dict(provenance or {})
         self._answering = answering
 
     @staticmethod
@@ -168,6 +171,7 @@ class Queued:
 
         What taking a free turn costs, some 2 us, is the engine's time.
         """
+        trace.provenance = self.provenance
         trace.mark(RESIDUAL)
         turn = self.turns.join()
         try:
@@ -180,6 +184,7 @@ class Queued:
 
     def answer(self, request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
         """Answer in a turn that has come, and leave it."""
+        trace.provenance = self.provenance
         trace.mark(RESIDUAL)
         try:
             turn.check(now_ns())

@@ -121,4 +121,5 @@ def remote_of_json(value: dict[str, Any]) -> Remote:
         frame_stamp_ns=value["frame_stamp_ns"],
         frame_marks=[(stage, stamp) for stage, stamp in value["frame_marks"]],
         facts=value["facts"],
+        provenance=value.get("provenance", {}),
     )

@@ -131,7 +131,8 @@ def application(queued: Queued, limits: Limits, *, documented: bool = False) -> 
 
     @app.get("/v1/models")
     def models() -> dict[str, Any]:
-        return {"object": "list", "data": [{"id": "s2a", "object": "model", "owned_by": "s2a-bench"}]}
+        model = {"id": "s2a", "object": "model", "owned_by": "s2a-bench", "s2a_provenance": queued.provenance}
+        return {"object": "list", "data": [model]}
 
     @app.post(own.PATHS[own.AS_DEPLOYED])
     def as_deployed(body: ChatRequest, http_request: HttpRequest) -> Response:

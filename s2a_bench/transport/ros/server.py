@@ -14,6 +14,8 @@ from threading import Event, Lock, Thread
 from typing import Any, Protocol
 
 from s2a_bench.errors import Busy, Overdue
+from s2a_bench.ros import QoS
+from s2a_bench.ros import messages as ros
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros.action import ActionFront
@@ -21,6 +23,7 @@ from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.topic import TopicFront
+from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, provenance_message
 from s2a_bench.transport.turns import Queued, Turn
 from s2a_bench.types import Request, Token
 
@@ -84,6 +87,8 @@ class RosServer:
             TopicFront(self.middleware, self.address, self._cache),
             ActionFront(self.middleware, wiring, self._cache),
         ]
+        origin = self.middleware.publisher(self.address + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True))
+        origin.send(origin.pack(provenance_message(self._queued.provenance)))
         self._stopped = Event()
 
     def serve(self) -> None:

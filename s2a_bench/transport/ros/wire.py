@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from secrets import token_hex
 from typing import Any, Final
 
 from s2a_bench.errors import TransportError
+from s2a_bench.provenance import Provenance
 from s2a_bench.ros import QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Remote, Trace
@@ -21,6 +22,10 @@ READER_QOS = QoS(depth=0)
 
 TOKEN_QOS = QoS(depth=1000)
 """Our writers keep the last: one that keeps all blocks for as long as a reader does not read."""
+
+
+PROVENANCE_TOPIC: Final = "/provenance"
+"""Below the namespace: who answers, for who joins late too."""
 
 
 UNREADABLE: Final = "unreadable_n"
@@ -88,7 +93,13 @@ def marks_message(request_id: str, remote: Remote) -> Any:
         frame_stamps=ros.int64_array(stamp for _, stamp in remote.frame_marks),
         fact_names=list(remote.facts),
         fact_values=ros.float64_array(remote.facts.values()),
+        provenance=provenance_message(remote.provenance),
     )
+
+
+def provenance_message(told: Mapping[str, str]) -> Any:
+    """Turn what a server says of who answers into s2a_msgs/Provenance."""
+    return ros.message(ros.PROVENANCE, **told)
 
 
 def remote_of(marks: Any) -> Remote:
@@ -100,4 +111,5 @@ def remote_of(marks: Any) -> Remote:
         frame_stamp_ns=int(marks.frame_stamp),
         frame_marks=list(zip(marks.frame_stages, marks.frame_stamps.tolist(), strict=True)),
         facts=dict(zip(marks.fact_names, marks.fact_values.tolist(), strict=True)),
+        provenance={name: getattr(marks.provenance, name) for name in Provenance().to_dict()},
     )

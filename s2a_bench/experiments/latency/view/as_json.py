@@ -26,13 +26,13 @@ def latency_json(run: Run) -> dict[str, Any]:
 
 def about_cell(cell: Cell, run: Run) -> dict[str, Any]:
     """Return what the cells of all commands say about themselves; ``dummy`` where it is known."""
-    model = run.manifest.get("model", {})
+    origin = run.origins.of(cell.name)
     return {
         "cell": cell.name,
         **cell.about,
-        "profile": model.get("profile"),
+        "profile": origin.profile or None,
         "emulated": cell.emulated,
-        "dummy": model.get("dummy"),
+        "dummy": {"real": False, "dummy": True, "none": True}.get(origin.weights),
         "n": cell.n,
         "errors": cell.errors,
         "warmups": cell.warmups,

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from s2a_bench.provenance import UNKNOWN
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import ratio_of_blocks
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
@@ -166,15 +167,26 @@ def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | Non
 
 def engine_note(run: Run, cells: list[Cell]) -> Note:
     """Return what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
-    engines = {cell.about["engine"] for cell in cells}
+    engines, by_name = {cell.about["engine"] for cell in cells}, [cell.name for cell in cells]
     notes = []
     if "echo" in engines:
         notes.append(Note("echo engine", ECHO))
     if "replay" in engines:
-        notes.append(_emulated(run.manifest.get("model") or {}))
-    if "llama" in engines and (run.manifest.get("model") or {}).get("dummy"):
+        notes.append(_emulated(_replayed(run, cells)))
+    if any(origin.weights == "dummy" and not origin.emulated for origin in map(run.origins.of, by_name)):
         notes.append(Note("dummy weights", DUMMY))
+    if UNKNOWN in engines:
+        notes.append(Note("engine unknown, as the server does not tell", "engine unknown"))
     return Note(", ".join(notes), *(label for note in notes for label in note.labels))
+
+
+def _replayed(run: Run, cells: list[Cell]) -> dict[str, Any]:
+    """Return what is known of the profile that was played: by a server of ours, or by one that told in its answers."""
+    model: dict[str, Any] = run.manifest.get("model") or {}
+    if model.get("emulated"):
+        return model
+    told = next((origin for cell in cells if (origin := run.origins.of(cell.name)).emulated), None)
+    return {"profile": told.profile, "dummy": told.weights == "dummy"} if told else model
 
 
 def _emulated(model: dict[str, Any]) -> Note:
@@ -201,7 +213,7 @@ def stages_present(cells: list[Cell]) -> list[str]:
 def _cell(name: str, samples: pd.DataFrame, tokens: pd.DataFrame, stages: Mapping[str, str]) -> Cell:
     """Sort the samples of one cell into those that count and those that are only counted."""
     about = {
-        key: str(samples[key].iloc[0])
+        key: str(samples[key].iloc[-1])  # who answers may be known from the first answer on
         for key in ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
     }
     about["payload"] = EARLIER_PAYLOADS.get(about["payload"], about["payload"])

@@ -25,7 +25,7 @@ from s2a_bench.inference import need_engine
 from s2a_bench.inference.models import resolve
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.progress import Progress
-from s2a_bench.provenance import Origins
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
@@ -101,6 +101,8 @@ class Link:
     """What the engine says about itself."""
     rate: float | None = None
     """Tokens/s: set, or as first seen."""
+    origin: Provenance = field(default_factory=Provenance)
+    """Who answers, as far as it was told."""
     answers: int = 0
     """Plans that came as they should."""
 
@@ -114,6 +116,7 @@ class Link:
             self.progress.stage(f"starting the {self.cell.transport.name} server")
         facts = self.servers.start()
         self.facts = self.servers.model(facts)
+        self.origin = self.servers.origin(self.cell)
         with self.servers.death_explained(self.cell):
             client = open_client(self.servers.wiring(self.cell), self.servers.alive(self.cell))
         self.tee = stack.enter_context(closing(Tee(client)))
@@ -122,12 +125,10 @@ class Link:
         self.writer.update(
             servers=facts,
             model=self.facts,
-            provenance=Origins(self.servers.origin(self.cell)).to_manifest(),
+            provenance=Origins(self.origin).to_manifest(),
             live={
                 "transport": self.cell.name,
-                "engine": self.facts.get("engine", "unknown"),
-                "emulated": self.emulated,
-                **({"dummy": self.facts["dummy"]} if "dummy" in self.facts else {}),
+                **self._told(),
                 **({"paced_tokens_per_s": self.rate} if self.rate else {}),
                 "grammar": not self.config.no_grammar,
                 "skills": self.config.skill_set.name,
@@ -138,7 +139,16 @@ class Link:
     @property
     def emulated(self) -> bool:
         """Return whether the engine is the replay of a profile."""
-        return bool(self.facts.get("emulated", False))
+        return self.origin.emulated
+
+    def _told(self) -> dict[str, Any]:
+        """Return what the manifest's ``live`` says of who answers; ``dummy`` where it is known."""
+        dummy = {"dummy": True, "real": False}.get(self.origin.weights)
+        return {
+            "engine": self.origin.engine,
+            "emulated": self.emulated,
+            **({} if dummy is None else {"dummy": dummy}),
+        }
 
     def warm_up(self, ask: Ask) -> GapPrior | None:
         """Ask as often as the configuration wants, and return what policies learn from that."""
@@ -166,8 +176,11 @@ class Link:
             seed=requests.seed + plan,
         )
         self.tee.plan = feed
-        session = Session(self.cell, self.tee, self.feed, asked)
+        session = Session(self.cell, self.tee, self.feed, asked, origin=self.origin)
         measured = session.measure(Place(next(self.blocks), 0, warmup=feed is None))
+        if session.origin != self.origin:
+            self.origin = session.origin
+            self.writer.update(provenance=Origins(self.origin).to_manifest(), live=self._told())
         if feed is not None:  # the executors' times: the harness sees a token some microseconds later
             tokens = [replace(row, client_ns=at_ns) for row, at_ns in zip(measured.tokens, feed.token_ns, strict=False)]
             measured = replace(measured, tokens=tokens)
