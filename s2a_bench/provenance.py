@@ -106,7 +106,7 @@ class Provenance:
         if not self.known:
             return "engine UNKNOWN (the server does not tell)"
         model = ", ".join(filter(None, (self.model, self.quantisation, _WEIGHTS.get(self.weights, ""))))
-        engine = "no engine" if self.engine == NONE else self.engine + (f" ({model})" if model else " (no model)")
+        engine = "no engine" if self.engine == NONE else self.engine + (f" ({model})" if model else "")
         weights = " with DUMMY WEIGHTS" if self.engine == NONE and self.weights == "dummy" else ""
         tokens = f"tokens {self.tokens.upper() if self.tokens in _LOUD else self.tokens}"
         tokens += f" after {self.profile}{weights}" if self.profile else ""
@@ -116,7 +116,7 @@ class Provenance:
 
 
 _FIELDS: Final = tuple(item.name for item in fields(Provenance))
-_WEIGHTS: Final = {"dummy": "DUMMY WEIGHTS", UNKNOWN: "weights unknown"}
+_WEIGHTS: Final = {"dummy": "DUMMY WEIGHTS", NONE: "no model", UNKNOWN: "weights unknown"}
 _LOUD: Final = {"emulated", "paced", UNKNOWN}
 _UNPLAIN: Final = {"emulated", "virtual"}
 _LONGEST: Final = 200

@@ -12,7 +12,7 @@ from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.machine.resources.sampler import Sampler
-from s2a_bench.provenance import Provenance
+from s2a_bench.provenance import UNKNOWN, Provenance
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import Mark, Trace
 from s2a_bench.transport import Client
@@ -130,8 +130,9 @@ class Session:
     ) -> Measured:
         """Turn what was seen into rows."""
         config, facts = self._config, trace.facts
-        if trace.remote is not None and trace.remote.provenance.get("engine"):
-            self.origin = replace(Provenance.from_dict(trace.remote.provenance), link=self.origin.link)
+        told = trace.provenance or (trace.remote.provenance if trace.remote else {})
+        if told.get("engine", UNKNOWN) != UNKNOWN:
+            self.origin = replace(Provenance.from_dict(told), link=self.origin.link)
         streamed = self._streamed(trace, request_id)
         if streamed:
             index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index

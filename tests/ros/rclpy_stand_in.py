@@ -268,7 +268,7 @@ class ActionServer(Waitable):
 
 def modules() -> dict[str, dict[str, Any]]:
     """The modules the glue imports, with what it takes from them."""
-    profile = SimpleNamespace(KEEP_ALL=1, KEEP_LAST=2, RELIABLE=3, BEST_EFFORT=4)
+    profile = SimpleNamespace(KEEP_ALL=1, KEEP_LAST=2, RELIABLE=3, BEST_EFFORT=4, VOLATILE=5, TRANSIENT_LOCAL=6)
     return {
         "rclpy": {
             "init": lambda *, args, context, domain_id: args or setattr(context, "domain", domain_id),
@@ -280,7 +280,10 @@ def modules() -> dict[str, dict[str, Any]]:
             "SingleThreadedExecutor": Executor,
             "ExternalShutdownException": type("ExternalShutdownException", (Exception,), {}),
         },
-        "rclpy.qos": {"HistoryPolicy": profile, "ReliabilityPolicy": profile, "QoSProfile": SimpleNamespace},
+        "rclpy.qos": {
+            **dict.fromkeys(("DurabilityPolicy", "HistoryPolicy", "ReliabilityPolicy"), profile),
+            "QoSProfile": SimpleNamespace,
+        },
         "rclpy.serialization": {"serialize_message": serialize_message, "deserialize_message": deserialize_message},
         "rclpy.action": {
             "ActionClient": ActionClient,

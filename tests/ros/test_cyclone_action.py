@@ -128,7 +128,7 @@ def test_a_node_is_listed_by_name_with_its_endpoints(dds_domain: int) -> None:
         publisher = named.publisher("/x", "std_msgs/msg/String", QoS())
         named.action_server(NAME, llama.GENERATE_RESPONSE)
         participant = listening._participant  # type: ignore[attr-defined]
-        reader = RawReader(participant, DISCOVERY, PARTICIPANT_ENTITIES, dds_qos(QoS(0), "", transient_local=True))
+        reader = RawReader(participant, DISCOVERY, PARTICIPANT_ENTITIES, dds_qos(QoS(0, latched=True), ""))
         waiter = Waiter(participant, [reader])
         deadline = now_ns() + 20_000_000_000
         nodes: dict[str, Any] = {}

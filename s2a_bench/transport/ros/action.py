@@ -30,7 +30,16 @@ from s2a_bench.transport import CameraSink, Wiring
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.transport.ros.wire import READER_QOS, TOKEN_QOS, marks_message, readable, remote_of, token_message
+from s2a_bench.transport.ros.wire import (
+    PROVENANCE_TOPIC,
+    READER_QOS,
+    TOKEN_QOS,
+    marks_message,
+    readable,
+    remote_of,
+    token_message,
+    told_by,
+)
 from s2a_bench.types import Request, Token
 
 ACTION = "/generate_response"
@@ -57,6 +66,9 @@ class GenerateClient:
         try:
             self._client, self._version = self._connect()
             self._marks = None
+            self._origin = self.middleware.subscription(
+                self._name.rpartition("/")[0] + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
+            )
             if not wiring.black_box:
                 self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, READER_QOS)
                 camera = CameraPublisher(self.middleware, namespace, wiring.options.payload, wiring.options.qos)
@@ -99,6 +111,8 @@ class GenerateClient:
         yield from self._tokens(goal_id, request.max_tokens, trace)
         if self._marks is not None:
             self._receive_marks(goal_id.hex(), trace)
+        elif (told := self._origin.take(0)) is not None and (origin := readable(self._origin, told, trace)) is not None:
+            trace.provenance = told_by(origin)
 
     def _tokens(self, goal_id: bytes, limit: int, trace: Trace) -> Iterator[Token]:
         """Yield the tokens of a goal; it is cancelled after ``limit``, or when the caller leaves early."""

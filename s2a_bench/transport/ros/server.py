@@ -87,8 +87,10 @@ class RosServer:
             TopicFront(self.middleware, self.address, self._cache),
             ActionFront(self.middleware, wiring, self._cache),
         ]
-        origin = self.middleware.publisher(self.address + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True))
-        origin.send(origin.pack(provenance_message(self._queued.provenance)))
+        self._origin = self.middleware.publisher(  # kept: what is latched goes with its writer
+            self.address + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
+        )
+        self._origin.send(self._origin.pack(provenance_message(self._queued.provenance)))
         self._stopped = Event()
 
     def serve(self) -> None:

@@ -99,7 +99,12 @@ def marks_message(request_id: str, remote: Remote) -> Any:
 
 def provenance_message(told: Mapping[str, str]) -> Any:
     """Turn what a server says of who answers into s2a_msgs/Provenance."""
-    return ros.message(ros.PROVENANCE, **told)
+    return ros.message(ros.PROVENANCE, **{**Provenance().to_dict(), **told})
+
+
+def told_by(origin: Any) -> dict[str, str]:
+    """Read who answers from s2a_msgs/Provenance."""
+    return {name: getattr(origin, name) for name in Provenance().to_dict()}
 
 
 def remote_of(marks: Any) -> Remote:
@@ -111,5 +116,5 @@ def remote_of(marks: Any) -> Remote:
         frame_stamp_ns=int(marks.frame_stamp),
         frame_marks=list(zip(marks.frame_stages, marks.frame_stamps.tolist(), strict=True)),
         facts=dict(zip(marks.fact_names, marks.fact_values.tolist(), strict=True)),
-        provenance={name: getattr(marks.provenance, name) for name in Provenance().to_dict()},
+        provenance=told_by(marks.provenance),
     )

@@ -1,0 +1,106 @@
+"""A replay behind `--url` or `--action` is labelled as one, wherever its numbers go; a black box is unknown."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from s2a_bench.store.run import Run, read_run
+from s2a_bench.testing.transport import Recorder
+from tests.servers.sockets import serving as serving_socket
+from tests.servers.speakers import Cloud, answering
+
+SMALL = ("--size", "64x48", "--runs", "5", "--warmup", "1", "--max-tokens", "3")
+
+
+@contextmanager
+def serving(*arguments: str) -> Iterator[str]:
+    """Serve and yield the first line."""
+    command = [sys.executable, "-m", "s2a_bench", "serve", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        assert process.stdout is not None
+        yield process.stdout.readline()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def measured(output: Path, *arguments: str) -> tuple[Run, str]:
+    """Measure and return the run with what was printed."""
+    command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, *arguments, "--output", str(output)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    (folder,) = output.iterdir()
+    return read_run(folder), done.stdout
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, str]:
+    with serving("http", "--engine", "replay", "--profile", "rtx-4080", "--port", "0") as line:
+        url = line.split()[2].rstrip(";").split("/v1")[0]
+        return measured(tmp_path_factory.mktemp("replayed"), "--transport", "http/as-deployed", "--url", url)
+
+
+def test_a_replay_behind_a_url_is_emulated_in_every_place(replayed: tuple[Run, str], tmp_path: Path) -> None:
+    run, said = replayed
+    (origin,) = run.origins.every
+    assert (origin.engine, origin.tokens, origin.profile) == ("replay", "emulated", "rtx-4080")
+    assert "EMULATED" in said
+    assert set(run.samples["engine"]) == {"replay"}
+    assert set(run.samples["provenance"]) == {"replay/real/emulated"}
+    for path in (run.path / "tables").iterdir():
+        head, _, rest = path.read_text().partition("\n")
+        rows = rest.splitlines() if path.suffix == ".csv" else [head + rest]
+        assert all("emulated" in row.lower() for row in rows), path
+    page = tmp_path / "page.html"
+    command = [sys.executable, "-m", "s2a_bench", "report", str(run.path), "--output", str(page)]
+    subprocess.run(command, check=True, capture_output=True)
+    assert "EMULATED after rtx-4080" in page.read_text()
+    shown = json.loads(
+        subprocess.run(
+            [sys.executable, "-c", f"import json, s2a_bench as s; print(json.dumps(s.load({str(run.path)!r}).json()))"],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+    )
+    assert [(cell["engine"], cell["emulated"], cell["profile"]) for cell in shown["cells"]] == [
+        ("replay", True, "rtx-4080")
+    ]
+    assert shown["provenance"]["cells"]["http/as-deployed"]["tokens"] == "emulated"
+
+
+def test_it_is_not_compared_with_a_measured_run(replayed: tuple[Run, str], tmp_path: Path) -> None:
+    own, _ = measured(tmp_path, "--transport", "http/as-deployed", "--engine", "echo")
+    command = [sys.executable, "-m", "s2a_bench", "compare", str(own.path), str(replayed[0].path)]
+    refused = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert refused.returncode != 0
+    assert "provenance tokens: measured against emulated" in refused.stderr
+
+
+def test_a_replay_behind_an_action_is_emulated_too(tmp_path: Path) -> None:
+    namespace = f"/replayed_{os.getpid()}"
+    with serving("ros", "--engine", "replay", "--profile", "rtx-4080", "--namespace", namespace) as line:
+        assert line
+        action: tuple[Any, ...] = ("--transport", "ros/action", "--action", f"{namespace}/generate_response")
+        run, said = measured(tmp_path, *action)
+    assert run.origins.of("ros/action").code == "replay/real/emulated"
+    assert set(run.samples["engine"]) == {"replay"}
+    assert "EMULATED" in said
+
+
+def test_a_server_that_does_not_tell_is_unknown_never_the_default(tmp_path: Path) -> None:
+    with serving_socket(answering(Cloud(), Recorder(["x", "y"]))) as url:
+        run, said = measured(tmp_path, "--transport", "http/as-deployed", "--url", url, "--dialect", "openai")
+    assert set(run.samples["engine"]) == {"unknown"}
+    assert not any(origin.known for origin in run.origins.cells.values())
+    assert "engine UNKNOWN" in said
