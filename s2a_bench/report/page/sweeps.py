@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 from s2a_bench.experiments.latency.view.cells import cells_of, engine_note
 from s2a_bench.experiments.latency.view.tables import TITLES
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.provenance import joined
+from s2a_bench.provenance import Origins
 from s2a_bench.report.page import Content
 from s2a_bench.stats import summary_of
 from s2a_bench.store.requests import TOKENS
@@ -123,7 +123,8 @@ def _joined(sweep: Sweep, runs: Sequence[Run]) -> Run:
     manifest["calibrations"] = {
         name: found for run in runs for name, found in (run.manifest.get("calibrations") or {}).items()
     }
-    manifest["provenance"] = joined(run.origins for run in runs).to_manifest()
+    cells = {name: origin for run in runs for name, origin in run.origins.cells.items()}
+    manifest["provenance"] = Origins(runs[0].origins.run, cells).to_manifest()
     return Run(sweep.path, manifest, tables)
 
 
