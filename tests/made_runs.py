@@ -1,6 +1,7 @@
 """Runs made by hand: durations in ms a stage and cell, the empty name being the residual."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -116,6 +117,7 @@ def make_run(tmp_path: Path) -> MakeRun:
         n_tokens: int = 3,
         manifest: Mapping[str, Any] | None = None,
         extra: tuple[SampleRow, ...] = (),
+        payloads: Mapping[str, str] | None = None,
         **facts: Any,
     ) -> Run:
         rng = np.random.default_rng(1)
@@ -125,6 +127,7 @@ def make_run(tmp_path: Path) -> MakeRun:
                 for cell, durations in cells.items():
                     marks = marks_of(durations, 10**9, load * rng.lognormal(0, spread))
                     row = row_of(cell, durations, block, marks=marks, warmup=block < 0, n_tokens=n_tokens, **facts)
+                    row = replace(row, payload=(payloads or {}).get(row.pipeline, row.payload))
                     run.sample(row)
                     run.tokens(
                         TokenRow(row.request_id, cell, i, i, "x", None, marks[-1][1] + i * 2_000_000)

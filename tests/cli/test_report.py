@@ -42,7 +42,7 @@ def test_what_is_asked_for_is_written_and_nothing_else(timeline: Path, tmp_path:
     done = run(timeline, "--latex", "tex", "--csv", "csv", "--markdown", "all.md", "--against", "paper", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("the paper's claims: ")
-    assert "20 no run given, 5 confirmed, 1 not confirmed" in done.stdout
+    assert "24 undecided or not testable, 3 supported, 1 contradicted" in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"tex", "csv", "all.md"}
     assert sorted(timeline.rglob("*")) == before
 

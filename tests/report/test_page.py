@@ -244,6 +244,7 @@ def test_a_sweep_of_timelines_is_shown_as_the_one_run_that_it_amounts_to(tmp_pat
     overview, pooled = read_chapters([folder], against_paper=False)
     assert pooled.content.tables["timelines"] == replace(execution_table(whole), provenance=whole.origins.line)
     assert pooled.content.csvs == timeline_csv(whole)
+    assert pooled.run.origins == whole.origins
     assert panels_of(pooled.content.timelines) == panels_of(timelines_of(whole))
     assert len(overview.content.tables["cells"].rows) == 12
     assert overview.content.summary[0] == "12 of 12 cells of s2a-bench timeline are finished."
@@ -341,9 +342,10 @@ def test_every_verdict_has_its_evidence_on_the_page(computed: Path) -> None:
     text = page_of(computed, against_paper=True)
     page = Page(text)
     assert "AGX Orin: naive shows intermittent stalls" in page.text
-    assert "naive at L = 6: 7 stalls of 1.75 s; none at L = 4" in page.text
+    assert "Rule: At some L between 10 and 90 % of the gaps" in page.text
+    assert "met, source: EMULATED after jetson-agx-orin, 4.8 tokens/s of table II" in page.text
     assert "Run: s2a-bench latency" in page.text
-    for verdict in ("confirmed", "not-confirmed", "no-run-given"):
+    for verdict in ("supported", "contradicted", "undecided"):
         assert f'class="claim {verdict}"' in text
 
 

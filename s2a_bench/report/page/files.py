@@ -72,7 +72,7 @@ def _latex(report: Report, drawn: dict[str, dict[str, Drawn]]) -> Iterator[tuple
     parts = []
     if report.judged:
         table = _claims(report)
-        yield "claims.tex", to_siunitx(table, ("22mm", "62mm", "22mm", "130mm"), long=True)
+        yield "claims.tex", to_siunitx(table, ("18mm", "34mm", "44mm", "20mm", "46mm", "78mm"), long=True)
         parts.append(r"\input{claims}")
     for chapter in report.chapters:
         lines = [f"\\section*{{{escape(chapter.title)}}}"]
@@ -92,11 +92,14 @@ def _csv(report: Report) -> Iterator[tuple[str, str]]:
     """Yield CSV texts by their paths."""
     if report.judged:
         rows = [
-            (each.verdict, each.claim.where, each.claim.text, each.claim.run, " ".join(each.evidence))
+            (each.verdict, each.claim.where, each.claim.text, each.claim.rule, each.required, " ".join(each.evidence))
             for each in report.judged
         ]
         origins = joined(chapter.run.origins for chapter in report.chapters)
-        yield "claims.csv", CsvTable.of(("verdict", "where", "claim", "run", "evidence"), rows).text(origins)
+        yield (
+            "claims.csv",
+            CsvTable.of(("verdict", "where", "claim", "rule", "required", "evidence"), rows).text(origins),
+        )
     for chapter in report.chapters:
         for name, table in chapter.content.csvs.items():
             yield f"{chapter.name}/{name}", table.text(chapter.run.origins)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench import __version__
-from s2a_bench.report.claims.claim import NO_RUN
 from s2a_bench.report.claims.verdicts import Judged
 from s2a_bench.report.page.chapters import when
 from s2a_bench.report.page.contents import labels_of
@@ -41,7 +40,7 @@ def render(
         lstrip_blocks=True,
     )
     world.filters["short"] = lambda value: f"{value:.6g}"
-    world.globals.update(most_panels=MOST_PANELS, no_run=NO_RUN)
+    world.globals.update(most_panels=MOST_PANELS)
     source = world.loader
     assert source is not None  # noqa: S101 - it was just given
     shown = [_view(chapter, figures.get(chapter.name, {})) for chapter in chapters]
