@@ -1,7 +1,8 @@
 """Set up `.venv` from nothing: check what is needed, compile llama-cpp-python once, install the rest.
 
 Standard library only, because it runs before anything is installed: ``python3 tools/setup.py``. Does nothing when
-the installation is up to date; prints what it does, and one clear line for what is missing.
+the installation is up to date; prints what it does, and one clear line for what is missing. ``core`` behind it installs
+only what measures transports, from wheels: numbers come first, the compiler later.
 
 ``S2A_BENCH_CUDA=1`` (`make setup CUDA=1`) builds llama-cpp-python for an NVIDIA GPU, ``0`` for the CPU; without it the
 build stays what it is, so that a later `make test` does not undo it. The same holds for AMX, the matrix unit of some
@@ -47,8 +48,8 @@ class SetupError(Exception):
     """Something is missing; the message is the one line that the user sees."""
 
 
-def check_machine() -> None:
-    """Fail before anything is downloaded if the rest cannot succeed."""
+def check_python() -> None:
+    """Fail before anything is downloaded if this Python cannot make the environment."""
     if sys.version_info < OLDEST:
         found = ".".join(map(str, sys.version_info[:3]))
         raise SetupError(f"Python {found} is too old: run `make PYTHON=python3.10` or newer")
@@ -60,6 +61,10 @@ def check_machine() -> None:
     except ImportError as error:
         name = f"python{sys.version_info[0]}.{sys.version_info[1]}-venv"
         raise SetupError(f"this Python cannot make virtual environments ({error}): sudo apt install {name}") from error
+
+
+def check_compilers() -> None:
+    """Fail before anything is compiled if that cannot succeed."""
     if built_for() != wanted_build() and not compiler():
         raise SetupError(
             "no C++ compiler found, and llama-cpp-python has to be compiled: sudo apt install build-essential "
@@ -255,26 +260,47 @@ def pip(*arguments: str, watch: bool = False, environment: dict[str, str] | None
         raise SetupError(f"{tail}\npip failed; the whole log is {LOG}")
 
 
-def install() -> None:
-    """Make the environment, compile llama-cpp-python, install the rest (`dev` has all but Ray and CARLA)."""
-    check_machine()
+def make_environment() -> None:
+    """Make the environment where there is none that is whole, with an empty log."""
+    check_python()
     if not has_pip():
         print(f"making {VENV}", flush=True)
         venv = [sys.executable, "-m", "venv", "--clear", str(VENV)]
         if subprocess.run(venv, check=False).returncode:  # noqa: S603 - our own interpreter
             raise SetupError(f"cannot make a virtual environment in {VENV}; is the folder writable?")
     LOG.write_text("")
+
+
+def install_core() -> None:
+    """Make the environment and install what needs no compiler; say how long a newcomer waited for that."""
+    started = time.monotonic()
+    make_environment()
+    print("installing the packages that measure transports, from wheels", flush=True)
+    pip("--quiet", "--editable", str(ROOT))
+    print(f"ready to measure transports after {time.monotonic() - started:.0f} s", flush=True)
+
+
+def install() -> None:
+    """Make the environment, compile llama-cpp-python, install the rest (`dev` has all but Ray and CARLA)."""
+    check_compilers()
+    make_environment()
     if built_for() != wanted_build():
         build_llama()
     print("installing the other packages", flush=True)
     pip("--quiet", "--editable", f"{ROOT}[dev]")
 
 
-def main() -> int:
-    """Bring `.venv` up to date, and see that llama.cpp works on this processor."""
-    stamp = VENV / "s2a-bench-installed"
+def main(*asked: str) -> int:
+    """Bring `.venv` up to date, and see that llama.cpp works on this processor; with ``core`` its first part alone."""
+    stamp, core = VENV / "s2a-bench-installed", VENV / "s2a-bench-core"
     installed, _, tried_on = stamp.read_text().partition("\n") if stamp.exists() else ("", "", "")
     try:
+        if asked == ("core",):
+            done = installed or (core.read_text() if core.exists() else "")
+            if done != fingerprint() or not PYTHON.exists():
+                install_core()
+                core.write_text(fingerprint())
+            return 0
         if installed != fingerprint() or not PYTHON.exists() or built_for() != wanted_build():
             install()
         elif tried_on == processor():
@@ -292,4 +318,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(*sys.argv[1:]))

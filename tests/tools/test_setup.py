@@ -338,3 +338,22 @@ def test_a_gpu_build_without_its_driver_is_not_tried(
     assert script.main() == 0
     assert "not tried: the GPU's driver is not here" in capsys.readouterr().out
     assert built(calls) == ["-DGGML_CUDA=on"]
+
+
+def test_the_core_needs_no_compiler_and_is_installed_once(
+    script: ModuleType, calls: Calls, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(script, "compiler", lambda: None)
+    assert script.main("core") == 0
+    assert [arguments for arguments, _ in calls] == [("--quiet", "--editable", str(script.ROOT))]
+    assert "ready to measure transports after" in capsys.readouterr().out
+    calls.clear()
+    assert script.main("core") == 0
+    assert calls == []
+
+
+def test_what_is_wholly_installed_has_the_core(script: ModuleType, calls: Calls) -> None:
+    assert script.main() == 0
+    calls.clear()
+    assert script.main("core") == 0
+    assert calls == []
