@@ -113,7 +113,8 @@ class Trace:
     def to_remote(self) -> Remote:
         """Return what a server sends back about this request."""
         frame = self.frame_stamp_ns, self.frame_marks
-        return Remote(clock_id(), self.marks, self.token_ns, *frame, self.facts, self.provenance)
+        facts = {str(name): value for name, value in self.facts.items()}  # not every serialiser takes a subclass of str
+        return Remote(clock_id(), self.marks, self.token_ns, *frame, facts, self.provenance)
 
     def chain(self) -> list[Mark]:
         """Join both sides' marks in order of time; the server's are left out if its clock is not ours."""

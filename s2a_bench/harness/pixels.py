@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from s2a_bench.facts import Fact
 from s2a_bench.frames.convert import bgr_to_rgb, decode_image, to_bgr, yuyv_to_rgb
 from s2a_bench.types import Frame, Pixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-RGB_ENGINE = "rgb_engine"
-"""The fact by which a server tells the checksum of its engine's pixels."""
+RGB_ENGINE = Fact("rgb_engine", "", "checksum of the engine's pixels")
+"""What a server tells besides; it becomes a column of its own."""
 
 
 def fingerprint(frame: Frame) -> int:

@@ -7,6 +7,15 @@ from itertools import pairwise
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, RequestFailed, S2AError, ServerDied, SourceError, UsageError
+from s2a_bench.facts import (
+    CACHE_N,
+    CAMERA_FRAMES,
+    FRAMES_LOST,
+    FRAMES_PUBLISHED,
+    PAYLOAD_BYTES,
+    PROMPT_MS,
+    PROMPT_N,
+)
 from s2a_bench.harness.feed import Feed, StreamedFrame, StreamFeed
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint
 from s2a_bench.harness.plan import RequestsConfig
@@ -146,7 +155,7 @@ class Session:
         rgb_engine = _whole(facts.pop(RGB_ENGINE, None))
         error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)
-        self.prompt_n = _whole(facts.get("prompt_n")) or self.prompt_n
+        self.prompt_n = _whole(facts.get(PROMPT_N)) or self.prompt_n
         sample = SampleRow(
             cell=self.cell.name,
             pipeline=self.cell.transport.name,
@@ -166,12 +175,12 @@ class Session:
             n_tokens=len(seen),
             last_token_ns=seen[-1][1] if seen else None,
             frame_age_ns=started_ns - captured_ns if started_ns is not None and captured_ns >= 0 else None,
-            cache_n=_whole(facts.get("cache_n")),
-            prompt_n=_whole(facts.get("prompt_n")),
-            server_prompt_ms=facts.get("prompt_ms"),
+            cache_n=_whole(facts.get(CACHE_N)),
+            prompt_n=_whole(facts.get(PROMPT_N)),
+            server_prompt_ms=facts.get(PROMPT_MS),
             rgb_source=rgb_source,
             rgb_engine=rgb_engine,
-            payload_bytes=_whole(facts.get("payload_bytes")),
+            payload_bytes=_whole(facts.get(PAYLOAD_BYTES)),
             facts=facts,
         )
         engine_ns = trace.remote.token_ns if trace.remote else []
@@ -207,9 +216,9 @@ class Session:
             used = self._frames.get(trace.remote.frame_stamp_ns) if trace.remote else None
             if used is not None and trace.remote is not None:
                 used.marks = used.marks if used.used_by else [*used.marks, *trace.remote.frame_marks]
-                if "camera_frames" in trace.facts:
-                    trace.facts["frames_published"] = used.sequence
-                    trace.facts["frames_lost"] = used.sequence - trace.facts["camera_frames"]
+                if CAMERA_FRAMES in trace.facts:
+                    trace.facts[FRAMES_PUBLISHED] = used.sequence
+                    trace.facts[FRAMES_LOST] = used.sequence - trace.facts[CAMERA_FRAMES]
         if used is not None:
             used.used_by = request_id
         return used

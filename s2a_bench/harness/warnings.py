@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from s2a_bench.clock import realtime_offset_ns
+from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, USAGE_ZERO
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Finding, Machine, examine
@@ -17,7 +18,7 @@ from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import RESIDUAL_LIMIT, budget
 
 CLOCK_STEP_NS = 50_000_000
-HEADERS_OFF_MS, HEADERS_OFF_SHARE = 20.0, 0.25
+SURELY_OFF_MS, SURELY_OFF_SHARE = 20.0, 0.25
 """Beyond both, a llama-server's headers did not leave when its slot started."""
 
 
@@ -109,7 +110,7 @@ class SampleGuard:
         """Look at one sample and the fingerprint of its picture."""
         if self._frames.setdefault((row.cell, fingerprint), row.request_id) != row.request_id:
             _count(self._repeated, row.cell)
-        if lost := row.facts.get("frames_lost"):
+        if lost := row.facts.get(FRAMES_LOST):
             self._frames_lost[row.cell] = int(lost)
         self._in_a_row[row.cell] = self._in_a_row.get(row.cell, 0) + 1 if row.error else 0
         if row.error:
@@ -122,10 +123,10 @@ class SampleGuard:
             self._cached_share = max(self._cached_share, row.cache_n / (row.cache_n + (row.prompt_n or 0)))
         if not row.warmup:
             _count(self._succeeded, row.cell)
-        if "usage_zero" in row.facts and row.prompt_n is None:
+        if USAGE_ZERO in row.facts and row.prompt_n is None:
             _count(self._uncounted, row.cell)
-        off_ms = row.facts.get("headers_off_ms", 0.0)
-        if not row.warmup and abs(off_ms) > max(HEADERS_OFF_MS, HEADERS_OFF_SHARE * (row.server_prompt_ms or 0.0)):
+        off_ms = row.facts.get(HEADERS_OFF_MS, 0.0)
+        if not row.warmup and abs(off_ms) > max(SURELY_OFF_MS, SURELY_OFF_SHARE * (row.server_prompt_ms or 0.0)):
             _count(self._headers_early if off_ms > 0 else self._headers_late, row.cell)
         share = budget(row.marks).residual_share
         if not row.warmup and share is not None and share > RESIDUAL_LIMIT:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Final, Protocol
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
+from s2a_bench.facts import Fact
 from s2a_bench.inference.llama_settings import FLASH_ATTENTION, KV_TYPES, LARGEST, LEAST_BATCH, LEAST_CONTEXT, SAMPLINGS
 from s2a_bench.options import Options, one_of, option
 from s2a_bench.registry import Registry
@@ -19,7 +20,7 @@ class Engine(Protocol):
 
     @property
     def facts(self) -> dict[str, float]:
-        """Return what it says about the last request, as llama.cpp's ``timings``: prompt_n, prompt_ms, ..."""
+        """Return what it tells of the last request, as llama.cpp's ``timings``: those that its class declares."""
         ...
 
     def generate(self, request: Request) -> Iterator[Token]:
@@ -43,12 +44,12 @@ ENGINES: Final[Registry[Callable[[EngineConfig], Engine]]] = Registry(
     "engines",
     "engine",
     {
-        "llama": "s2a_bench.inference.one_thread:llama",
+        "llama": "s2a_bench.inference.one_thread:Llama",
         "echo": "s2a_bench.inference.echo:EchoEngine",
         "replay": "s2a_bench.inference.replay:ReplayEngine",
     },
 )
-"""What builds each engine from its configuration."""
+"""What builds each engine from its configuration: its class, which names its facts as ``tells``."""
 
 CHECKS: dict[str, str] = {"llama-build": "s2a_bench.inference.checks:llama_build"}
 """Code -> ``module:function`` of the doctor's checks that are about engines."""
@@ -86,6 +87,11 @@ class EngineConfig(Options):
                 f"`kv_type` {self.kv_type} needs flash attention, which alone reads a quantised V cache; "
                 "leave out `flash_attention` off"
             )
+
+
+def told_by(name: str) -> Sequence[Fact]:
+    """Return the facts that an engine tells."""
+    return getattr(ENGINES[name], "tells", ())
 
 
 def default_engine(say: Callable[[str], None]) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from s2a_bench import extras
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import BadRequest, EngineError, ModelError
+from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_EVAL_MS, PROMPT_MS, PROMPT_N
 from s2a_bench.inference import EngineConfig, llama_log
 from s2a_bench.inference.grammar_limits import beyond_limits
 from s2a_bench.inference.llama_decode import GreedySampler, Sampler, TokenBatch, TokenBytes
@@ -175,11 +176,11 @@ class LlamaCppEngine:
         prompt_done = now_ns()
         perf = llama_cpp.llama_perf_context(llama.ctx)
         self.facts = {
-            "prompt_n": float(perf.n_p_eval),
-            "prompt_ms": (prompt_done - started) / _MS_NS,
-            "prompt_eval_ms": perf.t_p_eval_ms,
-            "predicted_n": 0.0,
-            "predicted_ms": 0.0,
+            PROMPT_N: float(perf.n_p_eval),
+            PROMPT_MS: (prompt_done - started) / _MS_NS,
+            PROMPT_EVAL_MS: perf.t_p_eval_ms,
+            PREDICTED_N: 0.0,
+            PREDICTED_MS: 0.0,
         }
         ignore_end = self._files.dummy and not request.grammar  # random weights end at random, counts should not
         decode = codecs.getincrementaldecoder("utf-8")("replace").decode
@@ -201,8 +202,8 @@ class LlamaCppEngine:
             raise EngineError(f"llama: generation failed: {llama_log.reason() or error}") from error
         finally:
             if turn == self._turn:
-                self.facts["predicted_n"] = float(count)
-                self.facts["predicted_ms"] = (last_ns - prompt_done) / _MS_NS
+                self.facts[PREDICTED_N] = float(count)
+                self.facts[PREDICTED_MS] = (last_ns - prompt_done) / _MS_NS
 
     def _evaluate(self, llama: _Prefilled, request: Request) -> None:
         """Run pictures and prompt through the model, on an empty KV cache, up to the first token's logits."""

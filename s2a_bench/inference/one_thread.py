@@ -16,6 +16,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from s2a_bench.errors import EngineError
+from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_EVAL_MS, PROMPT_MS, PROMPT_N
 from s2a_bench.inference import Engine, EngineConfig
 from s2a_bench.types import Request, Token
 
@@ -121,8 +122,17 @@ def _close(tokens: object) -> None:
         close()
 
 
-def llama(config: EngineConfig) -> OneThreadEngine:
-    """Start the llama engine on a thread of its own."""
-    from s2a_bench.inference.llama_cpp import LlamaCppEngine
+class Llama(OneThreadEngine):
+    """The llama engine, on a thread of its own."""
 
-    return OneThreadEngine(lambda: LlamaCppEngine(config))
+    tells = (PROMPT_N, PROMPT_MS, PROMPT_EVAL_MS, PREDICTED_N, PREDICTED_MS)
+
+    def __init__(self, config: EngineConfig) -> None:
+        """Load the model."""
+
+        def make() -> Engine:
+            from s2a_bench.inference.llama_cpp import LlamaCppEngine
+
+            return LlamaCppEngine(config)
+
+        super().__init__(make)

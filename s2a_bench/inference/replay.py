@@ -15,6 +15,7 @@ from s2a_bench.boards.profile import Profile
 from s2a_bench.boards.search import load_profile
 from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import EngineError, UsageError
+from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_MS
 from s2a_bench.inference import EngineConfig
 from s2a_bench.types import Request, Token
 
@@ -82,6 +83,8 @@ class ReplayEngine:
     times for all requests of a run would hide the spread; a recording goes on where the request before ended.
     """
 
+    tells = (PROMPT_MS, PREDICTED_N, PREDICTED_MS)
+
     def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
         """Load the profile; raises UsageError for what `check_replay` refuses."""
         self.facts: dict[str, float] = {}
@@ -105,12 +108,12 @@ class ReplayEngine:
         prompt_s = self._prompt_s(rng)
         gaps_s = [prompt_s + self._profile.gaps.mean_s, *self._draw(rng, request.max_tokens - 1, self._played)]
         due_ns = accumulate(round(gap * 1e9) for gap in gaps_s)
-        self.facts = {"prompt_ms": prompt_s * 1e3, "predicted_n": 0.0, "predicted_ms": 0.0}
+        self.facts = {PROMPT_MS: prompt_s * 1e3, PREDICTED_N: 0.0, PREDICTED_MS: 0.0}
         for index, (text, due) in enumerate(zip(islice(_plan(request.seed), request.max_tokens), due_ns, strict=True)):
             self._clock.sleep_until_ns(started_ns + due)
             self._played += index > 0
-            self.facts["predicted_n"] = float(index + 1)
-            self.facts["predicted_ms"] = (self._clock.now_ns() - started_ns) / 1e6 - self.facts["prompt_ms"]
+            self.facts[PREDICTED_N] = float(index + 1)
+            self.facts[PREDICTED_MS] = (self._clock.now_ns() - started_ns) / 1e6 - self.facts[PROMPT_MS]
             yield Token(index, text)
 
     def _prompt_s(self, rng: np.random.Generator) -> float:

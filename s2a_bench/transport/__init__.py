@@ -10,6 +10,7 @@ To add a transport, write a package with a module like this, and offer its insta
         name, options = "toy", ToyOptions           # --transport 'toy?port=7000', serve toy
         payloads = ("raw",)                         # the first is the default
         stages = {"frame_length": "pack"}           # marked by its client or server, beside those of trace.STAGES
+        tells = (PAYLOAD_BYTES,)                    # the numbers beside the marks, those of its own as facts.Fact(...)
 
         def client(self, wiring, alive):
             from toy.client import ToyClient        # what is heavy is imported here
@@ -41,6 +42,7 @@ from s2a_bench.registry import Registry
 from s2a_bench.transport.limits import LIMITS, Limits
 
 if TYPE_CHECKING:
+    from s2a_bench.facts import Fact
     from s2a_bench.trace import Trace
     from s2a_bench.transport.options import Options
     from s2a_bench.types import Frame, Request, Token
@@ -166,6 +168,8 @@ class Transport(Generic[O]):
     """How pictures can travel, the default first; nothing where they do not travel at all."""
     stages: ClassVar[Mapping[str, str]] = {}
     """Stage -> group (one of `trace.GROUPS`), those of `trace.STAGES` left out."""
+    tells: ClassVar[Sequence[Fact]] = ()
+    """The facts that its client and server tell, those of the handler left out."""
     order: ClassVar[float] = 50
     """How its cells sort among others."""
     looks: ClassVar[Mapping[str, tuple[str, str]]] = {}
@@ -200,6 +204,10 @@ class Transport(Generic[O]):
     def travels(self, variant: str, options: O) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
         """Return how pictures can travel over a variant, the default first."""
         return self.payloads
+
+    def told(self, options: O) -> Sequence[Fact]:  # noqa: ARG002 - for subclasses
+        """Return the facts that may be told with these options, by somebody else's server too."""
+        return self.tells
 
     def check(self, variant: str, options: O, *, mode: str, engine: str) -> None:
         """Raise UsageError for options that do not go together with the variant or with a run's settings."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from s2a_bench.facts import Fact
 from s2a_bench.store.schema import Table
 
 
@@ -37,3 +38,26 @@ class ResourceRow:
 
 RESOURCES: Final[Table[ResourceRow]] = Table("resources", ResourceRow)
 """One row a reading beside the run."""
+
+
+BOARD_ENERGY_J = Fact("board_energy_j", "J", "energy at the board's input")
+ENERGY_J = Fact("energy_j", "J", "energy of the board, else of the GPUs and CPU packages that can be read")
+POWER_W = Fact("power_w", "W", "`energy_j` over the time of the request")
+SPENT: Final = (
+    Fact("client_cpu_ns", "ns", "CPU time of the harness"),
+    Fact("server_cpu_ns", "ns", "CPU time of all servers of ours"),
+    Fact("client_rss_bytes", "bytes", "memory of the harness, largest value"),
+    Fact("server_rss_bytes", "bytes", "memory of all servers of ours, largest value"),
+    Fact("memory_available_bytes", "bytes", "memory that the machine has left, mean"),
+    Fact("cpu_busy", "", "busy share of all CPUs, mean"),
+    Fact("package_energy_j", "J", "energy of the CPU packages"),
+    Fact("gpu_busy", "", "busy share of the GPUs, mean"),
+    Fact("gpu_memory_bytes", "bytes", "memory in use on the GPUs, largest value"),
+    Fact("gpu_power_w", "W", "power of the GPUs, mean"),
+    Fact("gpu_energy_j", "J", "energy of the GPUs"),
+    Fact("gpu_temperature_c", "°C", "temperature of the GPUs, largest value"),
+    Fact("gpu_clock_hz", "Hz", "clock of the GPUs, mean"),
+    Fact("board_power_w", "W", "power at the board's input, mean"),
+    *(BOARD_ENERGY_J, ENERGY_J, POWER_W),
+)
+"""The facts of a request that are read beside it, under the columns' names."""

@@ -17,14 +17,14 @@ from typing import Any
 
 from s2a_bench.clock import now_ns
 from s2a_bench.machine.resources import Reader, open_readers
-from s2a_bench.machine.resources.rows import RESOURCES, ResourceRow
+from s2a_bench.machine.resources.rows import BOARD_ENERGY_J, ENERGY_J, POWER_W, RESOURCES, ResourceRow
 from s2a_bench.store.run import RunWriter
 
 COUNTERS = ("client_cpu_ns", "server_cpu_ns", "package_energy_j", "gpu_energy_j")
 """Columns that count up; a window's value is the rise."""
 PEAKS = ("client_rss_bytes", "server_rss_bytes", "gpu_memory_bytes", "gpu_temperature_c")
 """Columns of which a window keeps the largest; of all others it keeps the mean."""
-ENERGY_OF_POWER = {"gpu_power_w": "gpu_energy_j", "board_power_w": "board_energy_j"}
+ENERGY_OF_POWER = {"gpu_power_w": "gpu_energy_j", "board_power_w": BOARD_ENERGY_J}
 """Power that is summed over time where the source has no counter of energy."""
 PARTS = ("gpu_energy_j", "package_energy_j")
 """What ``energy_j`` adds up where the board's own input is not measured."""
@@ -126,12 +126,12 @@ class Sampler:
             with source.lock:
                 facts |= _facts(source.readings, start_ns, end_ns, int(1e9 / self._hz))
         parts = [facts[name] for name in PARTS if name in facts]
-        if "board_energy_j" in facts:
-            facts["energy_j"] = facts["board_energy_j"]
+        if BOARD_ENERGY_J in facts:
+            facts[ENERGY_J] = facts[BOARD_ENERGY_J]
         elif parts:
-            facts["energy_j"] = sum(parts)
-        if "energy_j" in facts and end_ns > start_ns:
-            facts["power_w"] = facts["energy_j"] / (end_ns - start_ns) * 1e9
+            facts[ENERGY_J] = sum(parts)
+        if ENERGY_J in facts and end_ns > start_ns:
+            facts[POWER_W] = facts[ENERGY_J] / (end_ns - start_ns) * 1e9
         return facts
 
     def describe(self) -> dict[str, Any]:

@@ -5,11 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from s2a_bench.errors import UsageError
+from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, Fact
 from s2a_bench.transport import Client, Handler, Program, Server, Transport, Wiring
 from s2a_bench.transport.http.options import HttpOptions
 
 VARIANTS = ("as-deployed", "best-effort", "binary")
 BINARY = VARIANTS[2]
+
+RECONNECTS = Fact("reconnects", "", "1 where the server had closed the kept connection")
+HEADERS_MS = Fact("headers_ms", "ms", "last byte packed to the headers of a black box's answer")
+THINKING_PIECES = Fact("thinking_pieces", "", "messages of the answer that were thinking")
+THINKING_MS = Fact("thinking_ms", "ms", "first thinking to the first token")
 
 
 class Http(Transport[HttpOptions]):
@@ -26,6 +32,7 @@ class Http(Transport[HttpOptions]):
         "json_parse": "parse",
         "base64_decode": "decode",
     }
+    tells = (PAYLOAD_BYTES, RECONNECTS, HEADERS_MS, HEADERS_OFF_MS, THINKING_PIECES, THINKING_MS)
     order = 10
     looks = {"as-deployed": ("#D55E00", "-"), "best-effort": ("#E69F00", "--"), "binary": ("#CC79A7", "-.")}
     compared_with = ("ros", "loopback")
@@ -58,6 +65,16 @@ class Http(Transport[HttpOptions]):
         from s2a_bench.transport.http.dialects import open_dialect
 
         return open_dialect(options.spoken or "openai").payloads
+
+    def told(self, options: HttpOptions) -> Sequence[Fact]:
+        """Return what the client tells, and what the dialect of a black box has words for."""
+        if not self.foreign_by(options):
+            return self.tells
+        from s2a_bench.transport.http.detect import OWNERS
+        from s2a_bench.transport.http.dialects import open_dialect
+
+        spoken = (options.spoken,) if options.spoken else ("openai", *OWNERS.values())  # what it may turn out to be
+        return (*self.tells, *(fact for name in spoken for fact in open_dialect(name).tells))
 
     def check(self, variant: str, options: HttpOptions, *, mode: str, engine: str) -> None:  # noqa: ARG002
         """Refuse what only our own server knows, a key that is not there, and a model's server without a model."""

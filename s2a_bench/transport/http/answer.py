@@ -17,6 +17,7 @@ from fastapi.responses import JSONResponse, Response
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError
+from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport.http import own
 from s2a_bench.transport.turns import Queued
@@ -157,7 +158,7 @@ class Answer(Response):
         return "length" if count >= self._request.max_tokens else "stop"
 
     def _usage(self, count: int) -> dict[str, int]:
-        prompt = int(self._trace.facts.get("prompt_n", 0))
+        prompt = int(self._trace.facts.get(PROMPT_N, 0))
         return {"prompt_tokens": prompt, "completion_tokens": count, "total_tokens": prompt + count}
 
 

@@ -16,10 +16,11 @@ import httpx
 
 from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError
+from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, PROMPT_MS, THINKING_N
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.credentials import read_key
-from s2a_bench.transport.http import own
+from s2a_bench.transport.http import HEADERS_MS, RECONNECTS, THINKING_MS, THINKING_PIECES, own
 from s2a_bench.transport.http.detect import body_of, detected, getter
 from s2a_bench.transport.http.dialects import OWN, Dialect, Event, Picture, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
@@ -129,7 +130,7 @@ class HttpClient:
         except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
             if self._options.connection != "keep-alive":
                 raise
-            trace.facts["reconnects"] = 1.0
+            trace.facts[RECONNECTS] = 1.0
             return stack.enter_context(client.stream("POST", self._url, content=body, headers=headers))
 
     def _pack(self, request: Request, trace: Trace) -> tuple[bytes, dict[str, str]]:
@@ -146,7 +147,7 @@ class HttpClient:
             fields = merged(self._dialect.body(request, pictures, self._model), self._extra)
             body, headers = self._codec.dumps(fields), self._headers
         trace.mark("json_pack")
-        trace.facts["payload_bytes"] = len(body)
+        trace.facts[PAYLOAD_BYTES] = len(body)
         return body, headers
 
     def _pack_binary(self, request: Request, trace: Trace) -> tuple[bytes, dict[str, str]]:
@@ -180,12 +181,12 @@ class HttpClient:
                 trace.receive(event.remote)
         if not finished:
             raise RequestFailed(f"{self._url} ended the stream before the answer was complete")
-        if not first_ns and (thoughts or trace.facts.get("thinking_n")):
+        if not first_ns and (thoughts or trace.facts.get(THINKING_N)):
             raise RequestFailed(
                 f"{self._url} thought and gave no answer: raise `max_tokens`, or turn thinking off with `extra_body`"
             )
         if thinking_ns:
-            trace.facts |= {"thinking_pieces": float(thoughts), "thinking_ms": (first_ns - thinking_ns) / 1e6}
+            trace.facts |= {THINKING_PIECES: float(thoughts), THINKING_MS: (first_ns - thinking_ns) / 1e6}
         if first_ns:
             self._mark(trace, headers_ns, packed_ns, first_ns)
 
@@ -194,10 +195,10 @@ class HttpClient:
         if trace.remote is not None and trace.remote.clock == clock_id():
             trace.marks.append(("return", first_ns))
             return
-        trace.facts["headers_ms"] = (headers_ns - packed_ns) / 1e6
+        trace.facts[HEADERS_MS] = (headers_ns - packed_ns) / 1e6
         if self._dialect.starts_with_headers(trace.facts):
             trace.marks += [("ingest", headers_ns), ("inference", first_ns)]
-            trace.facts["headers_off_ms"] = (first_ns - headers_ns) / 1e6 - trace.facts["prompt_ms"]
+            trace.facts[HEADERS_OFF_MS] = (first_ns - headers_ns) / 1e6 - trace.facts[PROMPT_MS]
         else:
             trace.marks.append(("server", first_ns))
 

@@ -7,10 +7,12 @@ from collections.abc import Callable, Sequence
 from itertools import count
 
 from s2a_bench.errors import UsageError
+from s2a_bench.facts import CAMERA_FRAMES, PAYLOAD_BYTES, Fact
 from s2a_bench.transport import Client, Handler, Server, Transport, Wiring
 from s2a_bench.transport.ros.options import RosOptions
 
 TOPIC, ACTION = VARIANTS = ("topic", "action")
+UNREADABLE_N = Fact("unreadable_n", "messages", "of strangers, that could not be read while the request was under way")
 LARGE_PICTURE = 640 * 480
 """Pixels above which DDS needs more receive buffer than Linux gives by default."""
 
@@ -27,6 +29,7 @@ class Ros(Transport[RosOptions]):
         "accept": "network",  # an action's goal is accepted before work starts
         "cdr_parse": "parse",
     }
+    tells = (PAYLOAD_BYTES, CAMERA_FRAMES, UNREADABLE_N)
     order = 20
     looks = {TOPIC: ("#0072B2", "-"), ACTION: ("#56B4E9", "--")}
     packages = ("cyclonedds", "rosbags")

@@ -13,6 +13,7 @@ from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, TransportError
+from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.ros import (
     ActionClient,
     Feedback,
@@ -107,7 +108,7 @@ class GenerateClient:
         packed = self._client.pack(generate_goal(prompt, images, version=self._version, **sampling))
         trace.mark("cdr_pack")
         goal_id = self._client.send(packed)
-        trace.facts["payload_bytes"] = len(packed)
+        trace.facts[PAYLOAD_BYTES] = len(packed)
         yield from self._tokens(goal_id, request.max_tokens, trace)
         if self._marks is not None:
             self._receive_marks(goal_id.hex(), trace)

@@ -13,6 +13,7 @@ from typing import Any
 
 from s2a_bench.clock import realtime_offset_ns
 from s2a_bench.errors import RequestFailed
+from s2a_bench.facts import CAMERA_FRAMES
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Mark, Trace
@@ -122,7 +123,7 @@ class CameraCache:
         if newest is None:
             return ()
         trace.frame_stamp_ns, trace.frame_marks = newest.frame.stamp_ns, newest.marks
-        trace.facts["camera_frames"] = newest.count
+        trace.facts[CAMERA_FRAMES] = newest.count
         return (newest.frame,)
 
     def _watch(self, camera: Subscription) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, TransportError
+from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
@@ -63,7 +64,7 @@ class TopicClient:
         packed = self._publisher.pack(message)
         trace.mark("cdr_pack")
         self._publisher.send(packed)
-        trace.facts["payload_bytes"] = len(packed)
+        trace.facts[PAYLOAD_BYTES] = len(packed)
         expected = 0
         while True:
             token = self._next(name, trace)

@@ -11,6 +11,7 @@ from s2a_bench.provenance import Provenance
 from s2a_bench.ros import QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Remote, Trace
+from s2a_bench.transport.ros import UNREADABLE_N
 from s2a_bench.types import Request, Token
 
 REQUEST_QOS = QoS(depth=10)
@@ -28,10 +29,6 @@ PROVENANCE_TOPIC: Final = "/provenance"
 """Below the namespace: who answers, for who joins late too."""
 
 
-UNREADABLE: Final = "unreadable_n"
-"""Fact: messages of strangers that could not be read while this request was under way."""
-
-
 def unguessable(request_id: str) -> str:
     """Return a name for a request that no other node can answer before it has heard it."""
     return f"{request_id}#{token_hex(16)}"
@@ -47,7 +44,7 @@ def readable(subscription: Subscription, packed: Any, trace: Trace) -> Any | Non
     try:
         return subscription.unpack(packed)
     except TransportError:
-        trace.facts[UNREADABLE] = trace.facts.get(UNREADABLE, 0.0) + 1
+        trace.facts[UNREADABLE_N] = trace.facts.get(UNREADABLE_N, 0.0) + 1
         return None
 
 

@@ -15,6 +15,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of
 from s2a_bench.experiments.throughput.rows import REFERENCE
+from s2a_bench.facts import (
+    END_N,
+    PREDICTED_MS,
+    PREDICTED_N,
+    PREDICTED_STEPS,
+    PROMPT_EVAL_MS,
+    PROMPT_MS,
+    PROMPT_N,
+)
+from s2a_bench.machine.resources.rows import ENERGY_J
 from s2a_bench.stats.change import ratio_of_blocks
 from s2a_bench.transport import declared
 
@@ -116,28 +126,28 @@ def _metrics(facts: dict[str, float], events: int, span_s: float) -> dict[str, A
 
     ``predicted_steps`` is a fact where the engine's own time covers other than ``predicted_n`` tokens (vLLM).
     """
-    tokens = int((facts.get("predicted_n") or events) - facts.get("end_n", 0))
+    tokens = int((facts.get(PREDICTED_N) or events) - facts.get(END_N, 0))
     found: dict[str, Any] = {"tokens": tokens, "events": events}
     if tokens > 1 and span_s > 0:
         found["decode_tokens_per_s"] = (tokens - 1) / span_s
-    found["told"] = bool(facts.get("predicted_ms"))
+    found["told"] = bool(facts.get(PREDICTED_MS))
     if found["told"]:
-        found["tokens_per_s"] = facts.get("predicted_steps", tokens) / facts["predicted_ms"] * 1e3
+        found["tokens_per_s"] = facts.get(PREDICTED_STEPS, tokens) / facts[PREDICTED_MS] * 1e3
     elif "decode_tokens_per_s" in found:
         found["tokens_per_s"] = found["decode_tokens_per_s"]
-    if "prompt_ms" in facts:
-        found["prompt_ms"] = facts["prompt_ms"]
-        if "prompt_eval_ms" in facts:
+    if PROMPT_MS in facts:
+        found["prompt_ms"] = facts[PROMPT_MS]
+        if PROMPT_EVAL_MS in facts:
             found |= {
-                "prompt_eval_ms": facts["prompt_eval_ms"],
-                "image_ms": facts["prompt_ms"] - facts["prompt_eval_ms"],
+                "prompt_eval_ms": facts[PROMPT_EVAL_MS],
+                "image_ms": facts[PROMPT_MS] - facts[PROMPT_EVAL_MS],
             }
-        if facts.get("prompt_n") and facts["prompt_ms"] > 0:
-            found["prefill_tokens_per_s"] = facts["prompt_n"] / facts["prompt_ms"] * 1e3
-    if facts.get("prompt_n"):
-        found["prompt_tokens"] = facts["prompt_n"]
-    if facts.get("energy_j"):
-        found["tokens_per_joule"] = tokens / facts["energy_j"]
+        if facts.get(PROMPT_N) and facts[PROMPT_MS] > 0:
+            found["prefill_tokens_per_s"] = facts[PROMPT_N] / facts[PROMPT_MS] * 1e3
+    if facts.get(PROMPT_N):
+        found["prompt_tokens"] = facts[PROMPT_N]
+    if facts.get(ENERGY_J):
+        found["tokens_per_joule"] = tokens / facts[ENERGY_J]
     return found
 
 

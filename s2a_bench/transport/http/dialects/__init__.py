@@ -6,10 +6,11 @@ the `Decoder`'s; sending, marking stages and telling errors are the client's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
+from s2a_bench.facts import Fact
 from s2a_bench.registry import Registry
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.types import Frame, Pixels, Request
@@ -67,6 +68,8 @@ class Dialect(Protocol):
     payloads: tuple[str, ...]
     """How pictures can travel."""
     framing: Callable[[], Framing]
+    tells: Sequence[Fact]
+    """The facts of its events."""
 
     def met(self, base: str, model: str, get: Callable[[str], Any]) -> tuple[str, str]:
         """Return the URL and the model to ask: as told, else as the server says; ``get`` returns the JSON at a URL."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 from urllib.parse import urlsplit, urlunsplit
 
 from s2a_bench.errors import UsageError
+from s2a_bench.facts import USAGE_ZERO, Fact
 from s2a_bench.trace import Trace
 from s2a_bench.transport.http.dialects import Framing
 from s2a_bench.transport.http.dialects.framing import ServerSentEvents
@@ -32,6 +33,7 @@ class Chat:
     media_type = "text/event-stream"
     payloads: tuple[str, ...] = ("jpeg", "jpeg-preencoded", "png")
     framing: type[Framing] = ServerSentEvents
+    tells: Sequence[Fact] = ()
 
     def authorization(self, key: str) -> dict[str, str]:
         """Return the usual header of an API key."""
@@ -80,16 +82,16 @@ def refuse_grammar(request: Request, name: str) -> None:
         )
 
 
-def numbers(source: Any, names: dict[str, str], scale: float = 1.0) -> dict[str, float]:
-    """Return the numbers of a JSON object under our names, times ``scale``; what is missing or null stays absent."""
+def numbers(source: Any, names: dict[str, Fact], scale: float = 1.0) -> dict[str, float]:
+    """Return the numbers of a JSON object as facts, times ``scale``; what is missing or null stays absent."""
     found = source or {}
     return {ours: float(found[theirs]) * scale for theirs, ours in names.items() if found.get(theirs) is not None}
 
 
-def usage_of(source: Any, names: dict[str, str]) -> dict[str, float]:
-    """Return the counts of a usage object under our names; one of zeros alone tells nothing, which is noted."""
+def usage_of(source: Any, names: dict[str, Fact]) -> dict[str, float]:
+    """Return the counts of a usage object as facts; one of zeros alone tells nothing, which is noted."""
     counts = numbers(source, names)
-    return {"usage_zero": 1.0} if counts and not any(counts.values()) else counts
+    return {USAGE_ZERO: 1.0} if counts and not any(counts.values()) else counts
 
 
 def text_of(value: Any) -> str:

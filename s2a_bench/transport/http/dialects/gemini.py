@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 from urllib.parse import quote
 
+from s2a_bench.facts import CACHE_N, PREDICTED_N, PROMPT_N, THINKING_N, USAGE_ZERO
 from s2a_bench.transport.http.dialects import Event, Picture
 from s2a_bench.transport.http.dialects.common import (
     NO_LIST,
@@ -22,10 +23,10 @@ from s2a_bench.transport.http.dialects.common import (
 from s2a_bench.types import Request
 
 USAGE = {
-    "promptTokenCount": "prompt_n",
-    "candidatesTokenCount": "predicted_n",
-    "thoughtsTokenCount": "thinking_n",
-    "cachedContentTokenCount": "cache_n",
+    "promptTokenCount": PROMPT_N,
+    "candidatesTokenCount": PREDICTED_N,
+    "thoughtsTokenCount": THINKING_N,
+    "cachedContentTokenCount": CACHE_N,
 }
 VERSIONS = ("/v1beta", "/v1")
 """Roots of the API, the usual one first."""
@@ -37,6 +38,7 @@ class Gemini(Chat):
     """Google's API, by key."""
 
     name = "gemini"
+    tells = (*USAGE.values(), USAGE_ZERO)
 
     def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
         """Return the URL with the version that the server has, and the first model that it lists unless one is told."""
@@ -93,8 +95,8 @@ class Gemini(Chat):
         if finish and finish not in COMPLETE:
             return Event(error=f"the answer was cut: {finish}")
         facts = usage_of(message.get("usageMetadata"), USAGE)
-        if "prompt_n" in facts:  # evaluated, as llama.cpp counts them
-            facts["prompt_n"] -= facts.get("cache_n", 0.0)
+        if PROMPT_N in facts:  # evaluated, as llama.cpp counts them
+            facts[PROMPT_N] -= facts.get(CACHE_N, 0.0)
         return Event(said or None, -1, thought, finish, facts)
 
 

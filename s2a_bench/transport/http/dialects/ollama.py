@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_MS, Fact
 from s2a_bench.transport.http.dialects import Event, Picture
 from s2a_bench.transport.http.dialects.common import (
     TEMPERATURE,
@@ -17,13 +18,17 @@ from s2a_bench.transport.http.dialects.common import (
 from s2a_bench.transport.http.dialects.framing import JsonLines
 from s2a_bench.types import Request
 
-COUNTS = {"prompt_eval_count": "prompt_with_cached_n", "eval_count": "predicted_n"}
-"""Its count of the prompt holds the tokens that came from its cache, so it is not that of tokens evaluated."""
+PROMPT_WITH_CACHED_N = Fact("prompt_with_cached_n", "tokens", "prompt, whether evaluated or from its cache")
+TOTAL_MS = Fact("total_ms", "ms", "the whole request")
+LOAD_MS = Fact("load_ms", "ms", "loading the model")
+OUTSIDE_MODEL_MS = Fact("outside_model_ms", "ms", "`total_ms` less `load_ms`, `prompt_ms` and `predicted_ms`")
+
+COUNTS = {"prompt_eval_count": PROMPT_WITH_CACHED_N, "eval_count": PREDICTED_N}
 DURATIONS = {
-    "total_duration": "total_ms",
-    "load_duration": "load_ms",
-    "prompt_eval_duration": "prompt_ms",
-    "eval_duration": "predicted_ms",
+    "total_duration": TOTAL_MS,
+    "load_duration": LOAD_MS,
+    "prompt_eval_duration": PROMPT_MS,
+    "eval_duration": PREDICTED_MS,
 }
 """``api/types.go``; all in ns, and left out where zero."""
 
@@ -34,6 +39,7 @@ class Ollama(Chat):
     name = "ollama"
     media_type = "application/x-ndjson"
     framing = JsonLines
+    tells = (*COUNTS.values(), *DURATIONS.values(), OUTSIDE_MODEL_MS)
 
     def url(self, base: str, model: str) -> str:  # noqa: ARG002 - other dialects have the model in the path
         """Return the chat route."""
@@ -56,8 +62,8 @@ class Ollama(Chat):
         said = message.get("message") or {}
         finish = text_of(message.get("done_reason") or "stop") if message.get("done") else ""
         facts = {**numbers(message, COUNTS), **numbers(message, DURATIONS, 1e-6)}
-        if {"total_ms", "prompt_ms", "predicted_ms"} <= facts.keys():
-            known = facts["prompt_ms"] + facts["predicted_ms"] + facts.get("load_ms", 0.0)
-            facts["outside_model_ms"] = facts["total_ms"] - known
+        if {TOTAL_MS, PROMPT_MS, PREDICTED_MS} <= facts.keys():
+            known = facts[PROMPT_MS] + facts[PREDICTED_MS] + facts.get(LOAD_MS, 0.0)
+            facts[OUTSIDE_MODEL_MS] = facts[TOTAL_MS] - known
         thinking = text_of(said.get("thinking") or "")
         return Event(text_of(said.get("content") or "") or None, -1, thinking, finish, facts)

@@ -10,23 +10,40 @@ from dataclasses import replace
 from typing import Any
 from uuid import uuid4
 
+from s2a_bench.facts import (
+    CACHE_N,
+    END_N,
+    PREDICTED_MS,
+    PREDICTED_N,
+    PREDICTED_STEPS,
+    PROMPT_EVAL_MS,
+    PROMPT_MS,
+    PROMPT_N,
+    THINKING_N,
+    USAGE_ZERO,
+    Fact,
+)
 from s2a_bench.transport.http import own as dialect
 from s2a_bench.transport.http.dialects import OWN, Event, Picture
 from s2a_bench.transport.http.dialects.common import Chat, endpoint, numbers, refuse_grammar, text_of, usage_of
 from s2a_bench.types import Request
 
-TIMINGS = {name: name for name in ("cache_n", "prompt_n", "prompt_ms", "predicted_n", "predicted_ms")}
+TIMINGS = {str(fact): fact for fact in (CACHE_N, PROMPT_N, PROMPT_MS, PREDICTED_N, PREDICTED_MS)}
 """What of llama-server's ``timings`` is kept."""
 
-RATE = {"predicted_per_second": "rate"}
+RATE = Fact("predicted_per_second", "tokens/s", "becomes `predicted_steps`")
 
 METRICS = {
-    "time_to_first_token_ms": "first_token_ms",
-    "generation_time_ms": "predicted_ms",
-    "queue_time_ms": "queue_ms",
-    "mean_itl_ms": "mean_itl_ms",
+    "time_to_first_token_ms": Fact("first_token_ms", "ms", "request scheduled to first token"),
+    "generation_time_ms": PREDICTED_MS,
+    "queue_time_ms": Fact("queue_ms", "ms", "waiting to be scheduled"),
+    "mean_itl_ms": Fact("mean_itl_ms", "ms", "mean gap between tokens"),
 }
-"""What of vLLM's per-request ``metrics`` is kept; its time to first token counts from when it was scheduled."""
+"""What of vLLM's per-request ``metrics`` is kept."""
+
+USAGE = {"prompt_tokens": PROMPT_N, "completion_tokens": PREDICTED_N}
+CACHED = {"cached_tokens": CACHE_N}
+REASONING = {"reasoning_tokens": THINKING_N}
 
 TELLING = frozenset({"usage", "metrics", "timings"})
 
@@ -35,6 +52,7 @@ class OpenAI(Chat):
     """Any server of the dialect."""
 
     name = "openai"
+    tells = (*TIMINGS.values(), *METRICS.values(), THINKING_N, PREDICTED_STEPS, USAGE_ZERO)
 
     def url(self, base: str, model: str) -> str:  # noqa: ARG002 - other dialects have the model in the path
         """Return the chat route."""
@@ -70,20 +88,20 @@ class OpenAI(Chat):
             return {}
         usage = message.get("usage") or {}
         facts = {
-            **usage_of(usage, {"prompt_tokens": "prompt_n", "completion_tokens": "predicted_n"}),
-            **numbers(usage.get("prompt_tokens_details"), {"cached_tokens": "cache_n"}),
-            **numbers(usage.get("completion_tokens_details"), {"reasoning_tokens": "thinking_n"}),
+            **usage_of(usage, USAGE),
+            **numbers(usage.get("prompt_tokens_details"), CACHED),
+            **numbers(usage.get("completion_tokens_details"), REASONING),
         }
-        if "prompt_n" in facts:  # evaluated, as llama.cpp counts them
-            facts["prompt_n"] -= facts.get("cache_n", 0.0)
-        timings = numbers(message.get("timings"), TIMINGS | RATE)
-        if rate := timings.pop("rate", 0.0):  # over n tokens or n - 1, as the build sees it
-            timings["predicted_steps"] = float(round(rate * timings.get("predicted_ms", 0.0) / 1e3))
+        if PROMPT_N in facts:  # evaluated, as llama.cpp counts them
+            facts[PROMPT_N] -= facts.get(CACHE_N, 0.0)
+        timings = numbers(message.get("timings"), TIMINGS | {RATE: RATE})
+        if rate := timings.pop(RATE, 0.0):  # over n tokens or n - 1, as the build sees it
+            timings[PREDICTED_STEPS] = float(round(rate * timings.get(PREDICTED_MS, 0.0) / 1e3))
         return {**facts, **numbers(message.get("metrics"), METRICS), **timings}
 
     def starts_with_headers(self, facts: dict[str, float]) -> bool:
         """Tell a llama-server by its timings: it sends the headers when its slot starts."""
-        return "prompt_ms" in facts
+        return PROMPT_MS in facts
 
 
 class LlamaServer(OpenAI):
@@ -99,6 +117,7 @@ class Vllm(OpenAI):
     """vLLM; its metrics come with ``--enable-per-request-metrics``."""
 
     name = "vllm"
+    tells = (*OpenAI.tells, END_N)
 
     def _extra(self, request: Request) -> dict[str, Any]:
         """Keep prefixes apart by a salt of the request's own, and ask for metrics, which some versions want."""
@@ -114,9 +133,9 @@ class Vllm(OpenAI):
         event = super().event(message)
         facts = dict(event.facts)
         if event.finish == "stop":
-            facts["end_n"] = 1.0
-        if "predicted_ms" in facts and "predicted_n" in facts:
-            facts["predicted_steps"] = facts["predicted_n"] - 1
+            facts[END_N] = 1.0
+        if PREDICTED_MS in facts and PREDICTED_N in facts:
+            facts[PREDICTED_STEPS] = facts[PREDICTED_N] - 1
         return replace(event, facts=facts)
 
 
@@ -124,6 +143,7 @@ class Own(OpenAI):
     """Our own server: it wants the request's id, and sends empty tokens, token ids and its marks."""
 
     name = OWN
+    tells = (PROMPT_N, PROMPT_MS, PROMPT_EVAL_MS, PREDICTED_N, PREDICTED_MS)  # our engines behind it
     payloads = (*OpenAI.payloads, "raw")
 
     def _extra(self, request: Request) -> dict[str, Any]:

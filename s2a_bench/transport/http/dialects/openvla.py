@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from s2a_bench import extras
+from s2a_bench.facts import Fact
 from s2a_bench.frames.convert import bgr_to_rgb, to_bgr, yuyv_to_rgb
 from s2a_bench.trace import Trace
 from s2a_bench.transport.http.dialects import Event, Picture
@@ -24,6 +25,8 @@ json_numpy = extras.require("json_numpy", "openvla")
 FAILED = "error"
 """The whole body of a failure, with status 200 (``vla-scripts/deploy.py``)."""
 
+ACTION_N = Fact("action_n", "", "numbers of the action")
+
 NUMBERS = re.compile(r"[<>|=]?[fiu][0-9]+")
 """The element types that are read."""
 
@@ -35,6 +38,7 @@ class OpenVla(Chat):
     media_type = "application/json"
     payloads = ("raw",)
     framing = WholeBody
+    tells = (ACTION_N,)
 
     def met(self, base: str, model: str, get: Get) -> tuple[str, str]:  # noqa: ARG002 - a server has one model
         """Ask for nothing."""
@@ -75,4 +79,4 @@ class OpenVla(Chat):
         action = np.asarray(message, np.float64)
         if not (action.size and np.isfinite(action).all()):
             raise ValueError("an action that is no finite numbers")
-        return Event(json.dumps(action.tolist()), finish="stop", facts={"action_n": float(action.size)})
+        return Event(json.dumps(action.tolist()), finish="stop", facts={ACTION_N: float(action.size)})

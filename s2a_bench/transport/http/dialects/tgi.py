@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from s2a_bench.facts import PREDICTED_N, PROMPT_N
 from s2a_bench.transport.http.dialects import Event, Picture
 from s2a_bench.transport.http.dialects.common import (
     TEMPERATURE,
@@ -17,13 +18,14 @@ from s2a_bench.transport.http.dialects.common import (
 )
 from s2a_bench.types import Request
 
-DETAILS = {"generated_tokens": "predicted_n", "input_length": "prompt_n"}
+DETAILS = {"generated_tokens": PREDICTED_N, "input_length": PROMPT_N}
 
 
 class Tgi(Chat):
     """The native route; the chat route is the dialect `openai`."""
 
     name = "tgi"
+    tells = tuple(DETAILS.values())
 
     def met(self, base: str, model: str, get: Get) -> tuple[str, str]:  # noqa: ARG002 - a server has one model
         """Ask for nothing."""

@@ -1,0 +1,46 @@
+"""Facts: numbers that are told of a request besides its marks.
+
+Who tells a fact (a transport, a dialect, an engine, the harness) declares it among its ``tells``. Those that several
+tell, or that somebody else reads, are declared here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class Fact(str):
+    """The name of a fact, with its unit and its meaning; the key of ``trace.facts``, whose values are floats."""
+
+    __slots__ = ("about", "unit")
+
+    about: str
+    unit: str
+
+    def __new__(cls, name: str, unit: str = "", about: str = "") -> Fact:  # noqa: PYI034 - Self is typing's since 3.11
+        """Name a fact; ``about`` is one line, ``unit`` empty where it is a pure number."""
+        fact = super().__new__(cls, name)
+        fact.about, fact.unit = about, unit
+        return fact
+
+
+def facts_json(facts: Iterable[Fact]) -> dict[str, dict[str, str]]:
+    """Return what is declared as plain data, for the manifest."""
+    return {str(fact): {"unit": fact.unit, "about": fact.about} for fact in facts}
+
+
+PROMPT_N = Fact("prompt_n", "tokens", "prompt that was evaluated, pictures included")
+CACHE_N = Fact("cache_n", "tokens", "prompt that came from a cache")
+PROMPT_MS = Fact("prompt_ms", "ms", "evaluating the prompt, pictures included")
+PROMPT_EVAL_MS = Fact("prompt_eval_ms", "ms", "the language model's part of `prompt_ms`")
+PREDICTED_N = Fact("predicted_n", "tokens", "generated answer")
+PREDICTED_MS = Fact("predicted_ms", "ms", "generating the answer, from the end of the prompt to the last token")
+END_N = Fact("end_n", "tokens", "of `predicted_n`, the last that ends the answer and is never shown")
+PREDICTED_STEPS = Fact("predicted_steps", "tokens", "what `predicted_ms` covers, where it is not `predicted_n`")
+USAGE_ZERO = Fact("usage_zero", "", "1 where the server's usage was zeros alone, which tell nothing")
+THINKING_N = Fact("thinking_n", "tokens", "what the model said to itself before the answer")
+PAYLOAD_BYTES = Fact("payload_bytes", "bytes", "what the payload weighs on the wire")
+CAMERA_FRAMES = Fact("camera_frames", "frames", "camera frames that the server had received when it answered")
+FRAMES_PUBLISHED = Fact("frames_published", "frames", "camera frames sent, up to the one that the answer is about")
+FRAMES_LOST = Fact("frames_lost", "frames", "`frames_published` less `camera_frames`")
+HEADERS_OFF_MS = Fact("headers_off_ms", "ms", "response headers to first token, less `prompt_ms`")
