@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 from pydantic import create_model
 
 from s2a_bench.errors import UsageError
+from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
 from s2a_bench.frames import SOURCES
-from s2a_bench.inference import EngineConfig, default_engine
+from s2a_bench.inference import EngineConfig, default_engine, told_by
+from s2a_bench.machine.resources.rows import SPENT
 from s2a_bench.options import Grammar, Names, Options, Size, TextOrFile, group, option
 from s2a_bench.trace import path_of
 from s2a_bench.transport import TRANSPORTS, Transport
@@ -146,6 +148,14 @@ class RequestsConfig(Options):
     def stages(self) -> dict[str, str]:
         """Return stage -> group of the transports, in the order of the path."""
         return path_of(transport.stages for transport in self.used)
+
+    @property
+    def facts(self) -> dict[str, dict[str, str]]:
+        """Return fact -> unit and meaning, of all that may be told of a request."""
+        told = [fact for each in self.pipelines for fact in each.transport.told(each.options)]
+        told += told_by(self.engine.name) if self.own_engine else ()
+        told += (FRAMES_PUBLISHED, FRAMES_LOST) if self.mode == "stream" else ()
+        return facts_json([*told, *(SPENT if self.sample_resources_hz else ())])
 
     @property
     def packages(self) -> list[str]:

@@ -90,6 +90,7 @@ def _manifest(config: RequestsConfig, *, malloc_tuned: bool) -> dict[str, Any]:
     return {
         "configuration": config.to_manifest(),
         "stages": config.stages,
+        "facts": config.facts,
         "environment": environment.collect(config.packages),
         "seeds": {**dict.fromkeys(("order", "sampling", "source", "bootstrap"), config.seed), "nonce": config.nonce},
         "tuning": {

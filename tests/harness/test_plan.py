@@ -77,6 +77,21 @@ def test_the_stages_are_those_of_the_transports_in_the_order_of_the_path() -> No
     assert "cdr_pack" not in RequestsConfig(transports=("http",)).stages
 
 
+def test_the_facts_are_those_that_transport_dialect_engine_and_harness_may_tell() -> None:
+    few: dict[str, Any] = {"engine": EngineConfig(name="echo"), "sample_resources_hz": 0}
+    assert RequestsConfig(transports=("loopback",), **few).facts == {}
+    over_ros = RequestsConfig(transports=("ros",), mode="stream", **few).facts
+    assert {*over_ros} == {"payload_bytes", "camera_frames", "unreadable_n", "frames_published", "frames_lost"}
+    assert over_ros["payload_bytes"] == {"unit": "bytes", "about": "what the payload weighs on the wire"}
+    ollama = {"http": {"url": "http://x", "dialect": "ollama"}}
+    asked = RequestsConfig(transports=("http",), options=ollama, sample_resources_hz=0)
+    assert {"reconnects", "load_ms"} < asked.facts.keys()
+    assert "prompt_eval_ms" not in asked.facts
+    llama = RequestsConfig(transports=("http", "loopback"), engine=EngineConfig(name="llama"))
+    assert {"prompt_eval_ms", "energy_j"} < llama.facts.keys()
+    assert "load_ms" not in llama.facts
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

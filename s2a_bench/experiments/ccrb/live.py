@@ -54,6 +54,7 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
         manifest = {
             "configuration": {**config.to_manifest(), "live": {**live.to_manifest(), "source": source.name}},
             "stages": requests.stages,
+            "facts": requests.facts,
             "environment": environment.collect(requests.packages),
             "seeds": {"sampling": requests.seed, "nonce": requests.nonce},
         }

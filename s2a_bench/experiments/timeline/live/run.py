@@ -48,6 +48,7 @@ def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
         manifest = {
             "configuration": {**config.to_manifest(), "engine": requests.to_manifest()["engine"]},
             "stages": requests.stages,
+            "facts": requests.facts,
             "environment": environment.collect(requests.packages),
             "seeds": {"sampling": requests.seed, "source": requests.seed, "nonce": requests.nonce},
         }
