@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import EngineError
-from s2a_bench.inference import Engine
+from s2a_bench.inference import Engine, told_by
 from s2a_bench.types import Frame, Request, Token
 
 
@@ -76,6 +76,12 @@ class EngineSuite:
         assert json.loads(json.dumps(facts)) == facts
         assert isinstance(facts["engine"], str)
         assert isinstance(facts["dummy"], bool)
+
+    def test_every_fact_that_it_tells_is_declared(self, engine: Engine) -> None:
+        ask(engine, images=(rgb_frame(),))
+        told = told_by(str(engine.describe()["engine"]))
+        assert set(engine.facts) <= set(told)
+        assert all(fact.about for fact in told)
 
     def test_it_closes_twice_and_then_refuses_requests(self, fresh_engine: Engine) -> None:
         fresh_engine.close()

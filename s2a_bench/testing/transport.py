@@ -25,6 +25,7 @@ import pytest
 
 from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import EngineError, RequestFailed
+from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import GROUPS, RESIDUAL, STAGES, Trace, budget, path_of
 from s2a_bench.transport import TRANSPORTS, Client, Handler, Transport, Wiring, open_client, open_server
 from s2a_bench.transport.pipeline import one_pipeline, pipelines
@@ -53,7 +54,7 @@ class Recorder:
             yield Token(index, text, 7 + index)
         if self.fail_at == len(self.answer):
             raise EngineError("the engine has had enough")
-        trace.facts["prompt_n"] = 12.0
+        trace.facts[PROMPT_N] = 12.0
 
 
 def yuyv_frame(width: int = 64, height: int = 48, seed: int = 0) -> Frame:
@@ -193,7 +194,14 @@ class TransportSuite:
         assert trace.remote.clock == clock_id()
         assert len(trace.remote.token_ns) == 3
         assert trace.remote.token_ns == sorted(trace.remote.token_ns)
-        assert trace.facts["prompt_n"] == 12.0
+        assert trace.facts[PROMPT_N] == 12.0
+
+    def test_every_fact_that_it_tells_is_declared(
+        self, connect: Connect, transport: Transport[Any], told: Wiring[Any]
+    ) -> None:
+        _, trace = ask(connect(Recorder(["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
+        assert set(trace.facts) <= {*transport.told(told.options), PROMPT_N}  # which the handler tells
+        assert all(fact.about for fact in transport.told(told.options))
 
     def test_an_engine_that_refuses_fails_this_request_only(self, connect: Connect) -> None:
         handler = Recorder(["x"])

@@ -37,8 +37,11 @@ def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedPro
 
 
 def only_run(output: Path) -> Run:
+    """Return the run, all of whose facts are declared."""
     (folder,) = output.iterdir()
-    return read_run(folder)
+    kept = read_run(folder)
+    assert {name for told in kept.samples["facts"] for name in json.loads(told)} <= kept.manifest["facts"].keys()
+    return kept
 
 
 def test_one_run_compares_all_pipelines(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from s2a_bench.frames.convert import decode_image, encode_png, to_bgr
 from s2a_bench.testing.transport import Connect, Recorder, TransportSuite, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client
+from s2a_bench.transport.http import HTTP
 from s2a_bench.transport.http.dialects import DIALECTS
 from s2a_bench.types import Request, Token
 from tests.servers.sockets import CLOSE, Received, Reply, chunk, head, kept_head, serving
@@ -66,6 +67,10 @@ class TestContract(TransportSuite):
 
     name = "http/as-deployed"
     lossless = False
+
+    @pytest.fixture
+    def told(self, speaker: Speaker) -> Wiring[Any]:
+        return route(speaker, "http://localhost")
 
     @pytest.fixture
     def connect(self, speaker: Speaker) -> Iterator[Connect]:
@@ -123,13 +128,12 @@ FACTS = {
     "tgi": {"prompt_n": 8, "predicted_n": 2},
     "gemini": {"prompt_n": 8, "predicted_n": 2},
 }
-CLIENTS_OWN = {"payload_bytes", "headers_ms", "headers_off_ms", "reconnects"}
 
 
 def test_what_a_server_tells_of_itself_is_kept_by_clear_names(speaker: Speaker) -> None:
     texts, trace = said(speaker, answer(speaker))
     assert texts == ["go", "_to"]
-    told = {name: value for name, value in trace.facts.items() if name not in CLIENTS_OWN}
+    told = {name: value for name, value in trace.facts.items() if name not in HTTP.tells}
     assert told == pytest.approx(FACTS[speaker.dialect])
 
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
+from s2a_bench.facts import PAYLOAD_BYTES, Fact
 from s2a_bench.options import option
 from s2a_bench.transport import Client, Handler, Server, Transport, Wiring
 from s2a_bench.transport.options import SERVER, Options
+
+
+TOY_MESSAGES = Fact("toy_messages", "messages", "messages of the answer")
 
 
 class ToyOptions(Options):
@@ -22,6 +26,7 @@ class Toy(Transport[ToyOptions]):
     name = "toy"
     options = ToyOptions
     payloads = ("raw",)
+    tells = (PAYLOAD_BYTES, TOY_MESSAGES)
     stages: ClassVar[Mapping[str, str]] = {"toy_frame": "pack", "toy_unframe": "parse"}
     looks: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#8C564B", "-")}
 

@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 from s2a_bench.errors import EngineError, PortInUse, RequestFailed, ServerDied
+from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.pictures import bgr_of, rgb_of
 from s2a_bench.types import Frame, Request, Token
+from s2a_toy.transport import TOY_MESSAGES
 
 LENGTH = struct.Struct("<I")
 LIMIT = 1 << 20
@@ -78,16 +80,17 @@ class ToyClient:
         header = json.dumps(fields | {"sizes": sizes}).encode()
         parts = [LENGTH.pack(len(header)), header, *(memoryview(frame.data.reshape(-1)) for frame in pixels)]
         trace.mark("toy_frame")
-        trace.facts["payload_bytes"] = sum(map(len, parts))
+        trace.facts[PAYLOAD_BYTES] = sum(map(len, parts))
         done = False
         try:
             send(self._connection, *parts)
-            for message in self._messages():
+            for count, message in enumerate(self._messages(), 1):
                 if "error" in message:
                     done = True
                     raise RequestFailed(str(message["error"]))
                 if "remote" in message:
                     trace.receive(Remote(**message["remote"]))
+                    trace.facts[TOY_MESSAGES] = float(count)
                     done = True
                     return
                 if not message["index"]:
