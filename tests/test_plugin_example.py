@@ -92,6 +92,14 @@ def test_its_transport_is_measured_with_stages_of_its_own(measured: Path) -> Non
     assert (measured / "figures" / "stage_breakdown.png").exists()
 
 
+def test_a_fact_of_its_transport_is_in_manifest_samples_and_table(measured: Path) -> None:
+    facts = json.loads((measured / "manifest.json").read_text())["facts"]
+    assert facts["toy_messages"] == {"unit": "messages", "about": "messages of the answer"}
+    samples = pd.read_csv(measured / "samples.csv")
+    assert {json.loads(told)["toy_messages"] for told in samples[samples["cell"] == "toy"]["facts"]} == {4.0}
+    assert "| toy_messages | messages | 4.00 |" in (measured / "tables" / "facts.md").read_text()
+
+
 def test_its_runs_are_compared_and_reported(measured: Path, command: Command, tmp_path: Path) -> None:
     again = folder_of(command("latency", "--transport", "toy,loopback", *SMALL), tmp_path)
     whole = json.loads(command("compare", str(measured), str(again), "--metric", "toy_frame", "--json").stdout)
@@ -99,6 +107,7 @@ def test_its_runs_are_compared_and_reported(measured: Path, command: Command, tm
     command("report", str(measured), "--output", str(tmp_path / "report.html"))
     page = (tmp_path / "report.html").read_text()
     assert "toy_frame" in page
+    assert "toy_messages" in page
     json.loads(command("latency", "--transport", "toy", "--json", *SMALL).stdout)["cells"][0]["stages_ms"]["toy_frame"]
 
 

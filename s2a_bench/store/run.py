@@ -220,6 +220,12 @@ class Run:
         return found
 
     @property
+    def facts(self) -> dict[str, dict[str, str]]:
+        """Fact -> unit and meaning, of all that may be told of a request; empty in folders that do not say."""
+        found: dict[str, dict[str, str]] = self.manifest.get("facts", {})
+        return found
+
+    @property
     def samples(self) -> pd.DataFrame:
         """One row a request."""
         return self.table(samples_table(self.stages))

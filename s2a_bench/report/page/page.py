@@ -99,6 +99,7 @@ def _view(chapter: Chapter, figures: dict[str, Drawn]) -> dict[str, Any]:
         "environment": list(_facts(manifest.get("environment", {}))),
         "model": list(_facts(manifest.get("model") or {})),
         "configuration": list(_facts(manifest.get("configuration", {}))),
+        "facts": [(name, fact["about"]) for name, fact in chapter.run.facts.items()],
         "seeds": list(_facts(manifest.get("seeds", {}))),
     }
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from statistics import median
 from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.cells import (
@@ -110,6 +112,20 @@ def token_table(run: Run) -> TextTable | None:
     return TextTable(title, header, rows, 1, notes=_engine_notes(run, cells))
 
 
+def fact_table(run: Run) -> TextTable | None:
+    """Lay out what was told of the requests besides their marks; None where nothing was, or the folder is older."""
+    cells = cells_of(run) if run.facts else []
+    told = [[json.loads(str(facts)) for facts in cell.good["facts"]] for cell in cells]
+    rows = []
+    for fact, declared in run.facts.items():
+        values = [[facts[fact] for facts in of_cell if fact in facts] for of_cell in told]
+        if any(values):
+            entries = (number(median(found)) if found else ABSENT for found in values)
+            rows.append((fact, declared["unit"], *entries))
+    header = ("fact", "unit", *(cell.name for cell in cells))
+    return TextTable("Facts: medians", header, rows, 2, notes=_notes(run, cells)) if rows else None
+
+
 def _entry(summary: Summary | None, full: bool) -> str:
     """Write one entry of the stage table."""
     if summary is None:
@@ -164,4 +180,6 @@ def latency_tables(run: Run) -> dict[str, TextTable]:
         tables["tokens"] = tokens
     if frames := frame_table(run):
         tables["frames"] = frames
+    if facts := fact_table(run):
+        tables["facts"] = facts
     return tables
