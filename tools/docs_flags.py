@@ -1,13 +1,15 @@
-"""Write the flag tables of docs/*.md from the declarations: `.venv/bin/python tools/docs_flags.py`.
+"""Write the tables of flags and facts in docs/*.md from the declarations: `.venv/bin/python tools/docs_flags.py`.
 
-A table stands between `<!-- flags: COMMAND -->` and `<!-- /flags -->`. `timeline Live` has only the flags of the class
-Live, which the configuration is derived from or has as a group, `timeline -Live` all others; `throughput -latency` has
-the flags that latency has not, or has otherwise.
+A table of flags stands between `<!-- flags: COMMAND -->` and `<!-- /flags -->`, that of the facts between
+`<!-- facts -->` and `<!-- /facts -->`. `timeline Live` has only the flags of the class Live, which the configuration
+is derived from or has as a group, `timeline -Live` all others; `throughput -latency` has the flags that latency has
+not, or has otherwise.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -16,10 +18,16 @@ from typer.main import get_command
 
 from s2a_bench.cli import app
 from s2a_bench.experiments import EXPERIMENTS
+from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, Fact
+from s2a_bench.inference import ENGINES, told_by
+from s2a_bench.machine.resources.rows import SPENT
 from s2a_bench.options import Options, group_of
+from s2a_bench.transport import TRANSPORTS
+from s2a_bench.transport.http.dialects import DIALECTS
 
 DOCS = Path(__file__).parent.parent / "docs"
 TABLE = re.compile(r"(<!-- flags: (\S+)(?: (-?)(\w+))? -->\n).*?(<!-- /flags -->)", re.DOTALL)
+FACTS = re.compile(r"(<!-- facts -->\n).*?(<!-- /facts -->)", re.DOTALL)
 DEFAULT = re.compile(r" ?\[default: ([^\]]*)\]")
 COMMA = re.compile(r", *")
 PREFIX = re.compile(r"^--live: ")
@@ -61,8 +69,22 @@ def _belongs(command: str, name: str, row: str, group: str) -> bool:
     return field in bases.get(group, ()) or bool(inner and inner.__name__ == group)
 
 
+def fact_table() -> str:
+    """Return the table of the facts, in the order in which they come to be told."""
+    tellers: dict[str, Sequence[Fact]] = {name: TRANSPORTS[name].tells for name in TRANSPORTS.built_in()}
+    tellers |= {name: DIALECTS[name]().tells for name in DIALECTS.built_in()}
+    tellers |= {name: told_by(name) for name in ENGINES.built_in()}
+    tellers |= {"`--mode stream`": (FRAMES_PUBLISHED, FRAMES_LOST), "[resources](resources.md)": SPENT}
+    lines = ["| fact | unit | what it says | told by |", "|---|---|---|---|"]
+    for fact in dict.fromkeys(fact for told in tellers.values() for fact in told):
+        names = ", ".join(name for name, told in tellers.items() if fact in told)
+        lines.append(f"| `{fact}` | {fact.unit} | {fact.about} | {names} |")
+    return "\n".join(lines)
+
+
 def written(text: str) -> str:
     """Return a page with its tables as the declarations have them."""
+    text = FACTS.sub(lambda found: f"{found[1]}{fact_table()}\n{found[2]}", text)
     return TABLE.sub(lambda found: f"{found[1]}{table(found[2], found[3] or '', found[4] or '')}\n{found[5]}", text)
 
 

@@ -1,4 +1,4 @@
-"""The flag tables of docs/ are those of the declarations."""
+"""The tables of flags and facts in docs/ are those of the declarations."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent.parent
-PAGES = [page for page in sorted((ROOT / "docs").glob("*.md")) if "<!-- flags: " in page.read_text(encoding="utf-8")]
+PAGES = [page for page in sorted((ROOT / "docs").glob("*.md")) if "<!-- /f" in page.read_text(encoding="utf-8")]
 SPEC = importlib.util.spec_from_file_location("docs_flags", ROOT / "tools" / "docs_flags.py")
 assert SPEC is not None
 assert SPEC.loader is not None
@@ -18,7 +18,7 @@ SPEC.loader.exec_module(docs_flags)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_page_has_the_flags_as_they_are(page: Path) -> None:
+def test_a_page_has_its_tables_as_they_are(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert docs_flags.written(text) == text, "run tools/docs_flags.py"
 
