@@ -143,7 +143,7 @@ class RosServer:
         if job.request is None or self._stopped.is_set():
             job.end("the server is stopping" if job.request else "")
             return
-        if not turn.has_come:
+        if turn.come is not None:  # it had to wait, if only for as long as unpacking took
             job.trace.mark(RESIDUAL)
             try:
                 if not turn.wait(lambda: job.unwanted() or self._stopped.is_set()):
