@@ -15,6 +15,7 @@ from s2a_bench.errors import MissingExtra
 EXTRAS: Final = {
     "model": "GGUF model files",
     "llama": "the llama engine",
+    "llama-server": "llama.cpp's own server, without a compiler",
     "ccrb": "the embedded simulator and pictures of the road",
     "scenario": "OpenSCENARIO files",
     "nvidia": "load, memory and power of NVIDIA GPUs",

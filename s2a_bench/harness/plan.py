@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import create_model
 
+from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
 from s2a_bench.frames import SOURCES
@@ -45,7 +46,7 @@ def _variants(*, first: bool) -> type[Options]:
     for name, each in TRANSPORTS.loaded():
         if each.variants:
             about = f"{', '.join(each.variants)}; several with commas"
-            measured = each.variants[:1] if first else each.measured(each.options(), ())
+            measured = each.variants[:1] if first else each.measured(each.options(), (), "")
             default = measured if first else ()
             fields[name] = (Names, option(default, f"{about} [default: {','.join(measured)}]"))
     return _made(fields)
@@ -132,7 +133,7 @@ class RequestsConfig(Options):
     def pipelines(self) -> list[Pipeline]:
         """Return what is compared, a cell each; raises UsageError."""
         told = {name: {each: getattr(given, each) for each in given.model_fields_set} for name, given in self.options}
-        return pipelines(self.names, {**told, "": {"payload": self.payload}}, dict(self.variants))
+        return pipelines(self.names, {**told, "": {"payload": self.payload}}, dict(self.variants), self.engine.name)
 
     @property
     def used(self) -> list[Transport[Any]]:
@@ -180,9 +181,16 @@ class RequestsConfig(Options):
 
     def answered(self, say: Callable[[str], None]) -> RequestsConfig:
         """Return it with the engine that can answer where none is named, and ``say`` which if that is not llama."""
-        if "name" in self.engine.model_fields_set or not self.own_engine or self.starts_program:
+        if "name" in self.engine.model_fields_set or not self.own_engine:
             return self
-        return self.but(engine=self.engine.but(name=default_engine(say)))
+        if self.starts_program and not extras.installed("llama_cpp"):
+            only = [each.name for each in self.pipelines if each.transport.program(each.options)]
+            say(f"only {', '.join(only)}: our own servers have no engine here; {extras.how_to_install('llama')}")
+            return self.but(transports=only)
+        chosen = self.but(engine=self.engine.but(name=default_engine(say)))
+        if left_out := {each.name for each in self.pipelines} - {each.name for each in chosen.pipelines}:
+            say(f"{', '.join(sorted(left_out))}: left out, as it needs a model")
+        return chosen
 
     def check(self) -> None:
         """Raise UsageError, naming the field, for a combination that makes no sense."""

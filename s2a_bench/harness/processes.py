@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from selectors import EVENT_READ, DefaultSelector
@@ -21,6 +22,7 @@ from s2a_bench import errors
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import EngineError, PortInUse, ServerDied, UsageError
 from s2a_bench.exits import COMPILE_AGAIN, SETUP_AGAIN, how_it_ended
+from s2a_bench.harness import llama_wheel
 from s2a_bench.harness.llama_flags import llama_flags
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
@@ -108,14 +110,14 @@ class ServerProcess(ABC):
         self.stop()
 
 
-class OwnServer(ServerProcess):
-    """Our instrumented server."""
+class OwnProcess(ServerProcess):
+    """A module of ours that is told its job in one line, answers with one, and serves until its input ends."""
 
-    def __init__(self, name: str, job: ServerJob, log: Path | None = None) -> None:
-        """Start it and tell it its job."""
-        super().__init__(name, [sys.executable, "-m", "s2a_bench.harness.serving"], log)
+    def __init__(self, name: str, module: str, job: str, log: Path | None) -> None:
+        """Start ``module`` and tell it its ``job``."""
+        super().__init__(name, [sys.executable, "-m", module], log)
         assert self._process.stdin is not None  # noqa: S101 - opened as a pipe above
-        self._process.stdin.write(job.to_json().encode() + b"\n")
+        self._process.stdin.write(job.encode() + b"\n")
         self._process.stdin.flush()
 
     def _ask_to_stop(self) -> None:
@@ -145,6 +147,14 @@ class OwnServer(ServerProcess):
             raise kind(answer["error"])
         self.address = answer.pop("address")
         self.facts = answer
+
+
+class OwnServer(OwnProcess):
+    """Our instrumented server."""
+
+    def __init__(self, name: str, job: ServerJob, log: Path | None = None) -> None:
+        """Start it and tell it its job."""
+        super().__init__(name, "s2a_bench.harness.serving", job.to_json(), log)
 
 
 class LlamaServer(ServerProcess):
@@ -188,13 +198,32 @@ class LlamaServer(ServerProcess):
         raise ServerDied(f"llama-server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
 
 
-PROGRAMS: dict[str, type[LlamaServer]] = {"llama-server": LlamaServer}
+class WheelServer(OwnProcess):
+    """llama.cpp's own server out of the wheel xllamacpp: a black box in a process of ours."""
+
+    _cure = COMPILE_AGAIN
+
+    def __init__(self, program: Program, engine: EngineConfig, log: Path, *, has_grammar: bool) -> None:
+        """Start it on its port, or any free one for 0; the rest as `LlamaServer`."""
+        files = load_headers(engine)
+        job = llama_wheel.told(engine, program.port, ignore_end=files.dummy and not has_grammar)
+        super().__init__("llama-server", llama_wheel.__name__, json.dumps(job), log)
+        self._files = files
+
+    def wait_ready(self) -> None:
+        """Read the one line it answers."""
+        super().wait_ready()
+        self.facts["engine"] = {"engine": "llama-server", **_described(self._files)}
+
+
+PROGRAMS: dict[str, Callable[..., ServerProcess]] = {"llama-server": LlamaServer, "llama-server-wheel": WheelServer}
 """Kind of a transport's `Program` -> how it is started."""
 
 
 def _described(files: ModelFiles) -> dict[str, Any]:
     """Return what the manifest says about the model files of a server that says nothing itself."""
     return {
+        "name": str(files.model.fields.get("general.name", "")),
         "model": str(files.model.path),
         "mmproj": str(files.mmproj.path),
         "model_sha256": sha256(files.model.path),

@@ -197,9 +197,13 @@ class Transport(Generic[O]):
         """Bind a server, ready to `serve`; raises PortInUse or TransportError."""
         raise NotImplementedError
 
-    def measured(self, options: O, chosen: Sequence[str]) -> Sequence[str]:  # noqa: ARG002 - for subclasses
+    def measured(self, options: O, chosen: Sequence[str], engine: str) -> Sequence[str]:  # noqa: ARG002 - for subclasses
         """Return the variants to measure where the pipeline names none; ``chosen`` is what a flag says."""
         return chosen or self.variants[:1] or ("",)
+
+    def of_variant(self, variant: str, options: O) -> O:  # noqa: ARG002 - for subclasses
+        """Return the options as they hold for one variant."""
+        return options
 
     def travels(self, variant: str, options: O) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
         """Return how pictures can travel over a variant, the default first."""

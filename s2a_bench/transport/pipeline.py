@@ -71,16 +71,18 @@ def pipelines(
     names: Iterable[str],
     options: Mapping[str, Mapping[str, Any]] | None = None,
     variants: Mapping[str, Sequence[str]] | None = None,
+    engine: str = "",
 ) -> list[Pipeline]:
     """Return the pipelines that names stand for, each once; raises UsageError.
 
     ``options`` (transport -> option -> value) and ``variants`` (transport -> variants) hold what flags give, for names
-    that do not say it themselves. A ``payload`` under the transport "" is for all that can carry it.
+    that do not say it themselves. A ``payload`` under the transport "" is for all that can carry it. ``engine`` is what
+    answers, where variants that are measured by default depend on that.
     """
     given = {name: dict(values) for name, values in (options or {}).items()}
     found: dict[str, Pipeline] = {}
     for text in names:
-        for pipeline in _standing_for(_parse(text), given, variants or {}):
+        for pipeline in _standing_for(_parse(text), given, variants or {}, engine):
             found.setdefault(pipeline.name, pipeline)
     return list(found.values())
 
@@ -99,14 +101,14 @@ def one_pipeline(text: str, **options: Any) -> Pipeline:
 
 
 def _standing_for(
-    named: _Named, given: Mapping[str, Mapping[str, Any]], chosen: Mapping[str, Sequence[str]]
+    named: _Named, given: Mapping[str, Mapping[str, Any]], chosen: Mapping[str, Sequence[str]], engine: str = ""
 ) -> Iterator[Pipeline]:
     """Yield a pipeline a variant."""
     transport = TRANSPORTS[named.transport]
     flags = {**given.get("", {}), **given.get(transport.name, {})}
     plain = checked(transport.options, flags, transport.name)
     asked = checked(transport.options, {**flags, **named.options}, transport.name)
-    variants = [named.variant] if named.variant else transport.measured(asked, chosen.get(transport.name, ()))
+    variants = [named.variant] if named.variant else transport.measured(asked, chosen.get(transport.name, ()), engine)
     for variant in variants:
         if variant not in (transport.variants or ("",)):
             known = ", ".join(transport.variants) or "none: it has no variants"
@@ -114,7 +116,8 @@ def _standing_for(
             raise UsageError(f"`{field}`: '{variant}' is none of {transport.name}'s {known}")
         can = transport.travels(variant, asked)
         default, filled = (_filled(options, can) for options in (plain, asked))
-        yield Pipeline(_canonical(transport, variant, filled, default), transport, variant, filled)
+        name = _canonical(transport, variant, filled, default)
+        yield Pipeline(name, transport, variant, transport.of_variant(variant, filled))
 
 
 def _filled(options: Options, can: Sequence[str]) -> Options:

@@ -8,15 +8,73 @@ from typing import Any
 
 import pytest
 
+from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.inference import EngineConfig
+from s2a_bench.transport import http
 
 URL = {"http": {"url": "http://x"}}
 
 
 def names(config: RequestsConfig) -> list[str]:
     return [cell.name for cell in config.pipelines]
+
+
+@pytest.fixture(autouse=True)
+def no_llama_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether llama.cpp's own server is on this machine decides nothing here; where it matters, a test says so."""
+    monkeypatch.setattr(http, "found_llama_server", lambda: None)
+
+
+@pytest.mark.parametrize(
+    ("asked", "there"),
+    [
+        ({}, True),
+        ({"payload": "jpeg"}, True),
+        ({"payload": "raw"}, False),
+        ({"engine": EngineConfig(name="echo")}, False),
+        ({"options": {"http": {"url": "http://x"}}}, False),
+        ({"variants": {"http": ("binary",)}}, False),
+    ],
+)
+def test_llama_cpps_own_server_is_a_cell_where_it_has_the_same_to_do(
+    asked: dict[str, Any], there: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(http, "found_llama_server", lambda: http.WHEEL)
+    config = RequestsConfig(**asked)
+    assert ("http/llama-server" in names(config)) is there
+    for cell in config.pipelines:
+        program = cell.transport.program(cell.options)
+        assert (program is not None) is (cell.variant == "llama-server")
+
+
+def test_a_named_llama_server_adds_its_cell(tmp_path: Path) -> None:
+    config = RequestsConfig(options={"http": {"llama_server": tmp_path}})
+    assert names(config)[:4] == [f"http/{name}" for name in http.VARIANTS]
+    assert [cell.black_box for cell in config.pipelines[:4]] == [False, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({}, "there is none on PATH"),
+        ({"engine": EngineConfig(name="echo"), "options": {"http": {"llama_server": "x"}}}, "runs a model"),
+        ({"payload": "raw", "options": {"http": {"llama_server": "x"}}}, "travels as jpeg, not raw"),
+        ({"options": {"http": {"url": "http://x"}}}, "leave it out with `url`"),
+    ],
+)
+def test_asked_for_by_name_it_is_an_error_where_it_cannot_be(asked: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        RequestsConfig(transports=("http/llama-server",), **asked)
+
+
+def test_without_our_own_engine_its_cell_is_measured_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "found_llama_server", lambda: http.WHEEL)
+    monkeypatch.setattr(extras, "installed", lambda module: module != "llama_cpp")
+    said: list[str] = []
+    assert names(RequestsConfig().answered(said.append)) == ["http/llama-server"]
+    assert said == ["only http/llama-server: our own servers have no engine here; " + extras.how_to_install("llama")]
 
 
 def test_all_http_variants_and_ros_are_shown_unless_told() -> None:

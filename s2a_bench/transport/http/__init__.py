@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
+from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, Fact
 from s2a_bench.transport import Client, Handler, Program, Server, Transport, Wiring
 from s2a_bench.transport.http.options import HttpOptions
 
-VARIANTS = ("as-deployed", "best-effort", "binary")
-BINARY = VARIANTS[2]
+VARIANTS = ("as-deployed", "best-effort", "binary", "llama-server")
+BINARY, LLAMA_SERVER = VARIANTS[2:]
+WHEEL = Path("xllamacpp")
+"""Stands for llama.cpp's server out of the wheel of that name."""
 
 RECONNECTS = Fact("reconnects", "", "1 where the server had closed the kept connection")
 HEADERS_MS = Fact("headers_ms", "ms", "last byte packed to the headers of a black box's answer")
@@ -18,8 +23,15 @@ THINKING_PIECES = Fact("thinking_pieces", "", "messages of the answer that were 
 THINKING_MS = Fact("thinking_ms", "ms", "first thinking to the first token")
 
 
+def found_llama_server() -> Path | None:
+    """Find llama.cpp's own server: on PATH, else in the wheel, which reads models of the extra; None without either."""
+    if found := shutil.which("llama-server"):
+        return Path(found)
+    return WHEEL if extras.installed(str(WHEEL)) and extras.installed("gguf") else None
+
+
 class Http(Transport[HttpOptions]):
-    """Base64 and JSON as usually deployed, at their best, and the binary control."""
+    """Base64 and JSON as usually deployed, at their best, the binary control, and llama.cpp's own server."""
 
     name = "http"
     options = HttpOptions
@@ -34,7 +46,12 @@ class Http(Transport[HttpOptions]):
     }
     tells = (PAYLOAD_BYTES, RECONNECTS, HEADERS_MS, HEADERS_OFF_MS, THINKING_PIECES, THINKING_MS)
     order = 10
-    looks = {"as-deployed": ("#D55E00", "-"), "best-effort": ("#E69F00", "--"), "binary": ("#CC79A7", "-.")}
+    looks = {
+        "as-deployed": ("#D55E00", "-"),
+        "best-effort": ("#E69F00", "--"),
+        "binary": ("#CC79A7", "-."),
+        "llama-server": ("#8C510A", ":"),
+    }
     compared_with = ("ros", "loopback")
     packages = (
         *("fastapi", "httptools", "httpx", "json-numpy", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"),
@@ -54,13 +71,26 @@ class Http(Transport[HttpOptions]):
 
         return HttpServer(wiring, handler)
 
-    def measured(self, options: HttpOptions, chosen: Sequence[str]) -> Sequence[str]:
-        """Return all that the server speaks."""
-        return chosen or [name for name in VARIANTS if name != BINARY or not self.foreign_by(options)]
+    def measured(self, options: HttpOptions, chosen: Sequence[str], engine: str) -> Sequence[str]:
+        """Return all that the server speaks; llama.cpp's own too where it is there and has the same to do."""
+        if chosen:
+            return chosen
+        if options.url:
+            return VARIANTS[:2]
+        wanted = engine == "llama" and options.payload in {"", "jpeg"} and found_llama_server()
+        return VARIANTS if options.llama_server or wanted else VARIANTS[:3]
 
-    def travels(self, variant: str, options: HttpOptions) -> tuple[str, ...]:  # noqa: ARG002 - the same for all
+    def of_variant(self, variant: str, options: HttpOptions) -> HttpOptions:
+        """Return options that name llama.cpp's server for its own variant alone: the one on PATH, else the wheel's."""
+        if variant != LLAMA_SERVER:
+            return options.but(llama_server=None) if options.llama_server else options
+        return options.but(llama_server=options.llama_server or found_llama_server(), port=0)
+
+    def travels(self, variant: str, options: HttpOptions) -> tuple[str, ...]:
         """Return what our server takes, or what the dialect of a black box has words for."""
-        if not self.foreign_by(options):
+        if variant == LLAMA_SERVER:
+            return ("jpeg",)
+        if not options.url:
             return self.payloads
         from s2a_bench.transport.http.dialects import open_dialect
 
@@ -80,10 +110,16 @@ class Http(Transport[HttpOptions]):
         """Refuse what only our own server knows, a key that is not there, and a model's server without a model."""
         from s2a_bench.transport.credentials import read_key
 
-        if (field := self.foreign_by(options)) and variant == BINARY:
-            raise UsageError(f"`http`: binary needs our own server; leave it out with `{field}`")
-        if options.llama_server and engine != "llama":
-            raise UsageError(f"`llama_server` runs a model; leave out `engine` {engine}")
+        if options.url and variant in {BINARY, LLAMA_SERVER}:
+            raise UsageError(f"`http`: {variant} needs our own server; leave it out with `url`")
+        if variant == LLAMA_SERVER:
+            if options.llama_server is None:
+                raise UsageError(
+                    f"`transport` http/{LLAMA_SERVER}: there is none on PATH; name one with `llama_server`, or take "
+                    "the wheel: pip install 's2a-bench[llama-server]'"
+                )
+            if engine != "llama":
+                raise UsageError(f"`llama_server` runs a model; leave out `engine` {engine}")
         read_key(options.api_key_env)
 
     def foreign(self, options: HttpOptions) -> str:
@@ -99,7 +135,10 @@ class Http(Transport[HttpOptions]):
 
     def program(self, options: HttpOptions) -> Program | None:
         """Return llama.cpp's server where its program is named."""
-        return Program("llama-server", options.llama_server, options.port) if options.llama_server else None
+        if options.llama_server is None:
+            return None
+        kind = "llama-server-wheel" if options.llama_server == WHEEL else "llama-server"
+        return Program(kind, options.llama_server, options.port)
 
     def bind(self, options: HttpOptions, taken: Sequence[str]) -> str:
         """Return ``host:port``, with any free port where another server of ours has this one."""

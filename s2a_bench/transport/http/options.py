@@ -32,7 +32,7 @@ class HttpOptions(Options):
     api_docs: bool = option(False, "also serve /openapi.json, /docs and /redoc", side=SERVING)
     extra_body: TextOrFile = option("", "JSON, or @FILE, merged into every request to the url (RFC 7396)")
     llama_server: Path | None = option(
-        None, "start this llama.cpp server on the same model files (a black box)", side=SERVER
+        None, "llama.cpp's own server for http/llama-server [default: on PATH, else the wheel's]", side=SERVER
     )
 
     @field_validator("url")

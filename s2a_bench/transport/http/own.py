@@ -21,12 +21,13 @@ from s2a_bench.transport.http import VARIANTS
 from s2a_bench.transport.http.dialects.common import TEMPERATURE, TOP_P
 from s2a_bench.types import Request
 
-AS_DEPLOYED, BEST_EFFORT, BINARY = VARIANTS
+AS_DEPLOYED, BEST_EFFORT, BINARY, LLAMA_SERVER = VARIANTS
 
 PATHS = {
     AS_DEPLOYED: "/v1/chat/completions",
     BEST_EFFORT: "/best-effort/v1/chat/completions",
     BINARY: "/binary/v1/chat/completions",
+    LLAMA_SERVER: "/v1/chat/completions",
 }
 """Variant -> path on our own server; a black box is always asked at the first."""
 
@@ -61,7 +62,7 @@ FAST = Codec(
     to_base64=pybase64.b64encode_as_string,
     from_base64=lambda text: pybase64.b64decode(text, validate=True),
 )
-CODECS = {AS_DEPLOYED: STANDARD, BEST_EFFORT: FAST, BINARY: FAST}
+CODECS = {AS_DEPLOYED: STANDARD, BEST_EFFORT: FAST, BINARY: FAST, LLAMA_SERVER: STANDARD}
 
 
 def data_uri(media_type: str, encoded: str) -> str:

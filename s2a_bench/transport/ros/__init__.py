@@ -65,7 +65,7 @@ class Ros(Transport[RosOptions]):
 
         return RosServer(wiring, handler)
 
-    def measured(self, options: RosOptions, chosen: Sequence[str]) -> Sequence[str]:
+    def measured(self, options: RosOptions, chosen: Sequence[str], engine: str) -> Sequence[str]:  # noqa: ARG002
         """Return topics unless told, and of somebody else's node its action."""
         return (ACTION,) if options.action else chosen or (TOPIC,)
 

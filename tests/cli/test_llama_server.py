@@ -1,0 +1,84 @@
+"""llama.cpp's own server, out of the wheel: the baseline of the paper as a cell of a run."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.inference.models import tiny_dummy
+from s2a_bench.store.run import read_run
+
+pytestmark = pytest.mark.skipif(find_spec("xllamacpp") is None, reason="the wheel xllamacpp is not installed")
+
+SMALL = ("--size", "64x48", "--max-tokens", "4", "--warmup", "1")
+
+
+def latency(output: Path, *arguments: str, runs: int = 3) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, "--runs", str(runs), "--output", str(output)]
+    return subprocess.run([*command, *arguments], capture_output=True, text=True, check=False, timeout=300)
+
+
+def test_it_is_measured_beside_our_own_cells(tmp_path: Path) -> None:
+    done = latency(tmp_path, "--transport", "http/llama-server,http/as-deployed,loopback")
+    assert done.returncode == 0, done.stderr
+    (folder,) = tmp_path.iterdir()
+    run = read_run(folder)
+    theirs = run.samples[run.samples["cell"] == "http/llama-server"]
+    assert (theirs["error"] == "").all()
+    assert theirs["ingest_ns"].notna().all()
+    assert set(theirs["engine"]) == {"llama-server"}
+    assert (theirs["cache_n"] == 0).all()
+    assert run.origins.of("http/llama-server").weights == "dummy"
+    server = next(told for told in run.manifest["servers"].values() if "version" in told)
+    assert server["version"].startswith("xllamacpp ")
+    assert "http/llama-server" in done.stdout
+
+
+def test_a_grammar_is_obeyed(tmp_path: Path) -> None:
+    grammar = tmp_path / "g.gbnf"
+    grammar.write_text('root ::= "go"+\n')
+    output = tmp_path / "runs"
+    done = latency(output, "--transport", "http/llama-server", "--grammar", str(grammar))
+    assert done.returncode == 0, done.stderr
+    (folder,) = output.iterdir()
+    assert set("".join(read_run(folder).tokens["text"].dropna())) <= {"g", "o"}
+
+
+def test_killed_in_the_middle_is_one_line_and_keeps_the_samples(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, "--runs", "100000", "--output", str(tmp_path)]
+    process = subprocess.Popen(
+        [*command, "--transport", "http/llama-server"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 120
+    while not (folders := [*tmp_path.iterdir()]) or len(read_run(folders[0]).samples) < 3:
+        assert time.monotonic() < deadline
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.1)
+    (server,) = read_run(folders[0]).manifest["servers"].values()
+    os.kill(server["pid"], signal.SIGKILL)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert "killed by signal 9" in said
+    assert "Traceback" not in said
+    assert read_run(folders[0]).manifest["state"] == "failed"
+
+
+def test_a_projector_that_is_none_is_one_line(tmp_path: Path) -> None:
+    model, _ = tiny_dummy()
+    arguments = ("--transport", "http/llama-server", "--model", str(model), "--mmproj", str(model))
+    done = latency(tmp_path, *arguments)
+    assert done.returncode != 0
+    assert "Traceback" not in done.stderr
+    assert "error: " in done.stderr
+
+
+def test_a_port_in_use_is_not_taken_for_it(tmp_path: Path) -> None:
+    done = latency(tmp_path, "--transport", "http/llama-server,http/as-deployed", "--port", "18471")
+    assert done.returncode == 0, done.stderr  # the port is that of our own server
