@@ -88,6 +88,7 @@ class RequestsConfig(Options):
     engine: EngineConfig = group(EngineConfig)
     runs: int = option(50, "samples a pipeline [default: 50, quick: 10]", ge=1, le=10**9)
     warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
+    launches: int = option(1, "fresh sets of servers, --runs samples each; ratios then hold beyond one", ge=1, le=1000)
     mode: Literal["request", "stream"] = option("request", "request (a frame each), stream (a camera runs)")
     fps: float = option(30.0, "rate of the camera in --mode stream", ge=0.1, le=1000)
     max_tokens: int = option(32, "tokens an answer [default: 32, quick: 8]", ge=1, le=2**20)
@@ -207,6 +208,10 @@ class RequestsConfig(Options):
             raise UsageError(f"`record`: {self.record} exists already and is not overwritten; name another")
         for pipeline in self.pipelines:
             self._check(pipeline)
+        if self.launches > 1 and self.foreign:
+            raise UsageError(
+                f"`launches`: a server that runs already cannot be started afresh; leave out `{self.foreign}`"
+            )
         if self.engine.name == "replay" and self.foreign:
             raise UsageError(f"`engine` replay needs our own servers; leave out `{self.foreign}`")
         self._check_unused()

@@ -116,12 +116,15 @@ class _Sources:
         self._stack = stack
         self._shared = config.source.startswith("v4l2")
         self._ready: FrameSource | None = self._new()  # what is wrong with a source shows before anything starts
+        self._open: dict[str, FrameSource] = {}
 
-    def open(self, user: str) -> FrameSource:
-        """Return a source that nobody has yet, or the shared one, its stamps those of ``user``."""
-        source = self._ready or self._new()
-        self._ready = source if self._shared else None
-        return Stamped(source, f"{self._config.nonce}/{user}")
+    def of(self, user: str, stamp: str = "") -> FrameSource:
+        """Return the source of ``user``, which goes on in the next launch; one source is shared by all or by nobody."""
+        if user not in self._open:
+            source = self._ready or self._new()
+            self._ready = source if self._shared else None
+            self._open[user] = Stamped(source, f"{self._config.nonce}/{stamp}")
+        return self._open[user]
 
     def _new(self) -> FrameSource:
         config = self._config
@@ -131,23 +134,45 @@ class _Sources:
 
 
 def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunWriter, progress: Progress) -> None:
-    """Start the servers, measure all blocks, and write down what there is to warn of."""
+    """Measure every launch, and write down what there is to warn of."""
     machine = Machine(output=writer.path)
     watches_udp = any(transport.watches_udp for transport in config.used)
     warnings = before_run(config, machine)
     before = Counters.read(watches_udp=watches_udp)
     guard = SampleGuard()
+    writer.update(warnings=[warning.to_manifest() for warning in warnings])
     with ExitStack() as stack:
-        servers = ServerSet(config, stack, writer.path)
+        recorder: RunRecorder | None = None
+        if config.record is not None:
+            recorder = stack.enter_context(RunRecorder(config.record, config.options, live=config.mode == "stream"))
+        try:
+            for launch in range(config.launches):
+                _launch(launch, task, config, sources, recorder, guard, writer, progress)
+        finally:
+            warnings += [*guard.warnings(), *Counters.read(watches_udp=watches_udp).warnings_since(before)]
+            writer.update(warnings=[warning.to_manifest() for warning in warnings])
+
+
+def _launch(
+    launch: int,
+    task: Task,
+    config: RequestsConfig,
+    sources: _Sources,
+    recorder: RunRecorder | None,
+    guard: SampleGuard,
+    writer: RunWriter,
+    progress: Progress,
+) -> None:
+    """Start the servers and measure all blocks of one launch."""
+    with ExitStack() as stack:
+        servers = ServerSet(config, stack, writer.path, launch)
         if servers.count:
             progress.stage(f"starting {servers.count} server{'s' if servers.count > 1 else ''}")
         facts = servers.start()
-        writer.update(
-            servers=facts, model=servers.model(facts), warnings=[warning.to_manifest() for warning in warnings]
-        )
+        writer.update(servers=facts, model=servers.model(facts))
         pids = [server["pid"] for server in facts.values()]
         sampler = stack.enter_context(open_sampler(config.sample_resources_hz, pids))
-        sessions = list(_sessions(task, config, servers, sources, sampler, stack))
+        sessions = list(_sessions(task, config, servers, sources, recorder, sampler, stack))
         asked = {session.cell.name: session.client.describe() for session in sessions}
         origins = {session.cell.name: session.origin for session in sessions}
         run = Provenance.of_engine(servers.model(facts))
@@ -158,7 +183,7 @@ def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunW
         backoff = Backoff(SystemClock(), progress.stage)
         slots = [_slot(session, servers, writer, guard, backoff, sampler) for session in sessions]
         try:
-            run_blocks(slots, task.others(config, writer, sessions), config, progress)
+            run_blocks(slots, task.others(config, writer, sessions), config, progress, launch)
             guard.see_hits(hits, servers.cache_hits())
             for session in sessions:
                 _write_frames(writer, session.frames(keep=0))
@@ -166,22 +191,24 @@ def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunW
                     last = guard.last_error(session.cell.name)
                     raise TransportError(f"no request of {session.cell.name} succeeded, at last with {last}")
         finally:
-            warnings += [*guard.warnings(), *Counters.read(watches_udp=watches_udp).warnings_since(before)]
             sampler.flush(writer)
-            writer.update(warnings=[warning.to_manifest() for warning in warnings], resources=sampler.describe())
+            writer.update(resources=sampler.describe())
 
 
 def _sessions(
-    task: Task, config: RequestsConfig, servers: ServerSet, sources: _Sources, sampler: Sampler, stack: ExitStack
+    task: Task,
+    config: RequestsConfig,
+    servers: ServerSet,
+    sources: _Sources,
+    recorder: RunRecorder | None,
+    sampler: Sampler,
+    stack: ExitStack,
 ) -> Iterator[Session]:
-    """Open a client and a feed for each cell, and the recording if one is wanted."""
-    recorder: RunRecorder | None = None
-    if config.record is not None:
-        recorder = stack.enter_context(RunRecorder(config.record, config.options, live=config.mode == "stream"))
+    """Open a client and a feed for each cell."""
     clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
     camera: Camera | None = None
     if config.mode == "stream":
-        camera = Camera(sources.open("camera"), config.fps, on_frame=recorder.frame if recorder else None)
+        camera = Camera(sources.of("camera", "camera"), config.fps, on_frame=recorder.frame if recorder else None)
         camera.start()
         stack.callback(camera.stop)
     for cell in config.pipelines:
@@ -193,26 +220,29 @@ def _sessions(
             random = Random(config.seed)  # noqa: S311 - phases, not secrets
             feed = StreamFeed(camera, client.camera, int(1e9 / config.fps), random)
         else:
-            feed = RequestFeed(
-                sources.open(cell.name if cell.black_box else ""), preencoded=cell.payload == "jpeg-preencoded"
-            )
+            source = sources.of(cell.name, cell.name if cell.black_box else "")
+            feed = RequestFeed(source, preencoded=cell.payload == "jpeg-preencoded")
         name = task.in_process if cell.transport.in_process and task.in_process else cell.name
         yield Session(replace(cell, name=name), client, feed, config, recorder, sampler, servers.origin(cell))
 
 
-def run_blocks(slots: Sequence[Slot], others: Sequence[Slot], config: RequestsConfig, progress: Progress) -> None:
-    """Run every slot once a block, in a new random order each time; in the first block the others come last.
+def run_blocks(
+    slots: Sequence[Slot], others: Sequence[Slot], config: RequestsConfig, progress: Progress, launch: int = 0
+) -> None:
+    """Run every slot once a block, in a new random order each time; in a launch's first block the others come last.
 
     So that what is compared with the requests can learn from the first of them how long their prompts are.
     """
     everyone = [*slots, *others]
-    progress.expect(len(everyone) * (config.warmup + config.runs))
-    random = Random(config.seed)  # noqa: S311 - an order, not a secret
-    for block in range(config.warmup + config.runs):
-        progress.stage("warming up" if block < config.warmup else "measuring")
+    blocks = config.warmup + config.runs
+    progress.expect(len(everyone) * blocks * config.launches)
+    random = Random(config.seed + launch)  # noqa: S311 - an order, not a secret
+    which = f", launch {launch + 1} of {config.launches}" if config.launches > 1 else ""
+    for block in range(blocks):
+        progress.stage(f"{'warming up' if block < config.warmup else 'measuring'}{which}")
         order = random.sample(everyone, len(everyone))
         for position, slot in enumerate(order if block else sorted(order, key=lambda slot: slot in others)):
-            slot(Place(block, position, block < config.warmup))
+            slot(Place(launch * blocks + block, position, block < config.warmup, launch))
             progress.advance()
 
 

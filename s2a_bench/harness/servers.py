@@ -38,9 +38,10 @@ class _Running:
 class ServerSet:
     """The servers of a run; cells whose server would be told the same share one."""
 
-    def __init__(self, config: RequestsConfig, stack: ExitStack, folder: Path) -> None:
-        """Start what ``config`` needs; `ExitStack` stops it."""
+    def __init__(self, config: RequestsConfig, stack: ExitStack, folder: Path, launch: int = 0) -> None:
+        """Start what ``config`` needs; `ExitStack` stops it. Later launches than 0 show in the servers' names."""
         self._config = config
+        self._suffix = f"-launch-{launch + 1}" if launch else ""
         self._stack = stack
         self._folder = folder
         self._servers: dict[tuple[object, ...], _Running] = {}
@@ -72,7 +73,7 @@ class ServerSet:
     def _launch(self, pipeline: Pipeline) -> _Running:
         transport, config = pipeline.transport, self._config
         bound = self._bound.setdefault(transport.name, [])
-        name = f"{transport.name}-{len(bound) + 1}" if bound else transport.name
+        name = (f"{transport.name}-{len(bound) + 1}" if bound else transport.name) + self._suffix
         if address := transport.foreign(pipeline.options):
             return _Running(name, address)
         address = transport.bind(pipeline.options, bound)

@@ -42,6 +42,7 @@ class Place:
     block: int
     position: int
     warmup: bool
+    launch: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +169,7 @@ class Session:
             block=place.block,
             position=place.position,
             warmup=place.warmup,
+            launch=place.launch,
             request_id=request_id,
             frame_index=index,
             error=error,

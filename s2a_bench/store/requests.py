@@ -23,7 +23,8 @@ class SampleRow:
     jpeg-preencoded or png, nothing for loopback; folders that older versions wrote say bgr for raw and compressed
     for jpeg over ROS. An empty ``error`` means that the request succeeded. ``frame_age_ns`` is the frame's age when
     inference starts. ``rgb_source`` is a checksum of the RGB that a reference conversion of the source frame gives,
-    ``rgb_engine`` of the RGB at the engine; null where unknown, as behind a black box.
+    ``rgb_engine`` of the RGB at the engine; null where unknown, as behind a black box. ``launch`` counts the sets of
+    servers from 0, ``block`` on over all of them; folders from before `launches` have null.
     """
 
     cell: str
@@ -51,6 +52,7 @@ class SampleRow:
     rgb_source: int | None = None
     rgb_engine: int | None = None
     facts: dict[str, float] = field(default_factory=dict)
+    launch: int = 0
 
 
 @dataclass(frozen=True, slots=True)

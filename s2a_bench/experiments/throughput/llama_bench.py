@@ -52,6 +52,7 @@ class LlamaBench:
             n_gen=test["n_gen"],
             depth=test.get("n_depth", 0),
             decode_ns=test["samples_ns"][0],
+            launch=place.launch,
             facts={name: test[name] for name in test if not name.startswith(("samples", "avg", "stddev"))},
         )
         self._writer.append(REFERENCE, [row])

@@ -21,6 +21,7 @@ class ReferenceRow:
     depth: int
     decode_ns: int
     facts: dict[str, Any] = field(default_factory=dict)
+    launch: int = 0
 
 
 REFERENCE: Final[Table[ReferenceRow]] = Table("reference", ReferenceRow)

@@ -1,0 +1,71 @@
+"""Launches: every one has servers of its own, its warm-ups and its blocks, all in one run folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.latency.config import LatencyConfig
+from s2a_bench.experiments.latency.run import run_latency
+from s2a_bench.harness.rounds import run_blocks
+from s2a_bench.harness.session import Place
+from s2a_bench.inference import EngineConfig
+from s2a_bench.store.run import read_run
+from s2a_bench.testing import NullProgress
+
+ECHO = LatencyConfig(
+    engine=EngineConfig(name="echo"), transports=("http/binary", "loopback"), max_tokens=2, size=(64, 48)
+)
+
+
+def test_every_launch_has_fresh_servers_in_one_run_folder(tmp_path: Path) -> None:
+    config = ECHO.but(launches=3, runs=4, warmup=1)
+    run = read_run(run_latency(config, tmp_path, NullProgress()))
+    samples = run.samples
+    assert run.manifest["state"] == "finished"
+    assert dict(samples.groupby("launch").size().items()) == {0: 10, 1: 10, 2: 10}
+    assert samples["request_id"].is_unique
+    assert samples.groupby("block").size().tolist() == [2] * 15
+    assert set(samples[samples["warmup"]]["block"]) == {0, 5, 10}
+    pids = [server["pid"] for server in run.manifest["servers"].values()]
+    assert run.manifest["servers"].keys() == {"http", "http-launch-2", "http-launch-3"}
+    assert len(set(pids)) == 3
+    assert "duplicate-frames" not in {warning["code"] for warning in run.manifest["warnings"]}
+    frames = samples[samples["cell"] == "http/binary"]["frame_index"]
+    assert frames.is_unique  # a source goes on where the last launch left it: no picture twice
+
+
+def test_the_order_differs_from_launch_to_launch_and_the_total_is_told() -> None:
+    seen: list[list[str]] = [[], []]
+    progress = NullProgress()
+    for launch in range(2):
+
+        def turn(name: str, launch: int) -> None:
+            seen[launch].append(name)
+
+        slots = [lambda place, name=name: turn(name, place.launch) for name in "abcd"]
+        run_blocks(slots, [], ECHO.but(launches=2, runs=8, warmup=0), progress, launch)
+    assert sorted(seen[0]) == sorted(seen[1])
+    assert seen[0] != seen[1]
+    assert progress.expected == progress.done == 64
+
+
+def test_blocks_count_on_over_launches() -> None:
+    places: list[Place] = []
+    for launch in range(2):
+        run_blocks([places.append], [], ECHO.but(launches=2, runs=2, warmup=1), NullProgress(), launch)
+    assert [(place.launch, place.block, place.warmup) for place in places] == [
+        (0, 0, True),
+        (0, 1, False),
+        (0, 2, False),
+        (1, 3, True),
+        (1, 4, False),
+        (1, 5, False),
+    ]
+
+
+def test_a_server_that_runs_already_has_one_launch() -> None:
+    with pytest.raises(UsageError, match=r"`launches`: a server that runs already .*; leave out `url`"):
+        LatencyConfig(transports=("http/best-effort?url=http://x",), launches=2)
