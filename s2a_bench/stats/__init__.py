@@ -25,11 +25,17 @@ class Summary:
 
 @dataclass(frozen=True, slots=True)
 class Ratio:
-    """A ratio and its confidence interval; None where the values do not allow one, never NaN."""
+    """A ratio and its confidence interval; None where the values do not allow one, never NaN.
+
+    The interval of one launch says nothing of the next. Of several it is theirs, and ``launch_sd`` is the standard
+    deviation of the logarithms of their ratios: about the share by which a launch differs from the next.
+    """
 
     value: float | None
     low: float | None
     high: float | None
+    launches: int = 1
+    launch_sd: float | None = None
 
 
 def summarise(values: Iterable[float]) -> Summary:

@@ -5,16 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.batches import FEWEST_ROWS, Launch, Memory, Rows
+from s2a_bench.stats.power import Noise
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     Floats: TypeAlias = NDArray[np.float64]
+
+Middle: TypeAlias = Literal["median", "mean"]
+
+Blocks: TypeAlias = "Mapping[int, Sequence[float]]"
+"""The values of a cell in one launch, by block."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +30,7 @@ class Change:
     ``superiority`` is the probability that a value of ``other`` is the larger of two, ties counted half (Vargha and
     Delaney 2000); 0.5 means no difference. ``p`` is None where there are too few values for an interval.
     ``dependent`` is true where neighbours are so alike that batches are not independent: the interval is too narrow.
+    ``noise`` is what the test went by, None where nothing tells how uncertain the change is as a share.
     """
 
     baseline: float
@@ -33,6 +40,7 @@ class Change:
     superiority: Ratio
     p: float | None
     dependent: bool
+    noise: Noise | None
 
     @property
     def relative(self) -> float | None:
@@ -90,8 +98,10 @@ def change_between(
         test = _Test.of(below.log(), above.log(), confidence, paired)
         low, high = (None if bound is None else math.exp(bound) for bound in (test.low, test.high))
         ratio = Ratio(above.level / below.level, low, high)
+        noise = test.noise(1.0, logarithmic=True)
     else:
         test = plain
+        noise = test.noise(abs(below.level), logarithmic=False)
         ratio = Ratio(above.mean / below.mean if below.mean > 0 else None, None, None)
     return Change(
         below.level,
@@ -101,13 +111,40 @@ def change_between(
         _superiority(launches, draws, confidence),
         test.p,
         test.dependent,
+        noise,
     )
 
 
-def ratio_of_blocks(
-    above: Mapping[int, Sequence[float]], below: Mapping[int, Sequence[float]], seed: int
+def ratio_of_launches(
+    above: Mapping[int, Blocks], below: Mapping[int, Blocks], seed: int, statistic: Middle = "median"
 ) -> Ratio | None:
-    """Divide the medians of two cells of one launch, given by block; paired where both have the same blocks.
+    """Divide the medians (or means) of two cells, given by launch and block; None where no launch has values of both.
+
+    One launch: `ratio_of_blocks`. Several: the geometric mean of their ratios, with the interval of Student's t on the
+    logarithms, so that whatever differs from launch to launch is in it.
+    """
+    import numpy as np
+    from scipy import stats
+
+    both = [launch for launch in sorted(above) if above[launch] and below.get(launch)]
+    if len(both) <= 1:
+        return ratio_of_blocks(above[both[0]], below[both[0]], seed, statistic) if both else None
+    middle = np.median if statistic == "median" else np.mean
+    middles = np.array(
+        [[middle(np.concatenate([*cell[launch].values()])) for launch in both] for cell in (above, below)]
+    )
+    n = len(both)
+    if not (middles > 0).all():
+        over = float(middles[1].mean())
+        return Ratio(float(middles[0].mean()) / over if over > 0 else None, None, None, n)
+    logs = np.log(middles[0] / middles[1])
+    centre, sd = float(logs.mean()), float(logs.std(ddof=1))
+    reach = float(stats.t.ppf(0.975, n - 1)) * sd / math.sqrt(n)
+    return Ratio(math.exp(centre), math.exp(centre - reach), math.exp(centre + reach), n, sd)
+
+
+def ratio_of_blocks(above: Blocks, below: Blocks, seed: int, statistic: Middle = "median") -> Ratio | None:
+    """Divide the medians (or means) of two cells of one launch, given by block; paired where both have the same blocks.
 
     None where a cell has no values.
     """
@@ -116,7 +153,7 @@ def ratio_of_blocks(
     if not above or not below:
         return None
     rows = [[np.asarray(cell[block], dtype=np.float64) for block in sorted(cell)] for cell in (below, above)]
-    return change_between(rows[:1], rows[1:], "median", seed=seed, paired=above.keys() == below.keys()).ratio
+    return change_between(rows[:1], rows[1:], statistic, seed=seed, paired=above.keys() == below.keys()).ratio
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -210,6 +247,14 @@ class _Test:
     high: float | None
     p: float | None
     dependent: bool
+    error: float = 0.0
+    freedom: float = math.inf
+
+    def noise(self, unit: float, *, logarithmic: bool) -> Noise | None:
+        """Return how uncertain the shift is in ``unit``; None where nobody knows, or the unit is 0."""
+        if self.p is None or (self.error and not unit):
+            return None
+        return Noise(self.error / unit if self.error else 0.0, self.freedom, logarithmic)
 
     @classmethod
     def of(cls, below: _Side, above: _Side, confidence: float, paired: bool) -> _Test:
@@ -229,7 +274,7 @@ class _Test:
         error = math.sqrt(total)
         reach = float(stats.t.ppf((1 + confidence) / 2, freedom)) * error
         p = float(2 * stats.t.sf(abs(shift) / error, freedom))
-        return cls(shift, shift - reach, shift + reach, p, dependent)
+        return cls(shift, shift - reach, shift + reach, p, dependent, error, freedom)
 
 
 def _superiority(

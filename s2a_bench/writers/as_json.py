@@ -8,7 +8,7 @@ from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
 from s2a_bench.stats import Ratio, summary_of
-from s2a_bench.store.manifest import plain
+from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import SCHEMA
 
 if TYPE_CHECKING:
@@ -21,13 +21,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RatioJson:
-    """The median of one cell over that of another; ``ci95`` by the test of compare, None with too few blocks."""
+    """The median of one cell over that of another; ``ci95`` by the test of compare, None with too few blocks.
+
+    Over several launches it is their geometric mean, ``ci95`` holds for launches like them, and ``launch_sd`` is the
+    standard deviation of the logarithms of theirs; ``ci95`` of one launch holds for that launch.
+    """
 
     metric: str
     of: str
     to: str
     value: float | None
     ci95: tuple[float, float] | None
+    launches: Annotated[int, {"minimum": 1}] = 1
+    launch_sd: Annotated[float | None, {"minimum": 0}] = None
 
 
 def frame(run: Run | Sweep, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
@@ -73,8 +79,7 @@ def _may_lack(hint: Any) -> bool:
 def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
     """Return one ratio of the object."""
     interval = None if ratio.low is None or ratio.high is None else (ratio.low, ratio.high)
-    entry: dict[str, Any] = plain(RatioJson(metric, of, to, ratio.value, interval))
-    return entry
+    return present(RatioJson(metric, of, to, ratio.value, interval, ratio.launches, ratio.launch_sd))
 
 
 def summaries(metrics: Iterable[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:

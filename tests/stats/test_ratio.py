@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from s2a_bench.stats import Ratio
-from s2a_bench.stats.change import change_between, ratio_of_blocks
+from s2a_bench.stats.change import change_between, ratio_of_blocks, ratio_of_launches
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -123,3 +123,59 @@ def test_what_allows_no_interval_has_none_and_is_strict_json(
 def test_a_cell_without_values_has_no_ratio() -> None:
     assert ratio_of_blocks({}, blocks_of([1.0]), 0) is None
     assert ratio_of_blocks(blocks_of([1.0]), {}, 0) is None
+
+
+def launches(
+    rng: np.random.Generator, n: int, spread: float, runs: int = 15
+) -> list[dict[int, Mapping[int, list[float]]]]:
+    """Draw two cells whose ratio, 6, differs from launch to launch by ``spread``."""
+    cells: list[dict[int, Mapping[int, list[float]]]] = [{}, {}]
+    for launch in range(n):
+        load = remembering(rng, runs, 0.4)
+        shift = spread * rng.standard_normal()
+        cells[0][launch] = blocks_of(6 * np.exp(shift + 0.15 * (load + rng.standard_normal(runs))))
+        cells[1][launch] = blocks_of(np.exp(0.15 * (load + rng.standard_normal(runs))))
+    return cells
+
+
+@pytest.mark.parametrize("spread", [0.04, 0.08, 0.13])
+def test_over_launches_the_interval_covers_what_one_launch_cannot_know(spread: float) -> None:
+    rng = np.random.default_rng(5)
+    covered = alone = 0
+    for seed in range(400):
+        above, below = launches(rng, 5, spread)
+        found = ratio_of_launches(above, below, seed)
+        assert found is not None
+        assert found.low is not None
+        assert found.high is not None
+        covered += found.low <= 6 <= found.high
+        if seed < 100:
+            above, below = launches(rng, 1, spread, runs=75)  # as many requests, all in one launch
+            one = ratio_of_launches(above, below, seed)
+            assert one is not None
+            assert one.low is not None
+            assert one.high is not None
+            alone += one.low <= 6 <= one.high
+    assert 366 <= covered <= 393  # 99 of 100 of Binomial(400, 0.95)
+    assert alone <= {0.04: 94, 0.08: 82, 0.13: 65}[spread]
+
+
+def test_over_launches_the_ratio_is_the_geometric_mean_with_students_interval() -> None:
+    above, below = ({0: blocks_of([2.0]), 1: blocks_of([8.0])}, {0: blocks_of([1.0]), 1: blocks_of([1.0])})
+    found = ratio_of_launches(above, below, 0)
+    sd = math.log(4) / math.sqrt(2)
+    reach = 12.7062 * sd / math.sqrt(2)
+    assert found == Ratio(
+        pytest.approx(4.0),  # type: ignore[arg-type]
+        pytest.approx(4 * math.exp(-reach), rel=1e-4),  # type: ignore[arg-type]
+        pytest.approx(4 * math.exp(reach), rel=1e-4),  # type: ignore[arg-type]
+        2,
+        pytest.approx(sd),
+    )
+
+
+def test_a_launch_in_which_a_cell_has_nothing_does_not_count() -> None:
+    above, below = {0: blocks_of([2.0]), 1: blocks_of([4.0])}, {1: blocks_of([2.0])}
+    assert ratio_of_launches(above, below, 0) == Ratio(2.0, None, None)
+    assert ratio_of_launches({0: blocks_of([2.0])}, below, 0) is None
+    assert ratio_of_launches(above, {0: blocks_of([1.0]), 1: blocks_of([0.0])}, 0) == Ratio(6.0, None, None, 2)

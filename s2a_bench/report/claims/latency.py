@@ -11,12 +11,14 @@ from s2a_bench.report.claims.claim import CONTRADICTED, SUPPORTED, UNDECIDED, Cl
 from s2a_bench.report.claims.intervals import LIKE, TOO_FEW, change, verdict_of
 from s2a_bench.report.claims.needs import on_board, told
 from s2a_bench.stats import Ratio, summary_of
+from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.writers.tables import interval, mean_sd, number
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from s2a_bench.report.claims.intervals import Floats
+    from s2a_bench.stats.change import Blocks
     from s2a_bench.store.run import Run
 
 _METRIC: Final = "e2e_without_inference"
@@ -125,15 +127,18 @@ def _base64(part: Part) -> Said:
 
 
 def _ratio(part: Part) -> Ratio:
-    """Return how much longer HTTP takes in the mean, block by block."""
-    import numpy as np
+    """Return how much longer HTTP takes in the mean, launch by launch and block by block."""
+    http, ros = (cell.by_launch(_METRIC) for cell in part.cells)
+    shared = _shared(http, ros), _shared(ros, http)
+    return ratio_of_launches(*shared, part.run.bootstrap_seed, "mean") or Ratio(None, None, None)
 
-    http, ros = ({block: values[0] for block, values in cell.by_block(_METRIC).items()} for cell in part.cells)
-    both = sorted(http.keys() & ros.keys())
-    if not both:
-        return Ratio(None, None, None)
-    above, below = (np.array([cell[block] for block in both]) for cell in (http, ros))
-    return change(above, below, part.run.bootstrap_seed, paired=True).ratio
+
+def _shared(cell: Mapping[int, Blocks], other: Mapping[int, Blocks]) -> dict[int, Blocks]:
+    """Return the blocks of a cell that the other has too."""
+    return {
+        launch: {block: values for block, values in blocks.items() if block in other.get(launch, {})}
+        for launch, blocks in cell.items()
+    }
 
 
 def _share(cell: Cell, stages: Sequence[str], seed: int) -> Ratio:

@@ -114,7 +114,9 @@ def test_the_summary_table_by_hand(make_run: MakeRun, make_row: Callable[..., Sa
         ("ros/topic", "5", "0", "4.51 ± 0.00", "4.51", "4.51", "4.51", "1", "3.47 [3.47, 3.47]"),
         ("loopback", "5", "1", "1.30 ± 0.00", "1.30", "1.30", "1.30", NONE, "1"),
     ]
-    assert table.notes[-1] == "1 samples failed and are in no number here; samples.csv says why."
+    failed, launch = table.notes[-2:]
+    assert failed == "1 samples failed and are in no number here; samples.csv says why."
+    assert launch.startswith("The intervals hold for this launch only")
 
 
 def test_a_black_box_is_absent_where_its_inference_is_unknown(make_run: MakeRun, black_box: Any) -> None:
@@ -238,3 +240,16 @@ def test_importing_the_tables_imports_no_heavy_library() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_over_launches_the_table_says_by_how_much_they_differ(
+    make_run: MakeRun, make_row: Callable[..., SampleRow]
+) -> None:
+    rows = []
+    for launch, factor in enumerate((1.0, 1.1, 0.9)):
+        for cell, durations in HAND.items():
+            slow = {stage: ms * (factor if cell.startswith("http") else 1) for stage, ms in durations.items()}
+            rows += [make_row(cell, slow, 10 * launch + block, launch=launch) for block in range(3)]
+    table = summary_table(make_run({}, extra=tuple(rows)))
+    assert "Ratios are over 3 launches" in table.notes[-1]
+    assert "10 %" in table.notes[-1]

@@ -30,13 +30,15 @@ def show(run: Run, *, against: str = "", verbose: bool = False, **_: Any) -> Sho
     n = len(cells_of(run))
     tables = latency_tables(run)
     stages = group_table(run) if n > _STAGE_CELLS else stage_table(run, full=n <= _FULL_CELLS)
+    printed = _printed(run)
+    compared = tables["summary" if "summary" in printed else "summary-e2e"]
     return Shown(
         sentences=latency_sentences(run),
         tables=tables,
         main=["summary", "stages"],
-        printed=[name for name in tables if name in _printed(run)],
+        printed=[name for name in tables if name in printed],
         narrow={"stages": stages},
-        notes=[" ".join(stages.notes), *(_verbose(run) if verbose else ())],
+        notes=[" ".join(dict.fromkeys((*stages.notes, *compared.notes))), *(_verbose(run) if verbose else ())],
         csvs=csv_texts(run),
         figures=latency_figures(run, against_paper=against == "paper"),
         json=lambda: latency_json(run),

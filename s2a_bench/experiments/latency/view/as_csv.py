@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import astuple
 from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.cells import Cell, cells_of, ratios, stages_present
@@ -11,6 +12,9 @@ from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
+
+RATIOS = ("metric", "of", "to", "value", "ci95_low", "ci95_high", "launches", "launch_sd", "emulated")
+"""The columns of a table of ratios."""
 
 _METRICS = ("e2e_without_inference", "e2e", "ttft", "frame_age")
 
@@ -23,9 +27,9 @@ def csv_texts(run: Run) -> dict[str, CsvTable]:
         "stages.csv": CsvTable.of(("cell", "group", "stage", *SUMMARY, "emulated"), _stages(cells)),
         "summary.csv": CsvTable.of(("cell", "metric", "errors", "warmups", *SUMMARY, "emulated"), _summaries(cells)),
         "ratios.csv": CsvTable.of(
-            ("metric", "of", "to", "value", "ci95_low", "ci95_high", "emulated"),
+            RATIOS,
             (
-                (f"{metric}_ms", of.name, to.name, ratio.value, ratio.low, ratio.high, of.emulated or to.emulated)
+                (f"{metric}_ms", of.name, to.name, *astuple(ratio), of.emulated or to.emulated)
                 for metric, of, to, ratio in found
             ),
         ),

@@ -5,13 +5,13 @@ Warm-ups and failed samples are counted and take part in no summary.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from s2a_bench.provenance import UNKNOWN
 from s2a_bench.stats import Ratio
-from s2a_bench.stats.change import ratio_of_blocks
+from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import declared
 from s2a_bench.writers.tables import DUMMY, ECHO, EMULATED, PAPERS, Note
@@ -118,13 +118,18 @@ class Cell:
         """Return the times from a token's leaving the engine to the client's seeing it, of all requests, in ms."""
         return numbers_ms(self.answers["delay_ns"])
 
-    def by_block(self, metric: str) -> dict[int, list[float]]:
-        """Return the values of a metric in ms by the block in which they were taken."""
-        blocks: dict[int, list[float]] = {}
+    def by_launch(self, metric: str) -> dict[int, dict[int, list[float]]]:
+        """Return the values of a metric in ms by the launch and the block in which they were taken."""
         values = self._column(metric).dropna()
-        for block, value in zip(self.good.loc[values.index, "block"], values, strict=True):
-            blocks.setdefault(int(block), []).append(float(value) / _NS_PER_MS)
-        return blocks
+        return by_launch(self.good.loc[values.index], values / _NS_PER_MS)
+
+
+def by_launch(places: pd.DataFrame, values: Iterable[Any]) -> dict[int, dict[int, list[float]]]:
+    """Collect values by their places' columns ``launch`` and ``block``."""
+    found: dict[int, dict[int, list[float]]] = {}
+    for launch, block, value in zip(places["launch"], places["block"], values, strict=True):
+        found.setdefault(int(launch), {}).setdefault(int(block), []).append(float(value))
+    return found
 
 
 def numbers_ms(column: pd.Series[Any]) -> Floats:
@@ -134,7 +139,22 @@ def numbers_ms(column: pd.Series[Any]) -> Floats:
 
 def cells_of(run: Run) -> list[Cell]:
     """Split a run into its cells, in the order that their transports declare, then by name."""
-    samples, tokens, stages = run.samples, run.tokens, run.stages
+    return _cells(run, with_launch(run.samples))
+
+
+def launches_of(run: Run) -> list[tuple[int, list[Cell]]]:
+    """Return launch and cells for every launch of a run."""
+    samples = with_launch(run.samples)
+    return [(int(launch), _cells(run, samples[samples["launch"] == launch])) for launch in samples["launch"].unique()]
+
+
+def with_launch(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with the launch of each; folders from before there were several have the launch 0."""
+    return rows.assign(launch=rows["launch"].fillna(0))
+
+
+def _cells(run: Run, samples: pd.DataFrame) -> list[Cell]:
+    tokens, stages = run.tokens, run.stages
     cells = [
         _cell(str(name), samples[samples["cell"] == name], tokens[tokens["cell"] == name], stages)
         for name in samples["cell"].unique()
@@ -155,14 +175,14 @@ def ratios(cells: list[Cell], seed: int) -> Iterator[tuple[str, Cell, Cell, Rati
 
 
 def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | None:
-    """Divide the medians of two cells, block by block.
+    """Divide the medians of two cells, launch by launch and block by block.
 
     None where they cannot be compared: a llama-server's `ingest` slices and resizes the picture, which our engine
     counts as inference, so that only e2e means the same on both sides.
     """
     if metric == "e2e_without_inference" and cell.has_ingest != base.has_ingest:
         return None
-    return ratio_of_blocks(cell.by_block(metric), base.by_block(metric), seed)
+    return ratio_of_launches(cell.by_launch(metric), base.by_launch(metric), seed)
 
 
 def engine_note(run: Run, cells: list[Cell]) -> Note:

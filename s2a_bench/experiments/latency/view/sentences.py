@@ -54,6 +54,8 @@ def _times(cell: str, base: str, ratio: Ratio) -> str:
     """Return how many times as long as a base a cell takes."""
     between = ""
     if ratio.low is not None and ratio.high is not None:
-        between = f" (ratio of medians, 95 % interval {interval(ratio).partition(' ')[2][1:-1].replace(',', ' to')})"
+        over = f"over {ratio.launches} launches" if ratio.launches > 1 else "of one launch"
+        bounds = interval(ratio).partition(" ")[2][1:-1].replace(",", " to")
+        between = f" (ratio of medians {over}, 95 % interval {bounds})"
     value = "an unknown number of" if ratio.value is None else number(ratio.value)
     return f"{cell} takes {value} times as long as {base}{between}."

@@ -20,8 +20,10 @@ from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.writers.tables import ABSENT, TextTable, interval, mean_sd, number
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from s2a_bench.experiments.latency.view.cells import Floats
-    from s2a_bench.stats import Summary
+    from s2a_bench.stats import Ratio, Summary
     from s2a_bench.store.run import Run
 
 TITLES = {"e2e_without_inference": "End to end without inference", "e2e": "End to end"}
@@ -82,6 +84,7 @@ def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
         base for base in cells if base.values_ms(metric).size and any(cell.is_compared_with(base) for cell in cells)
     ]
     rows = []
+    found: list[Ratio] = []
     for cell in cells:
         summary = summary_of(cell.values_ms(metric))
         numbers = (
@@ -89,11 +92,13 @@ def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
             if summary
             else [ABSENT] * 4
         )
-        over = [_ratio(cell, base, metric, run.bootstrap_seed) for base in bases]
-        rows.append((cell.name, str(cell.n), str(cell.errors), *numbers, *over))
+        over = {base.name: _ratio(cell, base, metric, run.bootstrap_seed) for base in bases}
+        found += [ratio for ratio in over.values() if ratio]
+        ratios = ("1" if cell.name == base else interval(ratio) for base, ratio in over.items())
+        rows.append((cell.name, str(cell.n), str(cell.errors), *numbers, *ratios))
     header = ("cell", "n", "errors", "mean ± sd", "median", "p90", "p99", *(f"ratio to {base.name}" for base in bases))
     title = f"{TITLES[metric]} in ms; ratios of medians [95 % interval]"
-    return TextTable(title, header, rows, 1, notes=_notes(run, cells))
+    return TextTable(title, header, rows, 1, notes=(*_notes(run, cells), *filter(None, [launches_note(found)])))
 
 
 def token_table(run: Run) -> TextTable | None:
@@ -133,13 +138,24 @@ def _entry(summary: Summary | None, full: bool) -> str:
     return f"{number(summary.median)} ({mean_sd(summary)})" if full else number(summary.median)
 
 
-def _ratio(cell: Cell, base: Cell, metric: str, seed: int) -> str:
-    """Write the ratio of a cell to a base, where that is a comparison."""
-    if cell.name == base.name:
-        return "1"
-    if not cell.is_compared_with(base):
-        return ABSENT
-    return interval(ratio_between(cell, base, metric, seed))
+def _ratio(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | None:
+    """Return the ratio of a cell to a base, where that is a comparison."""
+    return ratio_between(cell, base, metric, seed) if cell.is_compared_with(base) else None
+
+
+def launches_note(ratios: Iterable[Ratio]) -> str:
+    """Return for what the intervals of ratios hold, one launch or any like those measured; empty without intervals."""
+    told = [ratio for ratio in ratios if ratio.low is not None]
+    if not told:
+        return ""
+    spreads = sorted(ratio.launch_sd for ratio in told if ratio.launch_sd is not None)
+    if not spreads:
+        return "The intervals hold for this launch only, the next may differ by more: measure with --launches 5."
+    span = " to ".join(dict.fromkeys(f"{spread * 100:.2g}" for spread in (spreads[0], spreads[-1])))
+    return (
+        f"Ratios are over {max(ratio.launches for ratio in told)} launches, which differ by a standard deviation of "
+        f"{span} %; the intervals (Student's t) hold for launches like these."
+    )
 
 
 def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:

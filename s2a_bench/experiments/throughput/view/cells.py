@@ -8,12 +8,12 @@ engine's own time from the end of the prompt to the last token; where a server d
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of
+from s2a_bench.experiments.latency.view.cells import Cell, by_launch, cells_of, launches_of, with_launch
 from s2a_bench.experiments.throughput.rows import REFERENCE
 from s2a_bench.facts import (
     END_N,
@@ -25,7 +25,7 @@ from s2a_bench.facts import (
     PROMPT_N,
 )
 from s2a_bench.machine.resources.rows import ENERGY_J
-from s2a_bench.stats.change import ratio_of_blocks
+from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.transport import declared
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ RATIO_METRIC = "decode_tokens_per_s"
 LLAMA_BENCH: Final = "llama-bench"
 """How the reference is called where cells are listed."""
 
-_SAMPLE = ("request_id", "block", "ttft_ns", "facts")
+_SAMPLE = ("request_id", "launch", "block", "ttft_ns", "facts")
 
 BIN = 32
 """Tokens of one bin of the rates by position."""
@@ -73,26 +73,27 @@ class Speed:
 
     @cached_property
     def requests(self) -> pd.DataFrame:
-        """Return a row a request that counts, with ``block`` and a column a metric; NaN where it has none."""
+        """Return a row a request that counts, with its place and a column a metric; NaN where it has none."""
         import pandas as pd
 
         times = self.cell.tokens.groupby("request_id")["client_ns"].agg(["min", "max", "size"])
         rows = []
         good = self.cell.good
-        for request, block, ttft_ns, facts in zip(*(good[name] for name in _SAMPLE), strict=True):
+        for request, launch, block, ttft_ns, facts in zip(*(good[name] for name in _SAMPLE), strict=True):
             first_ns, last_ns, events = (int(value) for value in times.loc[request])
             numbers = _metrics(json.loads(str(facts)), events, (last_ns - first_ns) / 1e9)
-            rows.append({"block": block, **numbers, "ttft_ms": None if pd.isna(ttft_ns) else ttft_ns / 1e6})
-        return pd.DataFrame(rows, columns=["block", *METRICS, "tokens", "events", "told"])
+            place = {"launch": launch, "block": block}
+            rows.append({**place, **numbers, "ttft_ms": None if pd.isna(ttft_ns) else ttft_ns / 1e6})
+        return pd.DataFrame(rows, columns=["launch", "block", *METRICS, "tokens", "events", "told"])
 
     def values(self, metric: str) -> Floats:
         """Return the values of a metric, one a request that has it."""
         return self.requests[metric].dropna().to_numpy(dtype="float64")
 
-    def by_block(self, metric: str) -> dict[int, list[float]]:
-        """Return the values of a metric by the block in which they were taken."""
+    def by_launch(self, metric: str) -> dict[int, dict[int, list[float]]]:
+        """Return the values of a metric by the launch and the block in which they were taken."""
         there = self.requests[self.requests[metric].notna()]
-        return _by_block(there["block"], there[metric])
+        return by_launch(there, there[metric])
 
     def by_position(self) -> dict[tuple[int, int], Floats]:
         """Return (first, last token of a bin, from 0) -> decode rates there, one a request that got so far.
@@ -151,30 +152,31 @@ def _metrics(facts: dict[str, float], events: int, span_s: float) -> dict[str, A
     return found
 
 
-def _by_block(blocks: Iterable[Any], values: Iterable[Any]) -> dict[int, list[float]]:
-    """Collect values by their block."""
-    found: dict[int, list[float]] = {}
-    for block, value in zip(blocks, values, strict=True):
-        found.setdefault(int(block), []).append(float(value))
-    return found
-
-
 def speeds_of(run: Run) -> list[Speed]:
     """Split a run into its cells: in-process first, then HTTP and ROS."""
-    speeds = [Speed(cell) for cell in cells_of(run)]
-    return sorted(speeds, key=lambda speed: not declared(speed.cell.pipeline).in_process)
+    return _speeds(cells_of(run))
 
 
-def reference_by_block(run: Run) -> dict[int, list[float]]:
-    """Return llama-bench's tokens/s by block, its warm-ups left out."""
-    rows = run.table(REFERENCE)
+def speeds_by_launch(run: Run) -> list[tuple[int, list[Speed]]]:
+    """Return launch and cells for every launch of a run."""
+    return [(launch, _speeds(cells)) for launch, cells in launches_of(run)]
+
+
+def _speeds(cells: list[Cell]) -> list[Speed]:
+    return sorted(map(Speed, cells), key=lambda speed: not declared(speed.cell.pipeline).in_process)
+
+
+def reference_by_launch(run: Run) -> dict[int, dict[int, list[float]]]:
+    """Return llama-bench's tokens/s by launch and block, its warm-ups left out."""
+    rows = with_launch(run.table(REFERENCE))
     counted = rows[~rows["warmup"]]
-    return _by_block(counted["block"], counted["n_gen"] / counted["decode_ns"] * 1e9)
+    return by_launch(counted, counted["n_gen"] / counted["decode_ns"] * 1e9)
 
 
 def reference_values(run: Run) -> list[float]:
     """Return llama-bench's tokens/s in the order of the blocks."""
-    return [value for _, values in sorted(reference_by_block(run).items()) for value in values]
+    launches = sorted(reference_by_launch(run).items())
+    return [value for _, blocks in launches for _, values in sorted(blocks.items()) for value in values]
 
 
 def reference_depths(run: Run) -> list[int]:
@@ -185,13 +187,13 @@ def reference_depths(run: Run) -> list[int]:
 
 def ratios_of(run: Run, speeds: list[Speed]) -> Iterator[tuple[str, str, Ratio]]:
     """Yield cell, base and ratio: every cell to llama-bench where it ran, and every other cell to in-process."""
-    reference = reference_by_block(run)
+    reference = reference_by_launch(run)
     base = next((speed for speed in speeds if declared(speed.cell.pipeline).in_process), None)
     for speed in speeds:
-        values = speed.by_block(RATIO_METRIC)
-        if ratio := ratio_of_blocks(values, reference, run.bootstrap_seed):
+        values = speed.by_launch(RATIO_METRIC)
+        if ratio := ratio_of_launches(values, reference, run.bootstrap_seed):
             yield speed.name, LLAMA_BENCH, ratio
         if base is not None and speed is not base:
-            ratio = ratio_of_blocks(values, base.by_block(RATIO_METRIC), run.bootstrap_seed)
+            ratio = ratio_of_launches(values, base.by_launch(RATIO_METRIC), run.bootstrap_seed)
             if ratio:
                 yield speed.name, base.name, ratio

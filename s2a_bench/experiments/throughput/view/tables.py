@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from typing import TYPE_CHECKING
 
+from s2a_bench.experiments.latency.view.as_csv import RATIOS
 from s2a_bench.experiments.latency.view.cells import engine_note
+from s2a_bench.experiments.latency.view.tables import launches_note
 from s2a_bench.experiments.throughput.view.cells import (
     BIN,
     LLAMA_BENCH,
@@ -123,13 +126,11 @@ def throughput_csv(run: Run) -> dict[str, CsvTable]:
         for (first, last), rates in speed.by_position().items()
     ]
     emulated = any(speed.cell.emulated for speed in speeds)  # one engine answers in all cells of a run
-    ratios = [
-        (RATIO_METRIC, of, to, ratio.value, ratio.low, ratio.high, emulated) for of, to, ratio in ratios_of(run, speeds)
-    ]
+    ratios = [(RATIO_METRIC, of, to, *astuple(ratio), emulated) for of, to, ratio in ratios_of(run, speeds)]
     return {
         "throughput.csv": CsvTable.of(("cell", "metric", *SUMMARY, "emulated"), summaries),
         "positions.csv": CsvTable.of(("cell", "first", "last", *SUMMARY, "emulated"), positions),
-        "ratios.csv": CsvTable.of(("metric", "of", "to", "value", "ci95_low", "ci95_high", "emulated"), ratios),
+        "ratios.csv": CsvTable.of(RATIOS, ratios),
     }
 
 
@@ -144,6 +145,8 @@ def _notes(run: Run, speeds: list[Speed]) -> tuple[str, ...]:
     if sampling := (run.manifest.get("model") or {}).get("sampling"):
         facts.append(f"sampling of our engine: {sampling}")
     notes.append(f"{', '.join(facts)}.")
+    if note := launches_note(ratio for _, _, ratio in ratios_of(run, speeds)):
+        notes.append(note)
     if note := engine_note(run, [speed.cell for speed in speeds]):
         notes.append(note.sentence())
     if depths := reference_depths(run):
