@@ -13,9 +13,10 @@ from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Finding, Machine, examine
 from s2a_bench.machine.doctor.robot import RMEM_WANTED
+from s2a_bench.stats.batches import Memory
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SampleRow
-from s2a_bench.trace import RESIDUAL_LIMIT, budget
+from s2a_bench.trace import RESIDUAL_LIMIT, Budget, budget
 
 CLOCK_STEP_NS = 50_000_000
 SURELY_OFF_MS, SURELY_OFF_SHARE = 20.0, 0.25
@@ -105,6 +106,8 @@ class SampleGuard:
     _uncounted: dict[str, int] = field(default_factory=dict)
     _hits: dict[str, int] = field(default_factory=dict)
     _last: dict[str, str] = field(default_factory=dict)
+    _times_ns: dict[str, list[int]] = field(default_factory=dict)
+    _launches: set[int] = field(default_factory=set)
 
     def see(self, row: SampleRow, fingerprint: int) -> None:
         """Look at one sample and the fingerprint of its picture."""
@@ -128,9 +131,16 @@ class SampleGuard:
         off_ms = row.facts.get(HEADERS_OFF_MS, 0.0)
         if not row.warmup and abs(off_ms) > max(SURELY_OFF_MS, SURELY_OFF_SHARE * (row.server_prompt_ms or 0.0)):
             _count(self._headers_early if off_ms > 0 else self._headers_late, row.cell)
-        share = budget(row.marks).residual_share
-        if not row.warmup and share is not None and share > RESIDUAL_LIMIT:
+        if not row.warmup:
+            self._see_times(row, budget(row.marks))
+
+    def _see_times(self, row: SampleRow, spent: Budget) -> None:
+        """Look at where the time of a sample that counts has gone."""
+        share, whole_ns = spent.residual_share, spent.e2e_without_inference_ns
+        if share is not None and share > RESIDUAL_LIMIT:
             _count(self._residual, row.cell)
+        self._launches.add(row.launch)
+        self._times_ns.setdefault(row.cell, []).append(spent.e2e_ns if whole_ns is None else whole_ns)
 
     def see_hits(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
         """Look at what servers count of their caches' hits before the run and after it."""
@@ -207,6 +217,26 @@ class SampleGuard:
             ),
             *_told(self._lost, "lost-messages", "requests lost messages on the way", "--dds-tuning tuned"),
             *_told(self._failed, "failed-samples", "requests failed", "see the column error of samples.csv"),
+            *(self._alike() if len(self._launches) == 1 else ()),
+        ]
+
+    def _alike(self) -> list[RunWarning]:
+        """Look at whether neighbouring samples are too much alike; over several launches no interval asks for more."""
+        import numpy as np
+
+        found = []
+        for cell, times_ns in self._times_ns.items():
+            memory = Memory.of(np.array(times_ns, dtype=np.float64))
+            if memory.dependent:
+                found.append(f"{cell}: {memory.n} samples tell as much as {memory.effective:.0f}")
+        if not found:
+            return []
+        return [
+            RunWarning(
+                "autocorrelation",
+                f"neighbouring samples are alike: intervals of this launch may be too narrow ({', '.join(found)})",
+                "measure several launches, --launches 5, or more samples, --runs",
+            )
         ]
 
 

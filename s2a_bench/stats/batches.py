@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias, final
@@ -26,6 +27,9 @@ FEWEST_ROWS: Final = 5
 
 FEWEST_BEYOND: Final = 5
 """A percentile has an interval where at least so many values lie beyond it: p90 needs 50 values, p99 500."""
+
+CHANCE: Final = 2.0
+"""Independent neighbours correlate with a standard deviation of about 1 / sqrt(n): beyond so many it is no chance."""
 
 _RESAMPLES: Final = 1000
 
@@ -117,9 +121,14 @@ class Memory:
         return cls(r, len(levels), min(BATCHES, len(levels)))
 
     @property
+    def effective(self) -> float:
+        """Return how many independent rows tell as much: n (1 - r) / (1 + r)."""
+        return self.n * (1 - self.r) / (1 + self.r)
+
+    @property
     def dependent(self) -> bool:
-        """Whether rows remember longer than a batch lasts: about (1 + r) / (1 - r) rows."""
-        return (1 + self.r) > self.n / self.k * (1 - self.r)
+        """Whether rows remember longer than a batch lasts, about (1 + r) / (1 - r) rows, which is no mere chance."""
+        return self.effective < self.k and self.r > CHANCE / math.sqrt(self.n)
 
     @property
     def hidden(self) -> float:

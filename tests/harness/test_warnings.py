@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from s2a_bench.harness.session import INTERRUPTED
@@ -107,6 +109,33 @@ def test_a_warning_names_cells_and_the_way_out() -> None:
 def test_counters_that_rise_are_warnings(after: Counters, code: str) -> None:
     before = Counters(receive_buffer_errors=0, throttles=0)
     assert [warning.code for warning in after.warnings_since(before)] == [code]
+
+
+def series(correlation: float, n: int = 60, launches: int = 1) -> list[SampleRow]:
+    """Return samples whose times remember the one before (AR(1))."""
+    rng = np.random.default_rng(4)
+    level, rows = 0.0, []
+    for place in range(n):
+        level = correlation * level + (1 - correlation**2) ** 0.5 * rng.standard_normal()
+        end_ns = round(1e6 * 1.1**level)
+        marks: list[Mark] = [("", 0), ("network", end_ns), ("inference", end_ns + 5), ("return", end_ns + 6)]
+        rows.append(row(f"{place}", marks=marks, launch=place * launches // n))
+    return rows
+
+
+def test_neighbours_that_are_alike_are_a_warning_with_the_way_out() -> None:
+    guard = SampleGuard()
+    for place, sample in enumerate(series(0.95, 100)):
+        guard.see(sample, place)
+    (warning,) = guard.warnings()
+    assert warning.code == "autocorrelation"
+    assert re.search(r"ros/topic: 100 samples tell as much as \d+\b", warning.message)
+    assert "--launches 5" in warning.advice
+
+
+@pytest.mark.parametrize(("correlation", "n", "launches"), [(0.0, 60, 1), (0.3, 60, 1), (0.0, 10, 1), (0.9, 60, 3)])
+def test_few_or_other_samples_or_several_launches_are_none(correlation: float, n: int, launches: int) -> None:
+    assert codes(*((sample, place) for place, sample in enumerate(series(correlation, n, launches)))) == []
 
 
 def test_failures_in_a_row_end_with_a_success() -> None:
