@@ -1,8 +1,13 @@
-"""How a child process ended, in words that say what to do."""
+"""How processes end: the exit codes of our own, and those of a child in words that say what to do."""
 
 from __future__ import annotations
 
 from signal import SIGILL
+
+TRIPPED = 3
+"""Exit code of `compare` where a gate trips."""
+UNDECIDED = 4
+"""Exit code of `compare` where no gate trips and one could not have seen a change of the size of its limit."""
 
 SETUP_AGAIN = "run `make setup` again"
 COMPILE_AGAIN = "compile it on this machine"

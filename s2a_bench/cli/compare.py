@@ -11,13 +11,11 @@ import typer
 from s2a_bench.cli.adapter import command
 from s2a_bench.cli.output import Json, print_json
 from s2a_bench.cli.output import console as open_console
+from s2a_bench.exits import TRIPPED, UNDECIDED
 from s2a_bench.report.compare.config import CompareConfig
 
 if TYPE_CHECKING:
     from s2a_bench.report.compare.gates import Judgement
-
-TRIPPED = 3
-"""Exit code where a gate trips."""
 
 
 def _compare(config: CompareConfig, *, json_: Json = False) -> None:
@@ -55,15 +53,16 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
 def _gate_code(judgements: Sequence[Judgement]) -> int:
     """Print what the gates found, and return the exit code: a tripped gate before one that cannot be judged."""
     from s2a_bench.report.compare import gates as compare_gates
-    from s2a_bench.report.compare.tables import change_text
+    from s2a_bench.report.compare.tables import change_text, seen_text
 
     for one in judgements:
         line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {change_text(one.comparison)}"
         p = "" if one.p_holm is None else f", p = {one.p_holm:.2g}"
-        few = "; too few values for a test: measure more, or --strict" if one.outcome == compare_gates.UNDECIDED else ""
-        _say(line + p + few)
+        seen = f", sees {seen_text(one.detectable)}"
+        few = "; measure more launches (--launches), or --strict" if one.outcome == compare_gates.UNDECIDED else ""
+        _say(line + p + ("; too few values for a test" if one.detectable is None else seen) + few)
     outcomes = {one.outcome for one in judgements}
-    return TRIPPED if compare_gates.TRIPPED in outcomes else 1 if compare_gates.UNDECIDED in outcomes else 0
+    return TRIPPED if compare_gates.TRIPPED in outcomes else UNDECIDED if compare_gates.UNDECIDED in outcomes else 0
 
 
 def _say(line: str) -> None:

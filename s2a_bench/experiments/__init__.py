@@ -62,7 +62,7 @@ class Subject:
 
     ``setting`` is what must be the same on both sides besides the name. ``rows`` gives a metric's values, a row a
     request (or plan) in the order in which they were made, none where the cell does not have the metric. ``exact``
-    values are computed without chance.
+    values are computed without chance. ``launch`` counts the launches of a run, each of which has every cell.
     """
 
     name: str
@@ -71,6 +71,7 @@ class Subject:
     errors: int
     rows: Callable[[str], Rows]
     exact: bool = False
+    launch: int = 0
 
 
 @dataclass(frozen=True, slots=True)

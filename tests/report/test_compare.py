@@ -62,6 +62,7 @@ def launch(tmp_path: Path, make_row: MakeRow) -> Launch:
         correlation: float = 0.4,
         cells: Any = tuple(CELLS),
         manifest: dict[str, Any] | None = None,
+        launches: int = 1,
         **facts: Any,
     ) -> Run:
         rng = np.random.default_rng(seed)
@@ -75,7 +76,7 @@ def launch(tmp_path: Path, make_row: MakeRow) -> Launch:
                     for stage, length_ms in STAGES.items():
                         at_ns += round(length_ms * slow * 1e6)
                         marks.append((stage, at_ns))
-                    run.sample(make_row(cell, STAGES, block, marks=marks, **facts))
+                    run.sample(make_row(cell, STAGES, block, marks=marks, launch=block * launches // n, **facts))
         return read_run(run.path)
 
     return make
@@ -320,8 +321,38 @@ def test_a_gate_does_not_trip_on_noise_unless_it_is_strict(launch: Launch) -> No
     assert one.p_holm is not None
     assert one.p_holm > 0.05
     rises = (one.comparison.change.relative or 0) > 0
-    assert one.outcome == "passed"
+    assert one.outcome == "undecided"
+    assert one.detectable is not None
+    assert one.detectable > 0.02
+    assert outcomes(found, f"e2e>{one.detectable * 100 + 0.1:.1f}%") == {"passed"}
     assert outcomes(found, "e2e>0%" if rises else "e2e<-0%", strict=True) == {"tripped"}
+
+
+def test_a_gate_passes_where_the_change_the_other_way_is_one(launch: Launch) -> None:
+    found = opened(launch(1, n=60), launch(2, n=60, factor=0.7))
+    assert outcomes(found, "e2e>0%") == {"passed"}
+    assert outcomes(found, "e2e<-0%") == {"tripped"}
+
+
+def test_the_smallest_change_that_could_be_seen_is_told_and_depends_on_the_noise(launch: Launch) -> None:
+    few, many = (compared(launch(1, n=n), launch(2, n=n), "e2e") for n in (20, 400))
+    for wide, narrow in zip(few.comparisons, many.comparisons, strict=True):
+        assert wide.detectable is not None
+        assert narrow.detectable is not None
+        assert wide.detectable > 2 * narrow.detectable
+    assert "one launch a side" in compare_table(few).notes[-1]
+    assert compare_table(few).header[-2:] == ("sees", "verdict")
+
+
+def test_launches_of_one_folder_count_as_launches(launch: Launch) -> None:
+    folders = [launch(1, n=60, launches=3), launch(2, n=60, launches=3)]
+    found = compared(*folders, "e2e")
+    assert found.launches
+    assert {one.n for one in found.comparisons} == {(60, 60)}
+    assert "one-launch" not in {warning.code for warning in warnings_of(found)}
+    apart = [[launch(10 * side + each) for each in range(3)] for side in (1, 2)]
+    both = open_comparison(folders[:1], apart[1], unlike=False, least=0.05)
+    assert [len(side) for side in (both.pairs[0].baseline, both.pairs[0].other)] == [3, 3]
 
 
 def test_a_gate_that_too_few_values_feed_is_undecided_not_passed(launch: Launch) -> None:

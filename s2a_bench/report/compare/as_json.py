@@ -13,6 +13,7 @@ from s2a_bench.experiments import Better
 from s2a_bench.report.compare.alike import Difference
 from s2a_bench.report.compare.comparison import LEVEL
 from s2a_bench.stats.batches import BATCHES
+from s2a_bench.stats.power import POWER
 from s2a_bench.store.manifest import RunWarning, plain
 
 if TYPE_CHECKING:
@@ -22,6 +23,13 @@ if TYPE_CHECKING:
 
 Interval: TypeAlias = tuple[float, float] | None
 Probability: TypeAlias = Annotated[float | None, {"minimum": 0, "maximum": 1}]
+Detectable: TypeAlias = Annotated[
+    float | None,
+    {
+        "minimum": 0,
+        "description": "The smallest change, as a share, that the test would have found; null where nothing tells it.",
+    },
+]
 Folders: TypeAlias = Annotated[list[str], {"minItems": 1}]
 Count: TypeAlias = Annotated[int, {"minimum": 1}]
 
@@ -50,6 +58,7 @@ class Test:
     correction: Literal["Holm"]
     level: float
     least_change: Annotated[float, {"minimum": 0}]
+    power: Annotated[float, {"description": "How often a change of the size `detectable` is found."}]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +81,7 @@ class Row:
     superiority: Annotated[Effect, {"description": "Probability that a value of B is above one of A, ties half."}]
     p: Probability
     p_holm: Probability
+    detectable: Detectable
     verdict: Literal["better", "worse", "lower", "higher", "same", "unclear", "too few"]
 
     @classmethod
@@ -95,6 +105,7 @@ class Row:
             superiority=Effect.of(change.superiority),
             p=change.p,
             p_holm=one.p_holm,
+            detectable=one.detectable,
             verdict=one.verdict,  # type: ignore[arg-type] # one of the words of `verdict`
         )
 
@@ -108,6 +119,7 @@ class Gated:
     change: float | None
     ci95: Interval
     p_holm: Probability
+    detectable: Detectable
     outcome: Literal["passed", "tripped", "undecided"]
 
     @classmethod
@@ -115,7 +127,8 @@ class Gated:
         """Return a judgement as JSON holds it."""
         change = one.comparison.change
         outcome: Any = one.outcome
-        return cls(one.gate.text, one.comparison.pair.name, change.relative, change.bounds, one.p_holm, outcome)
+        name = one.comparison.pair.name
+        return cls(one.gate.text, name, change.relative, change.bounds, one.p_holm, one.detectable, outcome)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +166,7 @@ def compare_json(
             compared=compared.command,
             baseline=[str(run.path) for run in compared.baseline],
             other=[str(run.path) for run in compared.other],
-            test=Test("Welch's t on logarithms", unit, batches, "Holm", LEVEL, compared.least),
+            test=Test("Welch's t on logarithms", unit, batches, "Holm", LEVEL, compared.least, POWER),
             comparisons=[Row.of(one) for one in compared.comparisons],
             only_in_baseline=list(compared.only[0]),
             only_in_other=list(compared.only[1]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -39,7 +39,10 @@ class Pair:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One statistic of one cell: what changed, the p-value corrected for all comparisons, and the verdict."""
+    """One statistic of one cell: what changed, the p-value corrected for all comparisons, and the verdict.
+
+    ``detectable`` is the smallest rise, as a share, that the test would have found in `POWER` of repeats.
+    """
 
     pair: Pair
     metric: Metric
@@ -48,6 +51,7 @@ class Comparison:
     change: Change
     p_holm: float | None = None
     verdict: str = TOO_FEW
+    detectable: float | None = None
 
     @property
     def name(self) -> str:
@@ -75,7 +79,12 @@ class ComparedRuns:
     @property
     def launches(self) -> bool:
         """Return whether launches were repeated on both sides, so that they are what the test goes by."""
-        return len(self.baseline) > 1 and len(self.other) > 1
+        return len(self.pairs[0].baseline) > 1
+
+    @property
+    def one_launch(self) -> bool:
+        """Whether what differs from launch to launch is in no interval, and there is such a thing."""
+        return not self.launches and any(pair.baseline[0].setting.get("mode") != "virtual" for pair in self.pairs)
 
     @property
     def origins(self) -> Origins:
@@ -99,15 +108,16 @@ def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bo
     if len(commands) > 1:
         raise UsageError(f"these are runs of {' and '.join(commands)}: name runs of one command")
     by = _declared(commands[0])
-    if (len(baseline) > 1) != (len(other) > 1):
+    sides = [[launch for run in side for launch in _launches(by.subjects(run))] for side in (baseline, other)]
+    if (len(sides[0]) > 1) != (len(sides[1]) > 1):
         raise UsageError(
-            "name several launches on both sides, or one on each: the test goes by launches or by requests"
+            "name several launches on both sides, or one on each: the test goes by launches or by requests; "
+            "`launches` measures several in one run"
         )
     found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
     fatal = [difference for difference in found if difference.fatal]
     if fatal and not unlike:
         raise UnlikeRuns(f"the runs are unlike: {in_words(fatal)}; `unlike` compares them all the same")
-    sides = [[{cell.name: cell for cell in by.subjects(run)} for run in side] for side in (baseline, other)]
     pairs, only, settings = _match(*sides)
     if settings and not unlike:
         raise UnlikeRuns(f"cells of one name differ: {in_words(settings)}; `unlike` compares them all the same")
@@ -115,6 +125,14 @@ def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bo
         raise UnlikeRuns(f"no cell is in every run: {', '.join(only[0])} against {', '.join(only[1])}")
     metrics = {**by.metrics, **by_name(metric for run in runs for metric in by.own(run))}
     return ComparedRuns(tuple(baseline), tuple(other), by, metrics, (*settings, *found), tuple(pairs), only, least)
+
+
+def _launches(subjects: Iterable[Subject]) -> list[dict[str, Subject]]:
+    """Return the cells of a run by their names, launch by launch."""
+    found: dict[int, dict[str, Subject]] = {}
+    for subject in subjects:
+        found.setdefault(subject.launch, {})[subject.name] = subject
+    return list(found.values()) or [{}]
 
 
 def _declared(command: str) -> Compared:
@@ -180,14 +198,27 @@ def metric_of(compared: ComparedRuns, name: str, flag: str) -> tuple[Metric, str
 
 
 def compare(compared: ComparedRuns, wanted: Sequence[tuple[Metric, str]]) -> ComparedRuns:
-    """Compare every cell by every metric that it has on both sides, and judge what changed."""
+    """Compare every cell by every metric that it has on both sides, judge what changed, and tell what had been seen.
+
+    What could be seen is told for the first step of Holm's correction, whose level is the strictest.
+    """
     found = [found for metric, statistic in wanted for found in changes(compared, metric, statistic)]
     corrected = holm([comparison.change.p for comparison in found])
     judged = [
-        replace(one, p_holm=p, verdict=verdict(one.change, p, one.metric, compared.least))
+        replace(
+            one,
+            p_holm=p,
+            verdict=verdict(one.change, p, one.metric, compared.least),
+            detectable=detectable(one.change, len(found)),
+        )
         for one, p in zip(found, corrected, strict=True)
     ]
     return replace(compared, comparisons=tuple(judged))
+
+
+def detectable(change: Change, tests: int, *, falls: bool = False) -> float | None:
+    """Return the smallest rise (or fall) that one of so many tests would have found; None where it has no noise."""
+    return None if change.noise is None else change.noise.detectable(LEVEL / tests, falls=falls)
 
 
 def changes(compared: ComparedRuns, metric: Metric, statistic: str) -> Iterator[Comparison]:

@@ -13,8 +13,15 @@ from fnmatch import fnmatchcase
 from typing import Final
 
 from s2a_bench.errors import UsageError
-from s2a_bench.report.compare.comparison import LEVEL, ComparedRuns, Comparison, changes, metric_of
-from s2a_bench.stats.change import holm
+from s2a_bench.report.compare.comparison import (
+    LEVEL,
+    ComparedRuns,
+    Comparison,
+    changes,
+    detectable,
+    metric_of,
+)
+from s2a_bench.stats.change import Change, holm
 
 _FLAG: Final = "`fail_if`"
 _FORM: Final = re.compile(r"(?:(?P<cells>.+):)?(?P<metric>[\w.]+)\s*(?P<sign>>|<\s*-)\s*(?P<limit>\d+(?:\.\d+)?)\s*%")
@@ -47,6 +54,8 @@ class Judgement:
     comparison: Comparison
     p_holm: float | None
     outcome: str
+    detectable: float | None
+    """The smallest change towards the limit that the test would have found, as a share."""
 
 
 def read_gate(text: str) -> Gate:
@@ -63,15 +72,17 @@ def judge(compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool) -> lis
     """Judge every gate in every cell it is about.
 
     A gate trips where the change is past the limit *and* is one: its p-value, corrected by Holm for all cells of all
-    gates, is below `LEVEL`. With ``strict`` the change itself is enough. Without it a gate is undecided where there are
-    too few values for a test. Raises UsageError for a metric or a cell that there is not.
+    gates, is below `LEVEL`. It passes where a change of the limit's size would have been seen, or one the other way
+    was; else it is undecided. With ``strict`` the change itself decides. Raises UsageError for a metric or a cell that
+    there is not.
     """
     asked = [(gate, one) for gate in gates for one in _concerned(compared, gate)]
     corrected = holm([one.change.p for _, one in asked])
-    return [
-        Judgement(gate, one, p, _outcome(gate, one, p, strict=strict))
-        for (gate, one), p in zip(asked, corrected, strict=True)
-    ]
+    judged = []
+    for (gate, one), p in zip(asked, corrected, strict=True):
+        seen = detectable(one.change, len(asked), falls=not gate.rises)
+        judged.append(Judgement(gate, one, p, _outcome(gate, one.change, p, seen, strict=strict), seen))
+    return judged
 
 
 def _concerned(compared: ComparedRuns, gate: Gate) -> list[Comparison]:
@@ -85,11 +96,14 @@ def _concerned(compared: ComparedRuns, gate: Gate) -> list[Comparison]:
     return found
 
 
-def _outcome(gate: Gate, comparison: Comparison, p_holm: float | None, *, strict: bool) -> str:
-    """Say in a word what a gate finds."""
-    change = comparison.change
-    past = gate.beyond(change.relative, change.other > change.baseline)
-    if p_holm is None and not strict:
-        return UNDECIDED
+def _outcome(gate: Gate, change: Change, p_holm: float | None, seen: float | None, *, strict: bool) -> str:
+    """Say in a word what a gate finds; ``seen`` is the smallest change that there was a fair chance to find."""
+    rises = change.other > change.baseline
+    past = gate.beyond(change.relative, rises)
+    if strict:
+        return TRIPPED if past else PASSED
     significant = p_holm is not None and p_holm < LEVEL
-    return TRIPPED if past and (strict or significant) else PASSED
+    if past and significant:
+        return TRIPPED
+    other_way = significant and rises != gate.rises
+    return PASSED if other_way or (seen is not None and seen <= abs(gate.limit)) else UNDECIDED

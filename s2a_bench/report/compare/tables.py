@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.report.compare.comparison import LEVEL
 from s2a_bench.stats.batches import BATCHES
+from s2a_bench.stats.power import POWER
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
     from s2a_bench.report.compare.comparison import ComparedRuns, Comparison
 
-_HEADER = ("cell", "n", "A", "B", "change [95 %]", "P(B > A)", "p", "verdict")
+_HEADER = ("cell", "n", "A", "B", "change [95 %]", "P(B > A)", "p", "sees", "verdict")
 _LEAST_P = 0.0005
+_MOST_SEEN = 10
 
 
 def compare_table(compared: ComparedRuns) -> TextTable:
@@ -40,12 +42,14 @@ def compare_table(compared: ComparedRuns) -> TextTable:
 
 def notes(compared: ComparedRuns) -> tuple[str, ...]:
     """Return what A and B are, and how a verdict comes about."""
+    of_one = ", that of one launch a side" if compared.one_launch else ""
     unit = "launches" if compared.launches else f"{BATCHES} batches in time of each launch"
     return (
         title(compared),
         f"Welch's t on logarithms over {unit}; p corrected for {len(compared.comparisons)} comparisons (Holm).",
         f"better, worse: p < {LEVEL:g} and a change of at least {compared.least * 100:g} %.",
         "same: the interval lies within that; unclear: neither; too few: no interval.",
+        f"sees: the smallest change found in {POWER * 100:g} of 100 repeats at this noise{of_one}.",
     )
 
 
@@ -60,7 +64,7 @@ def compare_csv(compared: ComparedRuns) -> str:
     """Write a row a comparison, every digit kept."""
     header = ("cell", "metric", "statistic", "unit", "n_baseline", "n_other", "baseline", "other", "ratio", "ratio_low",
               "ratio_high", "difference", "difference_low", "difference_high", "superiority", "superiority_low",
-              "superiority_high", "p", "p_holm", "verdict")  # fmt: skip
+              "superiority_high", "p", "p_holm", "detectable", "verdict")  # fmt: skip
     return CsvTable.of(header, (_full(one) for one in compared.comparisons)).text(compared.origins)
 
 
@@ -79,6 +83,13 @@ def change_text(one: Comparison) -> str:
     return f"{percent(relative)} %{interval}"
 
 
+def seen_text(share: float | None) -> str:
+    """Write the smallest change that could have been seen, in per cent."""
+    if share is None:
+        return ABSENT
+    return "> 1000 %" if share > _MOST_SEEN else f"{percent(share).lstrip('+')} %"
+
+
 def _title(one: Comparison) -> str:
     return f"{one.metric.name}: {one.statistic}" + (f", {one.metric.unit}" if one.metric.unit else "")
 
@@ -89,7 +100,7 @@ def _row(one: Comparison) -> tuple[str, ...]:
     change = one.change
     superiority = ABSENT if change.superiority.value is None else f"{change.superiority.value:.2f}"
     values = number(change.baseline), number(change.other)
-    return n, *values, change_text(one), superiority, _p(one.p_holm), one.verdict
+    return n, *values, change_text(one), superiority, _p(one.p_holm), seen_text(one.detectable), one.verdict
 
 
 def _p(value: float | None) -> str:
@@ -106,5 +117,5 @@ def _full(one: Comparison) -> tuple[object, ...]:
     return (
         one.pair.name, one.metric.name, one.statistic, one.metric.unit, *one.n, change.baseline, change.other,
         *(value for effect in effects for value in (effect.value, effect.low, effect.high)),
-        change.p, one.p_holm, one.verdict,
+        change.p, one.p_holm, one.detectable, one.verdict,
     )  # fmt: skip

@@ -33,12 +33,11 @@ def _runs(compared: ComparedRuns) -> Iterator[RunWarning]:
 
 def _test(compared: ComparedRuns) -> Iterator[RunWarning]:
     """Look at whether the intervals can be believed."""
-    measured = any(pair.baseline[0].setting.get("mode") != "virtual" for pair in compared.pairs)
-    if measured and not compared.launches:
+    if compared.one_launch:
         yield RunWarning(
             "one-launch",
             "one launch a side: what differs from launch to launch alone is not in the intervals",
-            "repeat the launches, A and B in turn, and name them with commas",
+            "measure both with --launches 5, or repeat the launches, A and B in turn, and name them with commas",
         )
     if names := sorted({one.pair.name for one in compared.comparisons if one.change.dependent}):
         yield RunWarning(

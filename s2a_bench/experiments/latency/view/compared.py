@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from s2a_bench.experiments import Compared, Metric, Subject, by_name
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note, numbers_ms
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note, launches_of, numbers_ms
 from s2a_bench.trace import GROUPS
 
 if TYPE_CHECKING:
@@ -21,9 +21,9 @@ TOKEN_METRICS: Final = (Metric("itl", "ms"), Metric("token_delay", "ms"))
 """What the tokens of a request show, so that a row has several values."""
 
 
-def subject_of(cell: Cell, rows: Callable[[str], Rows]) -> Subject:
-    """Return a cell of requests as it is compared."""
-    return Subject(cell.name, cell.about, cell.n, cell.errors, rows)
+def subject_of(cell: Cell, rows: Callable[[str], Rows], launch: int) -> Subject:
+    """Return a cell of requests in one launch as it is compared."""
+    return Subject(cell.name, cell.about, cell.n, cell.errors, rows, launch=launch)
 
 
 def origin_of(run: Run) -> list[str]:
@@ -43,7 +43,7 @@ def singles(values: Floats) -> Rows:
 
 
 def _subjects(run: Run) -> list[Subject]:
-    return [subject_of(cell, partial(_rows, cell)) for cell in cells_of(run)]
+    return [subject_of(cell, partial(_rows, cell), launch) for launch, cells in launches_of(run) for cell in cells]
 
 
 def _rows(cell: Cell, name: str) -> Rows:

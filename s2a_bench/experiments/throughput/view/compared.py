@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from s2a_bench.experiments import Compared, Metric, Subject, by_name
 from s2a_bench.experiments.latency.view.compared import TOKEN_METRICS, origin_of, singles, subject_of, token_rows
-from s2a_bench.experiments.throughput.view.cells import Speed, speeds_of
+from s2a_bench.experiments.throughput.view.cells import Speed, speeds_by_launch
 
 if TYPE_CHECKING:
     from s2a_bench.experiments import Rows
@@ -15,7 +15,11 @@ if TYPE_CHECKING:
 
 
 def _subjects(run: Run) -> list[Subject]:
-    return [subject_of(speed.cell, partial(_rows, speed)) for speed in speeds_of(run)]
+    return [
+        subject_of(speed.cell, partial(_rows, speed), launch)
+        for launch, speeds in speeds_by_launch(run)
+        for speed in speeds
+    ]
 
 
 def _rows(speed: Speed, name: str) -> Rows:
