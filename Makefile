@@ -6,15 +6,20 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-policy bench-ray test test-all check check-platforms core setup clean
+.PHONY: bench bench-coverage bench-policy bench-ray test test-all check check-platforms core setup clean
 
 # The main job: the transports alone (no model) with raw pixels and with JPEG, for which wheels suffice; then llama.cpp
-# is compiled once, and a real model answers. Whoever stops in between keeps what was measured.
+# is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
+# in three launches of a third of the runs, as launches differ by more than samples.
 bench: core
-	$(BIN)/s2a-bench latency --engine echo --transport http,ros,loopback --runs 100 --payload raw
-	$(BIN)/s2a-bench latency --engine echo --transport http,ros,loopback --runs 100
+	$(BIN)/s2a-bench latency --engine echo --transport http,ros,loopback --launches 3 --runs 34 --payload raw
+	$(BIN)/s2a-bench latency --engine echo --transport http,ros,loopback --launches 3 --runs 34
 	@$(PYTHON) tools/setup.py
 	$(BIN)/s2a-bench latency
+
+# How often the intervals of ratios hold the truth, and what comparisons see; a few minutes.
+bench-coverage: setup
+	$(BIN)/python -m benchmarks.ratio_coverage
 
 # Timelines per second on one core; wants a quiet machine.
 bench-policy: setup
