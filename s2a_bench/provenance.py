@@ -49,11 +49,11 @@ class Provenance:
     @classmethod
     def of_engine(cls, told: Mapping[str, Any], *, link: str = "real") -> Provenance:
         """Read what an engine says of itself (`Engine.describe`); what it does not say is unknown."""
+        weights = {True: "dummy", False: "real"}.get(told.get("dummy", ""), UNKNOWN)
         if not told.get("engine"):
-            return cls(link=link)
+            return cls(link=link, weights=weights)
         emulated, paced = bool(told.get("emulated")), "paced_tokens_per_s" in told
         no_model = told.get("model") == NONE
-        weights = {True: "dummy", False: "real"}.get(told.get("dummy", ""), UNKNOWN)
         return cls(
             engine=_text(told["engine"]),
             model="" if no_model else _text(told.get("name") or told.get("model")),

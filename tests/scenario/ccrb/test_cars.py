@@ -69,9 +69,11 @@ def test_the_deadline_of_the_operating_point() -> None:
 def test_braking_as_needed_just_avoids_the_car_ahead(speed: float, room: float, ahead: float, decel: float) -> None:
     need = float(needed(np.array([speed]), np.array([room]), np.array([ahead]), np.array([decel]))[0])
     decel = decel if decel > 0.5 else 0.0
-    step_s = 2e-3
-    mine = np.maximum(speed - need * np.arange(0, 80, step_s), 0)
-    theirs = np.maximum(ahead - decel * np.arange(0, 80, step_s), 0)
+    alike_s = (speed - ahead) / need if need else 0.0  # a little faster than the car ahead, it brakes for minutes
+    step_s = 2e-3 * max(1.0, alike_s / 60)
+    time_s = np.arange(0, 80, 2e-3) * (step_s / 2e-3)
+    mine = np.maximum(speed - need * time_s, 0)
+    theirs = np.maximum(ahead - decel * time_s, 0)
     gaps = room + np.cumsum(theirs - mine) * step_s
     together = np.flatnonzero(mine <= theirs)
     closest = gaps[: together[0] + 1].min() if len(together) and not decel else gaps.min()

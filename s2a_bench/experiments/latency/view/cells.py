@@ -187,13 +187,14 @@ def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | Non
 
 def engine_note(run: Run, cells: list[Cell]) -> Note:
     """Return what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
-    engines, by_name = {cell.about["engine"] for cell in cells}, [cell.name for cell in cells]
+    engines = {cell.about["engine"] for cell in cells}
     notes = []
     if "echo" in engines:
         notes.append(Note("echo engine", ECHO))
     if "replay" in engines:
         notes.append(_emulated(_replayed(run, cells)))
-    if any(origin.weights == "dummy" and not origin.emulated for origin in map(run.origins.of, by_name)):
+    answered = [cell.name for cell in cells if cell.about["engine"] != "replay"]
+    if any(run.origins.of(name).weights == "dummy" for name in answered):
         notes.append(Note("dummy weights", DUMMY))
     if UNKNOWN in engines:
         notes.append(Note("engine unknown, as the server does not tell", "engine unknown"))
