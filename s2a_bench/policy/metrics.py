@@ -38,6 +38,8 @@ class Metrics:
     """max(0, s_1 - S0) / S0."""
     signed_start_regret: Floats
     """(s_1 - S0) / S0: negative for a start before S0, which stretching can make safe."""
+    start_regret_elastic: Floats
+    """max(0, s_1 - S_lo) / S_lo, over the least start that stretching to T_max allows (T2)."""
     start_regret_of_wait: Floats
     """max(0, s_1 - S0) / (t_N - S0): 0 as clairvoyant, 1 as wait-then-act. Long times to first token flatter the
     regret over S0, not this one."""
@@ -65,8 +67,8 @@ def measure(plans: Plans, schedule: Schedule, *, observed_s: float = 0.0, tolera
     ``observed_s`` is when the picture was taken that the plan answers, on the same clock: 0 is the request, negative
     is earlier. ``tolerance_s`` decides which stalls count (20 ms unless told; studies of P(any stall) use 1 us).
     """
-    arrival_s, nominal_s, least_s, start_s, duration_s = align(
-        plans.arrival_s, plans.nominal_s, plans.least_s, schedule.start_s, schedule.duration_s
+    arrival_s, nominal_s, least_s, most_s, start_s, duration_s = align(
+        plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s, schedule.start_s, schedule.duration_s
     )
     first, end = start_s[0], start_s[-1] + duration_s[-1]
     safe = safe_start(arrival_s, nominal_s)
@@ -75,6 +77,7 @@ def measure(plans: Plans, schedule: Schedule, *, observed_s: float = 0.0, tolera
     stalls_s = stalls(schedule)
     stall_s = stalls_s.sum(axis=0)
     waits = queue_wait(plans, schedule)
+    least = safe_start(arrival_s, most_s)
     late = np.maximum(first - safe, 0.0)
     span = arrival_s[-1] - safe
     return Metrics(
@@ -86,6 +89,7 @@ def measure(plans: Plans, schedule: Schedule, *, observed_s: float = 0.0, tolera
         stall_ratio=_share(stall_s, end - first),
         start_regret=_share(late, safe),
         signed_start_regret=_share(first - safe, safe),
+        start_regret_elastic=_share(np.maximum(first - least, 0.0), least),
         start_regret_of_wait=_share(late, span),
         end_regret=_share(end - best_end, best_end),
         end_regret_of_wait=_share(end - best_end, span),

@@ -20,7 +20,7 @@ def column(*values: float) -> np.ndarray:
 
 
 PLANS = Plans(column(1.0, 4.0, 5.0), column(1.0, 2.0, 1.0), column(0.5, 1.0, 0.5), column(2.0, 4.0, 2.0))
-"""S0 = max(1, 3, 2) = 3, E = 3 + 4 = 7, E_lo = max(1, 3.5, 3.5) + 2 = 5.5, t_N = 5."""
+"""S0 = max(1, 3, 2) = 3, E = 3 + 4 = 7, S_lo = max(1, 2, -1) = 2, E_lo = max(1, 3.5, 3.5) + 2 = 5.5, t_N = 5."""
 
 
 def test_naive_by_hand() -> None:
@@ -31,6 +31,7 @@ def test_naive_by_hand() -> None:
     assert found.stall_ratio == [2 / 6]
     assert found.start_regret == [0.0]
     assert found.signed_start_regret == [-2 / 3]
+    assert found.start_regret_elastic == [0.0]
     assert found.start_regret_of_wait == [0.0]
     assert found.end_regret == [0.0]
     assert found.end_regret_of_wait == [0.0]
@@ -50,6 +51,7 @@ def test_wait_then_act_by_hand() -> None:
     assert (found.stalls, found.stall_s, found.stall_ratio) == ([0], [0.0], [0.0])
     assert found.start_regret == [2 / 3]
     assert found.signed_start_regret == [2 / 3]
+    assert found.start_regret_elastic == [3 / 2]
     assert found.start_regret_of_wait == [1.0]
     assert found.end_regret == [2 / 7]
     assert found.end_regret_of_wait == [1.0]

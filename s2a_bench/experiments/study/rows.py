@@ -16,7 +16,8 @@ class StudyRow:
     ``family`` names the gaps' distribution, ``condition`` what else was varied and ``block`` which stretch of a
     sequence of plans it is. Regrets are means over the plans, as `policy.metrics` defines them; ``caution`` is null
     where the policy waits for whole plans or knows no lambda; ``p_any_stall_high`` is the upper end of the two-sided
-    95 % Clopper-Pearson interval. Nothing in a study is measured: the plans are drawn.
+    95 % Clopper-Pearson interval. Nothing in a study is measured: the plans are drawn. Fields with a default are null
+    in folders from before they were there.
     """
 
     study: Annotated[str, {"enum": ["targets", "frontier", "drift", "misfit"]}]
@@ -45,6 +46,9 @@ class StudyRow:
     start_regret_of_wait: Annotated[NonNegative | None, about("Over t_N - S0; absent where t_N = S0 in every plan.")]
     end_regret: Annotated[float, about("Mean of (e_N - E) / E with E = S0 + P_N.")]
     end_regret_of_wait: float | None
+    start_regret_elastic: Annotated[NonNegative | None, about("Mean of max(0, s_1 - S_lo) / S_lo.")] = None
+    end_regret_elastic: Annotated[float | None, about("Mean of (e_N - E_lo) / E_lo.")] = None
+    speed_distortion: Annotated[NonNegative | None, about("Mean of durations over nominal ones.")] = None
 
 
 STUDY_CELLS: Final[Table[StudyRow]] = Table("studies", StudyRow)

@@ -81,6 +81,9 @@ def row_of(
         start_regret_of_wait=_mean(found.start_regret_of_wait),
         end_regret=_mean(found.end_regret),
         end_regret_of_wait=_mean(found.end_regret_of_wait),
+        start_regret_elastic=_mean(found.start_regret_elastic),
+        end_regret_elastic=_mean(found.end_regret_elastic),
+        speed_distortion=_mean(found.speed_distortion),
     )
 
 

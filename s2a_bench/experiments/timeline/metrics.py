@@ -89,6 +89,13 @@ METRICS: Final[Mapping[str, TimelineMetric]] = {
             bounds=_SHARE,
         ),
         _mean("start_regret", "late start", "max(0, s_1 - S0) / S0.", kind=SHARE, optional=True),
+        _mean(
+            "start_regret_elastic",
+            "over S_lo",
+            "max(0, s_1 - S_lo) / S_lo, over the least start that T_max allows.",
+            kind=SHARE,
+            optional=True,
+        ),
         _mean("signed_start_regret", about="(s_1 - S0) / S0.", bounds=_UNBOUND, optional=True),
         _mean(
             "start_regret_of_wait",

@@ -64,12 +64,14 @@ def target_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
         "start": "start_regret",
         "signed": "signed_start_regret",
         "of wait": "start_regret_of_wait",
+        "over S_lo": "start_regret_elastic",
         "end": "end_regret",
         "end of wait": "end_regret_of_wait",
+        "over E_lo": "end_regret_elastic",
     }
     parts = {"all": rows, "rho > .8": rows[rows["rho"] > HARD]}
     lines = [
-        (str(policy), scope, *(f"{each[column].mean():.2%}" for column in columns.values()))
+        (str(policy), scope, *(_share(each[column].mean()) for column in columns.values()))
         for policy in rows["policy"].unique()
         for scope, part in parts.items()
         for each in (part[part["policy"] == policy],)
@@ -77,6 +79,7 @@ def target_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
     notes = (
         "Means over settings. start: max(0, s_1 - S0) / S0; signed: with its sign; end: (e_N - E) / E, E = S0 + P_N.",
         "of wait: over t_N - S0, which a long time to first token does not flatter.",
+        "S0: the clairvoyant start at nominal durations. S_lo, E_lo: the least start and end when skills may stretch.",
     )
     yield TextTable("Policies", ("policy", "settings", *columns), lines, 2, notes=notes)
     worst = online.sort_values("p_any_stall", ascending=False).head(5)
@@ -139,6 +142,13 @@ def misfit_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
 
 def _world(row: pd.Series) -> tuple[str, ...]:
     return (*(f"{row[name]:g}" for name in WORLD), f"{row['rho']:.2f}")
+
+
+def _share(value: float, digits: int = 2) -> str:
+    """Write a share in percent; absent where a folder from before does not have it."""
+    import pandas as pd
+
+    return ABSENT if pd.isna(value) else f"{value:.{digits}%}"
 
 
 def _caution(row: pd.Series) -> str:

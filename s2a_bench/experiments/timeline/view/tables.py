@@ -27,6 +27,7 @@ _WAITING = (
     "oldest_action_s",
     "stall_ratio",
     "start_regret_of_wait",
+    "start_regret_elastic",
     "end_regret_elastic",
 )
 _MOTION = ("speed_distortion", "fluidity", "rms_jerk", "peak_jerk", "sparc")
@@ -39,7 +40,7 @@ def execution_table(run: Run) -> TextTable:
     header, rows, rules = _rows(cells, (*_EXECUTION, *(["p_any_stall"] if random else [])))
     title = f"Timelines{_common(cells)}: times in s{', means' if random else ''}"
     notes = [*origin_notes(run, cells), *_plan_notes(run, cells), *jitter_notes(run)]
-    notes.append("stalls: those above 20 ms. late start, late end: regret over S0 and S0 + P_N.")
+    notes.append("stalls: those above 20 ms. late start, late end: regret over clairvoyant S0 and S0 + P_N.")
     return TextTable(title, header, rows, 3, rules, tuple(notes))
 
 
@@ -48,7 +49,7 @@ def waiting_table(run: Run) -> TextTable:
     cells = timelines_of(run)
     notes = (
         "queued: from a skill's arrival to its start. age: from the request, as if pictured then, to a skill's start.",
-        "of wait: start regret over t_N - S0. over E_lo: end regret over the least end that T_min allows.",
+        "of wait: start regret over t_N - S0. over S_lo, E_lo: over the least start and end within T_min, T_max.",
     )
     header, rows, rules = _rows(cells, _WAITING)
     return TextTable(f"Waiting and age{_common(cells)}: times in s", header, rows, 3, rules, notes)
