@@ -9,10 +9,11 @@ control wants it. With n exchangeable plans, choosing the least lambda at which 
 - that share, for the lambda at hand rather than on average over calibrations, at most x with confidence
   1 - P(Bin(n, x) <= r): a risk-controlling prediction set (Bates et al., J. ACM 2021, arXiv 2101.02703).
 
-`calibrate` takes the greatest r that keeps the first at epsilon or less *and* the second at 2 epsilon with 99.9 %
-confidence: whoever calibrates once lives with that one lambda. With epsilon = 1 %, 400 plans give r = 0 and 1000 plans
-r = 7: more plans allow a smaller lambda. The scores come from plans that the prior may have been
-fitted to; with a prior of its own plans the first bound is exact.
+`calibrate` takes the greatest r that keeps the `Guarantee`. *expected* keeps the first at epsilon or less: epsilon
+means epsilon, on average over calibrations. *high-confidence*, the default, also keeps the second at 2 epsilon with
+99.9 % confidence: whoever calibrates once lives with that one lambda. With epsilon = 1 %, 400 plans give r = 3 and
+r = 0, a rule that stalls in .25 % of the plans on average; 1000 plans give r = 9 and r = 7. The scores come from plans
+that the prior may have been fitted to; with a prior of its own plans the first bound is exact.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Plans, Policy
@@ -45,6 +46,12 @@ CONFIDENCE: Final = 0.999
 """... with this confidence."""
 GRID: Final = (*(i / 4 for i in range(17)), 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0, 16.0, 24.0, 32.0)
 """The values of lambda that are tried; beyond them a plan is waited for."""
+Guarantee: TypeAlias = Literal["high-confidence", "expected"]
+"""What epsilon bounds; see the module's head."""
+GUARANTEE: Final = (
+    "what epsilon bounds: expected (the mean over calibrations), high-confidence (also 2 epsilon for this one, 99.9 %)"
+)
+"""The same for people who choose one."""
 ROUNDING: Final = 1e-9
 """A product this close below a whole number is one."""
 
@@ -64,6 +71,7 @@ class Calibration:
     risk: float
     """Bound on P(any stall) with this caution, with ``confidence``."""
     confidence: float
+    guarantee: Guarantee = "high-confidence"
 
 
 def scores(policy: StreamToAct, plans: Plans) -> Floats:
@@ -102,33 +110,44 @@ def coarse(plans: int, epsilon: float = EPSILON) -> bool:
     return upper_bound(0, plans, CONFIDENCE) > CEILING * epsilon
 
 
-def calibrate(policy: StreamToAct, plans: Plans, epsilon: float = EPSILON) -> Calibration:
+def calibrate(
+    policy: StreamToAct, plans: Plans, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence"
+) -> Calibration:
     """Find lambda for P(any stall) <= ``epsilon`` from recorded plans; see the module's head.
 
     Raises UsageError where so few plans allow no such promise.
     """
-    return choose(scores(policy, plans), epsilon)
+    return choose(scores(policy, plans), epsilon, guarantee)
 
 
-def choose(score: Floats, epsilon: float = EPSILON) -> Calibration:
+def may_stall(plans: int, epsilon: float, guarantee: Guarantee) -> int:
+    """Return r, how many of the calibration plans may stall."""
+    from scipy import stats
+
+    most = math.floor((plans + 1) * epsilon + ROUNDING) - 1
+    if guarantee == "high-confidence":
+        while most and stats.binom.cdf(most, plans, min(CEILING * epsilon, 1.0)) > 1 - CONFIDENCE:
+            most -= 1
+    return most
+
+
+def choose(score: Floats, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence") -> Calibration:
     """Find lambda from scores, shape (plans,)."""
     import numpy as np
-    from scipy import stats
 
     count = score.size
     check(count, epsilon)
-    may_stall = math.floor((count + 1) * epsilon + ROUNDING) - 1
-    while may_stall and stats.binom.cdf(may_stall, count, min(CEILING * epsilon, 1.0)) > 1 - CONFIDENCE:
-        may_stall -= 1
-    caution = float(np.sort(score)[count - 1 - may_stall])
+    above = may_stall(count, epsilon, guarantee)
+    caution = float(np.sort(score)[count - 1 - above])
     return Calibration(
         caution=caution,
         epsilon=epsilon,
         plans=count,
         stalled=int(np.sum(score > caution)),
-        expected_risk=(may_stall + 1) / (count + 1),
-        risk=upper_bound(may_stall, count, CONFIDENCE),
+        expected_risk=(above + 1) / (count + 1),
+        risk=upper_bound(above, count, CONFIDENCE),
         confidence=CONFIDENCE,
+        guarantee=guarantee,
     )
 
 

@@ -93,6 +93,25 @@ def test_every_cell_repeats_by_its_seed_whatever_runs_beside_it() -> None:
     assert config.but(seed=6).cells[100]() != alone
 
 
+def test_several_seeds_are_the_studies_of_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study_targets, "WORLDS", HARDEST[:1])
+    config = StudyConfig(name="targets", seed=5, seeds=3, plans=50, calibration_plans=120)
+    rows = [row for cell in config.cells for row in cell()]
+    assert [row.seed for row in rows if row.policy == "stream-to-act"] == [5, 6, 7]
+    (alone,) = StudyConfig(name="targets", seed=6, plans=50, calibration_plans=120).cells
+    assert [row for row in rows if row.seed == 6] == alone()
+    run = read_run(run_study(config, tmp_path, NullProgress()))
+    found = experiment_of("study-targets")
+    assert found is not None
+    shown = found.show(run)
+    starts = [row.start_regret for row in rows if row.policy == "wait-then-act"]
+    entry = shown.tables["policies"].rows[-2][3]
+    assert entry == f"{sum(starts) / 3:.2%} ({min(starts):.2%} to {max(starts):.2%})"
+    assert "mean and range of 3 seeds" in str(shown.notes[0])
+    stalls = shown.json()["targets"][1]
+    assert stalls["value"] == max(row.p_any_stall for row in rows if row.policy == "stream-to-act")
+
+
 @pytest.mark.slow
 def test_processes_change_nothing() -> None:
     cells = StudyConfig(name="misfit", plans=20, calibration_plans=120).cells
@@ -184,7 +203,11 @@ def test_a_frontier_marks_where_calibration_would_put_the_robot() -> None:
     config = StudyConfig(name="frontier", plans=300, calibration_plans=200)
     world = World(0.58, 3.0, 1, 8, 2.0)
     rows = study_jitter.cell(config, world)
-    (chosen,) = (row for row in rows if row.condition == study_jitter.CALIBRATED)
+    chosen, expected = (row for row in rows if row.condition)
+    assert [chosen.condition, expected.condition] == list(study_jitter.CALIBRATED.values())
+    assert expected.caution is not None
+    assert chosen.caution is not None
+    assert expected.caution <= chosen.caution
     drawn = world.draw(generator(config.seed, "frontier", world), config.calibration_plans)
     assert drawn.token_s is not None
     found = calibrate(StreamToAct(GapPrior.fit(drawn.token_s)), drawn, config.epsilon)

@@ -62,6 +62,15 @@ def test_more_plans_allow_more_of_them_to_stall(count: int, may_stall: int) -> N
     assert coarse(count) == (count < 342) == (found.risk > 0.02)
 
 
+@pytest.mark.parametrize(("count", "may_stall"), [(99, 0), (400, 3), (1000, 9), (4000, 39)])
+def test_expected_means_epsilon_and_no_less(count: int, may_stall: int) -> None:
+    found = choose(np.arange(count, dtype=float), 0.01, "expected")
+    assert (found.stalled, found.guarantee) == (may_stall, "expected")
+    assert found.expected_risk == (may_stall + 1) / (count + 1)
+    assert 0.009 < found.expected_risk <= 0.01
+    assert found.caution <= choose(np.arange(count, dtype=float), 0.01).caution
+
+
 def test_the_promises_hold_for_scores_of_any_distribution() -> None:
     rng = np.random.default_rng(6)
     risks = np.array([1 - choose(rng.random(400)).caution for _ in range(4000)])  # P(score > lambda), exactly
@@ -69,6 +78,9 @@ def test_the_promises_hold_for_scores_of_any_distribution() -> None:
     assert risks.mean() <= 1 / 401 + 4 * error
     assert risks.mean() >= 1 / 401 - 4 * error  # and no more careful than said
     assert (risks > 0.02).mean() <= 0.001 + 4 * (0.001 / 4000) ** 0.5
+    expected = np.array([1 - choose(rng.random(400), 0.01, "expected").caution for _ in range(4000)])
+    assert expected.mean() == pytest.approx(4 / 401, abs=4 * expected.std() / 4000**0.5)
+    assert (expected > 0.02).mean() > 0.02  # one calibration in 24 is worse than the other guarantee allows
 
 
 @pytest.mark.parametrize("gaps", [None, BURSTS], ids=["lognormal", "bursts"])

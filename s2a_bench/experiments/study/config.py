@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.study.studies import STUDIES
 from s2a_bench.options import Options, one_of, option
+from s2a_bench.policy.conformal import GUARANTEE, Guarantee
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.study.rows import StudyRow
@@ -28,8 +30,10 @@ class StudyConfig(Options):
     plans: int | None = option(None, "plans a cell [default: the study's own number]", ge=1)
     calibration_plans: int = option(400, "plans that prior and lambda come from")
     epsilon: float = option(0.01, "share of plans that may stall")
+    guarantee: Guarantee = option("high-confidence", GUARANTEE)
     profile: str = option("", "profile whose recorded gaps the frontier adds as a family")
     seed: int = option(0, "seed; every cell has its own from it", ge=0)
+    seeds: int = option(1, "run the whole study for as many seeds, this and the following ones", ge=1, le=1000)
     jobs: int = option(1, "processes", ge=1)
 
     @property
@@ -39,9 +43,10 @@ class StudyConfig(Options):
 
     @property
     def cells(self) -> Sequence[Cell]:
-        """List the study's cells."""
-        cells: Sequence[Cell] = resolve_name(STUDIES[self.name].cells)(self)
-        return cells
+        """List the study's cells, for one seed after another."""
+        cells_of = resolve_name(STUDIES[self.name].cells)
+        runs = [self.but(seed=self.seed + more, seeds=1) for more in range(self.seeds)]
+        return [partial(_seeded, cell, run.seed) for run in runs for cell in cells_of(run)]
 
     @cached_property
     def recording(self) -> tuple[float, ...]:
@@ -75,3 +80,8 @@ class StudyConfig(Options):
         """Return the options as plain data, with the recorded gaps that a profile's name stands for."""
         options = self.model_dump(exclude={"name"})
         return {"study": self.name, **options, "recording": self.recording}
+
+
+def _seeded(cell: Cell, seed: int) -> list[StudyRow]:
+    """Return a cell's rows, which say the seed."""
+    return [replace(row, seed=seed) for row in cell()]

@@ -1,6 +1,7 @@
 """What rare stalls cost: P(any stall) against regret, for families of gaps, as lambda goes from 0 to waiting.
 
-The lambda that calibration would choose is tried once more, under the condition `CALIBRATED`: where a robot would be.
+The lambdas that calibration would choose are tried once more, under the conditions of `CALIBRATED`, one a guarantee:
+where a robot would be.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from s2a_bench.experiments.study.config import Cell, StudyConfig
 from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.to_rows import study_row
 from s2a_bench.experiments.study.worlds import TOKEN_CV, World, calibrated
-from s2a_bench.policy.conformal import GRID
+from s2a_bench.policy.conformal import GRID, Guarantee
 from s2a_bench.policy.stream_to_act import QuantileStart, StreamToAct
 
 PLANS: Final = 4000
-CALIBRATED: Final = "calibrated"
+CALIBRATED: Final[dict[Guarantee, str]] = {"high-confidence": "calibrated", "expected": "calibrated, expected"}
 
 WORLDS: Final = (
     World(4.8, 0.5, 4, 8, 1.0),
@@ -60,4 +61,8 @@ def cell(config: StudyConfig, world: World) -> list[StudyRow]:
         for kind in (StreamToAct, QuantileStart)
         for caution in cautions
     ]
-    return [*found, replace(found[cautions.index(policy.caution)], condition=CALIBRATED)]
+    chosen = []
+    for guarantee, condition in CALIBRATED.items():
+        there, _ = calibrated(config.but(guarantee=guarantee), world, PLANS)
+        chosen.append(replace(found[cautions.index(there.caution)], condition=condition))
+    return [*found, *chosen]

@@ -49,6 +49,7 @@ class StudyRow:
     start_regret_elastic: Annotated[NonNegative | None, about("Mean of max(0, s_1 - S_lo) / S_lo.")] = None
     end_regret_elastic: Annotated[float | None, about("Mean of (e_N - E_lo) / E_lo.")] = None
     speed_distortion: Annotated[NonNegative | None, about("Mean of durations over nominal ones.")] = None
+    seed: Annotated[Count | None, about("Of the study it is from, where several were run.")] = None
 
 
 STUDY_CELLS: Final[Table[StudyRow]] = Table("studies", StudyRow)

@@ -103,7 +103,7 @@ def calibrated(config: StudyConfig, world: World, plans: int) -> tuple[StreamToA
     calibration = world.draw(rng, config.calibration_plans)
     assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
     policy = StreamToAct(GapPrior.fit(calibration.token_s))
-    policy = replace(policy, caution=calibrate(policy, calibration, config.epsilon).caution)
+    policy = replace(policy, caution=calibrate(policy, calibration, config.epsilon, config.guarantee).caution)
     return policy, world.draw(rng, config.plans or plans)
 
 

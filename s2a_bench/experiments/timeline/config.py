@@ -14,6 +14,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.live.config import Live, check_live, requests_of
 from s2a_bench.options import SEVERAL, Names, Options, option
 from s2a_bench.policy import POLICIES as NAMED
+from s2a_bench.policy.conformal import GUARANTEE, Guarantee
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.timeline.plans import Board
@@ -93,6 +94,7 @@ class Modelled(Options):
         "lognormal:cv=0.2",
     )
     epsilon: float = option(0.01, "share of plans that may stall: lambda is calibrated for it")
+    guarantee: Guarantee = option("high-confidence", GUARANTEE)
     calibration_plans: int = option(400, "other plans that prior and lambda are learned from")
     calibrate: Path | None = option(
         None, "run folder of latency or throughput: learn prior and lambda from its answers instead"

@@ -60,7 +60,7 @@ def learn(config: TimelineConfig, board: Board, setting: Setting, answers: Seque
     else:
         return Knowledge(StreamToAct(GapPrior(1 / board.tokens_per_s, LEAST_CV, LEAST_CV), CAUTION), None, bound_s)
     policy = StreamToAct(prior)
-    calibration = calibrate(policy, plans, config.epsilon)
+    calibration = calibrate(policy, plans, config.epsilon, config.guarantee)
     return Knowledge(replace(policy, caution=calibration.caution), calibration, bound_s)
 
 

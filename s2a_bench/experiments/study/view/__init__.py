@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.study.rows import STUDY_CELLS, StudyRow
-from s2a_bench.experiments.study.view.tables import study_of, study_tables
+from s2a_bench.experiments.study.view.tables import rows_of, study_of, study_tables
 from s2a_bench.experiments.study.view.targets import ONLINE, Target
 from s2a_bench.store.bounds import Positive, about
 from s2a_bench.store.schema import PROVENANCE
@@ -64,9 +64,12 @@ def study_json(run: Run) -> dict[str, Any]:
 
 
 def _targets(run: Run) -> list[Target]:
-    """Return what is wanted of this study; nothing of most."""
+    """Return what is wanted of this study, of several seeds the worst; nothing of most."""
     targets = study_of(run).targets
-    return list(resolve_name(targets)(run.table(STUDY_CELLS))) if targets else []
+    if not targets:
+        return []
+    by_seed = [resolve_name(targets)(rows) for _, rows in rows_of(run).groupby("seed")]
+    return [max(each, key=lambda target: target.value) for each in zip(*by_seed, strict=True)]
 
 
 def _cells(run: Run) -> Iterator[dict[str, Any]]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.experiments.study.rows import STUDY_CELLS
-from s2a_bench.experiments.study.view.tables import WORLD
+from s2a_bench.experiments.study.view.tables import WORLD, first_seed, rows_of
 from s2a_bench.experiments.study.view.targets import END, HARD, ONLINE, START, WORST
 from s2a_bench.writers.figures import new_figure
 
@@ -28,7 +27,7 @@ _DRAWN: Final = "Plans are drawn from models of the arrivals; nothing is measure
 
 def build_targets(run: Run) -> Figure:
     """Draw stream-to-act's share of stalled plans and regrets, a point a setting, against rho."""
-    rows = run.table(STUDY_CELLS)
+    rows = first_seed(rows_of(run))
     rows = rows[rows["policy"] == ONLINE]
     hard = rows[rows["rho"] > HARD]
     figure = new_figure(4.9, f"{ONLINE}: {len(rows)} settings, {int(rows['plans'].max()):,} plans each\n{_DRAWN}")
@@ -57,7 +56,7 @@ def build_targets(run: Run) -> Figure:
 
 def build_frontier(run: Run) -> Figure:
     """Draw P(any stall) against start regret as lambda grows, a panel a world, a colour a family of gaps."""
-    rows = run.table(STUDY_CELLS)
+    rows = first_seed(rows_of(run))
     epsilon = float(run.manifest["configuration"]["epsilon"])
     plans = int(rows["plans"].max())
     figure = new_figure(5.2, f"What rare stalls cost; {plans:,} plans a point\n{_DRAWN}")
@@ -70,9 +69,10 @@ def build_frontier(run: Run) -> Figure:
             for policy, width in ((ONLINE, 1.3), ("s2a-quantile", 0.6)):
                 tried = _needed(points[(points["policy"] == policy) & (points["condition"] == "")])
                 axes.plot(100 * tried["p_any_stall"], tried["start_regret"], line, color=colour, linewidth=width)
-            chosen = points[points["condition"] != ""]
-            look: Any = {"markersize": 5, "color": colour, "markeredgecolor": "black", "markeredgewidth": 0.7}
-            axes.plot(100 * chosen["p_any_stall"], chosen["start_regret"], marker, clip_on=False, zorder=4, **look)
+            for condition, fill in (("calibrated", colour), ("calibrated, expected", "white")):
+                chosen = points[points["condition"] == condition]
+                look: Any = {"markersize": 5, "color": fill, "markeredgecolor": colour, "markeredgewidth": 0.9}
+                axes.plot(100 * chosen["p_any_stall"], chosen["start_regret"], marker, clip_on=False, zorder=4, **look)
         axes.axvline(100 * epsilon, color="#999999", linewidth=0.6, linestyle=":")
         axes.set_title(_world(world).replace(": ", "\n"), loc="left", pad=2)
         axes.set_xscale("symlog", linthresh=100 / plans, linscale=0.5)
@@ -91,7 +91,7 @@ def build_frontier(run: Run) -> Figure:
 
 def build_drift(run: Run) -> Figure:
     """Draw P(any stall) block by block: prior and lambda fixed, lambda tracked, the prior refitted too."""
-    rows = run.table(STUDY_CELLS)
+    rows = first_seed(rows_of(run))
     rows = rows.assign(
         drift=[text.partition(", ")[0] for text in rows["condition"]],
         arm=[text.partition(", ")[2] for text in rows["condition"]],
@@ -128,7 +128,7 @@ def build_drift(run: Run) -> Figure:
 
 def build_misfit(run: Run) -> Figure:
     """Draw what a wrong length, granularity or rate costs: stalls above, late starts below, a line a world."""
-    rows = run.table(STUDY_CELLS)
+    rows = first_seed(rows_of(run))
     kinds = {"N": "skills a plan", "L": "tokens a skill", "gap": "mean gap of the prior"}
     rows = rows.assign(
         kind=[text.split()[0] for text in rows["condition"]], step=[text.split()[-1] for text in rows["condition"]]
@@ -220,14 +220,17 @@ def _frontier_legend(families: list[str], epsilon: float) -> list[Any]:
         *(_line(_FAMILIES.get(family, family), color=colour, linestyle=line) for family, (colour, line, _) in looks),
         _line(f"bold: {ONLINE}", color=_INK, linewidth=1.3),
         _line("thin: s2a-quantile (never stretches)", color=_INK, linewidth=0.6),
-        _line(
-            rf"calibrated $\lambda$ ($\epsilon$ = {_percent(epsilon)})",
-            color="#BBBBBB",
-            marker="o",
-            markersize=5,
-            linestyle="none",
-            markeredgecolor="black",
-            markeredgewidth=0.7,
+        *(
+            _line(
+                rf"calibrated $\lambda$ ($\epsilon$ = {_percent(epsilon)}): {guarantee}",
+                color=fill,
+                marker="o",
+                markersize=5,
+                linestyle="none",
+                markeredgecolor="#777777",
+                markeredgewidth=0.9,
+            )
+            for guarantee, fill in (("high-confidence", "#777777"), ("expected", "white"))
         ),
     ]
 

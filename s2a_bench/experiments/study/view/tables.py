@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Final
 
@@ -36,6 +37,36 @@ def regret_at(points: pd.DataFrame, level: float, what: str = "start_regret") ->
     return float(np.interp(level, ordered["p_any_stall"].to_numpy(dtype=float), cheapest))
 
 
+def rows_of(run: Run) -> pd.DataFrame:
+    """Return the rows of a study; those of a folder from before seeds were kept are of seed 0."""
+    rows = run.table(STUDY_CELLS)
+    return rows.assign(seed=rows["seed"].astype("Int64").fillna(0))
+
+
+def first_seed(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of the first seed."""
+    first: pd.DataFrame = rows[rows["seed"] == rows["seed"].iloc[0]]
+    return first
+
+
+def over_seeds(rows: pd.DataFrame, statistic: Callable[[pd.DataFrame], float], form: str = "{:.1%}") -> str:
+    """Write a number's mean over the seeds, with the range where there are several."""
+    import numpy as np
+
+    values = np.array([statistic(part) for _, part in rows.groupby("seed")], dtype=float)
+    if np.isnan(values).all():
+        return ABSENT
+    mean = form.format(np.nanmean(values))
+    if values.size == 1:
+        return mean
+    return f"{mean} ({form.format(np.nanmin(values))} to {form.format(np.nanmax(values))})"
+
+
+def mean_of(column: str) -> Callable[[pd.DataFrame], float]:
+    """Return what takes the mean of a column."""
+    return lambda rows: float(rows[column].astype("float64").mean())
+
+
 def study_of(run: Run) -> Study:
     """Return the study that a run is of; raises StoreError where it is of none."""
     name = str(run.manifest["configuration"].get("study", ""))
@@ -46,18 +77,25 @@ def study_of(run: Run) -> Study:
 
 def study_tables(run: Run) -> dict[str, TextTable]:
     """Return the tables of a study by their files' names, which are their titles: "Most stalls" is most-stalls."""
-    tables: Iterator[TextTable] = resolve_name(study_of(run).tables)(run.table(STUDY_CELLS))
+    tables: Iterator[TextTable] = resolve_name(study_of(run).tables)(rows_of(run))
     return {re.sub(r"[^a-z0-9]+", "-", table.title.lower()).strip("-"): table for table in tables}
 
 
 def target_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
     """Show the targets, the policies side by side, and where the online rule has it hardest."""
     online = rows[rows["policy"] == ONLINE]
-    judged = targets_of(rows)
+    by_seed = [targets_of(part) for _, part in rows.groupby("seed")]
     lines: list[tuple[str, ...]] = [
-        (each.what, f"{each.value:.2%}", f"{each.limit:.0%}", "met" if each.met else "MISSED") for each in judged
+        (
+            each[0].what,
+            over_seeds(rows, lambda part, place=place: targets_of(part)[place].value, "{:.2%}"),  # type: ignore[misc]
+            f"{each[0].limit:.0%}",
+            "met" if all(target.met for target in each) else "MISSED",
+        )
+        for place, each in enumerate(zip(*by_seed, strict=True))
     ]
-    note = Note(f"{len(online)} settings, {int(online['plans'].sum()):,} plans. {_DRAWN}", DRAWN)
+    settings = f"{len(first_seed(online))} settings{_seeds(rows)}"
+    note = Note(f"{settings}, {int(online['plans'].sum()):,} plans. {_DRAWN}", DRAWN)
     yield TextTable(f"Targets of {ONLINE}", ("", "reached", "wanted", ""), lines, 1, notes=(note,))
     columns = {
         "P(stall)": "p_any_stall",
@@ -71,7 +109,7 @@ def target_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
     }
     parts = {"all": rows, "rho > .8": rows[rows["rho"] > HARD]}
     lines = [
-        (str(policy), scope, *(_share(each[column].mean()) for column in columns.values()))
+        (str(policy), scope, *(over_seeds(each, mean_of(column), "{:.2%}") for column in columns.values()))
         for policy in rows["policy"].unique()
         for scope, part in parts.items()
         for each in (part[part["policy"] == policy],)
@@ -99,12 +137,36 @@ def frontier_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
             *_world(points.iloc[0]),
             str(points["family"].iloc[0]),
             str(points["policy"].iloc[0]),
-            *(f"{regret_at(points, level):+.0%}" for level in LEVELS),
+            *(over_seeds(points, partial(regret_at, level=level), "{:+.0%}") for level in LEVELS),
         )
-        for _, points in rows.groupby([*WORLD, "family", "policy"], sort=False)
+        for _, points in rows[rows["condition"] == ""].groupby([*WORLD, "family", "policy"], sort=False)
     ]
-    notes = (Note(f"Start regret over S0 where that share of the plans stalls. {_DRAWN}", DRAWN),)
+    notes = (Note(f"Start regret over S0 where that share of the plans stalls{_seeds(rows)}. {_DRAWN}", DRAWN),)
     yield TextTable("Frontier: what rare stalls cost", header, lines, 7, notes=notes)
+    yield _guarantees(rows)
+
+
+def _guarantees(rows: pd.DataFrame) -> TextTable:
+    """Show what each guarantee delivers and costs."""
+    calibrated = rows[rows["condition"] != ""]
+    header = ("R", "L", "N", "T", "rho", "gaps", "guarantee", "P(stall)", "late start", "over S_lo")
+    lines = [
+        (
+            *_world(points.iloc[0]),
+            str(points["family"].iloc[0]),
+            "expected" if "expected" in str(points["condition"].iloc[0]) else "high-confidence",
+            over_seeds(points, mean_of("p_any_stall"), "{:.2%}"),
+            over_seeds(points, mean_of("start_regret"), "{:.0%}"),
+            over_seeds(points, mean_of("start_regret_elastic"), "{:.0%}"),
+        )
+        for _, points in calibrated.groupby([*WORLD, "family", "condition"], sort=False)
+    ]
+    plans = int(rows["calibration_plans"].max())
+    notes = (
+        f"lambda as --guarantee makes calibration on {plans} plans choose it{_seeds(rows)}.",
+        "late start, over S_lo: start regret over S0 and over S_lo.",
+    )
+    return TextTable("What epsilon buys", header, lines, 7, notes=notes)
 
 
 def drift_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
@@ -115,8 +177,8 @@ def drift_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
         (
             *_world(points.iloc[0]),
             str(points["condition"].iloc[0]),
-            *(f"{share:.1%}" for share in points.sort_values("block")["p_any_stall"]),
-            f"{points['start_regret'].mean():.0%}",
+            *(over_seeds(points[points["block"] == block], mean_of("p_any_stall")) for block in blocks),
+            over_seeds(points, mean_of("start_regret"), "{:.0%}"),
         )
         for _, points in rows.groupby([*WORLD, "condition"], sort=False)
     ]
@@ -132,8 +194,13 @@ def misfit_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
     header = ("R", "L", "N", "T", "rho", "believed", "lambda", "P(stall)", "start", "signed", "end")
     names = ("p_any_stall", "start_regret", "signed_start_regret", "end_regret")
     lines = [
-        (*_world(row), str(row["condition"]), _caution(row), *(f"{row[name]:.1%}" for name in names))
-        for _, row in rows.iterrows()
+        (
+            *_world(points.iloc[0]),
+            str(points["condition"].iloc[0]),
+            _caution(points.iloc[0]) if len(points) == 1 else ABSENT,
+            *(over_seeds(points, mean_of(name)) for name in names),
+        )
+        for _, points in rows.groupby([*WORLD, "condition"], sort=False)
     ]
     yield TextTable(
         "Wrong beliefs", header, lines, 6, notes=(Note(f"Calibrated with the right ones. {_DRAWN}", DRAWN),)
@@ -144,11 +211,10 @@ def _world(row: pd.Series) -> tuple[str, ...]:
     return (*(f"{row[name]:g}" for name in WORLD), f"{row['rho']:.2f}")
 
 
-def _share(value: float, digits: int = 2) -> str:
-    """Write a share in percent; absent where a folder from before does not have it."""
-    import pandas as pd
-
-    return ABSENT if pd.isna(value) else f"{value:.{digits}%}"
+def _seeds(rows: pd.DataFrame) -> str:
+    """Say how many seeds there are, where there are several."""
+    count = rows["seed"].nunique()
+    return f", mean and range of {count} seeds" if count > 1 else ""
 
 
 def _caution(row: pd.Series) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.timeline.metrics import COUNT, FLAG, METRICS, SHARE, TIME, TimelineMetric
 from s2a_bench.experiments.timeline.view.cells import (
@@ -150,6 +150,16 @@ def _common(cells: Sequence[Timelines]) -> str:
     return "" if len(shapes) != 1 else ", N = {}, T_nom = {:g} s".format(*next(iter(shapes)))
 
 
+def _promise(calibrations: Iterable[Mapping[str, Any]]) -> str:
+    """Return what share of further plans calibration lets stall: that of epsilon, or less where plans are few."""
+    worst = max(calibrations, key=lambda each: float(each["expected_risk"]))
+    return (
+        f"--guarantee {worst.get('guarantee', 'high-confidence')}: lambda lets at most {worst['expected_risk']:.2%} of "
+        f"the plans stall on average, {worst['risk']:.2%} with {worst['confidence']:.1%} confidence "
+        f"(--epsilon {worst['epsilon']:g})."
+    )
+
+
 ONLINE_LIVE = ("stream-to-act", "live")
 
 
@@ -166,6 +176,7 @@ def _plan_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
         plans_each = next(iter(calibrations.values()))["plans"]
         kind = "recorded" if run.manifest["configuration"].get("calibrate") else "other"
         notes.append(f"stream-to-act: lambda {span}, calibrated on {plans_each} {kind} plans a setting.")
+        notes.append(_promise(calibrations.values()))
     elif live_cautions := {cell.about("caution") for cell in cells if (cell.policy, cell.about("mode")) == ONLINE_LIVE}:
         span = ", ".join(f"{caution:g}" for caution in sorted(live_cautions))
         notes.append(f"stream-to-act: lambda {span}, not calibrated; its prior comes from the warm-ups, or the pace.")
