@@ -133,6 +133,7 @@ POLICIES: Final[Registry[Callable[..., Policy]]] = Registry(
         "naive": "s2a_bench.policy.naive:Naive",
         "wait-then-act": "s2a_bench.policy.wait_then_act:WaitThenAct",
         "stream-to-act": "s2a_bench.policy.stream_to_act:StreamToAct",
+        "stream-to-act-early": "s2a_bench.policy.stream_to_act:EarlyStart",
         "s2a-clairvoyant": "s2a_bench.policy.clairvoyant:Clairvoyant",
         "s2a-mean": "s2a_bench.policy.stream_to_act:MeanStart",
         "s2a-quantile": "s2a_bench.policy.stream_to_act:QuantileStart",

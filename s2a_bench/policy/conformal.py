@@ -20,9 +20,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, get_args
 
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Plans, Policy
@@ -48,6 +48,7 @@ GRID: Final = (*(i / 4 for i in range(17)), 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0,
 """The values of lambda that are tried; beyond them a plan is waited for."""
 Guarantee: TypeAlias = Literal["high-confidence", "expected"]
 """What epsilon bounds; see the module's head."""
+GUARANTEES: Final[tuple[Guarantee, ...]] = get_args(Guarantee)
 GUARANTEE: Final = (
     "what epsilon bounds: expected (the mean over calibrations), high-confidence (also 2 epsilon for this one, 99.9 %)"
 )
@@ -185,6 +186,23 @@ class Tracker:
         """
         self.level = min(self.level + self.step * (self.epsilon - stalled), CEILING * self.epsilon)
         self._scores.append(score)
+
+    def state(self) -> dict[str, Any]:
+        """Return level and scores as plain data; an infinite score is null."""
+        scores = [None if math.isinf(score) else score for score in self._scores]
+        return {"epsilon": self.epsilon, "step": self.step, "level": self.level, "scores": scores}
+
+    @staticmethod
+    def resume(state: Mapping[str, Any]) -> Tracker:
+        """Go on from a state; raises KeyError, TypeError or ValueError for what is none."""
+        scores = [math.inf if score is None else float(score) for score in state["scores"]]
+        tracker = Tracker(scores, float(state["epsilon"]), step=float(state["step"]))
+        tracker.level = float(state["level"])
+        if not (0 < tracker.epsilon < 1 and 0 < tracker.step < 1 and math.isfinite(tracker.level)):
+            raise ValueError(f"epsilon {tracker.epsilon:g}, step {tracker.step:g}, level {tracker.level:g}")
+        if any(math.isnan(score) or score < 0 for score in scores):
+            raise ValueError("a score below 0")
+        return tracker
 
 
 def upper_bound(stalled: int, plans: int, confidence: float) -> float:

@@ -13,7 +13,7 @@ variance a token that *sums* of gaps have: larger than that of single gaps where
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
@@ -88,9 +88,15 @@ class GapPrior:
 
         ``gaps`` gaps took ``elapsed_s`` together.
         """
-        plan, token = self.plan_cv**2, self.token_cv**2
-        weight = plan / (token + gaps * plan)
-        return self.mean_s + weight * (elapsed_s - gaps * self.mean_s), token * weight
+        return posterior(self.mean_s, self.plan_cv**2, self.token_cv**2, gaps, elapsed_s)
+
+
+def posterior(
+    mean_s: float | Floats, plan: float | Floats, token: float, gaps: Number, elapsed_s: Number
+) -> tuple[Number, Number]:
+    """Return mu_g and v_g / mu_g^2 for a prior of mean ``mean_s`` and relative variances tau0^2, sigma^2."""
+    weight: Any = plan / (token + gaps * plan)
+    return mean_s + weight * (elapsed_s - gaps * mean_s), token * weight
 
 
 VAGUE: Final = GapPrior(mean_s=0.2, plan_cv=3.0, token_cv=0.2)

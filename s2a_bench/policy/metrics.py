@@ -40,6 +40,8 @@ class Metrics:
     """(s_1 - S0) / S0: negative for a start before S0, which stretching can make safe."""
     start_regret_elastic: Floats
     """max(0, s_1 - S_lo) / S_lo, over the least start that stretching to T_max allows (T2)."""
+    too_early_s: Floats
+    """max(0, S_lo - s_1): so much of the stalls no stretching can avoid once the robot has started."""
     start_regret_of_wait: Floats
     """max(0, s_1 - S0) / (t_N - S0): 0 as clairvoyant, 1 as wait-then-act. Long times to first token flatter the
     regret over S0, not this one."""
@@ -90,6 +92,7 @@ def measure(plans: Plans, schedule: Schedule, *, observed_s: float = 0.0, tolera
         start_regret=_share(late, safe),
         signed_start_regret=_share(first - safe, safe),
         start_regret_elastic=_share(np.maximum(first - least, 0.0), least),
+        too_early_s=np.maximum(least - first, 0.0),
         start_regret_of_wait=_share(late, span),
         end_regret=_share(end - best_end, best_end),
         end_regret_of_wait=_share(end - best_end, span),

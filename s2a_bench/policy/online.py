@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 from s2a_bench.policy import Plans, PlanShape, Schedule
+from s2a_bench.policy.changes import learned_along
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.schedule import align, hold
+from s2a_bench.policy.stream_to_act import FAVOURABLE, Rule
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,7 +21,7 @@ if TYPE_CHECKING:
     Ints: TypeAlias = NDArray[np.intp]
 
 
-def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, *, elastic: bool) -> Schedule:
+def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, rule: Rule) -> Schedule:
     """Decide for many plans at once; ``caution`` (lambda) is one number or one a plan, shape (M,).
 
     Plans need ``token_s`` and ``shape``; raises ValueError without. The stream ends with its last token or fragment.
@@ -28,22 +31,26 @@ def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, *, elastic: bool
     if plans.token_s is None or plans.shape is None:
         raise ValueError("an online policy learns from tokens: plans need token_s and shape")
     arrival_s, nominal_s, least_s, most_s = align(plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s)
-    rule = _Rule(prior, np.broadcast_to(np.asarray(caution, dtype=np.float64), arrival_s.shape[1:]), plans.shape)
+    cautions = np.broadcast_to(np.asarray(caution, dtype=np.float64), arrival_s.shape[1:])
+    learned = learned_along(prior, plans.token_s) if rule.detect else None
+    known = _Known(prior, cautions, plans.shape, rule, learned)
     stream = _Stream(plans.token_s, arrival_s)
     nominal_sum, most_sum = _sums_before(nominal_s), _sums_before(most_s)
     start_s = np.empty(arrival_s.shape)
     duration_s = np.empty(arrival_s.shape)
-    start_s[0] = _first_start(rule, stream, nominal_sum, most_sum if elastic else None)
+    start_s[0] = _first_start(known, stream, nominal_sum, most_sum)
     for i, now_s in enumerate(start_s):
         duration_s[i] = nominal_s[i]
-        if elastic:
+        if rule.elastic:
+            if rule.detect and i:
+                now_s[:] = _resume(known, stream, now_s, most_sum, i)
             late_s = np.maximum(now_s - (start_s[0] + nominal_sum[i]), 0.0)
             least = np.minimum(np.maximum(1 - late_s / nominal_s[i], least_s[i] / nominal_s[i]), 1.0)
-            demand = _demand(rule, stream, now_s, nominal_sum, i)
+            demand = _demand(known, stream, now_s, nominal_sum, i)
             duration_s[i] *= np.minimum(np.maximum(demand, least), most_s[i] / nominal_s[i])
         if i + 1 < len(start_s):
             np.maximum(now_s + duration_s[i], arrival_s[i + 1], out=start_s[i + 1])
-    return Schedule(start_s, hold(arrival_s, start_s, duration_s, most_s) if elastic else duration_s)
+    return Schedule(start_s, hold(arrival_s, start_s, duration_s, most_s) if rule.elastic else duration_s)
 
 
 def _sums_before(duration_s: Floats) -> Floats:
@@ -74,12 +81,15 @@ class _Stream:
 
 
 @dataclass(frozen=True, slots=True)
-class _Rule:
-    """What the rule knows before the first token."""
+class _Known:
+    """What is known before the first token."""
 
     prior: GapPrior
     caution: Floats
     shape: PlanShape
+    rule: Rule
+    learned: tuple[Floats, Floats] | None
+    """With changes of the rate: what is learned after each token."""
 
     def view(self, stream: _Stream, plans: Ints, event: Ints) -> _View:
         """See some of the plans as they are after one of their events each."""
@@ -87,7 +97,10 @@ class _Rule:
 
         tokens, parsed = stream.tokens[event, plans], stream.parsed[event, plans]
         last_s = stream.token_s[np.maximum(tokens, 1) - 1, plans]
-        mean_s, variance = self.prior.learned(np.maximum(tokens - 1.0, 0.0), last_s - stream.token_s[0, plans])
+        if self.learned is None:
+            mean_s, variance = self.prior.learned(np.maximum(tokens - 1.0, 0.0), last_s - stream.token_s[0, plans])
+        else:
+            mean_s, variance = (each[np.maximum(tokens, 1) - 1, plans] for each in self.learned)
         next_in = np.maximum(self.shape.tokens_per_skill - (tokens - stream.at_fragment[parsed, plans]), 1.0)
         missing = np.maximum(self.shape.n_skills - parsed, 0)
         unknown = np.arange(missing.max(initial=0), dtype=np.float64)[:, np.newaxis]
@@ -98,7 +111,7 @@ class _Rule:
 class _View:
     """What some of the plans look like after an event: one value a plan, and a row for each skill that is missing."""
 
-    rule: _Rule
+    known: _Known
     plans: Ints
     parsed: Ints
     missing: Ints
@@ -120,18 +133,18 @@ class _View:
 
         at_s = np.full(self.plans.shape, -np.inf)
         for unknown in (np.zeros_like(self.next_in), np.maximum(self.missing - 1.0, 0.0)):
-            tokens = self.next_in + unknown * self.rule.shape.tokens_per_skill
+            tokens = self.next_in + unknown * self.known.shape.tokens_per_skill
             budget_s = known_s + unknown * unknown_s
             each_s = self.last_s + tokens * self.mean_s - budget_s
             each_s[(tokens - 1) * self.mean_s > budget_s] = np.inf
             np.maximum(at_s, each_s, out=at_s)
         return np.where(self.missing > 0, at_s, -np.inf)
 
-    def cautious_start_s(self, known_s: Floats, unknown_s: float) -> Floats:
-        """Return the same for the cautious forecasts."""
+    def cautious_start_s(self, known_s: Floats, unknown_s: float, caution: Floats) -> Floats:
+        """Return the same for the cautious forecasts, each plan with a lambda of its own."""
         import numpy as np
 
-        forecast_s, overdue_s = self._forecasts(unknown_s)
+        forecast_s, overdue_s = self._forecasts(unknown_s, caution)
         budget_s = known_s + self.unknown * unknown_s
         each_s = self.last_s + forecast_s - budget_s
         each_s[overdue_s > budget_s] = np.inf
@@ -141,23 +154,28 @@ class _View:
         """Return the largest (cautious forecast - now) / (durations until then); -inf where nothing is missing."""
         import numpy as np
 
-        forecast_s, overdue_s = self._forecasts(unknown_s)
+        forecast_s, overdue_s = self._forecasts(unknown_s, self.caution)
         until_s = np.maximum(self.last_s + forecast_s, now_s + overdue_s) - now_s
         return self._worst(until_s / (known_s + self.unknown * unknown_s))
 
-    def _forecasts(self, unknown_s: float) -> tuple[Floats, Floats]:
-        """Return the cautious forecasts in s from the last token, and those from a token that comes now."""
-        tokens = self.next_in + self.unknown * self.rule.shape.tokens_per_skill
-        skills = self.unknown * (self.rule.shape.expected_cv * unknown_s) ** 2
-        return self._forecast(tokens, skills), self._forecast(tokens - 1, skills)
+    @property
+    def caution(self) -> Floats:
+        """Return each plan's lambda."""
+        return self.known.caution[self.plans]
 
-    def _forecast(self, tokens: Floats, skills: Floats) -> Floats:
+    def _forecasts(self, unknown_s: float, caution: Floats) -> tuple[Floats, Floats]:
+        """Return the cautious forecasts in s from the last token, and those from a token that comes now."""
+        tokens = self.next_in + self.unknown * self.known.shape.tokens_per_skill
+        skills = self.unknown * (self.known.shape.expected_cv * unknown_s) ** 2
+        return self._forecast(tokens, skills, caution), self._forecast(tokens - 1, skills, caution)
+
+    def _forecast(self, tokens: Floats, skills: Floats, caution: Floats) -> Floats:
         import numpy as np
 
-        gaps = tokens * self.rule.prior.token_cv**2 + tokens**2 * self.variance
+        gaps = tokens * self.known.prior.token_cv**2 + tokens**2 * self.variance
         noise = np.sqrt(self.mean_s**2 * gaps + skills)
         # No noise stays none, with infinite caution too.
-        np.multiply(noise, self.rule.caution[self.plans], out=noise, where=noise > 0)
+        np.multiply(noise, caution, out=noise, where=noise > 0)
         return tokens * self.mean_s + noise
 
     def _worst(self, each: Floats) -> Floats:
@@ -168,43 +186,89 @@ class _View:
         return worst
 
 
-def _first_start(rule: _Rule, stream: _Stream, nominal_sum: Floats, most_sum: Floats | None) -> Floats:
-    """Return when each plan starts, shape (M,); without ``most_sum`` the cautious forecast meets nominal durations."""
+def _first_start(known: _Known, stream: _Stream, nominal_sum: Floats, most_sum: Floats) -> Floats:
+    """Return when each plan starts, shape (M,)."""
     import numpy as np
 
-    expected = rule.shape.expected
-    start_s: Floats = stream.event_s[-1].copy()  # when all has come there is nothing to wait for
-    waiting = np.arange(start_s.size)
+    rule, expected = known.rule, known.shape.expected
+
+    def at_s(event: int, live: Ints, until_s: Floats) -> Floats:
+        view = known.view(stream, live, np.full(live.shape, event))
+        nominal_s, most_s = nominal_sum[view.parsed, live], most_sum[view.parsed, live]
+        if not rule.elastic:
+            return view.cautious_start_s(nominal_s, expected.nominal_s, view.caution)
+        budget_s = rule.budget(nominal_s, most_s)
+        found = view.mean_start_s(budget_s, rule.budget(expected.nominal_s, expected.most_s))
+        if rule.spend and rule.within < np.inf:
+            whole_s = nominal_s + view.missing * expected.nominal_s
+            found = np.where(found > rule.within * whole_s, view.mean_start_s(nominal_s, expected.nominal_s), found)
+        # This demand is cheap and lets few plans through before their time.
+        near = np.flatnonzero(found < until_s)
+        view = known.view(stream, live[near], np.full(near.shape, event))
+        cautious_s = view.cautious_start_s(most_s[near], expected.most_s, rule.start_caution * view.caution)
+        found[near] = np.maximum(found[near], cautious_s)
+        return found
+
+    waiting = np.arange(nominal_sum.shape[1])
+    return _first(stream, waiting, np.full(waiting.shape, -np.inf), at_s)
+
+
+def _resume(known: _Known, stream: _Stream, now_s: Floats, most_sum: Floats, skill: int) -> Floats:
+    """Return when the skill of that number starts: later than now where no forecast can be met."""
+    import numpy as np
+
+    unknown_s = known.shape.expected.most_s
+    plans, view = _seen(known, stream, now_s)
+    most_s = most_sum[view.parsed, plans] - most_sum[skill, plans]
+    favourable = np.full(plans.shape, -FAVOURABLE)
+    holding = plans[view.cautious_start_s(most_s, unknown_s, favourable) > now_s[plans]]
+
+    def at_s(event: int, live: Ints, until_s: Floats) -> Floats:  # noqa: ARG001 - nothing is cheaper here
+        view = known.view(stream, live, np.full(live.shape, event))
+        return view.cautious_start_s(most_sum[view.parsed, live] - most_sum[skill, live], unknown_s, view.caution)
+
+    start_s = now_s.copy()
+    start_s[holding] = _first(stream, holding, now_s[holding], at_s)
+    return start_s
+
+
+def _first(stream: _Stream, plans: Ints, from_s: Floats, at_s: Callable[[int, Ints, Floats], Floats]) -> Floats:
+    """Return the first time from ``from_s`` on that ``at_s`` allows after the events so far; when all has come, then.
+
+    ``at_s`` is told event, plans and when their next event is.
+    """
+    import numpy as np
+
+    start_s: Floats = np.maximum(stream.event_s[-1, plans], from_s)
+    waiting = np.arange(plans.size)
     for event in range(len(stream.event_s) - 1):
-        from_s, until_s = stream.event_s[event], stream.event_s[event + 1]
+        begins_s = np.maximum(stream.event_s[event, plans[waiting]], from_s[waiting])
+        until_s = stream.event_s[event + 1, plans[waiting]]
         # Nothing to start before the first fragment; nothing is decided between events at one instant.
-        live = waiting[(stream.parsed[event, waiting] > 0) & (from_s[waiting] < until_s[waiting])]
-        view = rule.view(stream, live, np.full(live.shape, event))
-        at_s = from_s[live]
-        if most_sum is not None:
-            # This demand is cheap and lets few plans through before their time.
-            at_s = np.maximum(at_s, view.mean_start_s(nominal_sum[view.parsed, live], expected.nominal_s))
-            near = at_s < until_s[live]
-            at_s, live = at_s[near], live[near]
-            view = rule.view(stream, live, np.full(live.shape, event))
-            cautious_s = view.cautious_start_s(most_sum[view.parsed, live], expected.most_s)
-        else:
-            cautious_s = view.cautious_start_s(nominal_sum[view.parsed, live], expected.nominal_s)
-        at_s = np.maximum(at_s, cautious_s)
-        starts = at_s < until_s[live]
-        start_s[live[starts]] = at_s[starts]
+        ready = (stream.parsed[event, plans[waiting]] > 0) & (begins_s < until_s)
+        live, begins_s, until_s = waiting[ready], begins_s[ready], until_s[ready]
+        found = np.maximum(begins_s, at_s(event, plans[live], until_s))
+        starts = found < until_s
+        start_s[live[starts]] = found[starts]
         waiting = np.setdiff1d(waiting, live[starts], assume_unique=True)
     return start_s
 
 
-def _demand(rule: _Rule, stream: _Stream, now_s: Floats, nominal_sum: Floats, skill: int) -> Floats:
+def _seen(known: _Known, stream: _Stream, now_s: Floats) -> tuple[Ints, _View]:
+    """Return the plans of which something is still to come, as they are now."""
+    import numpy as np
+
+    plans = np.flatnonzero(now_s < stream.event_s[-1])
+    event = (stream.event_s[:, plans] <= now_s[plans]).sum(axis=0) - 1
+    return plans, known.view(stream, plans, event)
+
+
+def _demand(known: _Known, stream: _Stream, now_s: Floats, nominal_sum: Floats, skill: int) -> Floats:
     """Return each plan's demand when the skill of that number (from 0) starts; -inf once all has come."""
     import numpy as np
 
     demand = np.full(now_s.shape, -np.inf)
-    plans = np.flatnonzero(now_s < stream.event_s[-1])
-    event = (stream.event_s[:, plans] <= now_s[plans]).sum(axis=0) - 1
-    view = rule.view(stream, plans, event)
+    plans, view = _seen(known, stream, now_s)
     known_s = nominal_sum[view.parsed, plans] - nominal_sum[skill, plans]
-    demand[plans] = view.demand(now_s[plans], known_s, rule.shape.expected.nominal_s)
+    demand[plans] = view.demand(now_s[plans], known_s, known.shape.expected.nominal_s)
     return demand

@@ -15,6 +15,11 @@ and every *cautious* forecast meets the stretched durations before it.
 until then), at least 1 and at most T_max / T_nom; a skill whose successor is still missing is held on up to T_max.
 Where that ratio allows it, a skill is compressed, down to T_min, to recover what stretching and stalls have cost.
 
+**Variants.** `Rule` says how the stretch is split between start and reserve, and whether a change of the rate within
+the plan is looked for (`changes`). Then the forecast is made anew; and at a boundary from which stretching cannot even
+meet a favourable forecast (lambda = -FAVOURABLE) the robot holds once, until it can meet the cautious one, instead of
+stalling again and again.
+
 The stepper here is plain arithmetic on one plan; `online.schedule` does the same for arrays of plans.
 """
 
@@ -27,15 +32,38 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, TypeAlias
 from pydantic import Field
 
 from s2a_bench.policy import Plans, PlanShape, Schedule, Start, Timing
-from s2a_bench.policy.estimator import VAGUE, GapPrior
+from s2a_bench.policy.estimator import VAGUE, GapPrior, Number
 
 if TYPE_CHECKING:
-    from s2a_bench.policy import Stepper
+    from s2a_bench.policy import Floats, Stepper
+    from s2a_bench.policy.changes import Watch
 
 CAUTION = 2.33
 """lambda until it is calibrated: the normal distribution's 99 % quantile."""
+FAVOURABLE = 2.0
+"""Standard deviations by which a favourable forecast is earlier than the mean."""
 Caution: TypeAlias = Annotated[float, Field(ge=0)]
 """lambda; infinity waits for the whole plan."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """What variants of the online rule differ in."""
+
+    elastic: bool = True
+    """Whether skills may be stretched, held on and compressed."""
+    spend: float = 0.0
+    """Share of the stretch, from nominal to longest durations, that the mean forecast may use up at the start."""
+    within: float = math.inf
+    """Spend only where the start comes within so many times the plan's nominal duration."""
+    start_caution: float = 1.0
+    """lambda at the start, over that which stretches."""
+    detect: bool = False
+    """Whether a change of the rate within the plan is looked for."""
+
+    def budget(self, nominal_s: Number, most_s: Number) -> Number:
+        """Return what the mean forecast has to meet at the start."""
+        return nominal_s if not self.spend else (1 - self.spend) * nominal_s + self.spend * most_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,22 +71,32 @@ class StreamToAct:
     """The online rule; ``prior`` comes from the hardware profile, ``caution`` (lambda) from `conformal.calibrate`."""
 
     name: ClassVar[str] = "stream-to-act"
-    elastic: ClassVar[bool] = True
-    """Whether skills may be stretched, held on and compressed."""
 
     prior: GapPrior = VAGUE
     caution: Caution | None = None
     """None: calibrated where a run has plans to do that on, else `CAUTION`."""
+    detect: bool = False
+    """Whether a change of the rate within the plan is looked for."""
 
     def schedule(self, plans: Plans) -> Schedule:
         """Decide for many plans at once; they need ``token_s`` and ``shape``."""
         from s2a_bench.policy.online import schedule
 
-        return schedule(self.prior, self._lambda, plans, elastic=self.elastic)
+        return schedule(self.prior, self._lambda, plans, self.rule)
 
     def stepper(self, shape: PlanShape) -> Stepper:
         """Follow one plan as it arrives."""
-        return OnlineStepper(self.prior, self._lambda, shape, self.elastic)
+        watch = None
+        if self.detect:
+            from s2a_bench.policy.changes import Watch
+
+            watch = Watch(self.prior)
+        return OnlineStepper(self.prior, self._lambda, shape, self.rule, watch)
+
+    @property
+    def rule(self) -> Rule:
+        """Return which variant this is."""
+        return Rule(detect=self.detect)
 
     @property
     def _lambda(self) -> float:
@@ -66,13 +104,33 @@ class StreamToAct:
 
 
 @dataclass(frozen=True, slots=True)
+class EarlyStart(StreamToAct):
+    """Start as soon as the cautious forecast meets the stretched durations: stretching is spent on an early start."""
+
+    name: ClassVar[str] = "stream-to-act-early"
+
+    spend: Annotated[float, Field(ge=0, le=1)] = 1.0
+    within: Annotated[float, Field(ge=0)] = math.inf
+    start_caution: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
+
+    @property
+    def rule(self) -> Rule:
+        """Return which variant this is."""
+        return Rule(spend=self.spend, within=self.within, start_caution=self.start_caution, detect=self.detect)
+
+
+@dataclass(frozen=True, slots=True)
 class MeanStart(StreamToAct):
     """For study, the obvious online rule: start when the mean forecast meets the nominal durations, never stretch."""
 
     name: ClassVar[str] = "s2a-mean"
-    elastic: ClassVar[bool] = False
 
     caution: Caution | None = 0.0
+
+    @property
+    def rule(self) -> Rule:
+        """Return which variant this is."""
+        return Rule(elastic=False, detect=self.detect)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +138,13 @@ class QuantileStart(StreamToAct):
     """For study: start when the cautious forecast meets the nominal durations, never stretch."""
 
     name: ClassVar[str] = "s2a-quantile"
-    elastic: ClassVar[bool] = False
 
     caution: Caution | None = CAUTION
+
+    @property
+    def rule(self) -> Rule:
+        """Return which variant this is."""
+        return Rule(elastic=False, detect=self.detect)
 
 
 @dataclass(slots=True)
@@ -92,7 +154,9 @@ class OnlineStepper:
     prior: GapPrior
     caution: float
     shape: PlanShape
-    elastic: bool
+    rule: Rule
+    watch: Watch | None = None
+    """Looks for changes of the rate."""
     parsed: list[Timing] = field(default_factory=list)
     started: int = 0
     tokens: int = 0
@@ -100,6 +164,8 @@ class OnlineStepper:
     first_token_s: float = math.nan
     last_token_s: float = math.nan
     ended: bool = False
+    holding: bool = False
+    """Whether the robot holds at a boundary, until stretching can meet the cautious forecast."""
     due_s: float = math.nan
     """When the next skill would start had all skills run at their nominal durations; NaN before the first start."""
 
@@ -110,6 +176,8 @@ class OnlineStepper:
         self.tokens += 1
         self.since_fragment += 1
         self.last_token_s = at_s
+        if self.watch is not None:
+            self.watch.token(_one(at_s))
 
     def fragment(self, at_s: float, timing: Timing) -> None:
         """Queue a skill."""
@@ -131,11 +199,13 @@ class OnlineStepper:
             if now_s < at_s:
                 return at_s
             self.due_s = now_s
+        elif self.watch is not None and self.rule.elastic and now_s < (at_s := self._resume_s(now_s)):
+            return at_s
         timing = self.parsed[self.started]
-        ratio = self._ratio(now_s, timing) if self.elastic else 1.0
+        ratio = self._ratio(now_s, timing) if self.rule.elastic else 1.0
         self.started += 1
         self.due_s += timing.nominal_s
-        return Start(ratio * timing.nominal_s, timing.most_s if self.elastic else timing.nominal_s)
+        return Start(ratio * timing.nominal_s, timing.most_s if self.rule.elastic else timing.nominal_s)
 
     def _missing(self) -> list[tuple[float, int]]:
         """List the skills to come: how many tokens away, and after how many other skills of unknown duration."""
@@ -146,31 +216,53 @@ class OnlineStepper:
 
     def _forecast(self, tokens: float, unknown: int, caution: float, duration_s: float) -> float:
         """Return the forecast, in s after the last token, for a skill after ``unknown`` ones of ``duration_s`` each."""
-        gaps = max(self.tokens - 1, 0)
-        mean, variance = self.prior.learned(float(gaps), self.last_token_s - self.first_token_s)
+        mean, variance = self._learned()
         gap_noise = mean**2 * (tokens * self.prior.token_cv**2 + tokens**2 * variance)
         skill_noise = unknown * (self.shape.expected_cv * duration_s) ** 2
         noise = math.sqrt(gap_noise + skill_noise)
         return tokens * mean + (caution * noise if noise else 0.0)  # no noise stays none, with infinite caution too
 
+    def _learned(self) -> tuple[float, float]:
+        """Return the plan's mean gap, and its variance relative to the mean squared."""
+        if self.watch is None:
+            return self.prior.learned(float(max(self.tokens - 1, 0)), self.last_token_s - self.first_token_s)
+        mean_s, variance = self.watch.learned
+        return float(mean_s[0]), float(variance[0])
+
     def _start_s(self) -> float:
         """Return the start time as things stand now; infinity where only another token can tell."""
-        expected = self.shape.expected
+        rule, expected = self.rule, self.shape.expected
         nominal_s = sum(timing.nominal_s for timing in self.parsed)
+        if not rule.elastic:
+            return self._met_s(self.caution, nominal_s, expected.nominal_s)
         most_s = sum(timing.most_s for timing in self.parsed)
-        demands = (
-            [(0.0, nominal_s, expected.nominal_s), (self.caution, most_s, expected.most_s)]
-            if self.elastic
-            else [(self.caution, nominal_s, expected.nominal_s)]
-        )
+        at_s = self._met_s(0.0, rule.budget(nominal_s, most_s), rule.budget(expected.nominal_s, expected.most_s))
+        whole_s = nominal_s + len(self._missing()) * expected.nominal_s
+        if rule.spend and at_s > rule.within * whole_s:
+            at_s = self._met_s(0.0, nominal_s, expected.nominal_s)
+        return max(at_s, self._met_s(self.caution * rule.start_caution, most_s, expected.most_s))
+
+    def _resume_s(self, now_s: float) -> float:
+        """Return until when to hold at this boundary; a time that is past where stretching may still be enough."""
+        most_s = sum(timing.most_s for timing in self.parsed[self.started :])
+        unknown_s = self.shape.expected.most_s
+        self.holding = self.holding or self._met_s(-FAVOURABLE, most_s, unknown_s) > now_s
+        at_s = self._met_s(self.caution, most_s, unknown_s) if self.holding else -math.inf
+        self.holding = now_s < at_s
+        return at_s
+
+    def _met_s(self, caution: float, known_s: float, unknown_s: float) -> float:
+        """Return from when on every forecast is met by the durations before it; infinity where only a token can tell.
+
+        ``known_s`` is what the skills take that are parsed, ``unknown_s`` each of those after them.
+        """
         at_s = -math.inf
         for tokens, unknown in self._missing():
-            for caution, known_s, unknown_s in demands:
-                budget_s = known_s + unknown * unknown_s
-                # Overdue at that time: the forecast moves on with the clock, so the budget must cover its rest.
-                if self._forecast(tokens - 1, unknown, caution, unknown_s) > budget_s:
-                    return math.inf
-                at_s = max(at_s, self.last_token_s + self._forecast(tokens, unknown, caution, unknown_s) - budget_s)
+            budget_s = known_s + unknown * unknown_s
+            # Overdue at that time: the forecast moves on with the clock, so the budget must cover its rest.
+            if self._forecast(tokens - 1, unknown, caution, unknown_s) > budget_s:
+                return math.inf
+            at_s = max(at_s, self.last_token_s + self._forecast(tokens, unknown, caution, unknown_s) - budget_s)
         return at_s
 
     def _ratio(self, now_s: float, timing: Timing) -> float:
@@ -185,3 +277,9 @@ class OnlineStepper:
         late_s = max(now_s - self.due_s, 0.0)
         least = min(max(1 - late_s / timing.nominal_s, timing.least_s / timing.nominal_s), 1.0)
         return min(max(demand, least), timing.most_s / timing.nominal_s)
+
+
+def _one(value: float) -> Floats:
+    import numpy as np
+
+    return np.array([value])

@@ -68,7 +68,7 @@ def test_json_is_one_object_that_keeps_its_schema(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["fly"], "NAME: 'fly' is none of targets, frontier, drift, misfit"),
+        (["fly"], "NAME: 'fly' is none of targets, frontier, drift, shift, split, misfit"),
         (["targets", "--plans", "0"], "--plans: 0 should be greater than or equal to 1"),
         (["targets", "--calibration-plans", "20"], "20 calibration plans promise 0.048 at best, not 0.01: take 99 or"),
         (["targets", "--epsilon", "0"], "--epsilon: 0 should be between 0 and 1"),

@@ -17,6 +17,8 @@ from s2a_bench.experiments import experiment_of
 from s2a_bench.experiments.study import drift as study_drift
 from s2a_bench.experiments.study import jitter as study_jitter
 from s2a_bench.experiments.study import misfit as study_misfit
+from s2a_bench.experiments.study import shift as study_shift
+from s2a_bench.experiments.study import split as study_split
 from s2a_bench.experiments.study import targets as study_targets
 from s2a_bench.experiments.study.config import StudyConfig
 from s2a_bench.experiments.study.rows import STUDY_CELLS, StudyRow
@@ -226,7 +228,7 @@ def test_recorded_answers_become_plans_and_short_ones_are_left_out() -> None:
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (study_targets, study_jitter, study_drift, study_misfit):
+    for module in (study_targets, study_jitter, study_drift, study_misfit, study_shift, study_split):
         monkeypatch.setattr(module, "WORLDS", HARDEST[:1])
     monkeypatch.setattr(study_drift, "REFIT", 32)
     progress = NullProgress()
@@ -259,7 +261,7 @@ def test_a_study_is_kept_and_told(name: str, tmp_path: Path, monkeypatch: pytest
     ("asked", "message"),
     [
         ({}, "`name` is needed"),
-        ({"name": "fly"}, "`name`: 'fly' is none of targets, frontier, drift, misfit"),
+        ({"name": "fly"}, "`name`: 'fly' is none of targets, frontier, drift, shift, split, misfit"),
         ({"name": "targets", "jobs": 0}, "`jobs`: 0 should be"),
         ({"name": "targets", "plans": 0}, "`plans`: 0 should be"),
         ({"name": "targets", "seed": -1}, "`seed`: -1 should be"),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,14 +16,36 @@ from s2a_bench.policy import Plans, PlanShape, Start, Timing, stepping
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
-from s2a_bench.policy.stream_to_act import MeanStart, OnlineStepper, QuantileStart, StreamToAct
+from s2a_bench.policy.stream_to_act import EarlyStart, MeanStart, OnlineStepper, QuantileStart, Rule, StreamToAct
 from s2a_bench.testing.policy import EXACT, draw
 
 SHAPE = PlanShape(4, 2, Timing(1.0, 0.8, 1.5), expected_cv=0.2)
 PRIOR = GapPrior(0.5, 0.1, 0.2)
 KINDS = st.sampled_from([StreamToAct, MeanStart, QuantileStart])
+VARIANTS = st.one_of(
+    st.builds(partial, KINDS, detect=st.booleans()),
+    st.builds(
+        partial,
+        st.just(EarlyStart),
+        detect=st.booleans(),
+        spend=st.sampled_from([0.0, 0.3, 1.0]),
+        within=st.sampled_from([0.0, 0.5, 1.0, math.inf]),
+        start_caution=st.sampled_from([0.1, 0.7, 1.0]),
+    ),
+)
+"""What makes a policy of a prior and a caution."""
 PRIORS = st.builds(GapPrior, st.floats(0.02, 2), st.floats(0.01, 3), st.floats(0.01, 2))
 CAUTIONS = st.one_of(st.floats(0, 6), st.just(math.inf))
+
+
+def slowing(plans: Plans, times: float) -> Plans:
+    """Make all gaps so many times as long from the middle of the plan on."""
+    assert plans.token_s is not None
+    count, tokens = len(plans.arrival_s), len(plans.token_s)
+    gaps = np.diff(plans.token_s, axis=0, prepend=0.0)
+    gaps[tokens // 2 :] *= times
+    token_s = np.cumsum(gaps, axis=0)
+    return replace(plans, token_s=token_s, arrival_s=token_s[tokens // count - 1 :: tokens // count])
 
 
 def stepper(caution: float = 2.0, *, prior: GapPrior = PRIOR) -> OnlineStepper:
@@ -109,7 +133,7 @@ def test_lateness_is_recovered_down_to_the_least_duration_and_not_beyond_schedul
 
 @settings(deadline=None, max_examples=150)
 @given(
-    kind=KINDS,
+    kind=VARIANTS,
     prior=PRIORS,
     caution=CAUTIONS,
     seed=st.integers(0, 2**32 - 1),
@@ -121,9 +145,10 @@ def test_lateness_is_recovered_down_to_the_least_duration_and_not_beyond_schedul
     expected_cv=st.floats(0, 0.5),
     parsing_s=st.floats(0, 0.4),
     trailing=st.integers(0, 3),
+    slower=st.sampled_from([1.0, 2.0, 5.0]),
 )
 def test_steps_and_arrays_agree_whatever_is_believed_and_however_fragments_lag(
-    kind: type[StreamToAct],
+    kind: Callable[[GapPrior, float], StreamToAct],
     prior: GapPrior,
     caution: float,
     seed: int,
@@ -135,8 +160,9 @@ def test_steps_and_arrays_agree_whatever_is_believed_and_however_fragments_lag(
     expected_cv: float,
     parsing_s: float,
     trailing: int,
+    slower: float,
 ) -> None:
-    plans = draw(seed, n_skills, tokens, rho, 3)
+    plans = slowing(draw(seed, n_skills, tokens, rho, 3), slower)
     assert plans.token_s is not None
     after = plans.token_s[-1] + np.cumsum(np.full((trailing, 3), 0.21), axis=0)
     plans = replace(
@@ -167,7 +193,7 @@ def test_each_plan_may_have_its_own_caution() -> None:
 
     plans = draw(7, 6, 3, 1.4, 4)
     cautions = [0.0, 1.0, 3.0, math.inf]
-    together = schedule(PRIOR, cautions, plans, elastic=True)
+    together = schedule(PRIOR, cautions, plans, Rule())
     for column, caution in enumerate(cautions):
         alone = StreamToAct(PRIOR, caution).schedule(plans)
         np.testing.assert_array_equal(together.start_s[:, column], alone.start_s[:, column])

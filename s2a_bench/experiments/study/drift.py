@@ -7,10 +7,10 @@ the last plans, anew every 50 plans.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import fields
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -18,11 +18,12 @@ from s2a_bench.experiments.study.config import Cell, StudyConfig
 from s2a_bench.experiments.study.rows import StudyRow
 from s2a_bench.experiments.study.to_rows import row_of
 from s2a_bench.experiments.study.worlds import World, generator
-from s2a_bench.policy import Plans, online
-from s2a_bench.policy.conformal import GRID, TOLERANCE_S, Tracker, choose, scores, take
+from s2a_bench.policy import Plans
+from s2a_bench.policy.conformal import TOLERANCE_S, Tracker, choose, scores, take
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import Metrics, measure
 from s2a_bench.policy.stream_to_act import StreamToAct
+from s2a_bench.policy.tracking import Tracked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,7 +35,6 @@ BLOCKS: Final = 8
 REFIT: Final = 50
 ARMS: Final = ("fixed", "tracked", "refitted")
 WORLDS: Final = (World(4.8, 0.5, 6, 8, 1.0), World(0.58, 3.0, 1, 8, 1.0))
-CAUTIONS: Final = (*GRID, float("inf"))
 
 
 def drifts(plans: int) -> dict[str, Floats]:
@@ -79,53 +79,29 @@ def cell(config: StudyConfig, world: World, drift: str) -> list[StudyRow]:
 
 
 def follow(calibration: Plans, plans: Plans, epsilon: float, arm: str) -> tuple[Floats, Metrics]:
-    """Decide the plans one after another; returns each plan's lambda and how it went.
-
-    What a stretch of plans would do at every lambda is computed at once, and lambda is picked from it plan by plan.
-    """
+    """Decide the plans one after another; returns each plan's lambda and how it went."""
     assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
     policy = StreamToAct(GapPrior.fit(calibration.token_s))
-    score = scores(policy, calibration)
-    tracker, fixed = Tracker(score, epsilon), choose(score, epsilon).caution
-    window, count = calibration.arrival_s.shape[1], plans.arrival_s.shape[1]
-    seen = calibration.token_s
+    score, count = scores(policy, calibration), plans.arrival_s.shape[1]
+    if arm == "fixed":
+        fixed = choose(score, epsilon).caution
+        schedule = replace(policy, caution=fixed).schedule(plans)
+        return np.full(count, fixed), measure(plans, schedule, tolerance_s=TOLERANCE_S)
+    tracked = Tracked(policy, Tracker(score, epsilon))
+    window, seen = calibration.arrival_s.shape[1], calibration.token_s
     chosen, parts = [], []
     for places in np.array_split(np.arange(count), max(1, count // REFIT) if arm == "refitted" else 1):
         part = take(plans, places)
-        found = _at_every_caution(policy, part)
-        least = _scores(found.stalls > 0)
-        ranks = np.empty(places.size, dtype=np.intp)
-        for place, score_of_plan in enumerate(least):
-            ranks[place] = CAUTIONS.index(fixed if arm == "fixed" else tracker.caution)
-            tracker.learn(score_of_plan, stalled=bool(found.stalls[ranks[place], place]))
-        chosen += [CAUTIONS[rank] for rank in ranks]
-        parts.append(_at(found, ranks, np.arange(places.size)))
+        caution, schedule = tracked.follow(part)
+        chosen.append(caution)
+        parts.append(measure(part, schedule, tolerance_s=TOLERANCE_S))
         if arm == "refitted":
             assert part.token_s is not None  # noqa: S101
             seen = np.concatenate([seen, part.token_s], axis=1)[:, -window:]
-            policy = StreamToAct(GapPrior.fit(seen))
+            tracked = Tracked(StreamToAct(GapPrior.fit(seen)), tracked.tracker)
     columns = [[getattr(part, item.name) for part in parts] for item in fields(Metrics)]
-    return np.array(chosen), Metrics(*map(np.concatenate, columns))
+    return np.concatenate(chosen), Metrics(*map(np.concatenate, columns))
 
 
-def _at_every_caution(policy: StreamToAct, plans: Plans) -> Metrics:
-    """Return how each plan would go at each lambda: metrics of shape (lambdas, plans)."""
-    count = plans.arrival_s.shape[1]
-    copies = take(plans, np.tile(np.arange(count), len(CAUTIONS)))
-    schedule = online.schedule(policy.prior, np.repeat(CAUTIONS, count), copies, elastic=policy.elastic)
-    return _each(measure(copies, schedule, tolerance_s=TOLERANCE_S), lambda values: values.reshape(-1, count))
-
-
-def _scores(stalls: NDArray[np.bool_]) -> list[float]:
-    """Return the least lambda from which on each plan does not stall; ``stalls`` has the shape (lambdas, plans)."""
-    above = len(CAUTIONS) - np.argmax(stalls[::-1], axis=0)
-    ranks = np.where(stalls.any(axis=0), above, 0)
-    return [CAUTIONS[min(rank, len(CAUTIONS) - 1)] for rank in ranks]
-
-
-def _at(found: Metrics, *places: NDArray[np.intp]) -> Metrics:
-    return _each(found, lambda values: values[places])
-
-
-def _each(found: Metrics, change: Callable[[Any], Any]) -> Metrics:
-    return Metrics(*(change(getattr(found, item.name)) for item in fields(Metrics)))
+def _at(found: Metrics, places: NDArray[np.intp]) -> Metrics:
+    return Metrics(*(getattr(found, item.name)[places] for item in fields(Metrics)))

@@ -20,7 +20,7 @@ class StudyRow:
     in folders from before they were there.
     """
 
-    study: Annotated[str, {"enum": ["targets", "frontier", "drift", "misfit"]}]
+    study: Annotated[str, {"enum": ["targets", "frontier", "drift", "shift", "split", "misfit"]}]
     policy: str
     tokens_per_s: Positive
     prompt_s: Annotated[NonNegative, about("c: from the request to the start of decoding.")]
@@ -49,6 +49,10 @@ class StudyRow:
     start_regret_elastic: Annotated[NonNegative | None, about("Mean of max(0, s_1 - S_lo) / S_lo.")] = None
     end_regret_elastic: Annotated[float | None, about("Mean of (e_N - E_lo) / E_lo.")] = None
     speed_distortion: Annotated[NonNegative | None, about("Mean of durations over nominal ones.")] = None
+    stalls: Annotated[NonNegative | None, about("Mean number of stalls a plan.")] = None
+    p_too_early: Annotated[
+        Fraction | None, about("Share of the plans that start before S_lo: no stretching can keep them from stalling.")
+    ] = None
     seed: Annotated[Count | None, about("Of the study it is from, where several were run.")] = None
 
 

@@ -48,6 +48,20 @@ _ALL: Final = (
         figure=f"{_HERE}.view.figures:build_drift",
     ),
     Study(
+        "shift",
+        "plans unlike those of the calibration",
+        cells=f"{_HERE}.shift:cells",
+        tables=f"{_HERE}.view.rules:shift_tables",
+        figure=f"{_HERE}.view.rules:build_shift",
+    ),
+    Study(
+        "split",
+        "stretching spent on an early start or kept",
+        cells=f"{_HERE}.split:cells",
+        tables=f"{_HERE}.view.rules:split_tables",
+        figure=f"{_HERE}.view.rules:build_split",
+    ),
+    Study(
         "misfit",
         "wrong N, L, rate",
         cells=f"{_HERE}.misfit:cells",

@@ -84,6 +84,8 @@ def row_of(
         start_regret_elastic=_mean(found.start_regret_elastic),
         end_regret_elastic=_mean(found.end_regret_elastic),
         speed_distortion=_mean(found.speed_distortion),
+        stalls=float(found.stalls.mean()),
+        p_too_early=float(np.mean(found.too_early_s > TOLERANCE_S)),
     )
 
 

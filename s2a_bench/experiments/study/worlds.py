@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 LEAST, MOST = 0.8, 1.5
 """T_min and T_max over T_nom."""
+HARD = 0.8
+"""rho above which starting when a skill arrives is not safe."""
 SKILL_CV = 0.20
 PLAN_CV = 0.10
 TTFT_CV = 0.15

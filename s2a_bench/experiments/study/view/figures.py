@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.study.view.tables import WORLD, first_seed, rows_of
-from s2a_bench.experiments.study.view.targets import END, HARD, ONLINE, START, WORST
+from s2a_bench.experiments.study.view.targets import END, ONLINE, START, WORST
+from s2a_bench.experiments.study.worlds import HARD
 from s2a_bench.writers.figures import new_figure
 
 if TYPE_CHECKING:

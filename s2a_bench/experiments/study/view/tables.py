@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments.study.rows import STUDY_CELLS
 from s2a_bench.experiments.study.studies import STUDIES, Study
-from s2a_bench.experiments.study.view.targets import HARD, ONLINE, targets_of
+from s2a_bench.experiments.study.view.targets import ONLINE, targets_of
+from s2a_bench.experiments.study.worlds import HARD
 from s2a_bench.writers.tables import ABSENT, DRAWN, Note, TextTable
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 LEVELS: Final = (0.01, 0.05, 0.20)
 """Shares of stalled plans at which a frontier's regret is read off."""
 WORLD: Final = ["tokens_per_s", "tokens_per_skill", "n_skills", "t_nom_s"]
-_DRAWN: Final = "Plans are drawn from models of the arrivals; nothing here is measured."
+DRAWN_PLANS: Final = "Plans are drawn from models of the arrivals; nothing here is measured."
 
 
 def regret_at(points: pd.DataFrame, level: float, what: str = "start_regret") -> float:
@@ -94,8 +95,8 @@ def target_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
         )
         for place, each in enumerate(zip(*by_seed, strict=True))
     ]
-    settings = f"{len(first_seed(online))} settings{_seeds(rows)}"
-    note = Note(f"{settings}, {int(online['plans'].sum()):,} plans. {_DRAWN}", DRAWN)
+    settings = f"{len(first_seed(online))} settings{seeds(rows)}"
+    note = Note(f"{settings}, {int(online['plans'].sum()):,} plans. {DRAWN_PLANS}", DRAWN)
     yield TextTable(f"Targets of {ONLINE}", ("", "reached", "wanted", ""), lines, 1, notes=(note,))
     columns = {
         "P(stall)": "p_any_stall",
@@ -141,7 +142,7 @@ def frontier_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
         )
         for _, points in rows[rows["condition"] == ""].groupby([*WORLD, "family", "policy"], sort=False)
     ]
-    notes = (Note(f"Start regret over S0 where that share of the plans stalls{_seeds(rows)}. {_DRAWN}", DRAWN),)
+    notes = (Note(f"Start regret over S0 where that share of the plans stalls{seeds(rows)}. {DRAWN_PLANS}", DRAWN),)
     yield TextTable("Frontier: what rare stalls cost", header, lines, 7, notes=notes)
     yield _guarantees(rows)
 
@@ -163,7 +164,7 @@ def _guarantees(rows: pd.DataFrame) -> TextTable:
     ]
     plans = int(rows["calibration_plans"].max())
     notes = (
-        f"lambda as --guarantee makes calibration on {plans} plans choose it{_seeds(rows)}.",
+        f"lambda as --guarantee makes calibration on {plans} plans choose it{seeds(rows)}.",
         "late start, over S_lo: start regret over S0 and over S_lo.",
     )
     return TextTable("What epsilon buys", header, lines, 7, notes=notes)
@@ -184,7 +185,7 @@ def drift_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
     ]
     notes = (
         "P(any stall) in one stretch of plans after the other; the drift begins with the third of eight.",
-        Note(f"late start: mean start regret over S0. {_DRAWN}", DRAWN),
+        Note(f"late start: mean start regret over S0. {DRAWN_PLANS}", DRAWN),
     )
     yield TextTable("Drift", header, lines, 6, notes=notes)
 
@@ -203,7 +204,7 @@ def misfit_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
         for _, points in rows.groupby([*WORLD, "condition"], sort=False)
     ]
     yield TextTable(
-        "Wrong beliefs", header, lines, 6, notes=(Note(f"Calibrated with the right ones. {_DRAWN}", DRAWN),)
+        "Wrong beliefs", header, lines, 6, notes=(Note(f"Calibrated with the right ones. {DRAWN_PLANS}", DRAWN),)
     )
 
 
@@ -211,7 +212,7 @@ def _world(row: pd.Series) -> tuple[str, ...]:
     return (*(f"{row[name]:g}" for name in WORLD), f"{row['rho']:.2f}")
 
 
-def _seeds(rows: pd.DataFrame) -> str:
+def seeds(rows: pd.DataFrame) -> str:
     """Say how many seeds there are, where there are several."""
     count = rows["seed"].nunique()
     return f", mean and range of {count} seeds" if count > 1 else ""

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from s2a_bench.experiments.study.worlds import HARD
 from s2a_bench.policy.conformal import upper_bound
 
 if TYPE_CHECKING:
     import pandas as pd
 
 ONLINE: Final = "stream-to-act"
-HARD: Final = 0.8
-"""rho above which starting when a skill arrives is not safe."""
 POOLED, WORST, START, END = 0.01, 0.02, 0.05, 0.06
 """What is wanted: P(any stall) of all plans and of every setting, mean start and end regret."""
 
