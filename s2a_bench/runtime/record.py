@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from s2a_bench.plan import Call
+from s2a_bench.policy import Plans, PlanShape
 from s2a_bench.runtime.events import Fault
 
 Outcome: TypeAlias = Literal["completed", "short", "skill-failed", "skill-overran", "aborted"] | Fault
@@ -79,3 +80,25 @@ class Record:
     def stalls_ns(self) -> list[int]:
         """Return how long the robot had nothing to do between skills, as it happened."""
         return [after.start_ns - (before.end_ns or 0) for before, after in zip(self.ran, self.skills[1:], strict=False)]
+
+
+def observed(record: Record, shape: PlanShape) -> Plans | None:
+    """Return the plan as it came, one column with tokens and ``shape``; None where it did not come whole."""
+    import numpy as np
+
+    zero_ns, arrivals = record.requested_ns, record.arrivals[: shape.n_skills]
+    if zero_ns is None or len(arrivals) < shape.n_skills or not record.token_ns:
+        return None
+
+    def column(values: list[float]) -> Any:
+        return np.array(values, dtype=np.float64)[:, np.newaxis]
+
+    times = [call.skill.durations for _, call in arrivals]
+    return Plans(
+        arrival_s=column([(at_ns - zero_ns) / 1e9 for at_ns, _ in arrivals]),
+        nominal_s=column([time.nominal_s for time in times]),
+        least_s=column([time.least_s for time in times]),
+        most_s=column([time.most_s for time in times]),
+        token_s=column([(at_ns - zero_ns) / 1e9 for at_ns in record.token_ns]),
+        shape=shape,
+    )

@@ -131,3 +131,15 @@ def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
         drive(REPLAYED, tmp_path / "runs", fast)
     (folder,) = (tmp_path / "runs").iterdir()
     assert len(read_run(folder).table(TOKENS)) == 2 * L
+
+
+def test_lambda_comes_from_earlier_plans_and_this_one_teaches(fast: str, tmp_path: Path) -> None:
+    file = tmp_path / "machine.json"
+    asked = REPLAYED.but(track_file=file)
+    first = drive(asked, tmp_path / "first", fast)
+    (state,) = json.loads(file.read_text())["policies"].values()
+    assert state["level"] != state["epsilon"]
+    drive(asked, tmp_path / "second", fast)
+    (again,) = json.loads(file.read_text())["policies"].values()
+    assert again["scores"][:-1] == state["scores"][1:]
+    assert first.manifest["configuration"]["live"]["track_file"] == str(file)

@@ -362,3 +362,61 @@ def test_skills_keep_their_own_durations_unless_they_are_given(config: TimelineC
     assert (bool(given.grammar), given.max_tokens) == (True, 48)
     (free,) = asks_of(config.but(no_grammar=True), None)
     assert free.grammar == ""
+
+
+def test_what_lambda_has_learned_goes_on_in_the_next_run(config: TimelineConfig, tmp_path: Path) -> None:
+    file = tmp_path / "machine.json"
+    asked = config.but(policies=("stream-to-act", "stream-to-act?detect=True"), track_file=file, plans=2)
+    first, _ = live(asked, tmp_path / "first")
+    learned = json.loads(file.read_text())
+    assert set(learned["policies"]) == {f"L6/N8/T0.03/{policy}" for policy in asked.policies}
+    state = learned["policies"]["L6/N8/T0.03/stream-to-act"]
+    assert len(state["scores"]) == 400
+    assert state["level"] != state["epsilon"] == 0.01
+    second, _ = live(asked.but(plans=1), tmp_path / "second")
+    again = json.loads(file.read_text())["policies"]["L6/N8/T0.03/stream-to-act"]
+    assert again["prior"] == state["prior"]
+    assert again["scores"][:-1] == state["scores"][1:]
+    assert first.manifest["configuration"]["track_file"] == str(file)
+    assert second.manifest["state"] == "finished"
+
+
+def test_lambda_is_followed_in_real_time(fast: str, tmp_path: Path) -> None:
+    config = TimelineConfig(
+        real_time=True,
+        profiles=(fast,),
+        tokens_per_skill=(2,),
+        n_skills=(4,),
+        t_nom_s=(0.01,),
+        jitter="lognormal:cv=0.3",
+        policies=("stream-to-act",),
+        plans=2,
+        track_file=tmp_path / "machine.json",
+    )
+    run = read_run(run_real_time(config, tmp_path / "runs", Watched()))
+    assert len(run.table(TIMELINES)) == 2
+    (state,) = json.loads((tmp_path / "machine.json").read_text())["policies"].values()
+    assert len(state["scores"]) == 400
+    assert state["level"] != state["epsilon"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("not json", "name another file"),
+        ("[]", "was not written by --track-file"),
+        ('{"schema": "s2a-bench-tracking/1", "policies": 3}', "was not written by --track-file"),
+        (
+            '{"schema": "s2a-bench-tracking/1", "policies": {"L6/N8/T0.03/stream-to-act": {"scores": []}}}',
+            "holds no state of tracking",
+        ),
+    ],
+)
+def test_a_file_that_tracking_did_not_write_is_refused_and_left(
+    config: TimelineConfig, text: str, message: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "machine.json"
+    file.write_text(text)
+    with pytest.raises(UsageError, match=f"`track_file`: .*{message}"):
+        live(config.but(track_file=file, policies=("stream-to-act",)), tmp_path)
+    assert file.read_text() == text

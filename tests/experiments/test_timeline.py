@@ -24,6 +24,7 @@ from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.to_rows import KEPT_PLANS, Setting, timeline_rows
 from s2a_bench.experiments.timeline.traces import recordings
 from s2a_bench.experiments.timeline.view.cells import timelines_of
+from s2a_bench.experiments.timeline.view.tables import timeline_tables
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.conformal import Calibration
 from s2a_bench.policy.robust import RobustStart
@@ -283,7 +284,7 @@ def test_a_folder_without_a_run_or_answers_is_named(tmp_path: Path) -> None:
 
 def test_lambda_that_nothing_can_promise_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     never = Calibration(math.inf, 0.01, 400, 0, 0.0, 0.01, 0.99)
-    monkeypatch.setattr("s2a_bench.experiments.timeline.policies.calibrate", lambda *_: never)
+    monkeypatch.setattr("s2a_bench.experiments.timeline.policies.choose", lambda *_: never)
     config = JITTERY.but(plans=20)
     run = ran(config, tmp_path)
     (warning,) = run.manifest["warnings"]
@@ -317,3 +318,57 @@ def test_a_skill_that_fails_at_once_has_a_row_and_no_motion() -> None:
     (row,) = timeline_rows(setting, "naive", Plans(second, second, second, second), Schedule(second, 0 * second), ["a"])
     kept = asdict(row)
     assert (kept["start_ns"], kept["end_ns"], kept["sparc"], kept["rms_jerk"]) == (10**9, 10**9, None, None)
+
+
+def test_followed_lambda_changes_from_plan_to_plan_and_keeps_the_stalls_rare(tmp_path: Path) -> None:
+    bursts = JITTERY.but(policies=("stream-to-act",), jitter="lognormal:cv=0.6", plans=200, epsilon=0.05)
+    rows = ran(bursts.but(track=True), tmp_path).table(TIMELINES)
+    fixed = ran(bursts, tmp_path / "fixed").table(TIMELINES)
+    assert fixed["caution"].nunique() == 1
+    assert rows["caution"].nunique() > 1
+    assert list(rows["last_arrival_ns"]) == list(fixed["last_arrival_ns"])
+    # (level_1 + step) / (step T) = (.05 + .002) / (.002 * 200) above epsilon at most.
+    assert rows["any_stall"].mean() <= 0.05 + 0.13
+
+
+def test_every_online_rule_is_calibrated_for_itself(tmp_path: Path) -> None:
+    early = "stream-to-act-early"
+    config = JITTERY.but(policies=("stream-to-act", early, f"{early}?caution=1"), plans=50)
+    run = ran(config, tmp_path)
+    (setting,) = (setting for _, setting in settings(config))
+    found = run.manifest["calibrations"]
+    assert set(found) == {setting.name, f"{setting.name}/{early}"}
+    cautions = {cell.policy: cell.about("caution") for cell in timelines_of(run)}
+    assert cautions[early] == found[f"{setting.name}/{early}"]["caution"]
+    assert cautions[f"{early}?caution=1"] == 1
+    starts = {cell.policy: cell.mean("start_s") for cell in timelines_of(run)}
+    assert starts[early] < starts["stream-to-act"]  # type: ignore[operator]
+
+
+def test_a_guarantee_is_kept_with_the_calibration_and_said(tmp_path: Path) -> None:
+    found = {}
+    for guarantee in ("high-confidence", "expected"):
+        run = ran(JITTERY.but(guarantee=guarantee, plans=20), tmp_path / guarantee)
+        (found[guarantee],) = run.manifest["calibrations"].values()
+        notes = " ".join(timeline_tables(run)["timelines"].notes)
+        assert f"--guarantee {guarantee}" in notes
+        assert f"{found[guarantee]['expected_risk']:.2%} of the plans stall on average" in notes
+    assert found["expected"]["expected_risk"] == 4 / 401
+    assert found["high-confidence"]["expected_risk"] == 1 / 401
+    assert found["expected"]["caution"] <= found["high-confidence"]["caution"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"policies": ("naive",), "track": True}, "`track`: no policy here has a lambda to follow"),
+        ({"policies": ("stream-to-act?caution=1",), "track": True}, "`track`: no policy here has a lambda to follow"),
+        ({"jitter": "none", "plans": None, "track": True}, "`track`: without `jitter` or `t_nom_cv`"),
+        ({"live": True, "track_file": Path("/none/state.json")}, "`track_file`: there is no folder /none"),
+        ({"track_file": Path("state.json")}, "`track_file`: plans are drawn anew in every run"),
+        ({"live": True, "jitter": "none", "plans": None, "epsilon": 0.05}, "`epsilon`: nothing is calibrated"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused(asked: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        JITTERY.but(**asked)

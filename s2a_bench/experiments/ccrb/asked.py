@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2a_bench.errors import UsageError
@@ -20,6 +21,10 @@ class Asked(Options):
     live: bool = option(False, "take the tokens of a model that really answers, about the rendered scene")
     transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, loopback [default: ros]")
     engine: EngineConfig = group(EngineConfig, only=("name", "model", "mmproj", "threads", "pace"), about="--live: ")
+
+    track_file: Path | None = option(
+        None, "--live: take lambda from what earlier plans taught, and let this one teach: the file of timeline"
+    )
 
     @property
     def replayed(self) -> bool:
@@ -51,4 +56,5 @@ def live_timeline(config: CcrbConfig) -> TimelineConfig:
         tokens_per_skill=(config.tokens_per_skill,),
         n_skills=(config.scenario.skills,),
         seed=config.seed,
+        track_file=asked.track_file,
     )

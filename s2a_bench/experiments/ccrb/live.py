@@ -19,14 +19,16 @@ from s2a_bench.experiments.ccrb.plans import Prepared, complete
 from s2a_bench.experiments.ccrb.point import drive_point
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.timeline.live.asks import Ask
-from s2a_bench.experiments.timeline.live.asks import prepare as prepare_policy
+from s2a_bench.experiments.timeline.live.asks import prepare as prepare_policies
 from s2a_bench.experiments.timeline.live.link import Link, word
 from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
 from s2a_bench.plan import Parser
 from s2a_bench.policy import Plans, PlanShape, Timing
+from s2a_bench.policy.conformal import TOLERANCE_S
 from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy.metrics import stalls
 from s2a_bench.runtime.events import Event, SkillCame
 from s2a_bench.runtime.feed import PlanFeed
 from s2a_bench.scenario import simulator
@@ -109,5 +111,8 @@ def _hear(config: CcrbConfig, ask: Ask, link: Link, prior: GapPrior | None) -> P
         column(feed.token_ns),
         shape,
     )
-    policies = {name: prepare_policy(policy, prior) for name, policy in config.timeline.chosen.items()}
-    return complete(config, setting, request_id, plans, policies)
+    following = prepare_policies(config.request, shape, prior)
+    ready = complete(config, setting, request_id, plans, following.policies())
+    gaps_s = {name: stalls(schedule) for name, schedule in ready.schedules.items()}
+    following.learn_plan(plans, {name: bool((gap_s > TOLERANCE_S).any()) for name, gap_s in gaps_s.items()})
+    return ready

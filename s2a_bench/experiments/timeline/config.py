@@ -72,6 +72,11 @@ class Compared(Options):
     t_max: float = option(1.5, "longest duration of a skill, as a factor of T_nom", ge=1, allow_inf_nan=False)
     plans: int | None = option(None, "plans a cell [default: 1; with jitter 1000]", ge=1)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
+    epsilon: float = option(0.01, "share of plans that may stall: lambda is calibrated or tracked for it")
+    track: bool = option(False, "let online policies follow lambda from plan to plan (needs jitter, or --live)")
+    track_file: Path | None = option(
+        None, "with --live or --real-time: go on from what an earlier run learned, and keep it there; implies --track"
+    )
     real_time: bool = option(False, "play the boards' tokens on the clock and execute while you watch")
     live: bool = option(False, "execute what a model really answers, as it arrives")
 
@@ -93,7 +98,6 @@ class Modelled(Options):
         "none (tokens come evenly, as in the paper), profile (as the profile says), or a family of gaps, as "
         "lognormal:cv=0.2",
     )
-    epsilon: float = option(0.01, "share of plans that may stall: lambda is calibrated for it")
     guarantee: Guarantee = option("high-confidence", GUARANTEE)
     calibration_plans: int = option(400, "other plans that prior and lambda are learned from")
     calibrate: Path | None = option(
@@ -158,11 +162,20 @@ class TimelineConfig(Live, Modelled, Compared):
         """Return how many plans each cell has."""
         return self.plans if self.plans is not None else PLANS if not self.live and self.random else 1
 
+    @property
+    def tracks(self) -> bool:
+        """Whether lambda is followed from plan to plan."""
+        return self.track or self.track_file is not None
+
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
+        if self.tracks:
+            check_tracking(self)
         if self.live:
             if self.real_time:
                 raise UsageError("`live` and `real_time` are two things: a model answers, or a profile is played")
+            if "epsilon" in self.given(Compared) and not self.tracks:
+                raise UsageError("`epsilon`: nothing is calibrated with `live`; it needs `track`")
             for name in self.given(Modelled):
                 raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")
             check_live(self)
@@ -208,6 +221,23 @@ class TimelineConfig(Live, Modelled, Compared):
         own |= self.model_dump(include=set(Modelled.model_fields))
         own |= {"profiles": self._profiles, "t_nom_s": self.t_nom_s or (1.0,)}
         return own | ({"time": "real-time"} if self.real_time else {})
+
+
+def check_tracking(config: TimelineConfig) -> None:
+    """Refuse to track what does not vary or has no lambda to follow; raises UsageError naming the field."""
+    from s2a_bench.policy.stream_to_act import StreamToAct
+
+    field = "track_file" if config.track_file is not None else "track"
+    rules = [policy for policy in config.chosen.values() if isinstance(policy, StreamToAct) and policy.caution is None]
+    if not rules:
+        raise UsageError(f"`{field}`: no policy here has a lambda to follow; take stream-to-act without caution")
+    if config.virtual and config.track_file is not None:
+        raise UsageError("`track_file`: plans are drawn anew in every run; it needs `live` or `real_time`")
+    from s2a_bench.experiments.timeline.following import read
+
+    read(config.track_file)
+    if not config.live and not config.random:
+        raise UsageError(f"`{field}`: without `jitter` or `t_nom_cv` all plans are the same; nothing can be learned")
 
 
 def settings(config: TimelineConfig) -> Iterator[tuple[Board, Setting]]:

@@ -11,9 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.experiments.timeline.policies import finite
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows
-from s2a_bench.experiments.timeline.virtual import finite
 from s2a_bench.plan import Gap
 from s2a_bench.policy import Plans, PlanShape, Policy, Schedule
 from s2a_bench.policy.evaluate import TOLERANCE_S

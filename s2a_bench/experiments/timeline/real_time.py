@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.clock import SystemClock
 from s2a_bench.experiments.timeline.config import TimelineConfig, settings
 from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep, quick_switching
+from s2a_bench.experiments.timeline.following import Following
 from s2a_bench.experiments.timeline.plans import Board
 from s2a_bench.experiments.timeline.policies import draw, learn
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.to_rows import KEPT_PLANS, Setting
 from s2a_bench.experiments.timeline.traces import recordings
-from s2a_bench.experiments.timeline.virtual import board_facts, calibration_warnings, finite, origins_of
+from s2a_bench.experiments.timeline.virtual import board_facts, calibration_warnings, origins_of
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.machine import environment
 from s2a_bench.plan import Call, Durations, Skill
@@ -111,10 +112,11 @@ def _run_setting(
     """Play the plans of one setting."""
     progress.stage(f"learning {setting.title}")
     known = learn(config, board, setting, answers)
-    if known.calibration is not None:
-        caution = finite(known.calibration.caution)
-        so_far.calibrations[setting.name] = asdict(known.calibration) | {"caution": caution}
-    policies = {name: known.prepare(policy) for name, policy in config.chosen.items()}
+    made = {name: known.prepare(policy) for name, policy in config.chosen.items()}
+    so_far.calibrations |= known.facts(setting)
+    every = {name: known.tracked(policy) for name, policy in config.chosen.items() if config.tracks}
+    tracked = {name: each for name, each in every.items() if each is not None}
+    following = Following(config.shape(setting), made, tracked, config.track_file)
     token_s, plans = draw(config, board, setting, config.plans_a_cell, "plans")
     for plan in range(config.plans_a_cell):
         cut = slice(plan, plan + 1)
@@ -122,6 +124,7 @@ def _run_setting(
         play = _Play(token_s[:, plan], one)
         progress.stage(f"{setting.title}, L = {setting.tokens_per_skill}: about {play.span_s:.0f} s")
         known_too = replace(config.shape(setting), safe_start_s=float(safe_start(one.arrival_s, one.nominal_s)[0]))
+        policies = following.policies()
         robots = [TimedRobot() for _ in policies]
         executors = SideBySide(policies, known_too, "hold", robots, max(SILENCE_S, 2 * play.span_s))
         title = f"{setting.title}, {setting.tokens_per_s:g} tokens/s, L = {setting.tokens_per_skill} (EMULATED)"
@@ -134,6 +137,7 @@ def _run_setting(
             if plan < KEPT_PLANS:
                 writer.append(TOKENS, _token_rows(setting, request_id, executors.records[0]))
             so_far.warnings += keep(writer, setting, plan, request_id, policies, executors.records)
+        following.learn(executors.records)
         progress.advance()
 
 

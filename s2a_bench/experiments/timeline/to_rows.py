@@ -75,13 +75,14 @@ def timeline_rows(
     *,
     first_plan: int = 0,
     requested_ns: Sequence[int] | None = None,
-    caution: float | None = None,
+    caution: float | Sequence[float | None] | None = None,
     observed_s: float = 0.0,
     tolerance_s: float = TOLERANCE_S,
 ) -> list[PlanRow]:
     """Describe M timelines; ``tolerance_s`` is the longest gap that is no stall for ``any_stall`` (1 us unless told).
 
-    Motion is computed for plans below `KEPT_PLANS`. ``observed_s`` is when the picture was taken, from the request.
+    ``caution`` is one lambda, or one a plan. Motion is computed for plans below `KEPT_PLANS`. ``observed_s`` is when
+    the picture was taken, from the request.
     """
     found = metrics_of(plans, schedule, observed_s=observed_s, tolerance_s=tolerance_s)
     rows = []
@@ -104,7 +105,7 @@ def timeline_rows(
                 plan=plan,
                 request_id=request_id,
                 requested_ns=requested_ns[place] if requested_ns else 0,
-                caution=caution,
+                caution=caution[place] if isinstance(caution, Sequence) else caution,
                 **{METRICS[name].column: METRICS[name].stored(values[place]) for name, values in found.items()},
                 **motion,
             )

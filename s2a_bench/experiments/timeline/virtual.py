@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 from s2a_bench.boards.gaps import to_table
 from s2a_bench.experiments.timeline.config import TimelineConfig, settings
 from s2a_bench.experiments.timeline.plans import Board
-from s2a_bench.experiments.timeline.policies import draw, learn, plans_of
+from s2a_bench.experiments.timeline.policies import Knowledge, draw, finite, learn, plans_of
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows, token_rows
 from s2a_bench.experiments.timeline.traces import recordings
 from s2a_bench.machine import environment
-from s2a_bench.policy.conformal import Calibration
+from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import TOKENS
@@ -46,9 +46,7 @@ def run_virtual(config: TimelineConfig, output: Path, progress: Progress) -> Pat
             progress.expect(len(work))
         calibrations: dict[str, Any] = {}
         for board, setting in work:
-            calibration = _compute(config, board, setting, answers, writer)
-            if calibration is not None:
-                calibrations[setting.name] = asdict(calibration) | {"caution": finite(calibration.caution)}
+            calibrations |= _compute(config, board, setting, answers, writer)
             if config.random:
                 progress.advance()
         warnings = calibration_warnings(calibrations)
@@ -58,21 +56,30 @@ def run_virtual(config: TimelineConfig, output: Path, progress: Progress) -> Pat
 
 def _compute(
     config: TimelineConfig, board: Board, setting: Setting, answers: Sequence[Floats], writer: RunWriter
-) -> Calibration | None:
-    """Draw one setting's plans, let every policy decide them, and keep the rows."""
+) -> dict[str, Any]:
+    """Draw one setting's plans, let every policy decide them, keep the rows and return the calibrations."""
     known = learn(config, board, setting, answers)
     token_s, plans = draw(config, board, setting, config.plans_a_cell, "plans")
     request_ids = [setting.request_id(plan) for plan in range(config.plans_a_cell)]
     writer.append(TOKENS, token_rows(setting.name, token_s, request_ids))
     for name, chosen in config.chosen.items():
-        policy = known.prepare(chosen)
-        schedule = policy.schedule(plans)
-        rows = timeline_rows(
-            setting, name, plans, schedule, request_ids, caution=finite(getattr(policy, "caution", None))
-        )
+        caution, schedule = _decide(known, chosen, plans, track=config.tracks)
+        rows = timeline_rows(setting, name, plans, schedule, request_ids, caution=caution)
         writer.append(TIMELINES, rows)
         writer.append(SKILLS, skill_rows(rows[0].cell, plans, schedule, request_ids))
-    return known.calibration
+    return known.facts(setting)
+
+
+def _decide(
+    known: Knowledge, chosen: Policy, plans: Plans, *, track: bool
+) -> tuple[float | Sequence[float | None] | None, Schedule]:
+    """Return a policy's lambda, of each plan where it follows them, and what it makes of the plans."""
+    tracked = known.tracked(chosen) if track else None
+    if tracked is not None:
+        cautions, schedule = tracked.follow(plans)
+        return [finite(float(caution)) for caution in cautions], schedule
+    policy = known.prepare(chosen)
+    return finite(getattr(policy, "caution", None)), policy.schedule(plans)
 
 
 def origins_of(config: TimelineConfig, work: Sequence[tuple[Board, Setting]]) -> Origins:
@@ -105,8 +112,3 @@ def calibration_warnings(calibrations: dict[str, Any]) -> list[RunWarning]:
             "allow more stalls with --epsilon, or calibrate on more plans with --calibration-plans",
         )
     ]
-
-
-def finite(caution: float | None) -> float | None:
-    """Return lambda, or None where it is infinite: JSON has no infinity."""
-    return None if caution is None or caution == float("inf") else caution

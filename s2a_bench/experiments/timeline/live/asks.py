@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.experiments.timeline.following import Following, follow_live
 from s2a_bench.experiments.timeline.live.config import in_paper_format, settings_asked, skills_lasting
 from s2a_bench.plan import Format, SkillSet, choose_format, grammar, paper_format, prompt
-from s2a_bench.policy import PlanShape, Policy, Timing
+from s2a_bench.policy import PlanShape, Timing
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
 from s2a_bench.policy.stream_to_act import CAUTION, StreamToAct
 
@@ -97,8 +98,16 @@ def _spread_s(gaps_s: Floats) -> float:
     return max(float(gaps_s.std(ddof=1)), of_blocks)
 
 
-def prepare(policy: Policy, prior: GapPrior | None) -> Policy:
-    """Tell an online policy the prior, and lambda where it was not given: nothing is calibrated here."""
-    if not isinstance(policy, StreamToAct):
-        return policy
-    return replace(policy, prior=prior or policy.prior, caution=CAUTION if policy.caution is None else policy.caution)
+def prepare(config: TimelineConfig, shape: PlanShape, prior: GapPrior | None) -> Following:
+    """Tell online policies the prior, and lambda where it was not given: nothing is calibrated here, but tracked."""
+    made = {
+        name: replace(policy, prior=prior or policy.prior) if isinstance(policy, StreamToAct) else policy
+        for name, policy in config.chosen.items()
+    }
+    if config.tracks:
+        return follow_live(made, shape, config.epsilon, config.seed, config.track_file)
+    told = {
+        name: replace(policy, caution=CAUTION) if isinstance(policy, StreamToAct) and policy.caution is None else policy
+        for name, policy in made.items()
+    }
+    return Following(shape, told)

@@ -15,6 +15,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments.timeline.config import TimelineConfig
 from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep, quick_switching
+from s2a_bench.experiments.timeline.following import Following
 from s2a_bench.experiments.timeline.live.asks import Ask, prepare
 from s2a_bench.experiments.timeline.live.link import Link, word
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
@@ -24,7 +25,6 @@ from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
 from s2a_bench.plan import Parser
 from s2a_bench.policy import Policy
-from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.progress import Progress, watching
 from s2a_bench.runtime import ROBOTS, Robot
 from s2a_bench.runtime.events import StreamBroke
@@ -90,14 +90,15 @@ class _Live:
         self.progress.expect(self.config.warmup + len(asks) * self.config.plans_a_cell)
         prior = self.link.warm_up(asks[0])
         for ask in asks:
+            following = prepare(self.config, ask.shape, prior)
             for plan in range(self.config.plans_a_cell):
-                self._execute(ask, plan, prior)
+                self._execute(ask, plan, following)
                 self.progress.advance()
         self.link.require_answers()
 
-    def _execute(self, ask: Ask, plan: int, prior: GapPrior | None) -> None:
+    def _execute(self, ask: Ask, plan: int, following: Following) -> None:
         """Ask for one plan and let every policy execute it as it arrives."""
-        policies = {name: prepare(policy, prior) for name, policy in self.config.chosen.items()}
+        policies = following.policies()
         rate = self.link.rate
         span_s = ask.n_skills * (ask.tokens_per_skill / rate if rate else 0.0) + ask.n_skills * ask.t_nom_s
         self.progress.stage(f"{self.link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
@@ -118,6 +119,7 @@ class _Live:
         finally:  # what an interruption leaves is kept too
             self.records += side_by_side.records
             self._keep(ask, plan, request_id, policies, side_by_side.records)
+        following.learn(side_by_side.records)
 
     def _keep(
         self, ask: Ask, plan: int, request_id: str, policies: Mapping[str, Policy], records: list[Record]

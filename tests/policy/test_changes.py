@@ -1,0 +1,88 @@
+"""A change of the rate within a plan: found soon, not found where there is none, and answered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from s2a_bench.experiments.study.shift import SHIFTS
+from s2a_bench.experiments.study.worlds import World, generator
+from s2a_bench.policy.changes import Watch, learned_along
+from s2a_bench.policy.conformal import calibrate, stalled
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy.metrics import measure, stalls
+from s2a_bench.policy.stream_to_act import StreamToAct
+
+PRIOR = GapPrior(0.2, 0.1, 0.2)
+WORLD = World(4.8, 0.5, 6, 8, 1.0)
+
+
+def even(*gaps_s: float) -> np.ndarray:
+    return 1.0 + np.cumsum([0.0, *gaps_s])[:, np.newaxis]
+
+
+def test_without_a_change_it_is_the_plain_estimate() -> None:
+    token_s = even(*[0.21, 0.18, 0.2, 0.22] * 5)
+    mean_s, variance = learned_along(PRIOR, token_s)
+    for row, at_s in enumerate(token_s[:, 0]):
+        assert (mean_s[row, 0], variance[row, 0]) == pytest.approx(PRIOR.learned(float(row), float(at_s - 1.0)))
+
+
+def test_a_rate_that_halves_is_learned_within_two_tokens_and_forgotten_when_it_recovers() -> None:
+    token_s = even(*[0.2] * 20, *[0.4] * 6, *[0.2] * 20)
+    mean_s, _ = learned_along(PRIOR, token_s)
+    plain = PRIOR.learned(22.0, 20 * 0.2 + 2 * 0.4)[0]
+    assert plain < 0.22
+    assert mean_s[22, 0] == pytest.approx(0.4, rel=0.1)
+    assert mean_s[26, 0] == pytest.approx(0.4, rel=0.02)
+    assert mean_s[-1, 0] < 0.25
+
+
+def test_short_gaps_are_no_change() -> None:
+    watch = Watch(PRIOR)
+    for at_s in even(*[0.2] * 10, *[0.02] * 8):
+        watch.token(at_s)
+    assert not watch.slow[0]
+    assert watch.learned[0][0] == pytest.approx(PRIOR.learned(18.0, 10 * 0.2 + 8 * 0.02)[0])
+
+
+def test_plans_as_calibrated_are_hardly_ever_taken_for_slow() -> None:
+    plans = WORLD.draw(generator(1, "calm"), 1000)
+    assert plans.token_s is not None
+    watch = Watch(GapPrior.fit(plans.token_s), 1000)
+    ever = np.zeros(1000, dtype=bool)
+    for at_s in plans.token_s:
+        watch.token(at_s)
+        ever |= watch.slow
+    assert ever.mean() < 0.15
+
+
+def test_detection_costs_nothing_without_a_change_and_saves_stalls_with_one() -> None:
+    world = World(0.58, 3.0, 1, 16, 2.0)
+    rng = generator(2, "halves")
+    calibration = world.draw(rng, 400)
+    assert calibration.token_s is not None
+    plain = StreamToAct(GapPrior.fit(calibration.token_s))
+    calm, slow = world.draw(rng, 400), SHIFTS["rate halves in mid-plan"](world, rng, 400)
+    found = {}
+    for detect in (False, True):
+        policy = replace(plain, detect=detect)
+        policy = replace(policy, caution=calibrate(policy, calibration).caution)
+        starts = measure(calm, policy.schedule(calm)).start_regret.mean()
+        gaps_s = stalls(policy.schedule(slow))
+        found[detect] = starts, stalled(policy, calm).mean(), stalled(policy, slow).mean(), (gaps_s > 1e-6).sum() / 400
+    assert found[True][0] == pytest.approx(found[False][0], abs=0.02)
+    assert found[True][1] <= 0.02
+    assert found[True][2] < 0.75 * found[False][2]
+    assert found[True][3] < 0.7 * found[False][3]
+
+
+def test_a_robot_that_cannot_make_it_holds_once_instead_of_again_and_again() -> None:
+    rng = generator(3, "hold")
+    slow = SHIFTS["rate halves in mid-plan"](WORLD, rng, 200)
+    policy = StreamToAct(GapPrior(1 / 4.8, 0.1, 0.2), 2.33)
+    stops = {d: (stalls(replace(policy, detect=d).schedule(slow)) > 1e-6).sum(axis=0).mean() for d in (False, True)}
+    assert stops[False] > 2
+    assert stops[True] < 1.3
