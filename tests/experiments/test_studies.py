@@ -108,7 +108,7 @@ def test_several_seeds_are_the_studies_of_each(tmp_path: Path, monkeypatch: pyte
     shown = found.show(run)
     starts = [row.start_regret for row in rows if row.policy == "wait-then-act"]
     entry = shown.tables["policies"].rows[-2][3]
-    assert entry == f"{sum(starts) / 3:.2%} ({min(starts):.2%} to {max(starts):.2%})"
+    assert entry == f"{sum(starts) / 3:.2%} [{100 * min(starts):.2f}, {100 * max(starts):.2f}]"
     assert "mean and range of 3 seeds" in str(shown.notes[0])
     stalls = shown.json()["targets"][1]
     assert stalls["value"] == max(row.p_any_stall for row in rows if row.policy == "stream-to-act")

@@ -51,7 +51,7 @@ def first_seed(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def over_seeds(rows: pd.DataFrame, statistic: Callable[[pd.DataFrame], float], form: str = "{:.1%}") -> str:
-    """Write a number's mean over the seeds, with the range where there are several."""
+    """Write a number's mean over the seeds, with the range in brackets where there are several."""
     import numpy as np
 
     values = np.array([statistic(part) for _, part in rows.groupby("seed")], dtype=float)
@@ -60,7 +60,8 @@ def over_seeds(rows: pd.DataFrame, statistic: Callable[[pd.DataFrame], float], f
     mean = form.format(np.nanmean(values))
     if values.size == 1:
         return mean
-    return f"{mean} ({form.format(np.nanmin(values))} to {form.format(np.nanmax(values))})"
+    low, high = (form.format(end).removesuffix("%") for end in (np.nanmin(values), np.nanmax(values)))
+    return f"{mean} [{low}, {high}]"
 
 
 def mean_of(column: str) -> Callable[[pd.DataFrame], float]:
