@@ -21,6 +21,7 @@ from s2a_bench.experiments.boundary.view.figure import build_boundary
 from s2a_bench.experiments.study.config import StudyConfig
 from s2a_bench.experiments.study.run import run_study
 from s2a_bench.experiments.study.view.figures import build_frontier, build_targets
+from s2a_bench.experiments.study.view.rules import build_shift, build_split
 from s2a_bench.experiments.timeline.config import TimelineConfig
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
@@ -125,6 +126,8 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 SLOW: dict[str, Callable[[], Figure]] = {
     "study-targets": lambda: build_targets(study(StudyConfig(name="targets", seed=20261121))),
     "study-frontier": lambda: build_frontier(study(StudyConfig(name="frontier"))),
+    "study-shift": lambda: build_shift(study(StudyConfig(name="shift", seeds=10, jobs=2))),
+    "study-split": lambda: build_split(study(StudyConfig(name="split", seeds=10, jobs=2))),
 }
 """Drawn where they are named."""
 

@@ -247,6 +247,8 @@ def _first(stream: _Stream, plans: Ints, from_s: Floats, at_s: Callable[[int, In
         # Nothing to start before the first fragment; nothing is decided between events at one instant.
         ready = (stream.parsed[event, plans[waiting]] > 0) & (begins_s < until_s)
         live, begins_s, until_s = waiting[ready], begins_s[ready], until_s[ready]
+        if not live.size:
+            continue
         found = np.maximum(begins_s, at_s(event, plans[live], until_s))
         starts = found < until_s
         start_s[live[starts]] = found[starts]

@@ -38,8 +38,11 @@ class TestTheExample(PolicySuite):
 def test_the_table_names_every_parameter() -> None:
     rows = re.findall(r"^\| ([a-z0-9, -]+) \| `(\w+)` \|", PAGE, re.MULTILINE)
     documented = {(name, parameter) for names, parameter in rows for name in names.split(", ")}
-    assert documented == {(name, "caution") for name in ("stream-to-act", "s2a-mean", "s2a-quantile")} | {
-        ("s2a-robust", "gap_bound_s")
-    }
+    names = ("stream-to-act", "stream-to-act-early", "s2a-mean", "s2a-quantile")
+    early = {("stream-to-act-early", parameter) for parameter in ("spend", "within", "start_caution")}
+    both = {(name, parameter) for name in names for parameter in ("caution", "detect")}
+    assert documented == both | early | {("s2a-robust", "gap_bound_s")}
+    written = {"detect": "True", "spend": "0.7"}
     for name, parameter in documented:
-        assert list(policies([f"{name}?{parameter}=7"])) == [f"{name}?{parameter}=7"]
+        asked = f"{name}?{parameter}={written.get(parameter, '7')}"
+        assert list(policies([asked])) == [asked]
