@@ -106,7 +106,7 @@ def build_shift(run: Run) -> Figure:
 def build_split(run: Run) -> Figure:
     """Draw start regret over S_lo against distortion, a mark a rule, a colour a guarantee."""
     rows = rows_of(run)
-    figure = new_figure(3.6, f"What an early start costs{seeds(rows)}\n{DRAWN_PLANS}")
+    figure = new_figure(3.6, f"What an early start costs{seeds(rows)}\n{DRAWN_PLANS}", WIDE_IN)
     axes = figure.subplots()
     for guarantee, colour in _COLOURS.items():
         mine = rows[rows["condition"] == guarantee]
@@ -116,7 +116,7 @@ def build_split(run: Run) -> Figure:
         for name, point in means.iterrows():
             text = str(name).partition("?")[2] or str(name)
             at = (point["speed_distortion"], 100 * point["start_regret_elastic"])
-            axes.annotate(text, at, (3, 3), textcoords="offset points", fontsize=5)
+            axes.annotate(text, at, (3, 3), textcoords="offset points", fontsize=6)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("durations over nominal ones")
     axes.set_ylabel(r"start regret over $S_\mathrm{lo}$ (%)")
