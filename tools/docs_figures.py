@@ -106,10 +106,13 @@ def safe_start_figure() -> Figure:
     return figure
 
 
+RUNS = TemporaryDirectory()
+"""Where runs are until all is drawn: their tables are read when they are needed."""
+
+
 def _run(make: Callable[[Path], Path]) -> Run:
     """Make a run in a folder that goes again."""
-    with TemporaryDirectory() as folder:
-        return read_run(make(Path(folder)))
+    return read_run(make(Path(RUNS.name)))
 
 
 FIGURES: dict[str, Callable[[], Figure]] = {
