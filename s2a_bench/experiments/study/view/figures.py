@@ -223,7 +223,7 @@ def _frontier_legend(families: list[str], epsilon: float) -> list[Any]:
         _line("thin: s2a-quantile (never stretches)", color=_INK, linewidth=0.6),
         *(
             _line(
-                rf"calibrated $\lambda$ ($\epsilon$ = {_percent(epsilon)}): {guarantee}",
+                rf"$\epsilon$ = {_percent(epsilon)}, {guarantee}",
                 color=fill,
                 marker="o",
                 markersize=5,
