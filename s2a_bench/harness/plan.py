@@ -101,6 +101,13 @@ class RequestsConfig(Options):
         pattern="^[0-9A-Za-z_-]{0,64}$",
     )
     timeout_s: float = option(300.0, "longest silence of a server, in seconds", flag="timeout", ge=0.1, le=86_400)
+    deadline_s: float = option(
+        0.0,
+        "longest time of a whole answer, in seconds; 0: --timeout and 5 s a token",
+        flag="deadline",
+        ge=0,
+        le=86_400,
+    )
     sample_resources_hz: float = option(
         10.0,
         "readings a second of CPU, memory, GPU and power beside the run; 0: none",

@@ -103,7 +103,8 @@ class ServerSet:
         return server.address
 
     def _wiring(self, pipeline: Pipeline, address: str) -> Wiring[Any]:
-        told = {"timeout_s": self._config.timeout_s, "max_tokens": self._config.max_tokens}
+        config = self._config
+        told = {"timeout_s": config.timeout_s, "deadline_s": config.deadline_s, "max_tokens": config.max_tokens}
         return pipeline.wiring(address, limits=RUN_LIMITS, **told)
 
     def wiring(self, pipeline: Pipeline) -> Wiring[Any]:

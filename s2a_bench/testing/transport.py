@@ -71,12 +71,18 @@ def ask(client: Client, request: Request) -> tuple[list[Token], Trace]:
 
 
 def wiring(
-    name: str, address: str = "", *, timeout_s: float = 20, max_tokens: int = 512, **options: Any
+    name: str,
+    address: str = "",
+    *,
+    timeout_s: float = 20,
+    deadline_s: float = 0,
+    max_tokens: int = 512,
+    **options: Any,
 ) -> Wiring[Any]:
     """What a client or server of a pipeline's name is told, in a test; a black box is where its options say."""
     pipeline = one_pipeline(name, **options)
     address = address or pipeline.transport.foreign(pipeline.options)
-    return pipeline.wiring(address, timeout_s=timeout_s, max_tokens=max_tokens)
+    return pipeline.wiring(address, timeout_s=timeout_s, deadline_s=deadline_s, max_tokens=max_tokens)
 
 
 def connector(told: Wiring[Any]) -> Iterator[Connect]:

@@ -49,6 +49,9 @@ if TYPE_CHECKING:
 
 O = TypeVar("O", bound="Options")  # noqa: E741 - the one type variable here
 
+TOKEN_S: Final = 5.0
+"""Of a deadline that nobody set, for each token; far slower than any model that a robot could wait for."""
+
 Handler: TypeAlias = "Callable[[Request, Trace], Generator[Token, None, None]]"
 """What a server does with a request whose pictures are ``rgb8``: it yields tokens and marks the trace.
 
@@ -81,7 +84,7 @@ class Client(Protocol):
         """Send a request with its frames as captured, yield tokens as they arrive, mark every stage.
 
         After the last token ``trace.remote`` holds the server's marks. Raises RequestFailed when the server
-        refuses or breaks off, ServerDied when it is gone.
+        refuses or breaks off, or goes beyond what `transport.bounds` allows, ServerDied when it is gone.
         """
         ...
 
@@ -127,6 +130,8 @@ class Wiring(Generic[O]):
     """Whether the server is not ours, so that it sends no marks."""
     timeout_s: float = 300.0
     """The longest silence before a request counts as failed."""
+    deadline_s: float = 0.0
+    """The longest that a whole answer may take; 0: see `deadline_of`."""
     max_tokens: int = 512
     """The most tokens of a request that cannot say itself how many it wants."""
     limits: Limits = LIMITS
@@ -137,8 +142,12 @@ class Wiring(Generic[O]):
     def to_json(self) -> dict[str, Any]:
         """Return it as plain data."""
         told = {name: getattr(self, name) for name in ("transport", "variant", "address", "black_box", "restarted")}
-        told |= {"timeout_s": self.timeout_s, "max_tokens": self.max_tokens}
+        told |= {"timeout_s": self.timeout_s, "deadline_s": self.deadline_s, "max_tokens": self.max_tokens}
         return {**told, "options": self.options.model_dump(mode="json"), "limits": self.limits.to_manifest()}
+
+    def deadline_of(self, max_tokens: int) -> float:
+        """Return the seconds that an answer of so many tokens may take: as told, else generous for that many."""
+        return self.deadline_s or self.timeout_s + TOKEN_S * max_tokens
 
     @staticmethod
     def from_json(told: Mapping[str, Any]) -> Wiring[Any]:

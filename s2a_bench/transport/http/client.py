@@ -19,8 +19,10 @@ from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, PROMPT_MS, THINKING_N
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
+from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.credentials import read_key
 from s2a_bench.transport.http import HEADERS_MS, RECONNECTS, THINKING_MS, THINKING_PIECES, own
+from s2a_bench.transport.http.bounded import BoundedClient
 from s2a_bench.transport.http.detect import body_of, detected, getter
 from s2a_bench.transport.http.dialects import OWN, Dialect, Event, Picture, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
@@ -72,7 +74,7 @@ class HttpClient:
         return dialect, dialect.url(base, model), model
 
     @contextmanager
-    def _asking(self) -> Iterator[httpx.Client]:
+    def _asking(self) -> Iterator[BoundedClient]:
         """Lend the kept client, or one for the moment."""
         client = self._client or self._new_client()
         try:
@@ -89,13 +91,17 @@ class HttpClient:
         found = {"model": self._model} if self._model not in {self._wiring.options.served_model, NO_MODEL} else {}
         return {"url": self._url, "dialect": self._dialect.name, **found}
 
-    def _new_client(self) -> httpx.Client:
+    def _new_client(self) -> BoundedClient:
         """Build the client; its TLS context alone takes about 20 ms, which is why it is normally built once."""
         # a kept connection stays kept, however long a turn of the other cells takes
         limits = httpx.Limits(keepalive_expiry=None)
         # a cloud may be behind a proxy and with certificates that the environment names; what is measured here is not
         trust_env = self._wiring.address.startswith("https:")
-        return httpx.Client(timeout=self._wiring.timeout_s, trust_env=trust_env, limits=limits)
+        return BoundedClient(self._bounds(0), timeout=self._wiring.timeout_s, trust_env=trust_env, limits=limits)
+
+    def _bounds(self, max_tokens: int) -> Bounds:
+        """Start the bounds of an answer."""
+        return Bounds(self._wiring.address, self._wiring.deadline_of(max_tokens), max_tokens)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         """Encode and send the request and yield the streamed tokens."""
@@ -105,6 +111,7 @@ class HttpClient:
             client = self._new_client()
             trace.mark("connect")
         packed_ns = trace.marks[-1][1]
+        client.bounds = bounds = self._bounds(request.max_tokens)
         try:
             with self._translated(), ExitStack() as stack:
                 response = self._send(client, body, headers, stack, trace)
@@ -113,7 +120,11 @@ class HttpClient:
                 if response.status_code != httpx.codes.OK or not kind.startswith(self._dialect.media_type):
                     text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
                     raise refusal(self._url, response, text, self._options, self._dialect.media_type)
-                yield from self._tokens(response, trace, headers_ns, packed_ns)
+                if (coding := response.headers.get("content-encoding", "identity")) != "identity":
+                    raise RequestFailed(f"{self._url} compressed its answer ({coding}), which nobody asked for")
+                for token in self._tokens(response, trace, headers_ns, packed_ns):
+                    bounds.piece()
+                    yield token
         finally:
             if client is not self._client:
                 client.close()
@@ -206,7 +217,7 @@ class HttpClient:
         """Yield the events of an answer; comments and drops of an event do not count as a sign of life for ever."""
         decoder = Decoder(self._dialect, self._codec.loads)
         heard_ns, patience_ns = now_ns(), int(self._wiring.timeout_s * 1e9)
-        for data in response.iter_bytes():
+        for data in response.iter_raw():
             for event in decoder.feed(data):
                 yield event
                 heard_ns = now_ns()

@@ -11,7 +11,9 @@ from urllib.parse import urlsplit, urlunsplit
 import httpx
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import ServerDied
+from s2a_bench.errors import RequestFailed, ServerDied
+from s2a_bench.transport.bounds import Bounds
+from s2a_bench.transport.http.bounded import BoundedClient
 from s2a_bench.transport.http.dialects import OWN
 from s2a_bench.transport.http.dialects.common import NO_LIST, Get, first_model
 
@@ -40,30 +42,31 @@ def cache_hits(base: str, key: str = "") -> Mapping[str, float]:
     try:
         parts = urlsplit(base)
         path = re.sub(r"/(v1|v1beta|api)(/.*)?$", "", parts.path.rstrip("/")) + "/metrics"
-        with httpx.Client(trust_env=parts.scheme == "https") as client:
+        with BoundedClient(Bounds(base, PATIENCE_S, 0), trust_env=parts.scheme == "https") as client:
             headers = {"authorization": f"Bearer {key}"} if key else {}
             text = _text(urlunsplit((parts.scheme, parts.netloc, path, "", "")), client, headers)
         for name, value in HITS.findall(text):
             found[name] = found.get(name, 0.0) + float(value)
-    except (*NO_LIST, ServerDied, httpx.HTTPError, httpx.InvalidURL):
+    except (*NO_LIST, ServerDied, RequestFailed, httpx.HTTPError, httpx.InvalidURL):
         return {}
     return found
 
 
-def getter(client: httpx.Client, headers: dict[str, str]) -> Get:
+def getter(client: BoundedClient, headers: dict[str, str]) -> Get:
     """Return what asks for JSON at a URL, bounded in size and time."""
 
     def get(url: str) -> Any:
         try:
             return json.loads(_text(url, client, headers))
-        except (httpx.HTTPError, httpx.InvalidURL) as error:
+        except (RequestFailed, httpx.HTTPError, httpx.InvalidURL) as error:
             raise ValueError(str(error)) from error
 
     return get
 
 
-def _text(url: str, client: httpx.Client, headers: dict[str, str]) -> str:
-    """Return what a GET answers; raises ServerDied where nothing does."""
+def _text(url: str, client: BoundedClient, headers: dict[str, str]) -> str:
+    """Return what a GET answers; raises ServerDied where nothing does, RequestFailed where it does not end."""
+    client.bounds = Bounds(url, PATIENCE_S, 0)
     try:
         with client.stream("GET", url, headers=headers, timeout=PATIENCE_S) as response:
             response.raise_for_status()
@@ -75,7 +78,7 @@ def _text(url: str, client: httpx.Client, headers: dict[str, str]) -> str:
 def body_of(response: httpx.Response, limit: int, patience_s: float) -> str:
     """Return a body's first ``limit`` bytes, or what came of it in time, as text."""
     pieces, size, deadline = [], 0, now_ns() + int(patience_s * 1e9)
-    for piece in response.iter_bytes():
+    for piece in response.iter_raw():
         pieces.append(piece)
         size += len(piece)
         if size >= limit or now_ns() > deadline:

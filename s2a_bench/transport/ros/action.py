@@ -28,6 +28,7 @@ from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
 from s2a_bench.trace import Trace
 from s2a_bench.transport import CameraSink, Wiring
+from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
@@ -117,14 +118,17 @@ class GenerateClient:
 
     def _tokens(self, goal_id: bytes, limit: int, trace: Trace) -> Iterator[Token]:
         """Yield the tokens of a goal; it is cancelled after ``limit``, or when the caller leaves early."""
+        bounds = Bounds(self._name, self._wiring.deadline_of(limit), limit)
         count = 0
         heard: list[str] = []
         ended = False
         try:
             while not ended:
-                event = self._next(goal_id)
+                event = self._next(goal_id, bounds)
                 if isinstance(event, Feedback):
                     partial = self._client.unpack_feedback(event.packed).partial_response
+                    bounds.piece()
+                    bounds.came(len(partial.text))
                     heard.append(partial.text)
                     if count == limit:
                         continue
@@ -153,11 +157,11 @@ class GenerateClient:
         if self._marks is not None and result.status == Status.SUCCEEDED and heard != response.text:
             raise MessagesLost(f"of the answer's {len(response.text)} letters {len(heard)} came as feedback")
 
-    def _next(self, goal_id: bytes) -> Any:
+    def _next(self, goal_id: bytes, bounds: Bounds) -> Any:
         """Wait for the next event of this goal."""
         deadline = now_ns() + int(self._wiring.timeout_s * 1e9)
         while now_ns() < deadline:
-            event = self._client.next_event(POLL_S)
+            event = self._client.next_event(min(POLL_S, bounds.left_s()))
             if event is not None and event.goal_id == goal_id:
                 return event
             if event is None and not (self._alive() and self._client.server_present()):

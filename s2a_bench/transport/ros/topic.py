@@ -13,6 +13,7 @@ from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
+from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.limits import whole_number
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
@@ -65,15 +66,17 @@ class TopicClient:
         trace.mark("cdr_pack")
         self._publisher.send(packed)
         trace.facts[PAYLOAD_BYTES] = len(packed)
+        bounds = Bounds("the server", self._wiring.deadline_of(request.max_tokens), request.max_tokens)
         expected = 0
         while True:
-            token = self._next(name, trace)
+            token = self._next(name, trace, bounds)
             if token.index != expected:
                 raise MessagesLost(
                     f"token {token.index} came instead of {expected}: messages were lost, or two servers answer"
                 )
             if token.last:
                 break
+            bounds.piece()
             if not expected:
                 trace.mark("return")
             yield Token(token.index, token.text, token.token)
@@ -83,14 +86,15 @@ class TopicClient:
         if token.error:
             raise RequestFailed(f"the server broke off: {token.error}")
 
-    def _next(self, name: str, trace: Trace) -> Any:
+    def _next(self, name: str, trace: Trace, bounds: Bounds) -> Any:
         """Wait for the next token of this request, dropping what belongs to others and what is none."""
         deadline = now_ns() + int(self._wiring.timeout_s * 1e9)
         while now_ns() < deadline:
-            packed = self._subscription.take(POLL_S)
+            packed = self._subscription.take(min(POLL_S, bounds.left_s()))
             if packed is not None:
                 token = readable(self._subscription, packed, trace)
                 if token is not None and token.id == name:
+                    bounds.came(len(packed))
                     return token
             elif not self._alive():
                 raise ServerDied("the server's process is gone")

@@ -1,0 +1,115 @@
+"""The HTTP client against every server of `tests.servers.hostile`: one line, little time, little memory."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from threading import Event
+
+import pytest
+
+from s2a_bench.errors import RequestFailed
+from s2a_bench.store.run import read_run
+from s2a_bench.testing.transport import connector, wiring
+from s2a_bench.trace import Trace
+from s2a_bench.transport import open_client
+from s2a_bench.transport.http.detect import PATIENCE_S
+from s2a_bench.types import Request, Token
+from tests.servers.hostile import CASES, DIALECT, MAX_TOKENS, Case, delta
+from tests.servers.sockets import head, serving
+
+
+def memory_mib(name: str) -> float:
+    """A line of /proc/self/status: VmRSS is now, VmHWM the most since it was reset."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(name)) / 1024
+
+
+@pytest.fixture(params=CASES.values(), ids=list(CASES))
+def case(request: pytest.FixtureRequest) -> Case:
+    found: Case = request.param
+    return found
+
+
+def test_it_ends_in_one_line_and_costs_little(case: Case) -> None:
+    with serving(lambda _: case.pieces()) as url:
+        client = open_client(wiring("http/as-deployed", url=url, dialect=DIALECT, deadline_s=case.deadline_s))
+        Path("/proc/self/clear_refs").write_text("5")
+        before_mib, started = memory_mib("VmRSS"), time.monotonic()
+        with pytest.raises(RequestFailed, match=case.says) as caught:
+            list(client.request(Request("a", "plan", max_tokens=MAX_TOKENS), Trace()))
+        seconds, mib = time.monotonic() - started, memory_mib("VmHWM") - before_mib
+        client.close()
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+    assert seconds < case.seconds
+    assert mib < case.mib
+
+
+@pytest.mark.parametrize("name", ["103, slowly", "103", "headers, a byte at a time", "another media type"])
+def test_who_asks_what_a_server_is_does_not_wait_for_ever(name: str) -> None:
+    with serving(lambda _: CASES[name].pieces()) as url:
+        started = time.monotonic()
+        client = open_client(wiring("http/as-deployed", url=url))
+        assert client.describe()["dialect"] == "openai"
+        assert time.monotonic() - started < PATIENCE_S + 10
+        client.close()
+
+
+@pytest.mark.parametrize("name", ["tokens", "103, slowly"])
+def test_a_run_keeps_a_row_for_each_and_ends_with_the_reason(name: str, tmp_path: Path) -> None:
+    case = CASES[name]
+    small = ["--transport", "http/as-deployed", "--size", "64x48", "--runs", "2", "--warmup", "0", "--max-tokens", "8"]
+    with serving(lambda _: case.pieces()) as url:
+        asked = [*small, "--url", url, "--dialect", DIALECT, "--deadline", str(case.deadline_s or 60)]
+        command = [sys.executable, "-m", "s2a_bench", "latency", *asked, "--output", str(tmp_path)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    (folder,) = tmp_path.iterdir()
+    with (folder / "samples.csv").open() as file:
+        errors = [row["error"] for row in csv.DictReader(file)]
+    assert len(errors) == 2
+    assert all(error.startswith("RequestFailed: ") for error in errors)
+    run = read_run(folder)
+    assert run.manifest["state"] == "failed"
+    assert len(run.samples) == 2
+
+
+@pytest.mark.parametrize("name", ["ros/topic", "ros/action"])
+@pytest.mark.parametrize(
+    ("every_s", "says"), [(0.0, r"does not stop: \d+ pieces came for 1 tokens"), (0.2, "within 1 s; see `deadline`")]
+)
+def test_ros_clients_have_the_same_bounds(name: str, every_s: float, says: str) -> None:
+    left = Event()
+
+    def talks(request: Request, trace: Trace) -> Generator[Token, None, None]:
+        del request, trace
+        for index in count():
+            yield Token(index, "go ")
+            if left.wait(every_s):
+                return
+
+    told = wiring(name, deadline_s=30 if not every_s else 1)
+    with contextmanager(connector)(told) as connect:
+        client = connect(talks)
+        try:
+            with pytest.raises(RequestFailed, match=says):
+                list(client.request(Request("a", "plan", max_tokens=1), Trace()))
+        finally:
+            left.set()
+
+
+def test_a_server_that_counts_otherwise_is_not_cut() -> None:
+    """A gateway may send letters, and what a model thinks beside."""
+    pieces = [head(), *[delta(reasoning_content="h")] * 999, *[delta(content="x")] * 40, b"data: [DONE]\n\n"]
+    with serving(lambda _: pieces) as url:
+        client = open_client(wiring("http/as-deployed", url=url, dialect=DIALECT))
+        assert len(list(client.request(Request("a", "plan", max_tokens=MAX_TOKENS), Trace()))) == 40
+        client.close()
