@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any, Final, TypeAlias
 
 from s2a_bench.clock import clock_id, now_ns
 
@@ -64,6 +64,16 @@ def path_of(own: Iterable[Mapping[str, str]]) -> dict[str, str]:
     return table
 
 
+NAME_LIMIT: Final = 64
+"""Letters of a fact's name."""
+
+FACT_LIMIT: Final = 1 << 53
+"""No fact is larger: beyond, floats skip whole numbers; in ms these are 300,000 years."""
+
+STAMPS: Final = range(1 << 62)
+"""Times that can be, in ns: their differences fit 64 bits."""
+
+
 @dataclass(slots=True)
 class Remote:
     """What a server tells about one request, in its last message.
@@ -81,21 +91,37 @@ class Remote:
     provenance: dict[str, str] = field(default_factory=dict)
     """Who answered, as `provenance.Provenance` has it; empty where the server does not tell."""
 
+    def check(self) -> Remote:
+        """Return it; raises ValueError for what came from outside and can be no server's marks."""
+        marks = [*self.marks, *self.frame_marks]
+        if not all(isinstance(text, str) for text in (self.clock, *(stage for stage, _ in marks))):
+            raise ValueError("marks whose stages are no text")
+        for stamp in (*self.token_ns, *(stamp for _, stamp in marks), max(self.frame_stamp_ns, 0)):
+            if type(stamp) is not int or stamp not in STAMPS:
+                raise ValueError("marks whose times are none")
+        if not isinstance(self.facts, Mapping):
+            raise ValueError("facts without names")  # noqa: TRY004 - one error for all that comes from outside
+        if not isinstance(self.provenance, Mapping):
+            raise ValueError("a provenance without names")  # noqa: TRY004 - as above
+        return self
+
 
 class Trace:
     """The record of one request on one side of the wire.
 
     ``token_ns`` holds the times at which tokens left the engine; ``facts`` what the engine or a black-box server
     says about itself (llama.cpp's ``timings`` and the like); a client's ``remote`` what the server sent back.
+    ``odd`` holds the names of what it said that can be no fact.
     """
 
-    __slots__ = ("facts", "frame_marks", "frame_stamp_ns", "marks", "provenance", "remote", "token_ns")
+    __slots__ = ("facts", "frame_marks", "frame_stamp_ns", "marks", "odd", "provenance", "remote", "token_ns")
 
     def __init__(self) -> None:
         """Start empty."""
         self.marks: list[Mark] = []
         self.token_ns: list[int] = []
         self.facts: dict[str, float] = {}
+        self.odd: set[str] = set()
         self.remote: Remote | None = None
         self.frame_stamp_ns = -1
         self.frame_marks: list[Mark] = []
@@ -108,7 +134,17 @@ class Trace:
     def receive(self, remote: Remote) -> None:
         """Keep what the server sent back about this request."""
         self.remote = remote
-        self.facts.update(remote.facts)
+        self.learn(remote.facts)
+
+    def learn(self, facts: Mapping[str, Any]) -> None:
+        """Keep what a server says of itself; what can be no fact (NaN, 1e300, text) stays absent and is ``odd``."""
+        for name, value in facts.items():
+            if not (isinstance(name, str) and name.isidentifier() and len(name) < NAME_LIMIT):
+                self.odd.add("a name that is none")
+            elif type(value) in {int, float} and abs(value) <= FACT_LIMIT:
+                self.facts[name] = value
+            else:
+                self.odd.add(name)
 
     def to_remote(self) -> Remote:
         """Return what a server sends back about this request."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -58,6 +59,8 @@ class Measured:
     fingerprint: int
     fatal: S2AError | KeyboardInterrupt | None = None
     retry_after_s: float = 0.0
+    odd: frozenset[str] = frozenset()
+    """What the server said of itself that can be no fact."""
 
 
 UNKNOWN_ORIGIN = Provenance()
@@ -198,7 +201,7 @@ class Session:
             )
             for position, (token, client_ns) in enumerate(seen)
         ]
-        return Measured(sample, tokens, picture)
+        return Measured(sample, tokens, picture, odd=frozenset(trace.odd))
 
     def _doubt(self, trace: Trace, rgb_source: int | None, rgb_engine: int | None) -> str:
         """Return why a request that was answered is none that counts, or nothing."""
@@ -244,4 +247,4 @@ def inference_start_ns(trace: Trace) -> int | None:
 
 
 def _whole(value: float | None) -> int | None:
-    return None if value is None else int(value)
+    return None if value is None or not math.isfinite(value) else int(value)

@@ -108,9 +108,11 @@ class SampleGuard:
     _last: dict[str, str] = field(default_factory=dict)
     _times_ns: dict[str, list[int]] = field(default_factory=dict)
     _launches: set[int] = field(default_factory=set)
+    _odd: dict[str, set[str]] = field(default_factory=dict)
 
-    def see(self, row: SampleRow, fingerprint: int) -> None:
-        """Look at one sample and the fingerprint of its picture."""
+    def see(self, row: SampleRow, fingerprint: int, odd: Iterable[str] = ()) -> None:
+        """Look at one sample, the fingerprint of its picture, and the names of what can be no fact."""
+        self._odd.setdefault(row.cell, set()).update(odd)
         if self._frames.setdefault((row.cell, fingerprint), row.request_id) != row.request_id:
             _count(self._repeated, row.cell)
         if lost := row.facts.get(FRAMES_LOST):
@@ -216,6 +218,7 @@ class SampleGuard:
                 f"--qos reliable, --dds-tuning tuned, and sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
             ),
             *_told(self._lost, "lost-messages", "requests lost messages on the way", "--dds-tuning tuned"),
+            *odd_facts(self._odd),
             *_told(self._failed, "failed-samples", "requests failed", "see the column error of samples.csv"),
             *(self._alike() if len(self._launches) == 1 else ()),
         ]
@@ -238,6 +241,15 @@ class SampleGuard:
                 "measure several launches, --launches 5, or more samples, --runs",
             )
         ]
+
+
+def odd_facts(names: Mapping[str, Iterable[str]]) -> list[RunWarning]:
+    """Return a warning of what servers said that can be no fact: cell -> names."""
+    if not names:
+        return []
+    where = "; ".join(f"{cell}: {', '.join(sorted(odd))}" for cell, odd in names.items())
+    advice = "these facts are absent where they were odd: ask whoever runs the server"
+    return [RunWarning("odd-facts", f"a server told what is no number, or none that can be ({where})", advice)]
 
 
 def _count(counts: dict[str, int], cell: str) -> None:

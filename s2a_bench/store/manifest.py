@@ -71,7 +71,8 @@ def write(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Write the manifest; a reader sees the old one or the new one, never half of one."""
     path, part = folder / NAME, folder / f"{NAME}.part"
     try:
-        with part.open("w", encoding="utf-8") as file:
+        # half a surrogate pair, as bytes of argv that are no UTF-8 have, becomes JSON's own escape of it
+        with part.open("w", encoding="utf-8", errors="backslashreplace") as file:
             json.dump(manifest, file, indent=2, ensure_ascii=False, allow_nan=False)
             file.write("\n")
             file.flush()

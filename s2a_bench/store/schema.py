@@ -63,15 +63,27 @@ class Table(Generic[Row]):
         yield provenance
 
 
+INT64: Final = range(-(1 << 63), 1 << 63)
+
+
 def _stored(value: Any) -> Value:
-    """Turn a field into what the files hold; a float that is no number is null."""
-    if isinstance(value, dict):
-        value = {name: _stored(fact) for name, fact in value.items()}
+    """Turn a field into what the files hold."""
     if isinstance(value, (list, dict)):
-        return json.dumps(value, separators=(",", ":"), ensure_ascii=False)
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value  # type: ignore[no-any-return]
+        return json.dumps(_sound(value), separators=(",", ":"), ensure_ascii=False)
+    return _sound(value)  # type: ignore[no-any-return]
+
+
+def _sound(value: Any) -> Any:
+    """Make null of numbers that no reader takes: a float that is none, a whole one of more than 64 bits."""
+    if isinstance(value, dict):
+        return {name: _sound(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_sound(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, int) and not isinstance(value, bool):
+        return value if value in INT64 else None
+    return value
 
 
 def _kind(hint: Any) -> Kind:

@@ -187,7 +187,7 @@ class HttpClient:
                 yield Token(index, event.text, event.token_id)
                 index += 1
             finished = finished or bool(event.finish)
-            trace.facts.update(event.facts)
+            trace.learn(event.facts)
             if event.remote is not None:
                 trace.receive(event.remote)
         if not finished:

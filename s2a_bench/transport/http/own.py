@@ -114,7 +114,7 @@ def remote_json(remote: Remote) -> dict[str, Any]:
 
 
 def remote_of_json(value: dict[str, Any]) -> Remote:
-    """Read a server's marks from the last event."""
+    """Read a server's marks from the last event; raises ValueError for what can be none."""
     return Remote(
         clock=value["clock"],
         marks=[(stage, stamp) for stage, stamp in value["marks"]],
@@ -123,4 +123,4 @@ def remote_of_json(value: dict[str, Any]) -> Remote:
         frame_marks=[(stage, stamp) for stage, stamp in value["frame_marks"]],
         facts=value["facts"],
         provenance=value.get("provenance", {}),
-    )
+    ).check()

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from secrets import token_hex
 from typing import Any, Final
 
-from s2a_bench.errors import TransportError
+from s2a_bench.errors import RequestFailed, TransportError
 from s2a_bench.provenance import Provenance
 from s2a_bench.ros import QoS, Subscription
 from s2a_bench.ros import messages as ros
@@ -105,13 +105,16 @@ def told_by(origin: Any) -> dict[str, str]:
 
 
 def remote_of(marks: Any) -> Remote:
-    """Read a server's marks from s2a_msgs/Marks."""
-    return Remote(
-        clock=marks.clock,
-        marks=list(zip(marks.stages, marks.stamps.tolist(), strict=True)),
-        token_ns=marks.token_stamps.tolist(),
-        frame_stamp_ns=int(marks.frame_stamp),
-        frame_marks=list(zip(marks.frame_stages, marks.frame_stamps.tolist(), strict=True)),
-        facts=dict(zip(marks.fact_names, marks.fact_values.tolist(), strict=True)),
-        provenance=told_by(marks.provenance),
-    )
+    """Read a server's marks from s2a_msgs/Marks; raises RequestFailed for what can be none."""
+    try:
+        return Remote(
+            clock=marks.clock,
+            marks=list(zip(marks.stages, marks.stamps.tolist(), strict=True)),
+            token_ns=marks.token_stamps.tolist(),
+            frame_stamp_ns=int(marks.frame_stamp),
+            frame_marks=list(zip(marks.frame_stages, marks.frame_stamps.tolist(), strict=True)),
+            facts=dict(zip(marks.fact_names, marks.fact_values.tolist(), strict=True)),
+            provenance=told_by(marks.provenance),
+        ).check()
+    except ValueError as error:
+        raise RequestFailed(f"the server's marks are none: {error}") from error

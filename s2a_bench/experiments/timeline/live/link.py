@@ -20,7 +20,7 @@ from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Measured, Place, Session
-from s2a_bench.harness.warnings import before_run
+from s2a_bench.harness.warnings import before_run, odd_facts
 from s2a_bench.inference import need_engine
 from s2a_bench.inference.models import resolve
 from s2a_bench.policy.estimator import GapPrior
@@ -105,6 +105,8 @@ class Link:
     """Who answers, as far as it was told."""
     answers: int = 0
     """Plans that came as they should."""
+    odd: set[str] = field(default_factory=set)
+    """What the server said that can be no fact."""
 
     def connect(self, stack: ExitStack, source: FrameSource, robot: str) -> None:
         """Start the server or find the one that runs, and open a client; ``robot`` is who will act, for the record."""
@@ -185,6 +187,8 @@ class Link:
             tokens = [replace(row, client_ns=at_ns) for row, at_ns in zip(measured.tokens, feed.token_ns, strict=False)]
             measured = replace(measured, tokens=tokens)
             self.answers += not measured.sample.error
+        self.warnings += odd_facts({self.cell.name: new} if (new := measured.odd - self.odd) else {})
+        self.odd |= measured.odd
         self.writer.sample(measured.sample)
         self.writer.tokens(measured.tokens)
         if isinstance(measured.fatal, KeyboardInterrupt):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import nan
 from typing import Any, TypeAlias
 from urllib.parse import urlsplit, urlunsplit
 
 from s2a_bench.errors import UsageError
-from s2a_bench.facts import USAGE_ZERO, Fact
-from s2a_bench.trace import Trace
+from s2a_bench.facts import CACHE_N, PROMPT_N, USAGE_ZERO, Fact
+from s2a_bench.trace import FACT_LIMIT, Trace
 from s2a_bench.transport.http.dialects import Framing
 from s2a_bench.transport.http.dialects.framing import ServerSentEvents
 from s2a_bench.transport.pictures import encoded
@@ -25,6 +26,9 @@ NO_MODEL = "default"
 
 NO_LIST = (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError)
 """What reading a list of another form, or none, raises."""
+
+VOCABULARY = 1 << 31
+"""Larger than any."""
 
 
 class Chat:
@@ -83,9 +87,29 @@ def refuse_grammar(request: Request, name: str) -> None:
 
 
 def numbers(source: Any, names: dict[str, Fact], scale: float = 1.0) -> dict[str, float]:
-    """Return the numbers of a JSON object as facts, times ``scale``; what is missing or null stays absent."""
+    """Return the numbers of a JSON object as facts, times ``scale``; what is missing or null stays absent.
+
+    NaN stands for anything but a number of 0 to 2^53: `Trace.learn` tells of it.
+    """
     found = source or {}
-    return {ours: float(found[theirs]) * scale for theirs, ours in names.items() if found.get(theirs) is not None}
+    told = ((ours, found.get(theirs)) for theirs, ours in names.items())
+    return {ours: _number(value) * scale for ours, value in told if value is not None}
+
+
+def _number(value: Any) -> float:
+    return float(value) if type(value) in {int, float} and 0 <= value <= FACT_LIMIT else nan
+
+
+def evaluated(facts: dict[str, float]) -> dict[str, float]:
+    """Count the prompt as llama.cpp does: the tokens that were evaluated, without those from the cache."""
+    if PROMPT_N not in facts:
+        return facts
+    return {**facts, PROMPT_N: _number(facts[PROMPT_N] - facts.get(CACHE_N, 0.0))}
+
+
+def token_id(value: Any) -> int:
+    """Return a token's place in a vocabulary, or -1 for what can be none."""
+    return value if type(value) is int and 0 <= value < VOCABULARY else -1
 
 
 def usage_of(source: Any, names: dict[str, Fact]) -> dict[str, float]:

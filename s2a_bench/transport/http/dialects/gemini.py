@@ -15,6 +15,7 @@ from s2a_bench.transport.http.dialects.common import (
     Chat,
     Get,
     endpoint,
+    evaluated,
     first_model,
     refuse_grammar,
     text_of,
@@ -94,9 +95,7 @@ class Gemini(Chat):
             return Event(error=f"the prompt was refused: {blocked}")
         if finish and finish not in COMPLETE:
             return Event(error=f"the answer was cut: {finish}")
-        facts = usage_of(message.get("usageMetadata"), USAGE)
-        if PROMPT_N in facts:  # evaluated, as llama.cpp counts them
-            facts[PROMPT_N] -= facts.get(CACHE_N, 0.0)
+        facts = evaluated(usage_of(message.get("usageMetadata"), USAGE))
         return Event(said or None, -1, thought, finish, facts)
 
 

@@ -7,6 +7,7 @@ prompt cache off, and their names for a GBNF grammar.
 from __future__ import annotations
 
 from dataclasses import replace
+from math import isfinite
 from typing import Any
 from uuid import uuid4
 
@@ -25,7 +26,16 @@ from s2a_bench.facts import (
 )
 from s2a_bench.transport.http import own as dialect
 from s2a_bench.transport.http.dialects import OWN, Event, Picture
-from s2a_bench.transport.http.dialects.common import Chat, endpoint, numbers, refuse_grammar, text_of, usage_of
+from s2a_bench.transport.http.dialects.common import (
+    Chat,
+    endpoint,
+    evaluated,
+    numbers,
+    refuse_grammar,
+    text_of,
+    token_id,
+    usage_of,
+)
 from s2a_bench.types import Request
 
 TIMINGS = {str(fact): fact for fact in (CACHE_N, PROMPT_N, PROMPT_MS, PREDICTED_N, PREDICTED_MS)}
@@ -92,12 +102,11 @@ class OpenAI(Chat):
             **numbers(usage.get("prompt_tokens_details"), CACHED),
             **numbers(usage.get("completion_tokens_details"), REASONING),
         }
-        if PROMPT_N in facts:  # evaluated, as llama.cpp counts them
-            facts[PROMPT_N] -= facts.get(CACHE_N, 0.0)
         timings = numbers(message.get("timings"), TIMINGS | {RATE: RATE})
         if rate := timings.pop(RATE, 0.0):  # over n tokens or n - 1, as the build sees it
-            timings[PREDICTED_STEPS] = float(round(rate * timings.get(PREDICTED_MS, 0.0) / 1e3))
-        return {**facts, **numbers(message.get("metrics"), METRICS), **timings}
+            steps = rate * timings.get(PREDICTED_MS, 0.0) / 1e3
+            timings[PREDICTED_STEPS] = float(round(steps)) if isfinite(steps) else steps
+        return {**evaluated(facts), **numbers(message.get("metrics"), METRICS), **timings}
 
     def starts_with_headers(self, facts: dict[str, float]) -> bool:
         """Tell a llama-server by its timings: it sends the headers when its slot starts."""
@@ -151,11 +160,11 @@ class Own(OpenAI):
 
     def event(self, message: Any) -> Event:
         """Read one chunk, the last of which carries the marks."""
-        text, token_id, finish = None, -1, ""
+        text, token, finish = None, -1, ""
         for choice in message.get("choices") or ():
             delta = choice.get("delta") or {}
             text = text_of(delta["content"]) if "content" in delta else None
-            token_id = int(choice.get("token", -1))
+            token = token_id(choice.get("token"))
             finish = text_of(choice.get("finish_reason") or "")
         remote = dialect.remote_of_json(message["s2a"]) if "s2a" in message else None
-        return Event(text, token_id, finish=finish, remote=remote)
+        return Event(text, token, finish=finish, remote=remote)

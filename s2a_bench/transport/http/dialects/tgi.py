@@ -15,6 +15,7 @@ from s2a_bench.transport.http.dialects.common import (
     numbers,
     refuse_grammar,
     text_of,
+    token_id,
 )
 from s2a_bench.types import Request
 
@@ -56,4 +57,4 @@ class Tgi(Chat):
         if message.get("generated_text") is not None:
             finish = text_of(details.get("finish_reason") or "stop")
         text = "" if token.get("special") else text_of(token.get("text") or "")
-        return Event(text or None, int(token.get("id", -1)), "", finish, numbers(details, DETAILS))
+        return Event(text or None, token_id(token.get("id")), "", finish, numbers(details, DETAILS))

@@ -1,0 +1,130 @@
+"""Numbers that servers tell and that can be none: the fact is absent, the run says so once, the sample counts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from s2a_bench.errors import RequestFailed
+from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.harness.rounds import Task, run_requests
+from s2a_bench.progress import NullProgress
+from s2a_bench.store.run import read_run
+from s2a_bench.testing.transport import wiring
+from s2a_bench.trace import Remote, Trace
+from s2a_bench.transport import open_client
+from s2a_bench.transport.http.dialects import open_dialect
+from s2a_bench.transport.http.own import remote_of_json
+from s2a_bench.transport.ros.wire import remote_of
+from s2a_bench.types import Request
+from tests.servers.hostile import delta
+from tests.servers.sockets import head, serving
+
+NONE = ["NaN", "Infinity", "-Infinity", "1e25", "1e300", "1e999", '"12"', "true", "-1", "[]", "{}", str(10**400)]
+TOLD = [
+    ("openai", '{"choices": [], "usage": {"prompt_tokens": %s}}', "prompt_n"),
+    ("openai", '{"choices": [], "usage": {"prompt_tokens_details": {"cached_tokens": %s}}}', "cache_n"),
+    ("openai", '{"choices": [], "timings": {"prompt_ms": %s}}', "prompt_ms"),
+    ("vllm", '{"choices": [], "metrics": {"queue_time_ms": %s}}', "queue_ms"),
+    ("ollama", '{"done": true, "prompt_eval_count": %s}', "prompt_n"),
+    ("ollama", '{"done": true, "eval_duration": %s}', "predicted_ms"),
+    ("tgi", '{"details": {"generated_tokens": %s}}', "predicted_n"),
+    ("gemini", '{"usageMetadata": {"promptTokenCount": %s}}', "prompt_n"),
+]
+
+
+@pytest.mark.parametrize("value", NONE)
+@pytest.mark.parametrize(("dialect", "message", "fact"), TOLD)
+def test_it_is_absent_and_told(dialect: str, message: str, fact: str, value: str) -> None:
+    event, trace = open_dialect(dialect).event(json.loads(message % value)), Trace()
+    trace.learn(event.facts)
+    assert trace.facts == {}
+    assert trace.odd == {fact}
+
+
+@pytest.mark.parametrize(("dialect", "message", "fact"), TOLD)
+def test_a_number_that_can_be_is_kept(dialect: str, message: str, fact: str) -> None:
+    trace = Trace()
+    trace.learn(open_dialect(dialect).event(json.loads(message % "12")).facts)
+    assert trace.facts[fact] in {12.0, 12e-6}
+    assert not trace.odd
+
+
+def test_more_cached_than_there_was_is_odd() -> None:
+    usage = {"prompt_tokens": 3, "prompt_tokens_details": {"cached_tokens": 5}}
+    trace = Trace()
+    trace.learn(open_dialect("openai").event({"usage": usage}).facts)
+    assert trace.facts == {"cache_n": 5.0}
+    assert trace.odd == {"prompt_n"}
+
+
+@pytest.mark.parametrize("value", [1e300, 1.5, -1, "7", None, 2**70, True, [3]])
+def test_a_token_s_id_that_can_be_none_is_unknown(value: Any) -> None:
+    assert open_dialect("tgi").event({"token": {"id": value, "text": "x"}}).token_id == -1
+    choice = {"delta": {"content": "x"}, "token": value}
+    assert open_dialect("s2a").event({"choices": [choice]}).token_id == -1
+
+
+def test_a_run_with_them_counts_and_warns_once_a_field(tmp_path: Path) -> None:
+    numbers = b'data: {"choices": [], "usage": {"prompt_tokens": 1e25}, "timings": {"prompt_ms": NaN}}\n\n'
+    pieces = [head(), delta(content="x"), numbers, b"data: [DONE]\n\n"]
+    with serving(lambda _: pieces) as url:
+        http = {"url": url, "dialect": "llama-server"}
+        asked = RequestsConfig(transports="http/as-deployed", options={"http": http}, size="64x48", runs=3, warmup=1)
+        folder = run_requests(Task("latency"), asked, tmp_path, NullProgress())
+    run = read_run(folder)
+    assert run.samples.error.tolist() == [""] * 4
+    assert run.samples.prompt_n.isna().all()
+    assert run.samples.server_prompt_ms.isna().all()
+    (warning,) = [each for each in run.manifest["warnings"] if each["code"] == "odd-facts"]
+    assert "(http/as-deployed: prompt_ms, prompt_n)" in warning["message"]
+
+
+MARKS = {"clock": "c", "marks": [["", 1]], "token_ns": [2], "frame_stamp_ns": -1, "frame_marks": [], "facts": {}}
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"marks": [["", 2**63]]},
+        {"marks": [["", 1e25]]},
+        {"marks": [[7, 1]]},
+        {"marks": [["", -5]]},
+        {"token_ns": ["1"]},
+        {"token_ns": [True]},
+        {"frame_stamp_ns": 1e300},
+        {"frame_marks": [["x", None]]},
+        {"clock": None},
+        {"facts": [1]},
+    ],
+)
+def test_marks_that_can_be_none_fail_their_sample(odd: dict[str, Any]) -> None:
+    last = b"data: " + json.dumps({"choices": [], "usage": {}, "s2a": {**MARKS, **odd}}).encode() + b"\n\n"
+    pieces = [head(), delta(content="x"), last, b"data: [DONE]\n\n"]
+    with serving(lambda _: pieces) as url:
+        client = open_client(wiring("http/as-deployed", url=url, dialect="s2a"))
+        with pytest.raises(RequestFailed, match="this is not the dialect 's2a'"):
+            list(client.request(Request("a", "plan"), Trace()))
+        client.close()
+    assert remote_of_json(MARKS).token_ns == [2]
+
+
+def test_facts_of_marks_are_checked_in_name_and_value() -> None:
+    trace = Trace()
+    trace.receive(Remote("c", facts={"prompt_n": float("nan"), "\x1b[2J": 1.0, "x" * 99: 1.0, "load": 0.5}))
+    assert trace.facts == {"load": 0.5}
+    assert trace.odd == {"prompt_n", "a name that is none"}
+
+
+@pytest.mark.parametrize("odd", [{"stamps": [1, 2]}, {"stamps": [-1]}, {"fact_names": ["a"]}])
+def test_ros_marks_that_can_be_none_fail_their_sample(odd: dict[str, list[Any]]) -> None:
+    plain: dict[str, Any] = {"stages": ["a"], "stamps": [1], "token_stamps": [], "frame_stages": [], "frame_stamps": []}
+    lists = {**plain, "fact_names": [], "fact_values": [], **odd}
+    arrays = {name: np.array(value) for name, value in lists.items() if "stamps" in name or name == "fact_values"}
+    with pytest.raises(RequestFailed, match="the server's marks are none"):
+        remote_of(SimpleNamespace(**{"clock": "c", "frame_stamp": -1, **lists, **arrays}))
