@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,16 @@ TEXTS = st.text(st.characters(exclude_categories=()), max_size=20) | st.sampled_
 )
 WHOLE = st.integers() | st.sampled_from([2**63, -(2**63) - 1, 10**25, 10**5000])
 NUMBERS = WHOLE | st.floats() | st.sampled_from([1e25, 1e300])
-STAMPS = st.integers(-(2**70), 2**70)
+MARKS = st.lists(
+    st.tuples(st.sampled_from(["", "capture", "server", "return"]), st.integers(-(2**70), 2**70)), max_size=5
+).map(lambda marks: sorted(marks, key=itemgetter(1)))
+"""In order of time, as `Trace.chain` has them."""
 SAMPLES = st.fixed_dictionaries(
     {},
     optional={
         "error": TEXTS,
         "request_id": TEXTS,
-        "marks": st.lists(st.tuples(st.sampled_from(["", "capture", "server", "return"]), STAMPS), max_size=5),
+        "marks": MARKS,
         "n_tokens": WHOLE,
         "last_token_ns": WHOLE,
         "frame_age_ns": WHOLE,
@@ -88,18 +92,9 @@ def test_it_can_be_reported_on(samples: list[dict[str, Any]], tokens: list[tuple
     with tempfile.TemporaryDirectory() as root:
         with write(Path(root), samples, tokens, note) as run:
             pass
-        command = [
-            sys.executable,
-            "-m",
-            "s2a_bench",
-            "report",
-            str(run.path),
-            "--output",
-            f"{root}/page.html",
-            "--csv",
-            f"{root}/csv",
-        ]
-        command += ["--latex", f"{root}/latex", "--markdown", f"{root}/all.md"]
+        files = {"output": "page.html", "csv": "csv", "latex": "latex", "markdown": "all.md"}
+        asked = [f"--{flag}={root}/{name}" for flag, name in files.items()]
+        command = [sys.executable, "-m", "s2a_bench", "report", str(run.path), *asked]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
         assert done.returncode == 0, done.stderr
         assert "left out" not in done.stderr + done.stdout
