@@ -23,11 +23,18 @@ S2AError
 
 from __future__ import annotations
 
+from s2a_bench.secrets import struck
+from s2a_bench.text import one_line
+
 
 class S2AError(Exception):
     """Base of every expected failure: printed as one line, without a traceback."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        """Return the message on one line that shows every letter, without secrets: servers word part of many."""
+        return one_line(struck(super().__str__()))
 
 
 class UsageError(S2AError):

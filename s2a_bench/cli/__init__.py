@@ -14,6 +14,7 @@ import typer
 from s2a_bench import __version__
 from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import Commands
+from s2a_bench.cli.output import shown
 from s2a_bench.errors import S2AError
 from s2a_bench.machine import tuning
 
@@ -85,5 +86,5 @@ def main() -> None:
 
 
 def _say(line: str, code: int) -> int:
-    print(line, file=sys.stderr)  # noqa: T201 - the command line's own output
+    print(shown(line), file=sys.stderr)  # noqa: T201 - the command line's own output
     return code

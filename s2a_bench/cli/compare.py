@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from s2a_bench.cli.adapter import command
-from s2a_bench.cli.output import Json, print_json
+from s2a_bench.cli.output import Json, print_json, shown
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.exits import TRIPPED, UNDECIDED
 from s2a_bench.report.compare.config import CompareConfig
@@ -46,7 +46,7 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
         table = compare_table(compared)
         console.print(lay_out(table))
         for line in (*table.notes, *(f"written: {path}" for path in written)):
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
+            console.print(shown(line), highlight=False, markup=False, soft_wrap=True)
     raise typer.Exit(_gate_code(judgements))
 
 
@@ -66,7 +66,7 @@ def _gate_code(judgements: Sequence[Judgement]) -> int:
 
 
 def _say(line: str) -> None:
-    print(line, file=sys.stderr)  # noqa: T201 - the command line's own output
+    print(shown(line), file=sys.stderr)  # noqa: T201 - the command line's own output
 
 
 compare = command(_compare, CompareConfig)

@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from s2a_bench.cli.adapter import build, command, flags_named
 from s2a_bench.cli.output import Json, print_json
 from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import shown as shown_line
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS
 
@@ -139,7 +140,7 @@ def present(run: Run, shown: Shown, progress: RunProgress, *, as_json: bool) -> 
     for name in shown.tables if shown.printed is None else shown.printed:
         console.print(lay_out(shown.narrow.get(name) or shown.tables[name]))
     for note in (*shown.notes, run.origins.line):
-        console.print(note, markup=False, highlight=False)
+        console.print(shown_line(note), markup=False, highlight=False)
     for name in shown.files:
         if (run.path / name).exists():
             console.print(f"{name}: {run.path / name}", highlight=False, markup=False, soft_wrap=True)

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from s2a_bench.secrets import struck
+from s2a_bench.text import one_line, visible
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -17,10 +20,15 @@ WIDTH = 100
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output")]
 
 
+def shown(line: str) -> str:
+    """Return one line as it may be printed: all letters visible, no secret."""
+    return one_line(struck(line))
+
+
 def print_json(whole: dict[str, Any]) -> None:
     """Print one strict JSON object on standard output."""
-    json.dump(whole, sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
-    sys.stdout.write("\n")
+    text = json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False)
+    sys.stdout.write(visible(text) + "\n")  # hidden letters are in strings only, and escaped as JSON does
 
 
 def console() -> Console:

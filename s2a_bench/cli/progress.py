@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
+from s2a_bench.cli.output import shown
 from s2a_bench.clock import now_ns
 
 if TYPE_CHECKING:
@@ -53,7 +55,7 @@ class RunProgress:
 
     def say(self, line: str) -> None:
         """Print one line, above the bar."""
-        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self.console.print(shown(line), markup=False, highlight=False, soft_wrap=True)
 
     @contextmanager
     def watch(self, picture: Picture) -> Iterator[None]:
@@ -80,7 +82,7 @@ class RunProgress:
 
     def stage(self, text: str) -> None:
         """Show what is being done."""
-        self._bar.update(self._task, description=text)
+        self._bar.update(self._task, description=escape(shown(text)))
         if self._bar.disable and text != self._said:
             self.say(text)
         self._said = text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from s2a_bench.cli.adapter import command
+from s2a_bench.cli.output import shown
 from s2a_bench.report.page.config import ReportConfig
 
 
@@ -18,7 +19,7 @@ def _report(config: ReportConfig) -> None:
     errors = Console(stderr=True)
     unfinished = [f"{chapter.title}: {caveat}" for chapter in found.chapters for caveat in chapter.caveats]
     for caveat in (*found.caveats, *unfinished):
-        errors.print(f"warning: {caveat}", markup=False, highlight=False, soft_wrap=True)
+        errors.print(shown(f"warning: {caveat}"), markup=False, highlight=False, soft_wrap=True)
     written = write_report(found, config)
     console = Console()
     if found.judged:

@@ -8,8 +8,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rich.table import Table
+from rich.text import Text
 
 from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import shown
+from s2a_bench.text import visible
 
 if TYPE_CHECKING:
     from s2a_bench.store.sweep import Sweep
@@ -26,7 +29,7 @@ def print_plan(plan: Plan, cells: Sequence[Cell], expected: Expected) -> None:
     for cell in cells:
         where = f"  on {cell.board}" if cell.board else ""
         console.print(
-            f"{cell.name}-r{cell.repeat}  s2a-bench {shlex.join(cell.argv)}{where}",
+            visible(f"{cell.name}-r{cell.repeat}  s2a-bench {shlex.join(cell.argv)}{where}"),
             markup=False,
             highlight=False,
             soft_wrap=True,
@@ -50,7 +53,8 @@ def print_sweep(sweep: Sweep) -> None:
             table.add_column(name, overflow="fold")
         for row in failed.to_dict("records"):
             setting = " ".join(f"{key}={value}" for key, value in json.loads(row["settings"]).items())
-            table.add_row(f"{row['cell']}-r{row['repeat']}", setting, row["error"])
+            texts = (f"{row['cell']}-r{row['repeat']}", setting, row["error"])
+            table.add_row(*(Text(shown(text)) for text in texts))
         console.print(table)
     hosts = ", ".join(sorted(set(cells["host"])))
     console.print(

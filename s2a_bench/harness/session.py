@@ -23,6 +23,7 @@ from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.machine.resources.sampler import Sampler
 from s2a_bench.provenance import UNKNOWN, Provenance
+from s2a_bench.secrets import struck_pieces
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import Mark, Trace
 from s2a_bench.transport import Client
@@ -121,6 +122,8 @@ class Session:
         except KeyboardInterrupt as interrupt:
             error, fatal = INTERRUPTED, interrupt
         self._sampler.edge()
+        texts = struck_pieces([token.text for token, _ in seen])
+        seen = [(replace(token, text=text), at_ns) for (token, at_ns), text in zip(seen, texts, strict=True)]
         trace.facts.update(self._sampler.window(started_ns, now_ns()))
         if not error and not seen:
             error = "RequestFailed: the answer was empty"

@@ -245,9 +245,9 @@ class SampleGuard:
 
 def odd_facts(names: Mapping[str, Iterable[str]]) -> list[RunWarning]:
     """Return a warning of what servers said that can be no fact: cell -> names."""
-    if not names:
+    where = "; ".join(f"{cell}: {', '.join(sorted(odd))}" for cell, odd in names.items() if odd)
+    if not where:
         return []
-    where = "; ".join(f"{cell}: {', '.join(sorted(odd))}" for cell, odd in names.items())
     advice = "these facts are absent where they were odd: ask whoever runs the server"
     return [RunWarning("odd-facts", f"a server told what is no number, or none that can be ({where})", advice)]
 

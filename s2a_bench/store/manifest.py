@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from s2a_bench.errors import StoreError
+from s2a_bench.secrets import struck
 from s2a_bench.store.schema import SCHEMA
 
 NAME = "manifest.json"
@@ -39,6 +40,7 @@ def utc_now() -> str:
 def merge(into: dict[str, Any], facts: Mapping[str, Any]) -> None:
     """Merge facts: mappings key by key, anything else replaces what was there."""
     for key, value in facts.items():
+        key = struck(key, short=False)  # noqa: PLW2901 - a cell's name may hold one
         old = into.get(key)
         if isinstance(old, dict) and isinstance(value, Mapping):
             merge(old, value)
@@ -47,18 +49,23 @@ def merge(into: dict[str, Any], facts: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Turn a value into what JSON holds: dataclasses into objects, paths into text, NaN and infinity into null."""
+    """Turn a value into what JSON holds: dataclasses into objects, paths into text, NaN and infinity into null.
+
+    Secrets are struck out.
+    """
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
-    if value is None or isinstance(value, (str, int, float)):
+    if isinstance(value, str):
+        return struck(value, short=False)
+    if value is None or isinstance(value, (int, float)):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = {item.name: getattr(value, item.name) for item in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {struck(str(key), short=False): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
-    return str(value)
+    return struck(str(value), short=False)
 
 
 def present(value: Any) -> dict[str, Any]:

@@ -77,7 +77,7 @@ class RunWriter:
         whole: dict[str, Any] = {
             "schema": SCHEMA,
             "command": command,
-            "argv": list(sys.argv),
+            "argv": manifests.plain(sys.argv),
             "host": host,
             "state": "running",
             "error": None,

@@ -13,6 +13,8 @@ from functools import cached_property
 from types import NoneType
 from typing import Any, Final, Generic, Literal, TypeAlias, TypeVar, get_args, get_type_hints
 
+from s2a_bench.secrets import struck
+
 SCHEMA: Final = "s2a-bench/1"
 """The version of folder, columns and ``--json``; it changes when a column changes its meaning or goes."""
 
@@ -74,7 +76,7 @@ def _stored(value: Any) -> Value:
 
 
 def _sound(value: Any) -> Any:
-    """Make null of numbers that no reader takes: a float that is none, a whole one of more than 64 bits."""
+    """Strike out secrets, and make null of numbers that no reader takes: NaN, whole ones of more than 64 bits."""
     if isinstance(value, dict):
         return {name: _sound(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -83,7 +85,7 @@ def _sound(value: Any) -> Any:
         return value if math.isfinite(value) else None
     if isinstance(value, int) and not isinstance(value, bool):
         return value if value in INT64 else None
-    return value
+    return struck(value, short=False) if isinstance(value, str) else value
 
 
 def _kind(hint: Any) -> Kind:

@@ -6,12 +6,15 @@ import os
 import re
 
 from s2a_bench.errors import UsageError
+from s2a_bench.secrets import keep
 
 VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 def read_key(variable: str) -> str:
     """Return the key that an environment variable holds, without space around it; "" for no variable.
+
+    From now on it is struck out of what is shown and kept.
 
     Raises UsageError, which does not repeat the name: somebody may have given the key itself.
     """
@@ -24,4 +27,5 @@ def read_key(variable: str) -> str:
         raise UsageError("`api_key_env`: the environment has no such variable, or it is empty; export it first")
     if not (key.isascii() and key.isprintable()):
         raise UsageError(f"`api_key_env`: ${variable} holds what no HTTP header can carry")
+    keep(key)
     return key

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from s2a_bench.store.schema import PROVENANCE
+from s2a_bench.text import visible
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,8 +50,22 @@ class CsvTable:
         writer = csv.writer(out, lineterminator="\n")
         told = PROVENANCE in self.header  # a table of the store has it already
         cell = self.header.index("cell") if "cell" in self.header else None
-        writer.writerow(self.header if told else (*self.header, PROVENANCE))
+        writer.writerow(map(_inert, self.header if told else (*self.header, PROVENANCE)))
         for row in self.rows:
             code = origins.code if cell is None else origins.of_row(str(row[cell]))
-            writer.writerow(row if told else (*row, code))
+            writer.writerow(map(_inert, row if told else (*row, code)))
         return out.getvalue()
+
+
+def _inert(value: object) -> object:
+    """Return a value of visible letters that no spreadsheet takes for a formula (OWASP, CSV injection)."""
+    if not isinstance(value, str):
+        return value
+    value = visible(value)
+    if not value.startswith(("=", "+", "-", "@", "\t", "\n")):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value

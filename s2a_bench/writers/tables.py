@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+from s2a_bench.text import one_line
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -90,8 +93,17 @@ def interval(ratio: Ratio | None) -> str:
 def to_markdown(table: TextTable) -> str:
     """Write a table as Markdown, its title and notes around it."""
     rule = ["---"] * table.left + ["---:"] * (len(table.header) - table.left)
-    lines = ["| " + " | ".join(row) + " |" for row in (table.header, tuple(rule), *table.rows)]
-    return "\n".join([f"**{table.title}**", "", *lines, "", *table.footer]) + "\n"
+    header, *rows = (tuple(map(markdown_text, row)) for row in (table.header, *table.rows))
+    lines = ["| " + " | ".join(row) + " |" for row in (header, tuple(rule), *rows)]
+    return "\n".join([f"**{markdown_text(table.title)}**", "", *lines, "", *map(markdown_text, table.footer)]) + "\n"
+
+
+_MARKED = re.compile(r"[\\|*<]|(?<=\])(?=\()")
+
+
+def markdown_text(text: str) -> str:
+    """Return a text on one line in which Markdown finds no cell, emphasis, tag or link."""
+    return _MARKED.sub(lambda found: f"\\{found[0]}", one_line(text))
 
 
 def to_latex(table: TextTable) -> str:
@@ -99,7 +111,7 @@ def to_latex(table: TextTable) -> str:
 
     Where its numbers come from stands as its last line, which is printed with it.
     """
-    lines = [f"% {note}" for note in (table.title, *table.footer)]
+    lines = [f"% {one_line(note)}" for note in (table.title, *table.footer)]
     lines += [f"\\begin{{tabular}}{{{'l' * table.left}{'r' * (len(table.header) - table.left)}}}", "\\toprule"]
     lines += [_latex_row(table.header), "\\midrule"]
     for place, row in enumerate(table.rows):
@@ -125,5 +137,6 @@ def _latex_row(row: tuple[str, ...]) -> str:
 
 def _latex(text: str) -> str:
     """Write a text so that LaTeX sets it."""
-    escapes = {"_": "\\_", "%": "\\%", "&": "\\&", "#": "\\#", "±": "$\\pm$", ">": "$>$", ABSENT: "--"}
-    return "".join(escapes.get(char, char) for char in text)
+    from s2a_bench.writers.latex import escape  # it builds on the tables of this module
+
+    return escape(text)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from s2a_bench.text import one_line, visible
 from s2a_bench.writers.tables import TextTable
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def lay_out(table: TextTable) -> RenderableType:
     natural = sum(max(map(len, column)) for column in lines)
     gap = 1 if natural + 2 * (len(lines) - 1) <= _WIDTH else 0
     shown = Table(
-        title=table.title,
+        title=Text(one_line(table.title)),
         title_justify="left",
         title_style="bold",
         box=box.SIMPLE_HEAD,
@@ -35,11 +36,11 @@ def lay_out(table: TextTable) -> RenderableType:
         pad_edge=False,
     )
     for place, name in enumerate(header):
-        shown.add_column(Text(name), justify="left" if place < table.left else "right", no_wrap=True)
+        shown.add_column(Text(visible(name)), justify="left" if place < table.left else "right", no_wrap=True)
     for place, row in enumerate(table.rows):
         if place in table.rules:
             shown.add_section()
-        shown.add_row(*(Text(text) for text in row))
+        shown.add_row(*(Text(one_line(text)) for text in row))
     return Padding(shown, (0, 0, 1, 0))
 
 

@@ -13,9 +13,10 @@ from s2a_bench.report.claims.verdicts import Judged, claim_table, judge_claims
 from s2a_bench.report.page.chapters import mixed_machines
 from s2a_bench.report.page.page import GENERATOR, render, tally
 from s2a_bench.report.page.plots import draw
+from s2a_bench.text import visible
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.latex import document, escape, to_siunitx
-from s2a_bench.writers.tables import to_markdown
+from s2a_bench.writers.tables import markdown_text, to_markdown
 
 if TYPE_CHECKING:
     from s2a_bench.report.page import Chapter
@@ -113,13 +114,13 @@ def _claims(report: Report) -> TextTable:
 
 def _markdown(report: Report) -> str:
     """Return everything but the figures as one Markdown text."""
-    parts = [_MARK, *(f"> {caveat}" for caveat in report.caveats)]
+    parts = [_MARK, *(f"> {markdown_text(caveat)}" for caveat in report.caveats)]
     if report.judged:
         parts += [f"## The paper's claims\n\n{tally(report.judged)}.", to_markdown(_claims(report))]
     for chapter in report.chapters:
-        parts.append(f"## {chapter.title}")
-        parts += [f"> {caveat}" for caveat in chapter.caveats]
-        parts.append("\n".join(f"- {text}" for text in chapter.content.summary))
-        parts.append(f"```sh\n{chapter.command}\n```")
+        parts.append(f"## {markdown_text(chapter.title)}")
+        parts += [f"> {markdown_text(caveat)}" for caveat in chapter.caveats]
+        parts.append("\n".join(f"- {markdown_text(text)}" for text in chapter.content.summary))
+        parts.append(f"```sh\n{visible(chapter.command)}\n```")
         parts += [to_markdown(table) for table in chapter.content.tables.values()]
     return "\n\n".join(part for part in parts if part) + "\n"

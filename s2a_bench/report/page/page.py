@@ -14,6 +14,7 @@ from s2a_bench.report.page.contents import labels_of
 from s2a_bench.report.page.lanes import MOST_PANELS, panels_of
 from s2a_bench.store.manifest import utc_now
 from s2a_bench.store.sweep import is_sweep
+from s2a_bench.text import visible
 
 if TYPE_CHECKING:
     from s2a_bench.report.page import Chapter
@@ -35,6 +36,7 @@ def render(
     world = Environment(
         loader=PackageLoader("s2a_bench.report.page", "templates"),
         autoescape=True,
+        finalize=lambda value: visible(value) if type(value) is str else value,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -227,15 +227,10 @@ class HttpClient:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Turn what httpx raises into this project's errors, with the key struck out."""
+        """Turn what httpx raises into this project's errors."""
         url = self._url
         try:
             yield
-        except RequestFailed as error:
-            if not (self._key and self._key in str(error)):
-                raise
-            shown = str(error).replace(self._key, "***")
-            raise RequestFailed(shown, retry_after_s=error.retry_after_s) from None
         except httpx.ConnectError as error:
             raise ServerDied(f"nothing answers at {url}: {error}") from error
         except httpx.TimeoutException as error:

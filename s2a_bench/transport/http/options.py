@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Literal
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 from pydantic import field_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import TextOrFile, option
+from s2a_bench.secrets import is_secret
 from s2a_bench.transport.http.dialects import DIALECTS
 from s2a_bench.transport.options import SERVER, SERVING, Options
 
@@ -39,9 +41,13 @@ class HttpOptions(Options):
     @classmethod
     def _names_a_server(cls, url: str) -> str:
         if url and not _is_url(url):
-            raise ValueError(f"'{url}' should start with http:// or https:// and name a host")
+            shown = re.sub(r"[^/]*@", "***@", url.partition("?")[0])
+            raise ValueError(f"'{shown}' should start with http:// or https:// and name a host")
         if url and "@" in urlsplit(url).netloc:
             raise ValueError("leave the password out, which would be kept with the results; see `api_key_env`")
+        for name, _ in parse_qsl(urlsplit(url).query, keep_blank_values=True):
+            if is_secret(name):
+                raise ValueError(f"leave '{name}' out, which would be kept with the results; see `api_key_env`")
         return url
 
     @field_validator("dialect")

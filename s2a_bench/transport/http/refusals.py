@@ -11,6 +11,7 @@ from typing import Any
 import httpx
 
 from s2a_bench.errors import RequestFailed
+from s2a_bench.secrets import struck
 from s2a_bench.transport.http.dialects.decoder import error_in
 from s2a_bench.transport.http.options import HttpOptions
 
@@ -30,7 +31,7 @@ def refusal(url: str, response: httpx.Response, body: str, options: HttpOptions,
         value = json.loads(body)
     except (ValueError, RecursionError):
         value = None
-    said = error_in(value) or body[:QUOTED].strip() or "nothing"
+    said = error_in(value) or struck(body)[:QUOTED].strip() or "nothing"
     kind = response.headers.get("content-type", "no content type").partition(";")[0]
     if response.status_code == httpx.codes.OK and not kind.startswith(expected):
         said += f" (as {kind} where {expected} belongs; see `dialect`)"

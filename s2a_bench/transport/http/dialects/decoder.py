@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
+from s2a_bench.secrets import struck
 from s2a_bench.transport.http.dialects import Dialect, Event
 
 DONE = "[DONE]"
@@ -67,7 +68,7 @@ class Decoder:
                 return Event(error=f"the server broke off: {error}", status=status_in(value))
             event = self._dialect.event(value)
         except ODD as problem:
-            start = message[:QUOTED].strip()
+            start = struck(message)[:QUOTED].strip()  # before the cut, which could leave half a key
             return Event(error=f"this is not the dialect '{self._dialect.name}' ({problem!r}): {start}")
         return _storable(event)
 

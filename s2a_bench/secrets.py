@@ -1,0 +1,92 @@
+"""Secrets that this process was given: kept here to strike them out of whatever is shown or stored.
+
+A server may send a key back in an error, a header or its answer: as it is, percent-encoded, in JSON's escapes, in
+Base64 at any offset, in other case.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+LONG: Final = 8
+"""Letters from which a secret is no word: shorter ones are struck out of what servers say only, where they stand
+alone. A placeholder such as `ollama` would be struck out of settings otherwise."""
+
+STRUCK: Final = "***"
+
+_long: dict[str, str] = {}
+_short: dict[str, str] = {}
+"""Secret -> its pattern."""
+
+_NAME = re.compile(
+    r"(?:^|_)(?:key|token|secret|pass(?:word|wd|phrase)?|pwd|auth|authorization|credentials?|bearer|jwt|cookie|sig(?:nature)?)$"
+    r"|(?:api|access|secret|private)_?key$"
+)
+_NO_SECRET = re.compile(r"(?:stop|eos|bos|pad|unk|cls|sep|mask)_token$|cache_key$")
+
+
+def is_secret(name: str) -> bool:
+    """Return whether a name looks like that of a secret: ``api_key``, ``accessToken``, ``X-Auth``."""
+    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[^A-Za-z0-9]+", "_", name).strip("_").lower()
+    return bool(_NAME.search(words)) and not _NO_SECRET.search(words)
+
+
+def secrets_in(value: Any, name: str = "", *, inside: bool = False) -> Iterator[tuple[str, str]]:
+    """Yield name and text of every value of a JSON object that is under a secret's name, however deep."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            found = inside or is_secret(key)
+            yield from secrets_in(item, name if inside else key, inside=found)
+    elif isinstance(value, list):
+        for item in value:
+            yield from secrets_in(item, name, inside=inside)
+    elif inside and isinstance(value, (str, int)) and not isinstance(value, bool) and value != "":
+        yield name, str(value)
+
+
+def keep(secret: str) -> None:
+    """Strike a secret out from now on."""
+    if len(secret) >= LONG:
+        _long.setdefault(secret, "|".join([_letters(secret), *_in_base64(secret)]))
+    elif secret:
+        _short.setdefault(secret, rf"(?<!\w){_letters(secret)}(?!\w)")
+
+
+def struck(text: str, *, short: bool = True) -> str:
+    """Return a text without the secrets; ``short`` ones too, as in what servers say."""
+    patterns = [*_long.values(), *(_short.values() if short else ())]
+    return re.sub("|".join(patterns), STRUCK, text, flags=re.IGNORECASE) if patterns else text
+
+
+def struck_pieces(texts: Sequence[str]) -> list[str]:
+    """Return the pieces of one text without the secrets, which may go over several of them."""
+    whole, patterns = "".join(texts), [*_long.values(), *_short.values()]
+    found = list(re.finditer("|".join(patterns), whole, re.IGNORECASE)) if patterns else []
+    if not found:
+        return list(texts)
+    letters = list(whole)
+    for match in found:
+        letters[match.start() : match.end()] = [STRUCK, *[""] * (match.end() - match.start() - 1)]
+    pieces, at = [], 0
+    for text in texts:
+        pieces.append("".join(letters[at : at + len(text)]))
+        at += len(text)
+    return pieces
+
+
+def _letters(secret: str) -> str:
+    r"""Return a pattern of a text whose letters may each be plain, ``%xx``, ``\x`` or ``\u00xx``."""
+    return "".join(rf"(?:\\?{re.escape(each)}|%(?:25)*{ord(each):02x}|\\u{ord(each):04x})" for each in secret)
+
+
+def _in_base64(secret: str) -> Iterator[str]:
+    """Yield a pattern for each offset that a text can have inside of what was encoded."""
+    for before in range(3):
+        data = bytes(before) + secret.encode()
+        whole = base64.b64encode(data).decode()
+        sure = whole[-(-before * 4 // 3) : len(data) * 4 // 3]
+        signs = {"+": r"(?:[-+]|%2b)", "/": r"(?:[/_]|%2f)"}
+        yield "".join(signs.get(each, each) for each in sure) + r"[\w+/-]?(?:=|%3d){0,2}"
