@@ -263,7 +263,8 @@ def _slot(
         writer.tokens(measured.tokens)
         sampler.flush(writer)
         _write_frames(writer, session.frames())
-        guard.see(measured.sample, measured.fingerprint, measured.odd)
+        guard.see(measured.sample, measured.fingerprint)
+        guard.see_odd(session.cell.name, measured.odd)
         if isinstance(measured.fatal, KeyboardInterrupt):
             raise measured.fatal
         servers.raise_if_dead(session.cell, suspect=bool(measured.sample.error))

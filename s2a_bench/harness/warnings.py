@@ -110,9 +110,8 @@ class SampleGuard:
     _launches: set[int] = field(default_factory=set)
     _odd: dict[str, set[str]] = field(default_factory=dict)
 
-    def see(self, row: SampleRow, fingerprint: int, odd: Iterable[str] = ()) -> None:
-        """Look at one sample, the fingerprint of its picture, and the names of what can be no fact."""
-        self._odd.setdefault(row.cell, set()).update(odd)
+    def see(self, row: SampleRow, fingerprint: int) -> None:
+        """Look at one sample and the fingerprint of its picture."""
         if self._frames.setdefault((row.cell, fingerprint), row.request_id) != row.request_id:
             _count(self._repeated, row.cell)
         if lost := row.facts.get(FRAMES_LOST):
@@ -143,6 +142,11 @@ class SampleGuard:
             _count(self._residual, row.cell)
         self._launches.add(row.launch)
         self._times_ns.setdefault(row.cell, []).append(spent.e2e_ns if whole_ns is None else whole_ns)
+
+    def see_odd(self, cell: str, names: Iterable[str]) -> None:
+        """Look at the names of what a server said that can be no fact."""
+        if odd := set(names):
+            self._odd.setdefault(cell, set()).update(odd)
 
     def see_hits(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
         """Look at what servers count of their caches' hits before the run and after it."""

@@ -19,7 +19,7 @@ from s2a_bench.store.run import read_run
 from s2a_bench.testing.transport import connector, wiring
 from s2a_bench.trace import Trace
 from s2a_bench.transport import open_client
-from s2a_bench.transport.http.detect import PATIENCE_S
+from s2a_bench.transport.http.detect import PATIENCE_S, cache_hits
 from s2a_bench.types import Request, Token
 from tests.servers.hostile import CASES, DIALECT, MAX_TOKENS, Case, delta
 from tests.servers.sockets import head, serving
@@ -113,3 +113,11 @@ def test_a_server_that_counts_otherwise_is_not_cut() -> None:
         client = open_client(wiring("http/as-deployed", url=url, dialect=DIALECT))
         assert len(list(client.request(Request("a", "plan", max_tokens=MAX_TOKENS), Trace()))) == 40
         client.close()
+
+
+@pytest.mark.parametrize("name", ["103, slowly", "103", "headers, a byte at a time", "a compressed gigabyte"])
+def test_counters_of_caches_are_not_waited_for(name: str) -> None:
+    with serving(lambda _: CASES[name].pieces()) as url:
+        started = time.monotonic()
+        assert cache_hits(url) == {}
+        assert time.monotonic() - started < PATIENCE_S + 10

@@ -18,6 +18,7 @@ from s2a_bench.store.run import read_run
 from s2a_bench.testing.transport import wiring
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import open_client
+from s2a_bench.transport.http.detect import cache_hits
 from s2a_bench.transport.http.dialects import open_dialect
 from s2a_bench.transport.http.own import remote_of_json
 from s2a_bench.transport.ros.wire import remote_of
@@ -31,7 +32,7 @@ TOLD = [
     ("openai", '{"choices": [], "usage": {"prompt_tokens_details": {"cached_tokens": %s}}}', "cache_n"),
     ("openai", '{"choices": [], "timings": {"prompt_ms": %s}}', "prompt_ms"),
     ("vllm", '{"choices": [], "metrics": {"queue_time_ms": %s}}', "queue_ms"),
-    ("ollama", '{"done": true, "prompt_eval_count": %s}', "prompt_n"),
+    ("ollama", '{"done": true, "prompt_eval_count": %s}', "prompt_with_cached_n"),
     ("ollama", '{"done": true, "eval_duration": %s}', "predicted_ms"),
     ("tgi", '{"details": {"generated_tokens": %s}}', "predicted_n"),
     ("gemini", '{"usageMetadata": {"promptTokenCount": %s}}', "prompt_n"),
@@ -53,6 +54,22 @@ def test_a_number_that_can_be_is_kept(dialect: str, message: str, fact: str) -> 
     trace.learn(open_dialect(dialect).event(json.loads(message % "12")).facts)
     assert trace.facts[fact] in {12.0, 12e-6}
     assert not trace.odd
+
+
+@pytest.mark.parametrize("value", ["NaN", "1e300", '"12"'])
+def test_a_rate_that_can_be_none_fails_no_sample(value: str) -> None:
+    trace = Trace()
+    message = '{"timings": {"predicted_per_second": %s, "predicted_ms": 12}}'
+    trace.learn(open_dialect("llama-server").event(json.loads(message % value)).facts)
+    assert trace.facts == {"predicted_ms": 12.0}
+    assert trace.odd == {"predicted_steps"}
+
+
+@pytest.mark.parametrize("value", ["NaN", "+Inf", "1e300", "-1", "x"])
+def test_a_count_of_hits_that_can_be_none_is_absent(value: str) -> None:
+    pieces = [head(kind="text/plain"), f"vllm:prefix_cache_hits_total {value}\n".encode()]
+    with serving(lambda _: pieces) as url:
+        assert cache_hits(url) == {}
 
 
 def test_more_cached_than_there_was_is_odd() -> None:

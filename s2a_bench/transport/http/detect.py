@@ -12,6 +12,7 @@ import httpx
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied
+from s2a_bench.trace import FACT_LIMIT
 from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.http.bounded import BoundedClient
 from s2a_bench.transport.http.dialects import OWN
@@ -46,7 +47,8 @@ def cache_hits(base: str, key: str = "") -> Mapping[str, float]:
             headers = {"authorization": f"Bearer {key}"} if key else {}
             text = _text(urlunsplit((parts.scheme, parts.netloc, path, "", "")), client, headers)
         for name, value in HITS.findall(text):
-            found[name] = found.get(name, 0.0) + float(value)
+            if 0 <= float(value) <= FACT_LIMIT:
+                found[name] = found.get(name, 0.0) + float(value)
     except (*NO_LIST, ServerDied, RequestFailed, httpx.HTTPError, httpx.InvalidURL):
         return {}
     return found
