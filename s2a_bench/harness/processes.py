@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -27,6 +25,7 @@ from s2a_bench.harness.llama_flags import llama_flags
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.models import ModelFiles, load_headers, sha256
+from s2a_bench.machine.children import start_child
 from s2a_bench.transport import Program
 
 READY_TIMEOUT_S = 600.0
@@ -44,9 +43,8 @@ class ServerProcess(ABC):
         self.address = ""
         self.facts: dict[str, Any] = {}
         self._log: IO[bytes] | None = log.open("wb") if log else None
-        self._process = subprocess.Popen(  # noqa: S603 - the command is ours or the user's own llama-server
+        self._process = start_child(
             command,
-            preexec_fn=_die_with_parent,  # noqa: PLW1509 - calls one C function, resolved before the fork
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE if self._speaks_json else self._log,
             stderr=self._log,
@@ -245,11 +243,3 @@ def _free_port(wanted: int) -> int:
             ) from error
         port: int = probe.getsockname()[1]
         return port
-
-
-_prctl = ctypes.CDLL(None, use_errno=True).prctl
-PR_SET_PDEATHSIG = 1
-
-
-def _die_with_parent() -> None:
-    _prctl(PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -8,10 +8,11 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import active_children, get_context
 from pathlib import Path
 
+from s2a_bench.machine.children import end_with_parent
 from s2a_bench.machine.environment import collect
 from s2a_bench.store.manifest import utc_now
 from s2a_bench.sweep import Cell, Outcome
-from s2a_bench.sweep.perform import end_with_parent, perform
+from s2a_bench.sweep.perform import perform
 from s2a_bench.sweep.plan import Plan
 
 DIED = "the worker process died under it (out of memory?)"

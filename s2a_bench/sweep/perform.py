@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import io
 import signal
 import subprocess
@@ -15,13 +14,12 @@ from typing import Any, Final
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError, StoreError
 from s2a_bench.exits import how_it_ended
+from s2a_bench.machine.children import end_with_parent
 from s2a_bench.machine.environment import collect
 from s2a_bench.store import manifest as manifests
 from s2a_bench.sweep import Cell, Outcome
 
 LOG: Final = "stderr.txt"
-PR_SET_PDEATHSIG: Final = 1
-_prctl = ctypes.CDLL(None).prctl
 
 
 def perform(cell: Cell, folder: Path, entry: str) -> Outcome:
@@ -47,11 +45,6 @@ def perform(cell: Cell, folder: Path, entry: str) -> Outcome:
 def run_folder(folder: Path) -> Path | None:
     """Find the one run folder in a cell's folder."""
     return next((path.parent for path in folder.glob(f"*/{manifests.NAME}")), None)
-
-
-def end_with_parent(number: signal.Signals = signal.SIGKILL) -> None:
-    """Have the kernel end this process when the one that started it is gone, however it went."""
-    _prctl(PR_SET_PDEATHSIG, number)
 
 
 def _inside(argv: list[str], entry: str) -> str:

@@ -253,6 +253,9 @@ def test_an_interrupt_keeps_the_samples_and_stops_the_servers(tmp_path: Path, nu
 def test_a_killed_harness_takes_its_servers_along_and_leaves_a_readable_run(tmp_path: Path) -> None:
     process, folder = start_long(tmp_path, "--transport", "http,ros")
     servers = [server["pid"] for server in read_run(folder).manifest["servers"].values()]
+    for pid in (process.pid, *servers):
+        opened = [str(link.readlink()) for link in Path(f"/proc/{pid}/fd").iterdir()]
+        assert "/shm/" not in " ".join([Path(f"/proc/{pid}/maps").read_text(), *opened])  # nothing to clean up later
     process.kill()
     process.communicate(timeout=60)
     assert len(read_run(folder).samples) >= 29
