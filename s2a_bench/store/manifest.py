@@ -6,17 +6,87 @@ import dataclasses
 import json
 import math
 import os
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from s2a_bench.errors import StoreError
 from s2a_bench.secrets import struck
 from s2a_bench.store.schema import SCHEMA
 
 NAME = "manifest.json"
+SWEEP: Final = "sweep"
+"""The command of a sweep, whose folder holds runs."""
+MAX_BYTES: Final = 64 * 2**20
+"""Of a manifest; a sweep's of 100,000 cells is far below."""
+
+Facts = dict[str, Any]
+"""Of whoever measures, by name."""
+
+
+class _Shape(BaseModel):
+    """Base of what a manifest's objects hold at least; whoever measures adds facts."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+
+class _Environment(_Shape):
+    gpus: list[Facts] | None = None
+    packages: Facts = {}
+    affinity: list[int] = []
+
+
+class _Warning(_Shape):
+    code: str
+    message: str = ""
+    advice: str = ""
+
+
+class _Board(_Shape):
+    name: str = ""
+    title: str = ""
+    tokens_per_s: float | None = None
+
+
+class _Manifest(_Shape):
+    """What readers of every run go by; a key that an older version did not write is absent, not wrong."""
+
+    command: str
+    state: Literal["running", "finished", "interrupted", "failed"]
+    argv: list[str] = []
+    host: str = ""
+    error: str | None = None
+    started: str = ""
+    finished: str | None = None
+    configuration: Facts = {}
+    environment: _Environment = Field(_Environment())
+    seeds: dict[str, int | None] = {}
+    warnings: list[_Warning] = []
+    stages: dict[str, str] = {}
+    servers: dict[str, Facts] = {}
+    model: Facts | None = None
+    tuning: Facts | None = None
+    live: Facts | None = None
+    calibrations: Facts | None = None
+    boards: list[_Board] = []
+
+
+class _SweepConfiguration(_Shape):
+    command: str
+    hash: str = ""
+    cells: int = 0
+    boards: list[str] | None = None
+
+
+class _SweepManifest(_Manifest):
+    configuration: _SweepConfiguration  # type: ignore[assignment]
+    boards: Facts = {}  # type: ignore[assignment]
+    machines: Facts = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,32 +110,32 @@ def utc_now() -> str:
 def merge(into: dict[str, Any], facts: Mapping[str, Any]) -> None:
     """Merge facts: mappings key by key, anything else replaces what was there."""
     for key, value in facts.items():
-        key = struck(key, short=False)  # noqa: PLW2901 - a cell's name may hold one
-        old = into.get(key)
+        name = plain(str(key))  # a cell's name may hold a secret
+        old = into.get(name)
         if isinstance(old, dict) and isinstance(value, Mapping):
             merge(old, value)
         else:
-            into[key] = plain(value)
+            into[name] = plain(value)
 
 
 def plain(value: Any) -> Any:
     """Turn a value into what JSON holds: dataclasses into objects, paths into text, NaN and infinity into null.
 
-    Secrets are struck out.
+    Secrets are struck out; half a surrogate pair, as in an argument that is no UTF-8, is written out.
     """
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
     if isinstance(value, str):
-        return struck(value, short=False)
+        return struck(value.encode("utf-8", "backslashreplace").decode(), short=False)
     if value is None or isinstance(value, (int, float)):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = {item.name: getattr(value, item.name) for item in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {struck(str(key), short=False): plain(item) for key, item in value.items()}
+        return {plain(str(key)): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
-    return struck(str(value), short=False)
+    return plain(str(value))
 
 
 def present(value: Any) -> dict[str, Any]:
@@ -90,17 +160,37 @@ def write(folder: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """Read a run's manifest; raises StoreError where there is none or another version's."""
+    """Read a run's manifest; raises StoreError where there is none, another version's, or one of another shape."""
     path = folder / NAME
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise StoreError(f"{folder} is no run folder: {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise StoreError(f"{path} is damaged: {error}") from error
+    if len(text) > MAX_BYTES:
+        raise StoreError(f"{path} is damaged: it is larger than {MAX_BYTES >> 20} MiB")
+    try:
+        manifest = json.loads(text)
+        json.dumps(manifest, ensure_ascii=False).encode()  # half a surrogate pair cannot be shown
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
     schema = manifest.get("schema") if isinstance(manifest, dict) else None
     if schema != SCHEMA:
         raise StoreError(
-            f"{path} has schema {schema!r}, this s2a-bench reads {SCHEMA!r}; use the version that wrote it"
+            f"{path} has schema {reprlib.repr(schema)}, this s2a-bench reads {SCHEMA!r}; use the version that wrote it"
         )
+    _check(manifest, path)
     return dict(manifest)
+
+
+def _check(manifest: Mapping[str, Any], path: Path) -> None:
+    """Raise StoreError naming the first key that is missing or wrong."""
+    try:
+        (_SweepManifest if manifest.get("command") == SWEEP else _Manifest).model_validate(manifest)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in first["loc"])
+        wrong = "is missing"
+        if first["type"] != "missing":
+            wrong = first["msg"].replace("Input", reprlib.repr(first["input"]), 1)
+        raise StoreError(f"{path} is damaged: {reprlib.repr(key.lstrip('.'))[1:-1]}: {wrong}") from None

@@ -6,7 +6,8 @@ import os
 import re
 import socket
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from itertools import count
@@ -245,6 +246,16 @@ def read_run(path: Path) -> Run:
     """Open a run folder for reading; raises StoreError where it is none, or another version's."""
     path = Path(path)
     return Run(path, manifests.read(path))
+
+
+@contextmanager
+def fits(*runs: Run) -> Iterator[None]:
+    """Raise StoreError, naming the runs, where the block misses something in their rows or manifests."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        paths = ", ".join(str(run.path) for run in runs)
+        raise StoreError(f"{paths}: rows and manifest do not fit: {error!r}") from error
 
 
 def _read(path: Path, table: Table[Any]) -> pd.DataFrame:

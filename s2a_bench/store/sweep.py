@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.errors import StoreError
 from s2a_bench.provenance import Origins, joined
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.manifest import SWEEP
+from s2a_bench.store.run import Run, fits, read_run
 from s2a_bench.store.schema import Table
 
 if TYPE_CHECKING:
     import pandas as pd
 
-COMMAND = "sweep"
+COMMAND = SWEEP
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +88,7 @@ def read_sweep(path: Path) -> Sweep:
         raise StoreError(f"{path} is the folder of a {run.manifest['command']} run, not of a sweep")
     attempts = run.table(CELLS)
     cells = attempts.drop_duplicates(["cell", "repeat"], keep="last").sort_values(["cell", "repeat"], ignore_index=True)
-    settings = pd.DataFrame([json.loads(text) for text in cells["settings"]], index=cells.index)
+    with fits(run):
+        settings = pd.DataFrame([json.loads(text) for text in cells["settings"]], index=cells.index)
     new = [name for name in settings.columns if name not in cells.columns]
     return Sweep(Path(path), run.manifest, attempts, cells.join(settings[new]))

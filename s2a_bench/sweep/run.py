@@ -58,7 +58,7 @@ def check_resume(folder: Path, plan: Plan) -> None:
     run = read_run(folder)
     if not is_sweep(run.manifest):
         raise UsageError(f"`resume`: {folder} is the folder of a {run.manifest['command']} run, not of a sweep")
-    if run.manifest["configuration"]["hash"] != plan.config_hash:
+    if run.manifest["configuration"].get("hash") != plan.config_hash:
         raise UsageError(
             f"`resume`: the sweep in {folder} was another one: its file is {folder / COPY}, and the profiles and files "
             "that it names count too; start a new sweep, or put back what was changed"

@@ -376,3 +376,54 @@ def test_the_store_does_not_import_heavy_libraries_before_it_needs_them() -> Non
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+WRONG = {
+    "command": (5, "command: 5 should be a valid string"),
+    "state": ("lost", "state: 'lost' should be 'running', 'finished', 'interrupted' or 'failed'"),
+    "warnings": ([{"code": "load"}, {}], "warnings[1].code: is missing"),
+    "environment": ({"gpus": ["H200"]}, "environment.gpus[0]: 'H200' should be a valid dictionary"),
+    "seeds": (2**70, "seeds: 1180591620717411303424 should be a valid dictionary"),
+    "argv": ({}, "argv: {} should be a valid list"),
+    "configuration": ([], "configuration: [] should be a valid dictionary"),
+    "stages": ({"capture\x1b[2J": 5}, r"stages.capture\x1b[2J: 5 should be a valid string"),
+}
+
+
+@pytest.mark.parametrize("key", WRONG)
+def test_a_manifest_of_the_wrong_shape_is_one_line_with_file_and_key(tmp_path: Path, key: str) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        pass
+    path = run.path / "manifest.json"
+    value, said = WRONG[key]
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(StoreError) as error:
+        read_run(run.path)
+    assert str(error.value) == f"{path} is damaged: {said}"
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": "\\ud800"}', '{"a": ' + "9" * 5000 + "}", "\xff", ""])
+def test_a_manifest_that_is_no_json_is_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "manifest.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(StoreError, match=r"manifest.json is damaged: .") as error:
+        read_run(tmp_path)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_what_earlier_versions_did_not_write_is_absent_and_not_wrong(tmp_path: Path) -> None:
+    manifest = {"schema": "s2a-bench/1", "command": "latency", "state": "finished"}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    assert read_run(tmp_path).manifest == manifest
+
+
+def test_the_runs_that_earlier_versions_made_are_read() -> None:
+    folders = sorted((Path(__file__).parents[2] / "results/reference").glob("*/manifest.json"))
+    assert [read_run(path.parent).manifest["state"] for path in folders] == ["finished"] * 4
+
+
+def test_an_argument_that_is_no_utf_8_is_written_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["s2a-bench", "\udcff"])
+    with RunWriter.create(tmp_path, "latency", {"configuration": {"\udcfe": Path("\udcfd")}}) as run:
+        pass
+    manifest = read_run(run.path).manifest
+    assert (manifest["argv"], manifest["configuration"]) == (["s2a-bench", "\\udcff"], {"\\udcfe": "\\udcfd"})

@@ -13,10 +13,10 @@ from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.compare.alike import Difference, differences, in_words
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.stats.change import Change, change_between, holm
+from s2a_bench.store.run import Run, fits, read_run
 
 if TYPE_CHECKING:
     from s2a_bench.experiments import Rows
-    from s2a_bench.store.run import Run
 
 LEVEL: Final = 0.05
 """The chance to call any difference one where there is none, over all comparisons together."""
@@ -108,13 +108,15 @@ def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bo
     if len(commands) > 1:
         raise UsageError(f"these are runs of {' and '.join(commands)}: name runs of one command")
     by = _declared(commands[0])
-    sides = [[launch for run in side for launch in _launches(by.subjects(run))] for side in (baseline, other)]
+    with fits(*runs):
+        sides = [[launch for run in side for launch in _launches(by.subjects(run))] for side in (baseline, other)]
+        found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
+        own = by_name(metric for run in runs for metric in by.own(run))
     if (len(sides[0]) > 1) != (len(sides[1]) > 1):
         raise UsageError(
             "name several launches on both sides, or one on each: the test goes by launches or by requests; "
             "`launches` measures several in one run"
         )
-    found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
     fatal = [difference for difference in found if difference.fatal]
     if fatal and not unlike:
         raise UnlikeRuns(f"the runs are unlike: {in_words(fatal)}; `unlike` compares them all the same")
@@ -123,7 +125,7 @@ def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bo
         raise UnlikeRuns(f"cells of one name differ: {in_words(settings)}; `unlike` compares them all the same")
     if not pairs:
         raise UnlikeRuns(f"no cell is in every run: {', '.join(only[0])} against {', '.join(only[1])}")
-    metrics = {**by.metrics, **by_name(metric for run in runs for metric in by.own(run))}
+    metrics = {**by.metrics, **own}
     return ComparedRuns(tuple(baseline), tuple(other), by, metrics, (*settings, *found), tuple(pairs), only, least)
 
 
@@ -202,7 +204,8 @@ def compare(compared: ComparedRuns, wanted: Sequence[tuple[Metric, str]]) -> Com
 
     What could be seen is told for the first step of Holm's correction, whose level is the strictest.
     """
-    found = [found for metric, statistic in wanted for found in changes(compared, metric, statistic)]
+    with fits(*compared.baseline, *compared.other):
+        found = [found for metric, statistic in wanted for found in changes(compared, metric, statistic)]
     corrected = holm([comparison.change.p for comparison in found])
     judged = [
         replace(
@@ -256,8 +259,6 @@ def verdict(change: Change, p_holm: float | None, metric: Metric, least: float) 
 
 def read_side(text: str, flag: str) -> list[Run]:
     """Read a run folder, or several with commas between them; raises UsageError, StoreError."""
-    from s2a_bench.store.run import read_run
-
     folders = [part.strip() for part in text.split(",") if part.strip()]
     if not folders:
         raise UsageError(f"{flag}: name a run folder")

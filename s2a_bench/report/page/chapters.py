@@ -13,7 +13,7 @@ from s2a_bench.report.compare.alike import differences
 from s2a_bench.report.page import Chapter, Content
 from s2a_bench.report.page.contents import content_of
 from s2a_bench.report.page.sweeps import overview, pooled, words_of
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import Run, fits, read_run
 from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep
 
 if TYPE_CHECKING:
@@ -76,10 +76,11 @@ def _chapter(run: Run, title: str, against_paper: bool, **more: Any) -> Chapter:
     manifest = run.manifest
     caveats = list(_unfinished(manifest))
     try:
-        content = content_of(run, against_paper=against_paper)
-    except (KeyError, IndexError, TypeError, ValueError, StoreError) as error:
+        with fits(run):
+            content = content_of(run, against_paper=against_paper)
+    except StoreError:
         if not caveats:
-            raise StoreError(f"{run.path}: its rows and its manifest do not fit: {error!r}") from error
+            raise
         content = Content(summary=("What there is of this run is not enough for its tables; its CSV files hold it.",))
     command = more.pop("command", repeat_command(manifest))
     return Chapter(_slug(run.path.name), title, run, content, command, caveats, **more)
@@ -106,14 +107,15 @@ def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
     copy = sweep.path / "sweep.toml"
     attached = {copy.name: copy.read_text(encoding="utf-8")} if copy.is_file() else {}
     caveats = list(_unfinished(manifest))
-    pools, single = pooled(sweep, runs)
+    with fits(head):
+        pools, single = pooled(sweep, runs)
+        content = overview(sweep, runs)
     if len(single) > MOST_CHAPTERS:
         caveats.append(
             f"{len(single)} cells were run: the first {MOST_CHAPTERS} have a chapter each, all are in the overview; "
             "give the folders of others to s2a-bench report to see them."
         )
     command = repeat_command(manifest)
-    content = overview(sweep, runs)
     yield Chapter(_slug(sweep.path.name), title_of(manifest), head, content, command, caveats, attached)
     for place, run in enumerate(pools, 1):
         what = f"{run.manifest['command']}s of the sweep" + (f", part {place}" if len(pools) > 1 else "")

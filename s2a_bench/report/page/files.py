@@ -13,6 +13,7 @@ from s2a_bench.report.claims.verdicts import Judged, claim_table, judge_claims
 from s2a_bench.report.page.chapters import mixed_machines
 from s2a_bench.report.page.page import GENERATOR, render, tally
 from s2a_bench.report.page.plots import draw
+from s2a_bench.store.run import fits
 from s2a_bench.text import visible
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.latex import document, escape, to_siunitx
@@ -40,7 +41,9 @@ class Report:
 
 def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
     """Judge the claims where that is wanted, and look for runs of unlike machines."""
-    judged = judge_claims([chapter.run for chapter in chapters]) if against_paper else []
+    runs = [chapter.run for chapter in chapters]
+    with fits(*runs):
+        judged = judge_claims(runs) if against_paper else []
     return Report(chapters, judged, mixed_machines(chapters))
 
 
