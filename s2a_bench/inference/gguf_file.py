@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import math
 import mmap
+import os
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
@@ -20,6 +23,8 @@ MAGIC = b"GGUF"
 _SCALARS = {0: "<B", 1: "<b", 2: "<H", 3: "<h", 4: "<I", 5: "<i", 6: "<f", 7: "<?", 10: "<Q", 11: "<q", 12: "<d"}
 _STRING, _ARRAY = 8, 9
 _MAX_DIMS = 4
+_MAX_FIELDS, _MAX_TENSORS, _MAX_STRINGS = 2**16, 2**20, 2**24
+"""Ten times what the largest models have; a damaged count must not be read for minutes."""
 
 Value: TypeAlias = str | int | float | bool
 
@@ -105,7 +110,7 @@ class _Cursor:
     def skip_array(self) -> ArrayPlace:
         place = ArrayPlace(self.integer("<I"), self.integer("<Q"), self.at)
         if place.kind == _STRING:
-            for _ in range(place.length):
+            for _ in range(_at_most(place.length, _MAX_STRINGS)):
                 self.skip(self.integer("<Q"))
         else:
             self.skip(place.length * struct.calcsize(_SCALARS[place.kind]))
@@ -117,12 +122,23 @@ def read_header(path: Path, flag: str) -> GgufHeader:
 
     Raises ModelError, which names ``flag``, where the file is missing, no GGUF, damaged or cut short.
     """
+    with _mapped(path, flag) as data:
+        if data[: len(MAGIC)] != MAGIC:
+            raise ModelError(f"{flag} {path}: not a GGUF file; give one that llama.cpp can load")
+        return _parse(path, data, flag)
+
+
+@contextmanager
+def _mapped(path: Path, flag: str) -> Iterator[mmap.mmap]:
+    """Map a file, and turn what reading it runs into into a ModelError."""
     try:
+        if path.is_fifo() or path.is_char_device():
+            raise ModelError(f"{flag} {path}: not a GGUF file; give one that llama.cpp can load")
         with path.open("rb") as file:
-            if file.read(4) != MAGIC:
-                raise ModelError(f"{flag} {path}: not a GGUF file; give one that llama.cpp can load")
+            if not os.fstat(file.fileno()).st_size:
+                raise ModelError(f"{flag} {path}: not a GGUF file, it is empty; fetch it again")
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                return _parse(path, data, flag)
+                yield data
     except FileNotFoundError:
         raise ModelError(f"{flag} {path}: no such file; check the path") from None
     except OSError as error:
@@ -137,7 +153,7 @@ def _parse(path: Path, data: mmap.mmap, flag: str) -> GgufHeader:
     version = cursor.integer("<I")
     if version not in (2, 3):
         raise ModelError(f"{flag} {path}: GGUF version {version} is not known (2 and 3 are); convert the model again")
-    n_tensors, n_fields = cursor.integer("<Q"), cursor.integer("<Q")
+    n_tensors, n_fields = _at_most(cursor.integer("<Q"), _MAX_TENSORS), _at_most(cursor.integer("<Q"), _MAX_FIELDS)
     fields: dict[str, Value] = {}
     arrays: dict[str, ArrayPlace] = {}
     for _ in range(n_fields):
@@ -171,12 +187,18 @@ def _tensors(cursor: _Cursor, count: int) -> tuple[tuple[TensorInfo, ...], int]:
     return tuple(tensors), last
 
 
-def read_array(header: GgufHeader, key: str) -> list[Value]:
-    """Read one array of a header that `read_header` has checked; empty where the file has no such key."""
+def _at_most(count: int, most: int) -> int:
+    if count > most:
+        raise ValueError(count)
+    return count
+
+
+def read_array(header: GgufHeader, key: str, flag: str) -> list[Value]:
+    """Read one array of a file; empty where it has no such key. Raises ModelError, which names ``flag``."""
     place = header.arrays.get(key)
     if place is None:
         return []
-    with header.path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with _mapped(header.path, flag) as data:
         cursor = _Cursor(data, place.at)
         if place.kind == _STRING:
             return [cursor.string() for _ in range(place.length)]

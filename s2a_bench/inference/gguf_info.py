@@ -94,16 +94,18 @@ def describe(path: Path, flag: str) -> GgufInfo:
         architecture=header.architecture,
         mmproj=header.is_mmproj,
         dummy=header.is_dummy,
-        general={key: fields[f"general.{key}"] for key in _GENERAL if f"general.{key}" in fields},
+        general={key: _plain(fields[f"general.{key}"]) for key in _GENERAL if f"general.{key}" in fields},
         file_type=_file_type(fields.get("general.file_type")),
         parameters=sum(math.prod(tensor.shape) for tensor in header.tensors),
         types=_types(header.tensors),
         groups=_groups(header.tensors),
         settings={key.removeprefix(own): _plain(value) for key, value in fields.items() if key.startswith(own)},
         tokenizer={
-            key: fields[f"tokenizer.ggml.{key}"] for key in ("model", "pre") if f"tokenizer.ggml.{key}" in fields
+            key: _plain(fields[f"tokenizer.ggml.{key}"])
+            for key in ("model", "pre")
+            if f"tokenizer.ggml.{key}" in fields
         },
-        vocabulary=_vocabulary(header),
+        vocabulary=_vocabulary(header, flag),
         chat_template=str(fields[_CHAT_TEMPLATE]) if _CHAT_TEMPLATE in fields else None,
     )
 
@@ -153,10 +155,10 @@ def _groups(tensors: Sequence[TensorInfo]) -> tuple[TensorGroup, ...]:
     )
 
 
-def _vocabulary(header: GgufHeader) -> Vocabulary | None:
+def _vocabulary(header: GgufHeader, flag: str) -> Vocabulary | None:
     if _TOKENS not in header.arrays:
         return None
-    texts = [str(text) for text in read_array(header, _TOKENS)]
+    texts = [str(text) for text in read_array(header, _TOKENS, flag)]
     roles = {
         found[1]: int(value)
         for key, value in header.fields.items()
@@ -167,5 +169,7 @@ def _vocabulary(header: GgufHeader) -> Vocabulary | None:
         tokens=len(texts),
         merges=merges.length if merges else 0,
         special={role: (at, texts[at]) for role, at in roles.items() if 0 <= at < len(texts)},
-        control=tuple(text for text, kind in zip(texts, read_array(header, _TYPES), strict=False) if kind == _CONTROL),
+        control=tuple(
+            text for text, kind in zip(texts, read_array(header, _TYPES, flag), strict=False) if kind == _CONTROL
+        ),
     )

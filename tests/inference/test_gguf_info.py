@@ -1,4 +1,5 @@
 import json
+import os
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -82,7 +83,7 @@ def test_counts_and_bytes_are_those_that_gguf_py_reads(tmp_path: Path, quant: An
         assert sum(group.nbytes for group in info.groups) == sum(share.nbytes for share in info.types)
         header = read_header(path, FLAG)
         for key, place in header.arrays.items():
-            ours, theirs = read_array(header, key), reader.fields[key].contents()
+            ours, theirs = read_array(header, key, FLAG), reader.fields[key].contents()
             assert len(ours) == place.length
             assert ours == theirs
 
@@ -182,6 +183,36 @@ def test_no_alignment_is_a_damaged_header(tmp_path: Path) -> None:
     path.write_bytes(data[:at] + bytes(4) + data[at + 4 :])
     with pytest.raises(ModelError, match="damaged"):
         read_header(path, FLAG)
+
+
+def told(path: Path) -> str:
+    error = CliRunner().invoke(app, ["info", str(path)]).exception
+    assert isinstance(error, ModelError)
+    (line,) = str(error).splitlines()
+    return line
+
+
+def test_a_token_that_is_no_text_is_one_line(tmp_path: Path) -> None:
+    path = written(tmp_path / "m.gguf", lambda writer: writer.add_token_list(["a", "bcdefgh"]))
+    path.write_bytes(path.read_bytes().replace(b"bcdefgh", b"bcd\xff\xfegh"))
+    assert told(path) == f"model info {path}: the GGUF header is damaged or cut short; fetch the file again"
+
+
+@pytest.mark.parametrize("at", [8, 16])
+def test_a_count_without_sense_is_told_at_once(tmp_path: Path, at: int) -> None:
+    path = tmp_path / "m.gguf"
+    path.write_bytes(b"GGUF" + struct.pack("<IQQ", 3, 0, 0) + bytes(50_000_000))
+    with path.open("r+b") as file:
+        file.seek(at)
+        file.write(struct.pack("<Q", 2**40))
+    assert "the GGUF header is damaged" in told(path)
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    assert "not a GGUF file" in told(tmp_path / "fifo")
+    (tmp_path / "empty").touch()
+    assert "it is empty" in told(tmp_path / "empty")
 
 
 @settings(max_examples=300, deadline=None)
