@@ -11,12 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
-
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from typing import Annotated, Any, Final
 
 from s2a_bench.errors import StoreError
 from s2a_bench.secrets import struck
+from s2a_bench.store.room import why
 from s2a_bench.store.schema import SCHEMA
 
 NAME = "manifest.json"
@@ -24,69 +23,6 @@ SWEEP: Final = "sweep"
 """The command of a sweep, whose folder holds runs."""
 MAX_BYTES: Final = 64 * 2**20
 """Of a manifest; a sweep's of 100,000 cells is far below."""
-
-Facts = dict[str, Any]
-"""Of whoever measures, by name."""
-
-
-class _Shape(BaseModel):
-    """Base of what a manifest's objects hold at least; whoever measures adds facts."""
-
-    model_config = ConfigDict(strict=True, extra="allow")
-
-
-class _Environment(_Shape):
-    gpus: list[Facts] | None = None
-    packages: Facts = {}
-    affinity: list[int] = []
-
-
-class _Warning(_Shape):
-    code: str
-    message: str = ""
-    advice: str = ""
-
-
-class _Board(_Shape):
-    name: str = ""
-    title: str = ""
-    tokens_per_s: float | None = None
-
-
-class _Manifest(_Shape):
-    """What readers of every run go by; a key that an older version did not write is absent, not wrong."""
-
-    command: str
-    state: Literal["running", "finished", "interrupted", "failed"]
-    argv: list[str] = []
-    host: str = ""
-    error: str | None = None
-    started: str = ""
-    finished: str | None = None
-    configuration: Facts = {}
-    environment: _Environment = Field(_Environment())
-    seeds: dict[str, int | None] = {}
-    warnings: list[_Warning] = []
-    stages: dict[str, str] = {}
-    servers: dict[str, Facts] = {}
-    model: Facts | None = None
-    tuning: Facts | None = None
-    live: Facts | None = None
-    calibrations: Facts | None = None
-    boards: list[_Board] = []
-
-
-class _SweepConfiguration(_Shape):
-    command: str
-    hash: str = ""
-    cells: int = 0
-    boards: list[str] | None = None
-
-
-class _SweepManifest(_Manifest):
-    configuration: _SweepConfiguration  # type: ignore[assignment]
-    boards: Facts = {}  # type: ignore[assignment]
-    machines: Facts = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,19 +92,19 @@ def write(folder: Path, manifest: Mapping[str, Any]) -> None:
             os.fsync(file.fileno())
         part.replace(path)
     except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror}; the CSV files beside it are complete") from error
+        part.unlink(missing_ok=True)
+        raise StoreError(f"cannot write {path}: {why(error, folder)}; the CSV files beside it are complete") from error
 
 
 def read(folder: Path) -> dict[str, Any]:
     """Read a run's manifest; raises StoreError where there is none, another version's, or one of another shape."""
     path = folder / NAME
     try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1)
+        if path.stat().st_size > MAX_BYTES:
+            raise StoreError(f"{path} is damaged: it is larger than {MAX_BYTES >> 20} MiB")
+        text = path.read_bytes()
     except OSError as error:
         raise StoreError(f"{folder} is no run folder: {path}: {error.strerror}") from error
-    if len(text) > MAX_BYTES:
-        raise StoreError(f"{path} is damaged: it is larger than {MAX_BYTES >> 20} MiB")
     try:
         manifest = json.loads(text)
         json.dumps(manifest, ensure_ascii=False).encode()  # half a surrogate pair cannot be shown
@@ -179,18 +115,7 @@ def read(folder: Path) -> dict[str, Any]:
         raise StoreError(
             f"{path} has schema {reprlib.repr(schema)}, this s2a-bench reads {SCHEMA!r}; use the version that wrote it"
         )
-    _check(manifest, path)
+    from s2a_bench.store.shape import check
+
+    check(manifest, path)
     return dict(manifest)
-
-
-def _check(manifest: Mapping[str, Any], path: Path) -> None:
-    """Raise StoreError naming the first key that is missing or wrong."""
-    try:
-        (_SweepManifest if manifest.get("command") == SWEEP else _Manifest).model_validate(manifest)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in first["loc"])
-        wrong = "is missing"
-        if first["type"] != "missing":
-            wrong = first["msg"].replace("Input", reprlib.repr(first["input"]), 1)
-        raise StoreError(f"{path} is damaged: {reprlib.repr(key.lstrip('.'))[1:-1]}: {wrong}") from None

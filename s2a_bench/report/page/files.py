@@ -55,7 +55,8 @@ def write_report(report: Report, config: ReportConfig) -> list[Path]:
             drawn[chapter.name] = draw(chapter.name, chapter.content.figures, pdf=config.latex is not None)
     texts: dict[Path, str | bytes] = {}
     if config.page:
-        texts[config.page] = render(report.chapters, drawn, report.judged, report.caveats)
+        with fits(*(chapter.run for chapter in report.chapters)):
+            texts[config.page] = render(report.chapters, drawn, report.judged, report.caveats)
     if config.latex:
         texts |= {config.latex / name: text for name, text in _latex(report, drawn)}
     if config.csv:
