@@ -15,6 +15,7 @@ from s2a_bench import __version__
 from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import Commands
 from s2a_bench.cli.output import shown
+from s2a_bench.cli.shortage import check_limits, shortage
 from s2a_bench.errors import S2AError
 from s2a_bench.machine import tuning
 
@@ -67,6 +68,7 @@ def main() -> None:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)
     try:
+        check_limits()
         with tuning.allowed():
             code = app(standalone_mode=False)
         if code == INTERRUPTED:  # newer typer turns Ctrl-C into this code itself
@@ -82,6 +84,11 @@ def main() -> None:
     except BrokenPipeError:  # the reader of our output has gone, as with `| head`
         sys.stderr.close()
         code = 1
+    except (OSError, MemoryError, RuntimeError, ImportError) as error:
+        line = shortage(error)
+        if line is None:
+            raise
+        code = _say(f"error: {line}", 1)
     sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
+from errno import EIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.errors import StoreError
+from s2a_bench.store.room import why
 from s2a_bench.store.schema import Kind, Row, Table, Value
 
 if TYPE_CHECKING:
@@ -28,7 +30,7 @@ class CsvFile:
         try:
             self._file = path.open("r+b" if reopen else "xb", buffering=0)
         except OSError as error:
-            raise StoreError(f"cannot create {path}: {error.strerror}; choose another `output`") from error
+            raise StoreError(f"cannot create {path}: {why(error, path)}; choose another `output`") from error
         self._end = len(whole_records(self._file.read())) if reopen else 0
         self._file.truncate(self._end)
         self._file.seek(self._end)
@@ -55,7 +57,7 @@ class CsvFile:
         except OSError as error:
             self._file.truncate(self._end)
             self._file.seek(self._end)
-            raise StoreError(f"cannot write {self.path}: {error.strerror}; samples so far are kept") from error
+            raise StoreError(f"cannot write {self.path}: {why(error, self.path)}; samples so far are kept") from error
         self._end += len(data)
 
 
@@ -137,7 +139,8 @@ def write_parquet(path: Path, table: Any) -> None:
         part.replace(path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise StoreError(f"cannot write {path}: {os.strerror(error.errno or 0)}; the CSV files are complete") from error
+        whole = OSError(error.errno or EIO, os.strerror(error.errno or EIO))  # not Arrow's own words
+        raise StoreError(f"cannot write {path}: {why(whole, path)}; the CSV files are complete") from error
 
 
 def read_parquet(path: Path, columns: dict[str, Kind]) -> Any:

@@ -28,6 +28,7 @@ from s2a_bench.store.requests import (
     frames_table,
     samples_table,
 )
+from s2a_bench.store.room import release, reserve, why
 from s2a_bench.store.schema import PROVENANCE, SCHEMA, Row, Table
 
 if TYPE_CHECKING:
@@ -51,6 +52,11 @@ class RunWriter:
         self._manifest = manifest
         self._finished = False
         self._codes: dict[str, str] = {}
+        try:
+            reserve(path)
+        except OSError as error:
+            release(path)
+            raise StoreError(f"cannot write into {path}: {why(error, path)}") from error
         manifests.write(path, manifest)
         self._files: dict[str, tuple[Table[Any], CsvFile]] = {}
         stages = manifest.get("stages", EARLIER_STAGES)
@@ -74,7 +80,7 @@ class RunWriter:
         except (FileExistsError, NotADirectoryError) as error:
             raise StoreError(f"`output` {root}: {error.filename} is not a folder; name another one") from error
         except OSError as error:
-            raise StoreError(f"`output` {root}: cannot create a folder there: {error.strerror}") from error
+            raise StoreError(f"`output` {root}: cannot create a folder there: {why(error, root)}") from error
         whole: dict[str, Any] = {
             "schema": SCHEMA,
             "command": command,
@@ -145,7 +151,12 @@ class RunWriter:
         """Merge facts into the manifest (mappings key by key) and replace the file."""
         manifests.merge(self._manifest, facts)
         self._codes.clear()
-        manifests.write(self.path, self._manifest)
+        try:
+            manifests.write(self.path, self._manifest)
+        except StoreError:
+            if not release(self.path):
+                raise
+            manifests.write(self.path, self._manifest)
 
     def finish(self, state: str, error: str | None = None) -> None:
         """Close the files, write the Parquet ones and the final state; a second call does nothing."""
@@ -156,9 +167,13 @@ class RunWriter:
         self._finished = True
         for _, file in self._files.values():
             file.close()
+        release(self.path)
         try:
             for table, file in self._files.values():
                 write_parquet(self.path / f"{table.name}.parquet", read_csv(file.path, table.columns))
+        except StoreError as full:
+            state, error = "failed", error or str(full)
+            raise
         finally:
             # The state is written even where there is no room for Parquet, or Ctrl-C comes a second time.
             self.update(state=state, error=error, finished=manifests.utc_now())

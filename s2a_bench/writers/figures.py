@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.errors import StoreError
 from s2a_bench.provenance import ORIGIN
+from s2a_bench.store.room import why
 from s2a_bench.writers.style import WIDTH_IN, paper_column
 from s2a_bench.writers.tables import required
 
@@ -82,5 +83,5 @@ def save(folder: Path, builders: Mapping[str, Callable[[], Figure]]) -> list[Pat
                     figure.savefig(path)
                     written.append(path)
     except OSError as error:
-        raise StoreError(f"cannot write {folder}: {error.strerror}; the samples are kept") from error
+        raise StoreError(f"cannot write {folder}: {why(error, folder)}; the samples are kept") from error
     return written

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2a_bench.errors import StoreError
+from s2a_bench.store.room import why
 from s2a_bench.writers.tables import TextTable, to_latex, to_markdown
 
 if TYPE_CHECKING:
@@ -25,5 +26,5 @@ def write_texts(run: Run, tables: Mapping[str, TextTable], csvs: Mapping[str, Cs
         for name, text in texts.items():
             (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
-        raise StoreError(f"cannot write {folder}: {error.strerror}; the samples are kept") from error
+        raise StoreError(f"cannot write {folder}: {why(error, folder)}; the samples are kept") from error
     return [folder / name for name in texts]

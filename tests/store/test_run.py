@@ -12,8 +12,10 @@ import pandas as pd
 import pytest
 
 from s2a_bench.errors import StoreError
+from s2a_bench.store import manifest as manifests
 from s2a_bench.store.files import read_csv, read_parquet
 from s2a_bench.store.requests import EARLIER_STAGES, TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
+from s2a_bench.store.room import RESERVE, RESERVE_BYTES, why
 from s2a_bench.store.run import RunWriter, read_run
 
 CHAIN = [
@@ -285,7 +287,7 @@ class FullDisk:
     def __init__(self, file: FileIO) -> None:
         self.room = 10
         self.file = file
-        self.truncate, self.seek = file.truncate, file.seek
+        self.truncate, self.seek, self.close = file.truncate, file.seek, file.close
 
     def write(self, data: bytes) -> int:
         if not self.room:
@@ -427,3 +429,57 @@ def test_an_argument_that_is_no_utf_8_is_written_out(tmp_path: Path, monkeypatch
         pass
     manifest = read_run(run.path).manifest
     assert (manifest["argv"], manifest["configuration"]) == (["s2a-bench", "\\udcff"], {"\\udcfe": "\\udcfd"})
+
+
+def test_a_full_disk_names_its_file_system_and_the_run_has_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = False
+    write = manifests.write
+
+    def no_room_but_the_reserve(folder: Path, manifest: dict[str, object]) -> None:
+        if full and (folder / RESERVE).exists():
+            error = OSError(28, "No space left on device")
+            raise StoreError(f"cannot write {folder}: {why(error, folder)}") from error
+        write(folder, manifest)
+
+    monkeypatch.setattr("s2a_bench.store.run.manifests.write", no_room_but_the_reserve)
+    run = RunWriter.create(tmp_path, "latency", {})
+    assert (run.path / RESERVE).stat().st_size == RESERVE_BYTES
+    with pytest.raises(StoreError, match=r"No space left on device \(file system /"), run:  # noqa: PT012
+        run.sample(sample("r1"))
+        full = True
+        file = run._files["samples"][1]._file
+        monkeypatch.setattr(run._files["samples"][1], "_file", FullDisk(file))
+        run.sample(sample("r2"))
+    read = read_run(run.path)
+    assert read.samples["request_id"].tolist() == ["r1"]
+    assert read.manifest["state"] == "failed"
+    assert "No space left on device (file system /" in read.manifest["error"]
+    assert not (run.path / RESERVE).exists()
+
+
+def test_facts_can_be_told_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = RunWriter.create(tmp_path, "latency", {})
+    monkeypatch.setattr("s2a_bench.store.manifest.os.fsync", lambda _: _refuse_while(run.path / RESERVE))
+    run.update(warnings=[{"code": "x"}])
+    assert read_run(run.path).manifest["warnings"] == [{"code": "x"}]
+    run.finish("finished")
+
+
+def _refuse_while(path: Path) -> None:
+    if path.exists():
+        raise OSError(28, "No space left on device")
+
+
+def test_a_run_whose_parquet_files_cannot_be_written_has_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, _table: object) -> None:
+        raise StoreError(f"cannot write {path}")
+
+    monkeypatch.setattr("s2a_bench.store.run.write_parquet", refuse)
+    with pytest.raises(StoreError, match=r"samples\.parquet"), RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample())
+    manifest = read_run(run.path).manifest
+    assert (manifest["state"], manifest["error"]) == ("failed", f"cannot write {run.path / 'samples.parquet'}")

@@ -1,0 +1,75 @@
+"""What happens where a limit of the process is reached: one line, a run that says so, and nothing lost."""
+
+from __future__ import annotations
+
+import errno
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.cli.shortage import shortage
+from s2a_bench.store.run import read_run
+
+LATENCY = ["latency", "--engine", "echo", "--transport", "http,loopback", "--size", "64x48", "--data-only"]
+
+
+def run(kind: int, limit: int, output: Path, *more: str) -> list[str]:
+    """Run latency below a limit; return what it said, which ends with one line of error."""
+    done = subprocess.run(
+        [sys.executable, "-m", "s2a_bench", *LATENCY, *more, "--output", str(output)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        preexec_fn=lambda: resource.setrlimit(kind, (limit, limit)),
+    )
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    *said, last = done.stderr.splitlines()
+    assert last.startswith("error: ")
+    return [*said, last]
+
+
+@pytest.mark.parametrize("files", [10, 14, 63])
+def test_too_few_open_files_are_told_before_anything_begins(tmp_path: Path, files: int) -> None:
+    said = run(resource.RLIMIT_NOFILE, files, tmp_path)
+    assert said == [f"error: this process may open {files} files, and 64 are needed; raise `ulimit -n`"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_too_little_address_space_is_told_before_anything_begins(tmp_path: Path) -> None:
+    (said,) = run(resource.RLIMIT_AS, 400 * 2**20, tmp_path)
+    assert "may use 400 MiB of address space, and 1024 are needed; raise `ulimit -v`" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_may_not_grow_ends_the_run_with_its_samples(tmp_path: Path) -> None:
+    said = run(resource.RLIMIT_FSIZE, 600_000, tmp_path, "--runs", "1000000")
+    assert "csv: File too large; samples so far are kept" in said[-1]
+    (folder,) = tmp_path.iterdir()
+    kept = read_run(folder)
+    assert kept.manifest["state"] == "failed"
+    assert "File too large" in kept.manifest["error"]
+    assert len(kept.samples) > 100
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(errno.EMFILE, "Too many open files"), "too many open files; raise `ulimit -n`"),
+        (OSError(errno.ENOSPC, "No space left on device", "/a/b"), "/a/b'; make room there"),
+        (MemoryError(), "out of memory; "),
+        (ImportError("x.so: failed to map segment from shared object"), "out of memory; "),
+        (RuntimeError("can't start new thread"), "no more processes or threads"),
+    ],
+)
+def test_what_there_is_too_little_of_is_named(error: Exception, said: str) -> None:
+    assert said in str(shortage(error))
+
+
+@pytest.mark.parametrize("error", [RuntimeError("x"), ImportError("no module"), OSError(errno.ENOENT, "x")])
+def test_other_errors_are_not_taken_for_a_shortage(error: Exception) -> None:
+    assert shortage(error) is None
