@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError
+from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError, UsageError
@@ -23,6 +26,12 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CHANNELS = {"yuv422_yuy2": 2, "bgr8": 3, "rgb8": 3, "mono8": 1}
 TOPIC_KEY = "?topic="
+METADATA = "metadata.yaml"
+MAX_METADATA_BYTES = 8 * 2**20
+MAX_DEPTH = 32
+"""Of nested lists and maps in a recording's YAML, which has 8."""
+MOST_SAID = 300
+"""Characters of what a library says of a damaged file."""
 
 
 class Recording:
@@ -137,11 +146,34 @@ def _open(path: str) -> Any:
     if not Path(path).exists():
         raise SourceError(f"`source`: no recording at {path}")
     try:
+        _check_metadata(Path(path) / METADATA)
         reader = Reader(path)
         reader.open()
+        if not all(isinstance(name, str) for each in reader.connections for name in (each.topic, each.msgtype)):
+            raise ValueError("a topic's name or type is no text")
     except Exception as error:  # rosbags raises whatever its parsing of a damaged file runs into
         raise SourceError(f"`source`: {_unreadable(path, error)}") from error
     return reader
+
+
+def _check_metadata(path: Path) -> None:
+    """Refuse a folder's YAML that is no YAML, or that could grow without bound when it is read; rosbag2 writes none."""
+    if not path.is_file():
+        return
+    if path.stat().st_size > MAX_METADATA_BYTES:
+        raise ValueError(f"{METADATA} is larger than {MAX_METADATA_BYTES >> 20} MiB")
+    depth = 0
+    try:
+        for event in YAML(typ="safe", pure=True).parse(path.read_text(encoding="utf-8")):
+            where = f"{METADATA}, line {event.start_mark.line + 1}"
+            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+            if depth > MAX_DEPTH:
+                raise ValueError(f"{where}: deeper than {MAX_DEPTH}")
+            if "<<" in (getattr(event, "value", None) or ""):
+                raise ValueError(f"{where}: merged keys (<<) are not read")
+    except MarkedYAMLError as error:
+        where = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise ValueError(f"{METADATA}{where}: {error.problem}") from error
 
 
 def _connection(connections: list[Any], path: str, topic: str) -> Any:
@@ -160,8 +192,10 @@ def _connection(connections: list[Any], path: str, topic: str) -> Any:
 
 
 def _unreadable(path: str, error: Exception) -> str:
-    """Say that a recording cannot be read, and what may help."""
+    """Say in one line that a recording cannot be read, and what may help."""
+    said = " ".join(str(error).split()) or type(error).__name__
+    said = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in said[:MOST_SAID])
     return (
-        f"{path} is no recording that can be read ({error or type(error).__name__}); it should be a rosbag2 folder, "
+        f"{path} is no recording that can be read ({said}); it should be a rosbag2 folder, "
         "a .mcap or a .db3 file. `mcap recover` repairs an .mcap that was cut short, `ros2 bag reindex` a folder"
     )

@@ -178,6 +178,32 @@ def test_a_folder_that_is_none_is_named(tmp_path: Path, opened: Open) -> None:
         opened(tmp_path)
 
 
+LAUGHS = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 30))
+MERGED = "a0: &a0 {k: 1}\n" + "".join(f"a{i}: &a{i}\n  <<: [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: [1, 2\nb: }", "metadata.yaml, line 2: expected ',' or ']', but got ':'"),
+        ("a:\n\t- b", "metadata.yaml, line 2: found character '\\t' that cannot start any token"),
+        ("a: " + "[" * 100_000, "metadata.yaml, line 1: deeper than 32"),
+        (MERGED, "metadata.yaml, line 3: merged keys (<<) are not read"),
+        (LAUGHS + "rosbag2_bagfile_information: {version: 5, relative_file_paths: *a29}", "Invalid bag metadata"),
+        ("#" * 9_000_000, "metadata.yaml is larger than 8 MiB"),
+        ("[]", "Invalid bag metadata: list indices must be integers"),
+    ],
+    ids=["syntax", "tab", "deep", "merged", "laughs", "large", "list"],
+)
+def test_yaml_that_is_none_or_has_no_end_is_one_line(tmp_path: Path, text: str, said: str, opened: Open) -> None:
+    (tmp_path / "metadata.yaml").write_text(text)
+    with pytest.raises(SourceError) as error:
+        opened(tmp_path)
+    (line,) = str(error.value).splitlines()
+    assert f"{tmp_path} is no recording that can be read ({said}" in line
+    assert len(line) < 600
+
+
 def test_a_recording_cut_short_says_how_to_repair_it(tmp_path: Path, opened: Open) -> None:
     path = record(tmp_path / "bag", camera("bgr8")) / "bag.mcap"
     path.write_bytes(path.read_bytes()[:-100])
