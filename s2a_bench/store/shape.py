@@ -46,7 +46,7 @@ class _Manifest(_Shape):
     finished: str | None = None
     configuration: Facts = {}
     environment: _Environment = Field(_Environment())
-    seeds: dict[str, int | None] = {}
+    seeds: Facts = {}
     warnings: list[_Warning] = []
     stages: dict[str, str] = {}
     servers: dict[str, Facts] = {}
