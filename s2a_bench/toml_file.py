@@ -51,12 +51,19 @@ class TomlTable(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-def parse(table: type[T], text: str, where: str, parse_float: Callable[[str], Any] = float) -> T:
-    """Read TOML text; ``where`` begins every error. Raises UsageError naming the key that is wrong."""
+def loads(text: str, where: str, parse_float: Callable[[str], Any] = float) -> dict[str, Any]:
+    """Read TOML text; ``where`` begins every error. Raises UsageError."""
     try:
-        content = tomllib.loads(text, parse_float=parse_float)
-    except tomllib.TOMLDecodeError as error:
+        return tomllib.loads(text, parse_float=parse_float)
+    except RecursionError:
+        raise UsageError(f"{where}: no TOML that can be read: its arrays or tables are too deep") from None
+    except ValueError as error:  # a TOMLDecodeError, or a whole number of thousands of digits
         raise UsageError(f"{where}: no TOML: {error}") from error
+
+
+def parse(table: type[T], text: str, where: str, parse_float: Callable[[str], Any] = float) -> T:
+    """Read TOML text as a table; ``where`` begins every error. Raises UsageError naming the key that is wrong."""
+    content = loads(text, where, parse_float)
     try:
         return table.model_validate(content)
     except ValidationError as error:

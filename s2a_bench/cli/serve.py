@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,15 +13,11 @@ from s2a_bench.cli.adapter import command, flags_of
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Options, group, option, placed, places
+from s2a_bench.toml_file import loads
 from s2a_bench.transport import TRANSPORTS, Transport, Wiring
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.options import sides
 from s2a_bench.transport.pipeline import one_pipeline
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 if TYPE_CHECKING:
     from s2a_bench.harness.processes import ServerProcess
@@ -86,11 +81,9 @@ def _serve(config: Any) -> None:
 def _read(path: Path, chosen: Transport[Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Return a file's options of the engine, of the transport, and limits; raises UsageError naming the key."""
     try:
-        whole = tomllib.loads(path.read_text())
+        whole = loads(path.read_text(), f"`config` {path}")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"`config`: cannot read {path}: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"`config`: {path} is no TOML: {error}") from error
     limits = [name.replace("-", "_") for name in (flag.name for flag in flags_of(Limits))]
     known = ["engine", *ENGINE[1:], *_told(chosen), *limits]
     values = {key.replace("-", "_"): value for key, value in whole.items()}

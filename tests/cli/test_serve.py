@@ -187,7 +187,7 @@ def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -
         ("colour = 1", "'colour' is none of engine, model"),
         ('threads = "many"', "--threads: 'many' should be a valid integer"),
         ("threads = true", "threads = True should be a number"),
-        ("= 1", "is no TOML"),
+        ("= 1", "no TOML"),
         ("max-tokens = 0", "max-tokens: 0 should be greater than or equal to 1"),
         ("max-pixels = 0", "--max-pixels: 0 should be greater than or equal to 1"),
         ('max-body-mib = "much"', "--max-body-mib: 'much' should be a valid number"),
