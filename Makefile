@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-coverage bench-policy bench-ray test test-all check check-platforms core setup clean
+.PHONY: bench bench-coverage bench-policy bench-ray test test-all check check-platforms fuzz core setup clean
 
 # The main job: the transports alone (no model) with raw pixels and with JPEG, for which wheels suffice; then llama.cpp
 # is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
@@ -33,6 +33,10 @@ bench-ray: setup
 test: setup
 	$(BIN)/python -m pytest -m "not slow"
 	@echo "slow tests were left out: make test-all runs them too"
+
+# Ten minutes of damage to everything that reads what comes from outside; finds are tried first the next time.
+fuzz: setup
+	S2A_FUZZ_S=600 $(BIN)/python -m pytest tests/fuzz
 
 test-all: setup
 	$(BIN)/python -m pytest
