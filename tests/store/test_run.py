@@ -1,6 +1,8 @@
 import json
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -262,6 +264,13 @@ def test_two_runs_of_one_second_get_folders_of_their_own(tmp_path: Path, open_ru
     assert all(path.name[8] == "T" and path.name[15] == "Z" for path in paths)
 
 
+def test_a_folder_is_named_after_time_command_and_host(
+    tmp_path: Path, open_run: Callable[..., RunWriter], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: "jetson")
+    assert re.fullmatch(r"\d{8}T\d{6}Z-latency-jetson", open_run(tmp_path).path.name)
+
+
 @pytest.mark.parametrize("where", ["file", "file/below"])
 def test_an_output_that_is_no_folder_is_refused_by_name(tmp_path: Path, where: str) -> None:
     (tmp_path / "file").write_text("")
@@ -277,7 +286,7 @@ def test_an_output_that_cannot_be_written_is_refused_by_name() -> None:
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_folder_without_write_permission_is_refused(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
-    with pytest.raises(StoreError, match="--output"):
+    with pytest.raises(StoreError, match="`output`"):
         RunWriter.create(tmp_path, "latency", {})
 
 
@@ -334,6 +343,39 @@ def test_finishing_twice_keeps_the_first_state(tmp_path: Path) -> None:
         run.finish("finished")
     assert read_run(run.path).manifest["state"] == "failed"
     assert read_run(run.path).manifest["error"] == "server died"
+
+
+def test_a_run_that_goes_on_is_read_with_its_new_rows_before_it_finishes(tmp_path: Path) -> None:
+    samples = samples_table(EARLIER_STAGES)
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample("r1"))
+    again = RunWriter.reopen(run.path, [samples, TOKENS])
+    again.sample(sample("r2"))
+    read = read_run(run.path)
+    assert (read.manifest["state"], read.manifest["finished"]) == ("running", None)
+    assert read.samples["request_id"].tolist() == ["r1", "r2"]
+    assert read.row_counts() == {"samples": 2}
+    again.finish("finished")
+    assert read_run(run.path).samples["request_id"].tolist() == ["r1", "r2"]
+
+
+def test_intervals_are_drawn_from_the_seed_that_the_manifest_tells(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {"seeds": {"order": 3, "bootstrap": 7}}) as seeded:
+        pass
+    with RunWriter.create(tmp_path, "latency", {"seeds": {"order": 3}}) as unseeded:
+        pass
+    assert read_run(seeded.path).bootstrap_seed == 7
+    assert read_run(unseeded.path).bootstrap_seed == 0
+
+
+def test_rows_are_counted_in_files_of_either_kind_and_empty_tables_left_out(tmp_path: Path) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample("r1"))
+        run.sample(sample("r2", error='a "quoted"\nline'))
+        assert read_run(run.path).row_counts() == {"samples": 2}
+        run.tokens(token(index, "x\n") for index in range(3))
+        assert read_run(run.path).row_counts() == {"samples": 2, "tokens": 3}
+    assert read_run(run.path).row_counts() == {"samples": 2, "tokens": 3}
 
 
 def test_an_unknown_final_state_is_refused(open_run: Callable[..., RunWriter]) -> None:

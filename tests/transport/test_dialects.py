@@ -322,6 +322,27 @@ def test_a_kept_connection_that_the_server_closed_is_opened_again(speaker: Speak
             assert len(list(client.request(Request(str(number), "plan"), Trace()))) == 2
 
 
+def kept_until_the_second(speaker: Speaker) -> Reply:
+    """Keep the connection, and close it without an answer when the second request has come."""
+    whole = [kept_head(speaker.kind), chunk(b"".join(answer(speaker)[1:])), chunk(b"")]
+    replies = iter([whole, [CLOSE], whole, whole])
+    return lambda _: next(replies)
+
+
+def test_a_request_that_had_to_be_sent_again_says_so_and_no_other(speaker: Speaker) -> None:
+    with client_of(speaker, kept_until_the_second(speaker)) as client:
+        asked = [ask(client, Request(str(number), "plan")) for number in range(3)]
+    assert [len(tokens) for tokens, _ in asked] == [2, 2, 2]
+    assert [trace.facts.get("reconnects") for _, trace in asked] == [None, 1, None]
+
+
+def test_a_new_connection_that_is_closed_is_an_error_and_not_a_second_request(speaker: Speaker) -> None:
+    with client_of(speaker, kept_until_the_second(speaker), connection="per-request") as client:
+        ask(client, Request("a", "plan"))
+        with pytest.raises(RequestFailed):
+            ask(client, Request("b", "plan"))
+
+
 class TestKeys:
     def headers(self, speaker: Speaker, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
         seen: list[Received] = []

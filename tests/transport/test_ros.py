@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import TransportError
+from s2a_bench.errors import MessagesLost, TransportError
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
@@ -133,6 +133,22 @@ def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, told: Wir
         thread.join(20)
     assert "queue" not in budget(traces["1"].chain()).stages_ns
     assert budget(traces["2"].chain()).stages_ns["queue"] > 0
+
+
+@pytest.mark.parametrize(("came", "told_of"), [([0, 2], "token 2 came instead of 1"), ([0, 0], "token 0 .* of 1")])
+def test_tokens_out_of_order_are_messages_lost(
+    stack: ExitStack, told: Wiring[Any], came: list[int], told_of: str
+) -> None:
+    def handler(_request: Request, trace: Trace) -> Generator[Token, None, None]:
+        trace.mark("inference")
+        for index in came:
+            yield Token(index, "x")
+
+    serve(stack, told, handler)
+    answer = connect(stack, told).request(Request("a", "plan"), Trace())
+    assert next(answer).index == 0
+    with pytest.raises(MessagesLost, match=told_of):
+        next(answer)
 
 
 def test_a_second_server_of_a_namespace_is_refused(stack: ExitStack, told: Wiring[Any]) -> None:
