@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-coverage bench-policy bench-ray test test-all check check-platforms fuzz core setup clean
+.PHONY: bench bench-coverage bench-policy bench-ray test test-all check check-platforms fuzz core setup clean mutate
 
 # The main job: the transports alone (no model) with raw pixels and with JPEG, for which wheels suffice; then llama.cpp
 # is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
@@ -50,6 +50,11 @@ check: setup
 # Can every supported platform install the dependencies from wheels? Asks the package index, installs nothing.
 check-platforms: setup
 	$(BIN)/python tools/check_platforms.py
+
+# How many of 300 random changes of the code do the tests notice? Takes about an hour; docs/mutation.md.
+mutate: setup
+	$(BIN)/python -m pip install --quiet 'cosmic-ray>=8.4,<9'
+	$(BIN)/python tools/mutate.py
 
 core:
 	@$(PYTHON) tools/setup.py core
