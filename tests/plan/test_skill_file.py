@@ -74,6 +74,8 @@ def test_the_household_speaks_the_papers_plan() -> None:
         ("t_nom_s = 2", "", "skill[lift].t_nom_s: is missing"),
         ("t_nom_s = 2", "t_nom_s = true", "skill[lift].t_nom_s: should be a number"),
         ("t_nom_s = 2", "t_nom_s = inf", "skill[lift].t_nom_s: should be a number"),
+        ("t_nom_s = 2", "t_nom_s = 1000000001", "skill[lift].t_nom_s: should be a number"),
+        ("t_nom_s = 2", "t_nom_s = 1e400", "skill[lift].t_nom_s: should be a number"),
         ("t_nom_s = 2", "t_nom_s = 0", "skill[lift]: 0 < t_min_s <= t_nom_s <= t_max_s does not hold"),
         ("t_nom_s = 2", "t_nom_s = 2\nt_max_s = 1.9", "skill[lift]: 0 < t_min_s <= t_nom_s <= t_max_s"),
         ("t_nom_s = 2", "t_nom = 2", "skill[lift].t_nom: there is no such key; did you mean t_nom_s?"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -27,6 +28,10 @@ BURSTS = Markov(1 / 4.8, 0.2, pause_share=0.02, pause_ratio=10.0, pause_tokens=3
 def fitted(plans: Plans) -> StreamToAct:
     assert plans.token_s is not None
     return StreamToAct(GapPrior.fit(plans.token_s))
+
+
+def test_cautions_are_tried_in_ascending_order() -> None:
+    assert all(less < more for less, more in pairwise(GRID))
 
 
 def test_a_plan_s_score_is_the_least_caution_from_which_on_it_never_stalls() -> None:

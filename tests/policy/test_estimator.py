@@ -87,6 +87,13 @@ def test_bursts_count_with_the_spread_of_their_sums() -> None:
     assert fitted == pytest.approx(long_sums, rel=0.15)
 
 
+def test_what_a_gap_varies_is_told_by_sums_over_about_the_square_root_of_their_number() -> None:
+    gaps = np.array([0.1] * 4 + [0.3] * 4 + [0.1] * 4 + [0.3] * 4)
+    token_s = np.cumsum(np.tile([0.0, *gaps], (2, 1)).T, axis=0)
+    sums = np.array([0.4, 1.2, 0.4, 1.2])
+    assert GapPrior.fit(token_s).token_cv == pytest.approx((sums.var(ddof=1) / 4) ** 0.5 / 0.2)
+
+
 @pytest.mark.parametrize("shape", [(2, 50), (9, 1), (9, 0)])
 def test_too_little_is_refused(shape: tuple[int, int]) -> None:
     with pytest.raises(UsageError, match=r"a prior needs 2 plans of 3 tokens or more, not"):

@@ -72,6 +72,17 @@ def test_a_timeline_without_stalls_speeds_up_once_and_slows_down_once() -> None:
     assert np.abs(np.diff(speed)).max() / 0.01 == pytest.approx(1 / 0.2)
 
 
+def test_a_robot_is_at_full_speed_after_six_tenths_of_a_second_unless_told_otherwise() -> None:
+    speed = speed_profile(np.array([0.0]), np.array([3.0]), np.array([3.0]), 0.01)
+    assert np.argmax(speed > 1 - 1e-9) * 0.01 == pytest.approx(0.6, abs=0.02)
+    assert peak_jerk(speed, 0.01) == pytest.approx(1 / 0.3**2)
+
+
+def test_a_robot_that_follows_within_a_sample_moves_as_its_skills_say() -> None:
+    speed = speed_profile(np.array([0.0, 2.0]), np.array([1.0, 1.0]), np.ones(2), 0.5, ramp_s=0.1)
+    assert speed[speed.nonzero()[0][0] :].tolist() == pytest.approx([1, 1, 0, 0, 1, 1, 0])
+
+
 def test_a_stall_stops_the_robot_and_a_stretched_skill_slows_it() -> None:
     nominal_s = np.ones(3)
     stalled = speed_profile(np.array([0.0, 3.0, 4.0]), nominal_s, nominal_s, 0.01, ramp_s=0.2)

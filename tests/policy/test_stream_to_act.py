@@ -68,6 +68,16 @@ def forecast(tokens: float, unknown: int, caution: float, duration_s: float) -> 
     return tokens * mean + caution * math.sqrt(noise)
 
 
+@pytest.mark.parametrize("kind", [MeanStart, QuantileStart])
+def test_the_rules_for_study_never_stretch(kind: type[StreamToAct]) -> None:
+    made = kind(PRIOR).stepper(PlanShape(2, 2, Timing(1.0, 0.8, 1.5)))
+    made.token(1.0)
+    made.fragment(1.0, Timing(1.2, 1.0, 1.5))
+    made.fragment(2.0, Timing(1.0, 0.8, 1.5))
+    assert made.decide(2.0) == Start(1.2, 1.2)
+    assert made.decide(9.0) == Start(1.0, 1.0)  # late, and still not compressed
+
+
 @pytest.mark.parametrize("caution", [0.0, 1.0, 3.0])
 def test_the_start_is_when_mean_meets_nominal_and_caution_meets_stretched(caution: float) -> None:
     demands = [

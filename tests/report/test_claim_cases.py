@@ -132,6 +132,11 @@ NO_EVIDENCE: dict[str, tuple[Made, str, str]] = {
         "RTX 4080: 34.2",
         "8 layers on the GPU",
     ),
+    "all layers but one of the 28 on a 4080": (
+        lambda kit: kit.rates(34.2, REAL, GPU | {"gpu_layers": 27}),
+        "RTX 4080: 34.2",
+        "27 layers on the GPU",
+    ),
     "dummy weights at the 4080's rate": (lambda kit: kit.rates(34.2, DUMMY, GPU), "RTX 4080: 34.2", "weights: dummy"),
     "a paced server": (
         lambda kit: kit.rates(34.2, replace(REAL, tokens="paced"), GPU),
@@ -203,6 +208,10 @@ def test_what_is_no_evidence_decides_nothing_and_says_what_is_missing(kit: Kit, 
 
 
 EVIDENCE: dict[str, tuple[Made, dict[str, str]]] = {
+    "the paper's model with all of its 28 layers on a 4080": (
+        lambda kit: kit.rates(34.2, REAL, GPU | {"gpu_layers": 28}),
+        {"RTX 4080: 34.2 tokens/s": SUPPORTED},
+    ),
     "the paper's model on the Orin's GPU": (
         lambda kit: kit.live(REAL, 4.8, environment=ORIN, model=GPU),
         {"AGX Orin: stream-to-act eliminates stalls": UNDECIDED},  # one plan each: no interval

@@ -21,9 +21,9 @@ from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.report.claims.ccrb import CHOSEN
 from s2a_bench.report.claims.checks import CLAIMS
-from s2a_bench.report.claims.claim import CONTRADICTED, REPRODUCED, SUPPORTED, UNDECIDED
-from s2a_bench.report.claims.needs import is_board
-from s2a_bench.report.claims.verdicts import Judged, claim_table, judge_claims
+from s2a_bench.report.claims.claim import CONTRADICTED, REPRODUCED, SUPPORTED, UNDECIDED, Need, Part
+from s2a_bench.report.claims.needs import is_board, machine_of
+from s2a_bench.report.claims.verdicts import Judged, claim_table, judge, judge_claims
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
@@ -159,6 +159,40 @@ def test_a_board_is_known_by_its_whole_name(
     make_run: MakeRun, environment: dict[str, Any], name: str, same: bool
 ) -> None:
     assert is_board(make_run({}, manifest={"environment": environment}), name) == same
+
+
+@pytest.mark.parametrize(
+    ("environment", "named"),
+    [
+        (RTX | {"cpu": "AMD Ryzen 9"}, "AMD Ryzen 9, NVIDIA GeForce RTX 4080"),
+        (ORIN | {"gpus": []}, "NVIDIA Jetson AGX Orin Developer Kit"),
+        ({}, "a machine that is not known"),
+    ],
+)
+def test_a_machine_is_named_by_what_is_known_of_it(make_run: MakeRun, environment: dict[str, Any], named: str) -> None:
+    assert machine_of(make_run({}, manifest={"environment": environment})) == named
+
+
+def test_a_path_without_colour_conversions_contradicts_that_they_are_most_of_it(make_run: MakeRun) -> None:
+    cells = {**EVEN, "ros/topic": {"network": 3, "inference": 5, "return": 0}}
+    judged = claim_of("colour conversions", make_run(cells, payloads=PAYLOADS))
+    assert judged.verdict == CONTRADICTED
+    assert "take 0% [0%, 0%]" in judged.evidence[0]
+
+
+def test_a_run_whose_parts_all_lack_something_says_what_the_nearest_lacks(make_run: MakeRun) -> None:
+    run = make_run({}, manifest={})
+    parts = [
+        Part(run, "far", {"board", "mode"}),
+        Part(run, "near", {"model"}),
+        Part(run, "far too", {"board", "model"}),
+    ]
+    needs = [
+        Need(name, "right", lambda part, name=name: (name not in part.cells, part.name))
+        for name in ("board", "mode", "model")
+    ]
+    (finding,) = judge(replace(CLAIMS[0], command="latency", parts=lambda _: parts, needs=tuple(needs)), [run]).findings
+    assert "; ".join(map(str, finding.needs)) == "board: near; mode: near; model: near (needs right)"
 
 
 def test_the_timelines_of_table_ii_bear_the_papers_findings_out(timelines: Run) -> None:

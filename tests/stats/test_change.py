@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.signal import lfilter
 
-from s2a_bench.stats.batches import Launch, Rows
+from s2a_bench.stats.batches import Launch, Memory, Rows
 from s2a_bench.stats.change import change_between, holm
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -207,6 +207,35 @@ def test_something_out_of_nothing_has_no_size() -> None:
     assert change.difference.value == 0.5
     assert change.p is not None
     assert change.p < 0.01
+
+
+@pytest.mark.parametrize(
+    ("baseline", "other", "bounds"), [(-10.0, -5.0, (0.5, 0.5)), (0.0, 0.0, (0.0, 0.0)), (0.0, 5.0, None)]
+)
+def test_bounds_without_a_ratio_are_those_of_the_difference(
+    baseline: float, other: float, bounds: tuple[float, float] | None
+) -> None:
+    change = change_between([rows_of([baseline])], [rows_of([other])], "median", seed=0, exact=True)
+    assert change.bounds == bounds
+
+
+@pytest.mark.parametrize(("rows", "dependent"), [(59, True), (61, False)])
+def test_rows_remember_about_one_plus_r_over_one_minus_r_rows(rows: int, dependent: bool) -> None:
+    assert Memory(r=0.5, n=rows, k=20).dependent is dependent  # 3 rows, and batches of n / k
+
+
+@pytest.mark.parametrize("last", [6, 600])
+def test_memory_is_the_correlation_of_neighbouring_ranks(last: float) -> None:
+    assert Memory.of(np.array([1.0, 2, 3, 4, 5, last])).r == pytest.approx(8.75 / 17.5)  # ranks less 3.5
+
+
+@pytest.mark.parametrize("r", [0.0, 0.3, 0.8])
+def test_what_batches_hide_of_the_variance_is_that_of_the_means_of_a_series_of_order_one(r: float) -> None:
+    def variance(m: int) -> float:
+        return float(np.mean(r ** np.abs(np.subtract.outer(np.arange(m), np.arange(m)))))
+
+    between = (variance(6) - variance(120)) / 19  # of the means of 20 batches of 6 rows, around the whole mean
+    assert Memory(r, 120, 20).hidden == pytest.approx(variance(120) / between)
 
 
 def test_a_launch_that_remembers_longer_than_a_batch_is_told() -> None:
