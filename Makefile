@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-coverage bench-policy bench-ray test test-all check check-platforms fuzz core setup clean mutate
+.PHONY: bench bench-coverage bench-policy bench-ray test test-all check check-platforms fuzz core mutate setup clean
 
 # The main job: the transports alone (no model) with raw pixels and with JPEG, for which wheels suffice; then llama.cpp
 # is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
