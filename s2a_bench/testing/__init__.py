@@ -14,6 +14,7 @@ that its docstring names:
 | seam | suite | fixtures |
 |---|---|---|
 | transport | `transport.TransportSuite` | ``told``, or the pipeline's ``name`` as an attribute |
+| transport, against hostile peers | `hostile.HostileSuite` | the pipeline's ``name``, ``clients``, ``servers`` |
 | engine | `engine.EngineSuite` | ``engine``, and ``fresh_engine``, which is closed |
 | frame source | `frame_source.FrameSourceSuite` | ``make_source``: open it with this width and height |
 | policy | `policy.PolicySuite` | ``policy`` |

@@ -14,6 +14,7 @@ from s2a_toy.transport import TOY, ToyOptions
 from s2a_bench.frames import FrameSource
 from s2a_bench.policy import Policy
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
+from s2a_bench.testing.hostile import HostileSuite, tcp
 from s2a_bench.testing.policy import PolicySuite
 from s2a_bench.testing.transport import Connect, TransportSuite
 from s2a_bench.transport import Client, Handler, Wiring
@@ -37,6 +38,12 @@ class TestToyTransport(TransportSuite):
                 return client
 
             yield connect
+
+
+class TestToyPeers(HostileSuite):
+    name = "toy"
+    clients = tcp.CLIENTS
+    servers = tcp.SERVERS
 
 
 class TestStripes(FrameSourceSuite):

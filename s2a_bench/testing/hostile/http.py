@@ -1,0 +1,201 @@
+"""Hostile peers of our HTTP server and client."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import struct
+import zlib
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
+from s2a_bench.testing.hostile.tcp import CLIENTS as ANY_CLIENT
+from s2a_bench.testing.hostile.tcp import NOISE, answers, crowd, sends, sends_made, servers
+from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS
+
+CHAT = PATHS["as-deployed"]
+MIB = 1 << 20
+JSON = "Content-Type: application/json"
+
+
+def head(*headers: str, path: str = CHAT, length: int | None = None) -> bytes:
+    """Return the head of a request whose connection is closed after its answer."""
+    said = [] if length is None else [f"Content-Length: {length}"]
+    lines = [f"POST {path} HTTP/1.1", "Host: a", "Connection: close", *headers, *said]
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+def post(body: bytes, *headers: str, path: str = CHAT) -> bytes:
+    """Return a whole request."""
+    return head(*(headers or (JSON,)), path=path, length=len(body)) + body
+
+
+def chat(prompt: str = '"go on"', fields: str = "", path: str = CHAT) -> bytes:
+    """Return a request whose prompt and further fields are JSON text."""
+    return post(
+        f'{{"messages": [{{"role": "user", "content": {prompt}}}]{fields and ", " + fields}}}'.encode(), path=path
+    )
+
+
+def binary(body: bytes, fields: str = "{}", kind: str = "image/png") -> bytes:
+    """Return a request of the variant whose body is the picture."""
+    return post(body, f"Content-Type: {kind}", f"{PARAMETERS_HEADER}: {fields}", path=PATHS["binary"])
+
+
+@cache
+def png_of_zeros(width: int, height: int) -> bytes:
+    """Return a PNG of one bit a pixel, made without its pixels: 30000x30000 are 110 kB, and 2.7 GB once decoded."""
+    pack = zlib.compressobj(9)
+    rows = b"".join(pack.compress(bytes(1 + (width + 7) // 8)) for _ in range(height)) + pack.flush()
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    ihdr = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", ihdr) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def bomb() -> bytes:
+    """Return a small picture of 900 million pixels."""
+    return png_of_zeros(30_000, 30_000)
+
+
+def bomb_uri() -> Sequence[bytes]:
+    """Return a request with the bomb in a data URI."""
+    uri = "data:image/png;base64," + base64.b64encode(bomb()).decode()
+    return [chat(json.dumps([{"type": "image_url", "image_url": {"url": uri}}]))]
+
+
+def parentheses(number: int) -> str:
+    """Return a grammar as deep as that."""
+    return json.dumps("root ::= " + "(" * number + '"a"' + ")" * number)
+
+
+REFUSED = "^HTTP/1.1 400 .*"
+GOES_ON = '"stream": true, "max_tokens": 5000'
+_NUMBERS = ("-1", "0", "1.5", "[]", "1e99", str(1 << 31), '"many"', "true", "{}", "NaN")
+_VARIANTS = {name: PATHS[name] for name in ("as-deployed", "best-effort")}
+
+CLIENTS: tuple[Case[Attack], ...] = (
+    *ANY_CLIENT,
+    Case("half the headers, then gone", sends(head()[:40], then="goes")),
+    Case("half the body, then gone", sends(head(JSON, length=1000) + b"{", then="goes")),
+    Case("headers a byte at a time", sends(*(bytes([byte]) for byte in head() * 9), every_s=0.05), "^HTTP/1.1 408|^$"),
+    Case("body a byte at a time", sends(head(JSON, length=1000), *[b" "] * 20, every_s=0.1, then="goes")),
+    Case("1 GiB said", sends(head(JSON, length=1 << 30), bytes(MIB)), "^HTTP/1.1 413 "),
+    Case(
+        "1 GiB unsaid", sends(head(JSON, "Transfer-Encoding: chunked"), *[b"100000\r\n" + bytes(MIB) + b"\r\n"] * 1024)
+    ),
+    Case("64 MiB of spaces", sends_made(lambda: [post(b" " * 64 * MIB)]), REFUSED),
+    Case("64 MiB of zeros as pixels", sends_made(lambda: [binary(bytes(64 * MIB))]), REFUSED),
+    Case("1 MiB of headers", sends(head()[:-2], *[b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)])),
+    Case("one header of 1 MiB", sends(head()[:-2] + b"x: " + b"a" * MIB + b"\r\n\r\n")),
+    Case("length that is none", sends(head("Content-Length: -5"))),
+    Case("length of 20 digits", sends(head("Content-Length: 99999999999999999999"))),
+    Case("two lengths", sends(head("Content-Length: 3", "Content-Length: 5") + b"{}{}{}")),
+    Case(
+        "length and chunks",
+        sends(head("Content-Length: 3", "Transfer-Encoding: chunked") + b"0\r\n\r\nGET / HTTP/1.1\r\n\r\n"),
+    ),
+    Case("chunk of a size that is none", sends(head(JSON, "Transfer-Encoding: chunked") + b"-1\r\nzz\r\n")),
+    Case("chunk of 2^64 bytes", sends(head(JSON, "Transfer-Encoding: chunked") + b"FFFFFFFFFFFFFFFF\r\nzz\r\n")),
+    Case("HTTP/9.9", sends(b"POST / HTTP/9.9\r\n\r\n")),
+    Case("TLS", sends(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + NOISE[:500])),
+    Case("upgrade to a WebSocket", sends(head("Upgrade: websocket", "Sec-WebSocket-Key: a", length=0))),
+    Case("200 requests in one piece", sends(chat().replace(b"Connection: close\r\n", b"") * 200, chat())),
+    Case("no JSON", sends(post(b"{]")), REFUSED),
+    Case("no UTF-8", sends(post(b'{"messages": [{"role": "user", "content": "\xff\xfe"}]}')), REFUSED),
+    *(Case(f"deep JSON, {name}", sends(post(b"[" * MIB, path=path)), REFUSED) for name, path in _VARIANTS.items()),
+    *(
+        Case(f"messages {text[:20]}, {name}", sends(post(f'{{"messages": {text}}}'.encode(), path=path)), REFUSED)
+        for text in ("5", "[5]", "[[]]", '[{"role": 5}]', '{"a": 1}', "null", '[{"role": "user", "content": [[]]}]')
+        for name, path in _VARIANTS.items()
+    ),
+    *(
+        Case(f"max_tokens {number}, {name}", sends(chat(fields=f'"max_tokens": {number}', path=path)), REFUSED)
+        for number in _NUMBERS
+        for name, path in _VARIANTS.items()
+    ),
+    Case("half a surrogate pair as id", sends(chat(fields='"request_id": "\\ud800", "stream": true')), REFUSED),
+    Case("half a surrogate pair as prompt", sends(chat('"\\ud800"')), REFUSED),
+    Case("no parameters", sends(binary(b"", "[]")), REFUSED),
+    Case("deep parameters", sends(binary(b"", "[" * 50_000)), REFUSED),
+    Case("picture of 900 million pixels", sends_made(lambda: [binary(bomb())]), REFUSED + "30000x30000"),
+    Case("the same in a data URI", sends_made(bomb_uri), REFUSED + "30000x30000"),
+    Case("noise as a picture", sends(binary(NOISE)), REFUSED),
+    Case(
+        "raw pixels of another size",
+        sends(binary(b"abc", kind="application/x-raw;width=9;height=9;encoding=bgr8")),
+        REFUSED,
+    ),
+    Case("bad grammar", sends(chat(fields=f'"grammar": {parentheses(20_000)}'))),
+    Case("gone in the middle of an answer", sends(chat(fields=GOES_ON), then="goes")),
+    Case("reset in the middle of an answer", sends(chat(fields=GOES_ON), then="resets")),
+    Case("gone without waiting for the whole", sends(chat(fields='"max_tokens": 5000'), then="resets")),
+    Case("100 clients at once", crowd(100, sends(chat(fields='"stream": true'), seconds=20)), "HTTP/1.1 (200|503) "),
+    Case("100 clients that go", crowd(100, sends(chat(fields=GOES_ON), then="goes"))),
+)
+
+
+def said(*lines: str, status: str = "200 OK") -> bytes:
+    """Return the head of an answer."""
+    return "\r\n".join([f"HTTP/1.1 {status}", *lines, "", ""]).encode()
+
+
+STREAM = said("Content-Type: text/event-stream", "Connection: close")
+
+
+def event(value: Any) -> bytes:
+    """Return one server-sent event."""
+    return b"data: " + (value if isinstance(value, bytes) else json.dumps(value).encode()) + b"\n\n"
+
+
+def token(text: str = "go") -> dict[str, Any]:
+    """Return one token as our server sends it."""
+    return {"choices": [{"index": 0, "delta": {"content": text}, "finish_reason": None, "token": 1}]}
+
+
+def _answers(*pieces: bytes, **more: Any) -> Trap:
+    return answers(*pieces, scheme="http://", **more)
+
+
+def _streams(*values: Any, **more: Any) -> Trap:
+    return _answers(STREAM, *(event(value) for value in values), then="goes", **more)
+
+
+SERVERS: tuple[Case[Trap], ...] = (
+    *servers("http://"),
+    Case("headers, then silence", _answers(STREAM), "^RequestFailed: .*silent"),
+    Case("headers, then gone", _answers(STREAM, then="goes"), "before the answer was complete"),
+    Case("one token, then silence", _answers(STREAM, event(token())), "^RequestFailed: .*silent"),
+    Case("one token, then gone", _streams(token()), "before the answer was complete"),
+    Case("one token, then reset", _answers(STREAM, event(token()), then="resets"), FAILED),
+    Case("an event that ends in the middle", _answers(STREAM, b'data: {"choi', then="goes"), FAILED),
+    Case("events that are no JSON", _streams(b"{]"), FAILED),
+    Case("events that are no objects", _streams([], 5, "a", None), FAILED),
+    Case("choices that are none", _streams({"choices": "go"}, {"choices": [5]}, {"choices": [{"delta": 5}]}), FAILED),
+    Case("deep events", _streams(b"[" * 100_000), FAILED),
+    Case(
+        "another media type",
+        _answers(said("Content-Type: text/html", "Connection: close"), b"<html>", then="goes"),
+        FAILED,
+    ),
+    Case("a refusal of 4 GiB", _answers(said(status="500 No"), again=[b"no " * (1 << 15)]), "^RequestFailed: .*500"),
+    Case("a redirect", _answers(said("Location: http://127.0.0.1:1/", status="302 Found"), then="goes"), FAILED),
+    Case(
+        "a chunk of 2^60 bytes",
+        _answers(STREAM[:-2] + b"Transfer-Encoding: chunked\r\n\r\n1000000000000000\r\ngo"),
+        FAILED,
+    ),
+    Case("endless headers", _answers(b"HTTP/1.1 200 OK\r\n", again=[b"x: y\r\n" * 1000]), FAILED),
+    Case("an endless line", _answers(STREAM, b"data: ", again=[b"a" * (1 << 16)]), FAILED),
+    Case("no gzip", _answers(STREAM[:-2] + b"Content-Encoding: gzip\r\n\r\n" + NOISE, then="goes"), FAILED),
+    Case(
+        "a gzip of 1 GiB",
+        _answers(STREAM[:-2] + b"Content-Encoding: gzip\r\n\r\n", gzip.compress(bytes(1 << 20)) * 1024),
+        FAILED,
+    ),
+)
