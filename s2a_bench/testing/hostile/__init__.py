@@ -19,8 +19,9 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from selectors import EVENT_READ, DefaultSelector
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
@@ -118,10 +119,8 @@ class HostileSuite:
     @classmethod
     def server(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[OwnServer]:
         """Our server in a process of its own, one for all hostile clients."""
-        log = tmp_path_factory.mktemp("server") / "log"
-        with OwnServer("hostile", ServerJob(cls.told(), EngineConfig(name="echo")), log) as process:
-            process.wait_ready()
-            yield process  # type: ignore[misc]  # ServerProcess returns itself
+        with own_server(cls.told(), tmp_path_factory.mktemp("server") / "log") as process:
+            yield process
 
     @pytest.fixture(scope="class")
     @classmethod
@@ -172,6 +171,15 @@ class HostileSuite:
         assert got["tokens"] <= TOKENS
         assert got["seconds"] < hostile_server.seconds
         assert got["peak_mib"] < hostile_server.mib
+
+
+@contextmanager
+def own_server(told: Wiring[Any], log: Path, **engine: Any) -> Iterator[OwnServer]:
+    """Run a server in a process of its own, with the echo engine, which may be told more."""
+    server = OwnServer("hostile", ServerJob(told, EngineConfig(name="echo", **engine)), log)
+    with server:
+        server.wait_ready()
+        yield server
 
 
 def _settled(met: Callable[[], bool]) -> bool:

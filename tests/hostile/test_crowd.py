@@ -1,0 +1,49 @@
+"""A thousand clients at once are answered or refused, and none hangs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.testing.hostile import own_server
+from s2a_bench.testing.hostile.http import chat
+from s2a_bench.testing.hostile.tcp import crowd, sends
+from s2a_bench.testing.hostile.usage import usage
+from s2a_bench.testing.transport import ask, wiring
+from s2a_bench.transport import open_client
+from s2a_bench.transport.http.own import PATHS
+from s2a_bench.types import Request
+
+CLIENTS = 1000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
+@pytest.mark.parametrize("stream", ["true", "false"])
+def test_1000_clients_at_once(
+    tmp_path: Path, variant: str, stream: str, record_property: Callable[[str, object], None]
+) -> None:
+    fields = f'"stream": {stream}, "max_tokens": 3, "request_id": "one of many"'
+    told = wiring(f"http/{variant}")
+    with own_server(told, tmp_path / "log") as server:
+        here = replace(told, address=server.address)
+        began = now_ns()
+        said = crowd(CLIENTS, sends(chat(fields=fields, path=PATHS[variant]), seconds=120))(here)
+        seconds = (now_ns() - began) / 1e9
+        whole = said.count("data: [DONE]") if stream == "true" else said.count('"completion_tokens":3')
+        answered, refused = said.count("HTTP/1.1 200 "), said.count("HTTP/1.1 503 ")
+        peak = usage(server.pid).peak_mib
+        record_property("cost", f"1000 clients: {answered} answered, {seconds:.1f} s, {peak:.0f} MiB")
+        assert answered + refused == CLIENTS
+        assert whole == answered >= 65
+        assert said.count("retry-after: ") == refused
+        assert peak < 1024
+        client = open_client(here)
+        try:
+            assert len(ask(client, Request("afterwards", "go on", max_tokens=3))[0]) == 3
+        finally:
+            client.close()
