@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from threading import Event, Lock, Thread
+from threading import Event, Lock, Thread, active_count
 from typing import Any
 
 import httpx
@@ -19,11 +19,15 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, EngineError, RequestFailed
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
+from s2a_bench.ros import QoS
+from s2a_bench.ros import messages as ros
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Handler, open_client, open_server
 from s2a_bench.transport.http.own import PATHS
 from s2a_bench.transport.limits import LIMITS, Limits
+from s2a_bench.transport.ros.joining import join
+from s2a_bench.transport.ros.wire import request_message
 from s2a_bench.transport.turns import Queued, Turn, Turns
 from s2a_bench.types import Request, Token
 
@@ -298,3 +302,25 @@ def test_a_ros_request_too_many_is_refused_at_once() -> None:
         gate.go.set()
         for client in clients:
             client.close()
+
+
+def test_the_threads_of_ros_requests_that_waited_end() -> None:
+    go = Event()
+
+    def answer(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        go.wait(30)
+        yield Token(0, "a")
+
+    queued = Queued.around(answer)
+    with serving(queued, "ros/topic") as address:
+        middleware = join(wiring("ros/topic", address), "crowd")
+        publisher = middleware.publisher(address + "/request", ros.REQUEST, QoS(depth=0))
+        until(lambda: bool(publisher.matched()))
+        before = active_count()
+        for index in range(30):
+            publisher.send(publisher.pack(request_message(Request(str(index), "a", max_tokens=1))))
+        until(lambda: queued.turns.waiting == 29)
+        assert active_count() >= before + 28
+        go.set()
+        until(lambda: active_count() <= before)
+        middleware.close()

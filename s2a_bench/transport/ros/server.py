@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import partial
-from threading import Event, Lock, Thread
+from threading import Event, Lock, Thread, current_thread
 from typing import Any, Protocol
 
 from s2a_bench.errors import Busy, Overdue
@@ -206,6 +206,8 @@ class _Crew:
                         answer()
                     finally:
                         self._busy(-1)
+                    if self._retired():
+                        return
             except Exception as error:  # noqa: BLE001 - a node stays up: the next request may fare better
                 said = f"request not answered: {error or type(error).__name__}"
                 print(said, file=sys.stderr, flush=True)  # noqa: T201 - a node's log
@@ -215,3 +217,12 @@ class _Crew:
             self._idle -= change
             if not self._idle and not self._stopped.is_set():
                 self._hire()
+
+    def _retired(self) -> bool:
+        """Whether enough others are idle, so that this thread ends."""
+        with self._count:
+            if self._idle <= IDLE_WORKERS or self._stopped.is_set():
+                return False
+            self._idle -= 1
+            self._threads.remove(current_thread())
+        return True
