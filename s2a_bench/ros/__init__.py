@@ -171,6 +171,11 @@ class ServerGoal(Protocol):
         ...
 
     @property
+    def size_bytes(self) -> int:
+        """How large its request is: the CDR, or where the middleware keeps none its texts and pixels."""
+        ...
+
+    @property
     def cancel_requested(self) -> bool:
         """Whether a client has asked to cancel this goal."""
         ...

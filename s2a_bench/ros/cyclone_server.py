@@ -35,6 +35,11 @@ class CycloneServerGoal:
         self.id = bytes(packed[BODY_AT : BODY_AT + 16])
 
     @property
+    def size_bytes(self) -> int:
+        """Return the size of the CDR."""
+        return len(self._packed)
+
+    @property
     def cancel_requested(self) -> bool:
         """Ask the server's books."""
         return self._server.status(self.id) == Status.CANCELING

@@ -39,6 +39,13 @@ class RclpyServerGoal:
         self.id = bytes(request[1].goal_id.uuid)
 
     @property
+    def size_bytes(self) -> int:
+        """Return the letters of its prompt and the bytes of its pictures."""
+        goal = self._request[1].goal
+        images = goal.images if hasattr(goal, "images") else [goal.image]
+        return len(goal.prompt) + sum(len(image.data) for image in images)
+
+    @property
     def cancel_requested(self) -> bool:
         """Ask rclpy."""
         return self._status() == Status.CANCELING

@@ -23,7 +23,7 @@ from s2a_bench.ros import QoS
 from s2a_bench.ros import messages as ros
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Handler, open_client, open_server
+from s2a_bench.transport import Client, Handler, open_client, open_server
 from s2a_bench.transport.http.own import PATHS
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.ros.joining import join
@@ -324,3 +324,37 @@ def test_the_threads_of_ros_requests_that_waited_end() -> None:
         go.set()
         until(lambda: active_count() <= before)
         middleware.close()
+
+
+def is_answered(client: Client, prompt: str) -> bool:
+    try:
+        return len(ask(client, Request("afterwards", prompt))[0]) == 1
+    except RequestFailed:
+        return False
+
+
+def test_the_bytes_of_ros_requests_are_bounded_and_given_back() -> None:
+    go = Event()
+
+    def answer(request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        yield Token(0, "a")
+        assert go.wait(30) or request.id == "first"
+
+    limits, long = Limits(body_mib=1, in_flight_mib=1.5), "a" * 1_000_000
+    with ExitStack() as stack:
+        address = stack.enter_context(serving(Queued.around(answer), "ros/topic", limits))
+        first, second, goals = (open_client(wiring(f"ros/{way}", address)) for way in ("topic", "topic", "action"))
+        for client in (first, second, goals):
+            stack.callback(client.close)
+        with pytest.raises(RequestFailed, match="larger than 1048576 bytes"):
+            ask(second, Request("too long", 2 * long))
+        tokens = first.request(Request("first", long), Trace())
+        next(iter(tokens))
+        with pytest.raises(RequestFailed, match="1572864 bytes are under way already"):
+            ask(second, Request("second", long))
+        with pytest.raises(RequestFailed, match="rejected"):
+            ask(goals, Request("goal", long))
+        go.set()
+        assert len([*tokens]) == 0
+        for client in (second, goals, second):
+            until(lambda client=client: is_answered(client, long))  # type: ignore[misc]  # bound at once

@@ -222,6 +222,10 @@ class ActionFront:
             alone = self._active == 1
         return GenerateJob(self, packed, goal, trace, at_once=alone)  # from here on only `end` ends the goal
 
+    def size_bytes(self, packed: ServerGoal) -> int:
+        """Return the size of a goal."""
+        return packed.size_bytes
+
     def refuse(self, packed: ServerGoal, why: str) -> None:  # noqa: ARG002 - a rejection has no words
         """Reject a goal."""
         packed.reject()

@@ -13,7 +13,7 @@ from functools import partial
 from threading import Event, Lock, Thread, current_thread
 from typing import Any, Protocol
 
-from s2a_bench.errors import Busy, Overdue
+from s2a_bench.errors import Busy, Overdue, RequestFailed
 from s2a_bench.ros import QoS
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import RESIDUAL, Trace
@@ -59,6 +59,10 @@ class Front(Protocol):
         """Unpack and prepare a request, marking each stage; None for what is none."""
         ...
 
+    def size_bytes(self, packed: Any) -> int:
+        """Return how large a request is."""
+        ...
+
     def refuse(self, packed: Any, why: str) -> None:
         """Tell who asked that the request is not taken."""
         ...
@@ -79,6 +83,7 @@ class RosServer:
         """Join the domain and create all topics; raises TransportError where another server answers already."""
         self.address = namespace_of(wiring)
         self._queued = Queued.around(handler, wiring.limits)
+        self._limits, self._held_bytes, self._holding = wiring.limits, 0, Lock()
         if not wiring.restarted:
             refuse_company(wiring, self.address)
         self.middleware = join(wiring, "server")
@@ -123,20 +128,37 @@ class RosServer:
             return None
         trace = Trace()
         trace.mark("network")
+        size = front.size_bytes(packed)
+        try:
+            self._hold(size)
+        except RequestFailed as error:
+            front.refuse(packed, str(error))
+            return None
         try:
             turn = self._queued.turns.join()
         except Busy as error:
+            self._hold(-size)
             front.refuse(packed, str(error))
             return None
-        return partial(self._answer_in, turn, front, packed, trace)
+        return partial(self._answer_in, turn, front, packed, size, trace)
 
-    def _answer_in(self, turn: Turn, front: Front, packed: Any, trace: Trace) -> None:
+    def _hold(self, size: int) -> None:
+        """Count what all requests hold; raises RequestFailed for one that is too large, or too large now."""
+        with self._holding:
+            if size > self._limits.body_bytes:
+                raise RequestFailed(f"the request is larger than {self._limits.body_bytes} bytes")
+            if self._held_bytes + size > self._limits.in_flight_bytes:
+                raise Busy(f"requests of {self._limits.in_flight_bytes} bytes are under way already")
+            self._held_bytes += size
+
+    def _answer_in(self, turn: Turn, front: Front, packed: Any, size: int, trace: Trace) -> None:
         """Unpack a request, and answer it when its turn comes."""
         try:
             if (job := front.job(packed, trace)) is not None:
                 self._answer(job, turn)
         finally:
             turn.leave()
+            self._hold(-size)
 
     def _answer(self, job: Job, turn: Turn) -> None:
         """Answer one request; what goes wrong goes back to who asked."""

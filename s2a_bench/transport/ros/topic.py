@@ -128,6 +128,10 @@ class TopicFront:
         trace.mark("cdr_parse")
         return TopicJob(self, message, trace, self._cache)
 
+    def size_bytes(self, packed: Any) -> int:
+        """Return the size of its CDR."""
+        return len(packed)
+
     def refuse(self, packed: Any, why: str) -> None:
         """Answer a request with an error only; raises TransportError for bytes that are no request."""
         request_id = self._requests.unpack(packed).id
