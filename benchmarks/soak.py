@@ -1,0 +1,348 @@
+"""Hostile and honest clients together on a server that runs: ``python -m benchmarks.soak http|ros [--minutes M]``.
+
+The server is a `serve` process, and so is its twin, which nobody attacks: the idle latency of the one is divided by
+that of the other in interleaved blocks, before the load and after it, so that what else the machine does cancels out.
+The hostile clients are those of `s2a_bench.testing.hostile`. They load the server before anything is measured too: the
+memory that a pool keeps for good is no growth. Prints what came of it, writes it as JSON, and exits with 1 where a
+promise is broken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from statistics import median
+from threading import Event, Lock, Thread
+from typing import Any
+
+import httpx
+
+from s2a_bench.errors import RequestFailed, S2AError
+from s2a_bench.stats.change import ratio_of_blocks
+from s2a_bench.testing.hostile import http, ros
+from s2a_bench.testing.hostile.usage import Usage, family, usage
+from s2a_bench.testing.transport import ask, wiring
+from s2a_bench.transport import Client, Wiring, open_client
+from s2a_bench.transport.http.own import PATHS
+from s2a_bench.types import Request
+
+PROMPT, TOKENS = "go on and stop", 8
+PATIENCE_S, READY_S, SETTLES_S = 120.0, 300.0, 45.0
+SILENCE_S = 30.0
+"""Over ROS the last messages of an answer may be lost: a client hears nothing, and asks again."""
+WARM_UP = 0.2
+"""Of the minutes, before them."""
+HOSTILE = {"http": http.CLIENTS, "ros": ros.SERVER_CLIENTS}
+WARM_UP_ONLY = frozenset({"a prompt of 16 MiB", "8 requests of 16 MiB"})
+"""Over ROS requests are received on many threads, and glibc keeps the most that each ever held (machine/tuning.py):
+with these the memory swings by 150 MiB, which would hide growth."""
+HONEST = {"http": ("http", "http/best-effort", "whole"), "ros": ("ros/topic", "ros/topic", "ros/action")}
+"""What the honest clients speak; "whole" is an answer that is not streamed."""
+ATTACKERS = 3
+BLOCK = {"echo": 20}
+"""Requests of a block of idle latencies; of an engine that computes a quarter."""
+GROWTH_MIB, PEAK_MIB, SLOWER = 20.0, 1024.0, 1.2
+REFUSED = re.compile(r"requests are waiting|are under way|rejected the goal|answered 503")
+LOST = re.compile(r"^(no token|no feedback) for|letters|came instead of|marks did not arrive")
+
+
+@dataclass
+class Served:
+    """A `serve` process."""
+
+    process: subprocess.Popen[str]
+    address: str
+
+
+@dataclass
+class Result:
+    """What came of a soak."""
+
+    transport: str
+    engine: str
+    minutes: float
+    asked: int = 0
+    answered: int = 0
+    refused: int = 0
+    """Times that an honest request was told to come again."""
+    lost: int = 0
+    """Times that messages of an answer were lost, which the client was told or saw by the silence; it came again."""
+    failed: list[str] = field(default_factory=list)
+    attacks: int = 0
+    idle_ms_before: float = 0.0
+    idle_ms_after: float = 0.0
+    slower: float | None = None
+    """Idle latency after by before, each relative to the twin's."""
+    slower_low: float | None = None
+    slower_high: float | None = None
+    before: Usage | None = None
+    after: Usage | None = None
+    peak_mib: float = 0.0
+    survived: bool = False
+    ended_s: float = 0.0
+    exit_code: int | None = None
+
+    @property
+    def growth_mib(self) -> float:
+        """Return how much more resident memory the server has than before the load."""
+        return self.after.rss_mib - self.before.rss_mib if self.before and self.after else 0.0
+
+    def broken(self) -> list[str]:
+        """Return the promises that were broken."""
+        before, after = self.before, self.after
+        assert before  # noqa: S101 - measured
+        assert after  # noqa: S101 - measured
+        promises = {
+            "the server ended under the load": self.survived,
+            f"{self.asked - self.answered} of {self.asked} honest requests were not answered: {self.failed[:3]}": (
+                self.asked == self.answered > 0
+            ),
+            f"{after.threads - before.threads} threads are left": after.threads <= before.threads,
+            f"{after.descriptors - before.descriptors} descriptors are left": after.descriptors <= before.descriptors,
+            f"the memory has grown by {self.growth_mib:.0f} MiB": self.growth_mib < GROWTH_MIB,
+            f"the server held {self.peak_mib:.0f} MiB": self.peak_mib < PEAK_MIB,
+            f"the idle latency is {self.slower or 0:.2f} times that of before": (self.slower_low or 0) <= SLOWER,
+            f"SIGTERM ended it in {self.ended_s:.1f} s with {self.exit_code}": self.exit_code == 0,
+        }
+        return [said for said, kept in promises.items() if not kept]
+
+
+@contextmanager
+def served(transport: str, engine: str, name: str, log: Path) -> Iterator[Served]:
+    """Run `serve`, which ends with the context; what it writes to standard error goes to ``log``."""
+    line = [sys.executable, "-m", "s2a_bench", "serve", transport, "--engine", engine]
+    line += ["--port", "0"] if transport == "http" else ["--namespace", f"/{name}_{os.getpid()}"]
+    with (
+        log.open("a") as errors,
+        subprocess.Popen(line, stdout=subprocess.PIPE, stderr=errors, text=True) as process,  # noqa: S603 - ours
+    ):
+        try:
+            assert process.stdout  # noqa: S101 - a pipe
+            if not select.select([process.stdout], [], [], READY_S)[0]:
+                raise TimeoutError(f"the server said nothing for {READY_S:g} s")
+            said = process.stdout.readline()
+            found = re.search(r"http://[\d.:]+", said) if transport == "http" else re.search(rf"/{name}_\d+", said)
+            if found is None:
+                raise RuntimeError(f"the server said: {said}")
+            yield Served(process, found[0])
+        finally:
+            process.kill()
+
+
+def told(name: str, address: str) -> Wiring[Any]:
+    """Return what a client of a server is told."""
+    silence_s = PATIENCE_S if name.startswith("http") else SILENCE_S
+    return wiring(name, address, timeout_s=silence_s, max_tokens=TOKENS)
+
+
+class Honest:
+    """A client that means well: it comes again when told to, and looks at its answer."""
+
+    def __init__(self, name: str, address: str) -> None:
+        """Connect."""
+        self._url = address + PATHS["as-deployed"]
+        self._client: Client | None = None if name == "whole" else open_client(told(name, address))
+
+    def ask(self) -> int:
+        """Return how many tokens answered; raises RequestFailed."""
+        if self._client is not None:
+            return len(ask(self._client, Request(f"soak-{random.random()}", PROMPT, max_tokens=TOKENS))[0])  # noqa: S311
+        body = {"messages": [{"role": "user", "content": PROMPT}], "max_tokens": TOKENS}
+        try:
+            answer = httpx.post(self._url, json=body, timeout=PATIENCE_S, trust_env=False)
+        except httpx.HTTPError as error:
+            raise RequestFailed(f"whole: {type(error).__name__}: {error}") from error
+        if answer.is_error:
+            raise RequestFailed(f"answered {answer.status_code}: {answer.text}")
+        return int(answer.json()["usage"]["completion_tokens"])
+
+    def close(self) -> None:
+        """Leave."""
+        if self._client is not None:
+            self._client.close()
+
+
+class Load:
+    """Clients of both kinds, each on a thread of its own, until told to stop."""
+
+    def __init__(self, result: Result, address: str, without: frozenset[str] = frozenset()) -> None:
+        """Start nothing yet."""
+        self._result, self._address = result, address
+        self._cases = [case for case in HOSTILE[result.transport] if case.name not in without]
+        self._over, self._lock = Event(), Lock()
+        self.attacks: Counter[str] = Counter()
+
+    def run(self, seconds: float) -> None:
+        """Load the server."""
+        names = HONEST[self._result.transport]
+        threads = [Thread(target=self._honest, args=(name,)) for name in names]
+        threads += [Thread(target=self._hostile, args=(seed,)) for seed in range(ATTACKERS)]
+        for thread in threads:
+            thread.start()
+        time.sleep(seconds)
+        self._over.set()
+        for thread in threads:
+            thread.join()
+
+    def _honest(self, name: str) -> None:
+        try:
+            with closing(Honest(name, self._address)) as client:
+                while not self._over.is_set():
+                    error = self._insist(client)
+                    with self._lock:
+                        self._result.asked += 1
+                        self._result.answered += not error
+                        self._result.failed += [f"{name}: {error}"] * bool(error)
+                    time.sleep(0.02)
+        except S2AError as error:
+            with self._lock:
+                self._result.asked += 1
+                self._result.failed.append(f"{name}: {error}")
+
+    def _insist(self, client: Honest) -> str:
+        """Ask until answered, for as long as it is refused or messages are lost; return what was wrong."""
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                tokens = client.ask()
+            except S2AError as error:
+                refused, lost = bool(REFUSED.search(str(error))), bool(LOST.search(str(error)))
+                with self._lock:
+                    self._result.refused += refused
+                    self._result.lost += lost
+                if not (refused or lost) or time.monotonic() > deadline:
+                    return f"{type(error).__name__}: {error}"[:300]
+                time.sleep(0.2)
+            else:
+                return "" if tokens else "an empty answer"
+
+    def _hostile(self, seed: int) -> None:
+        cases = [*self._cases]
+        chosen = random.Random(seed)  # noqa: S311 - not secret
+        while not self._over.is_set():
+            chosen.shuffle(cases)
+            for case in cases:
+                if self._over.is_set():
+                    return
+                self.attack(case)
+
+    def attack(self, case: Any) -> None:
+        """Let one hostile client do its work."""
+        with suppress(OSError, S2AError):  # whatever becomes of it
+            case.does(told(HONEST[self._result.transport][0], self._address))
+        with self._lock:
+            self.attacks[case.name] += 1
+
+
+Blocks = dict[int, list[float]]
+
+
+def idle(client: Client, twin: Client, blocks: int, of: int) -> tuple[list[float], Blocks]:
+    """Return the latencies in ms of interleaved blocks, and by block those relative to the twin's median."""
+    plain: list[float] = []
+    relative: Blocks = {}
+    for block in range(blocks):
+        taken: dict[bool, list[float]] = {}
+        for ours in (True, False) if block % 2 else (False, True):
+            taken[ours] = [latency_ms(client if ours else twin) for _ in range(of)]
+        plain += taken[True]
+        relative[block] = [value / median(taken[False]) for value in taken[True]]
+    return plain, relative
+
+
+def latency_ms(client: Client) -> float:
+    """Return how long one whole answer takes."""
+    began = time.perf_counter()
+    ask(client, Request("idle", PROMPT, max_tokens=TOKENS))
+    return (time.perf_counter() - began) * 1e3
+
+
+def settled(pid: int, before: Usage, client: Client) -> Usage:
+    """Return what the server uses once nothing is left, or `SETTLES_S` are over; requests let its pool shrink."""
+    deadline = time.monotonic() + SETTLES_S
+    while True:
+        now = usage(pid)
+        if (now.threads <= before.threads and now.descriptors <= before.descriptors) or time.monotonic() > deadline:
+            return now
+        with suppress(S2AError):
+            latency_ms(client)
+        time.sleep(0.5)
+
+
+def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = 15) -> Result:
+    """Load a server for so long and return what came of it."""
+    result = Result(transport, engine, minutes)
+    with ExitStack() as stack:
+        server = stack.enter_context(served(transport, engine, "soak", log))
+        twin = stack.enter_context(served(transport, engine, "twin", log))
+        pid = server.process.pid
+
+        def quiet(before: Usage | None, blocks: int) -> tuple[Usage, list[float], Blocks]:
+            with ExitStack() as clients:  # one that does not read for minutes would have heard all the attackers
+                name = HONEST[transport][0]
+                client, other = (
+                    clients.enter_context(closing(open_client(told(name, each.address)))) for each in (server, twin)
+                )
+                idle(client, other, 1, 5)
+                uses = settled(pid, before or usage(pid), client)
+                return uses, *idle(client, other, blocks, BLOCK.get(engine, 5))
+
+        bare, _, _ = quiet(None, 1)
+        Load(Result(transport, engine, minutes), server.address).run(minutes * 60 * WARM_UP)
+        result.before, plain_before, relative_before = quiet(bare, blocks)
+        processes, load = [*family(pid)], Load(result, server.address, WARM_UP_ONLY)
+        load.run(minutes * 60)
+        result.after, plain_after, relative_after = quiet(result.before, blocks)
+        result.survived = server.process.poll() is None and processes == [*family(pid)]
+        result.peak_mib, result.attacks = usage(pid).peak_mib, load.attacks.total()
+        result.idle_ms_before, result.idle_ms_after = median(plain_before), median(plain_after)
+        later = {block + blocks: values for block, values in relative_after.items()}
+        if (ratio := ratio_of_blocks(later, relative_before, 1)) is not None:
+            result.slower, result.slower_low, result.slower_high = ratio.value, ratio.low, ratio.high
+        began = time.monotonic()
+        server.process.send_signal(signal.SIGTERM)
+        with suppress(subprocess.TimeoutExpired):
+            result.exit_code = server.process.wait(10)
+        result.ended_s = time.monotonic() - began
+    return result
+
+
+def result_json(result: Result) -> dict[str, Any]:
+    """Return it as plain data."""
+    plain = {name: value for name, value in vars(result).items() if name not in {"before", "after", "failed"}}
+    uses = {name: asdict(use) for name in ("before", "after") if (use := getattr(result, name))}
+    told = {"failed": len(result.failed), "failures": result.failed[:20], "growth_mib": result.growth_mib}
+    return {**plain, **uses, **told, "broken": result.broken()}
+
+
+def main() -> None:
+    """Soak, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("transport", choices=[*HOSTILE])
+    parser.add_argument("--engine", default="echo", help="echo, llama (the tiny dummy), ...")
+    parser.add_argument("--minutes", type=float, default=10)
+    parser.add_argument("--output", type=Path, help="[default: soak-TRANSPORT-ENGINE.json]")
+    given = parser.parse_args()
+    output = given.output or Path(f"soak-{given.transport}-{given.engine}.json")
+    whole = result_json(soak(given.transport, given.engine, given.minutes, output.with_suffix(".log")))
+    text = json.dumps(whole, indent=1)
+    output.write_text(text + "\n")
+    print(text)
+    sys.exit(1 if whole["broken"] else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,26 @@
+"""Whatever is killed, whenever: the client ends with one line within its bound, and others are answered."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from benchmarks.faults import FAULTS, Fault, outcomes
+
+SHORT = {"http/best-effort", "ros/topic"}
+"""The transports of the shorter form; `make hostile` runs all."""
+WHOLE = os.environ.get("S2A_HOSTILE") == "whole"
+
+
+@pytest.fixture(scope="module")
+def came(request: pytest.FixtureRequest) -> dict[Fault, str]:
+    """What came of the faults of all tests that were chosen: those of several transports happen at once."""
+    chosen = [getattr(item, "callspec", None) for item in request.session.items]
+    return outcomes([call.params["fault"] for call in chosen if call is not None and "fault" in call.params])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [fault for fault in FAULTS if WHOLE or fault.transport in SHORT], ids=str)
+def test_what_comes_of_a_fault_is_what_is_promised(fault: Fault, came: dict[Fault, str]) -> None:
+    assert came[fault] in fault.promised
