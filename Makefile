@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-coverage bench-policy bench-ray test test-all check check-platforms fuzz core mutate setup clean
+.PHONY: bench bench-coverage bench-policy bench-ray test test-all check check-platforms fuzz hostile core mutate setup clean
 
 # The main job: the transports alone (no model) with raw pixels and with JPEG, for which wheels suffice; then llama.cpp
 # is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
@@ -40,6 +40,10 @@ fuzz: setup
 
 test-all: setup
 	$(BIN)/python -m pytest
+
+# Everything that is tested against hostile peers, faults and load; `make test-all` has it with two transports' faults.
+hostile: setup
+	S2A_HOSTILE=whole $(BIN)/python -m pytest tests/hostile -o junit_family=xunit1 --junitxml=hostile.xml
 
 check: setup
 	$(BIN)/ruff check
