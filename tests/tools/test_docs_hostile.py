@@ -6,8 +6,12 @@ import runpy
 from pathlib import Path
 
 XML = """<testsuites><testsuite>
-<testcase name="test_a[one]"><properties><property name="cost" value="http, server: 1.50 s, 90 MiB"/></properties></testcase>
-<testcase name="test_a[two]"><properties><property name="cost" value="http, server: 0.25 s, 700 MiB"/></properties></testcase>
+<testcase name="test_a[one]">
+<properties><property name="cost" value="http, server: 1.50 s, 90 MiB"/></properties>
+</testcase>
+<testcase name="test_a[two]">
+<properties><property name="cost" value="http, server: 0.25 s, 700 MiB"/></properties>
+</testcase>
 <testcase name="test_b"/>
 </testsuite></testsuites>"""
 
