@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,17 @@ from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.ccrb.view import show
 from s2a_bench.experiments.ccrb.view.figures import build_scenario
-from s2a_bench.experiments.ccrb.view.outcomes import Share, rate_span, rate_span_here, scenes_of, share_of
+from s2a_bench.experiments.ccrb.view.outcomes import (
+    Share,
+    cells_of,
+    configuration,
+    rate_span,
+    rate_span_here,
+    scenes_of,
+    share_of,
+)
 from s2a_bench.experiments.ccrb.view.phase_figure import build_phase, region_of
-from s2a_bench.experiments.ccrb.view.sentences import findings
+from s2a_bench.experiments.ccrb.view.sentences import findings, origin_notes
 from s2a_bench.experiments.ccrb.view.tables import ccrb_json, ccrb_tables
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.options import CcrbOptions
@@ -73,13 +82,24 @@ def test_acting_at_once_is_more_often_better_than_worse(made: Callable[..., Run]
         assert share_of(scenes, "naive_better").k > share_of(scenes, "naive_worse").k
 
 
-def test_with_an_idm_follower_the_operating_point_turns_round(made: Callable[..., Run]) -> None:
-    run = made(scenario=CcrbOptions(follower="idm"), **GRID)
+def test_with_the_hybrid_follower_the_operating_point_turns_round(made: Callable[..., Run]) -> None:
+    run = made(scenario=CcrbOptions(follower="hybrid"), **GRID)
     point = run.table(ROLLOUTS)[run.table(ROLLOUTS)["study"] == "point"].set_index("policy")
     assert point["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "rear"}
     assert point["rear_impact_mps"]["stream-to-act"] > point["rear_impact_mps"]["naive"] + 1
     assert rate_span_here(run, "stop") is None
     assert share_of(scenes_of(run, "phase", "stop"), "paper").value < 0.02
+
+
+def test_a_folder_from_before_reads_its_idm_as_the_hybrid_that_it_was(made: Callable[..., Run]) -> None:
+    new = made(scenario=CcrbOptions(follower="idm"))
+    assert configuration(new)["follower"] == "idm"
+    assert {cell["follower"] for cell in cells_of(new)} == {"idm"}
+    manifest = {name: value for name, value in new.manifest.items() if name != "follower_law"}
+    old = replace(new, manifest=manifest)
+    assert configuration(old)["follower"] == "hybrid"
+    assert {cell["follower"] for cell in cells_of(old)} == {"hybrid"}
+    assert "hybrid follower" in " ".join(origin_notes(old))
 
 
 def test_in_random_scenarios_the_ordering_is_rare_and_waiting_is_worse(made: Callable[..., Run]) -> None:
@@ -175,7 +195,7 @@ def test_the_run_shows_what_its_options_ask_for(made: Callable[..., Run]) -> Non
     ("asked", "message"),
     [
         ({"simulator": "gazebo"}, "`simulator`: 'gazebo' is none of longitudinal, embedded, carla"),
-        ({"scenario": {"follower": "drunk"}}, "`follower`: 'drunk' is none of careful, idm"),
+        ({"scenario": {"follower": "drunk"}}, "`follower`: 'drunk' is none of careful, hdm, idm, hybrid"),
         ({"scenario": {"gap": "panic"}}, "`gap`: 'panic' should be 'stop', 'coast', 'hold' or 'cruise'"),
         ({"scenario": {"front_gap_m": 0.0}}, "`front_gap_m`: 0.0 should be greater than 0"),
         ({"scenario": {"n_skills": 0}}, "`n_skills`: 0 should be greater than or equal to 1"),

@@ -55,6 +55,7 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
         source = RoadSource(config.scenario.cars, requests.width, requests.height, fps=requests.fps)
         manifest = {
             "configuration": {**config.to_manifest(), "live": {**live.to_manifest(), "source": source.name}},
+            "follower_law": config.scenario.follower_law,
             "stages": requests.stages,
             "facts": requests.facts,
             "environment": environment.collect(requests.packages),

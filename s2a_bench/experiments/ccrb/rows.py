@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 from s2a_bench.plan.skillset import GAPS
+from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
 from s2a_bench.store.bounds import Count, Facts, Many, NonNegative, Positive, about
 from s2a_bench.store.schema import Table
@@ -33,7 +34,7 @@ class RolloutRow:
     title: str
     emulated: Annotated[bool, about("True where no model answered.")]
     simulator: Annotated[str, {"enum": ["longitudinal", "embedded", "carla"]}]
-    follower: Annotated[str, {"enum": ["careful", "idm"]}]
+    follower: Annotated[str, {"enum": list(FOLLOWERS)}]
     gap_behaviour: Annotated[str, {"enum": list(GAPS)}]
     reflex: bool
     lane_change: bool

@@ -38,6 +38,7 @@ def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
             "configuration": config.to_manifest(),
             "environment": environment.collect(),
             "seeds": {"plans": config.seed},
+            "follower_law": config.scenario.follower_law,
             "boards": [{name: getattr(board, name) for name in _BOARD}],
             "provenance": Origins(board.provenance).to_manifest(),
         }

@@ -14,6 +14,8 @@ from typing import Final
 
 FOLLOWERS: Final[dict[str, str]] = {
     "careful": "s2a_bench.scenario.ccrb.follower:Careful",
+    "hdm": "s2a_bench.scenario.ccrb.follower:Hdm",
     "idm": "s2a_bench.scenario.ccrb.follower:Idm",
+    "hybrid": "s2a_bench.scenario.ccrb.follower:Hybrid",
 }
 """Laws of the car behind, by name."""

@@ -24,8 +24,7 @@ NCAP_DECELS_MPS2: Final = (2.0, 6.0)
 LEAD_JERK_MPS3: Final = 6.0
 """How fast the lead's braking builds up."""
 EGO_MOST_MPS2, EGO_LEAST_MPS2 = 2.0, -8.0
-"""What the ego can do; its full braking is also what the gap behaviour *stop* does."""
-EGO_JERK_MPS3: Final = 30.0
+"""What the ego can do."""
 EGO_LOOP_S: Final = 0.3
 """Time constant of the ego's speed control."""
 LEAST_IMPACT_MPS: Final = 0.5
@@ -52,6 +51,14 @@ class Cars:
     """What the ego does between skills, while none is valid; one name, or an array of them."""
     follower: str = "careful"
     """The trailing car's law, a name of FOLLOWERS."""
+    gap_decel_mps2: ArrayLike = 8.0
+    """How hard the gap behaviour *stop* brakes."""
+    ego_jerk_mps3: ArrayLike = 30.0
+    """How fast the ego's acceleration changes at most."""
+    build_s: ArrayLike = 0.6
+    """How long the trailing car's full brake force takes to build up."""
+    onset_s: ArrayLike = 0.0
+    """When the lead begins to brake, counted from the request; until then all drive at v0."""
     reflex: bool = False
     """Whether the ego brakes by itself where the plan would not: `ego.Reflex`."""
 

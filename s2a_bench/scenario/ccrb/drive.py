@@ -12,7 +12,7 @@ from s2a_bench.policy import Schedule
 from s2a_bench.scenario import EGO, LEAD, REAR, Command, Simulator, State
 from s2a_bench.scenario.ccrb.cars import LEAD_JERK_MPS3, Cars, DrivingPlan
 from s2a_bench.scenario.ccrb.ego import DONE, Ego
-from s2a_bench.scenario.ccrb.follower import Seen, follower
+from s2a_bench.scenario.ccrb.follower import Motion, Seen, follower
 from s2a_bench.scenario.ccrb.outcome import Outcomes, Watch
 from s2a_bench.scenario.lockstep import LockStep
 
@@ -89,6 +89,8 @@ class _Drive:
         self._ego = Ego(cars, plan, schedule, rollouts)
         self._rear = follower(cars, rollouts)
         self._lead_decel = np.broadcast_to(np.asarray(cars.lead_decel_mps2, float), (rollouts,))
+        self._onset_s = np.broadcast_to(np.asarray(cars.onset_s, float), (rollouts,))
+        self._begin_s = min(float(self._onset_s.min()), 0.0)
         position, speed = np.zeros((3, rollouts)), np.empty((3, rollouts))
         position[LEAD], position[REAR] = cars.front_gap_m, -np.asarray(cars.rear_gap_m, float)
         speed[:] = cars.speed_mps
@@ -105,9 +107,9 @@ class _Drive:
         """Step until all is decided."""
         step_s = self._simulator.step_s
         every = max(round(RECORD_S / step_s), 1)
-        last = int((float(self._ego.end_s.max()) + AFTER_S) / step_s)
+        last = int((float(self._ego.end_s.max()) + AFTER_S - self._begin_s) / step_s)
         for step in range(last):
-            self._decide(step * step_s)
+            self._decide(self._begin_s + step * step_s)
             if record and step % every == 0:
                 now = (self._state, self._acceleration.copy(), self._ego.phase, self._ego.index.copy())
                 self._records.append(now)
@@ -134,6 +136,7 @@ class _Drive:
         self._left = self._left[columns]
         self._seen_at_rest = self._seen_at_rest[columns]
         self._lead_decel = self._lead_decel[columns]
+        self._onset_s = self._onset_s[columns]
         self._acceleration = self._acceleration[:, columns]
         now = self._state
         self._state = State(now.position_m[:, columns], now.speed_mps[:, columns], now.lateral_m[:, columns])
@@ -142,10 +145,11 @@ class _Drive:
     def _decide(self, now_s: float) -> None:
         """Ask the three cars' laws for the next step."""
         state, step_s, acceleration = self._state, self._simulator.step_s, self._acceleration
-        seen = self._delay.see(state, self._ego.acceleration_mps2)
-        self._seen_at_rest = seen.ego_speed_mps <= 0
+        seen = self._delay.see(state, self._ego.acceleration_mps2, acceleration[REAR])
+        self._seen_at_rest = seen.ego_then.speed_mps <= 0
         lead = acceleration[LEAD]
-        np.maximum(lead - LEAD_JERK_MPS3 * step_s, -self._lead_decel, out=lead)
+        braking = now_s >= self._onset_s - 1e-12
+        np.maximum(lead - LEAD_JERK_MPS3 * step_s, -self._lead_decel, out=lead, where=braking)
         lead_decel = np.where(state.speed_mps[LEAD] > 0, -lead, 0.0)
         gap = state.position_m[LEAD] - state.position_m[EGO]
         acceleration[EGO] = self._ego.decide(
@@ -169,7 +173,7 @@ class _Drive:
         """Stack the records."""
         states = [state for state, *_ in self._records]
         return Trajectory(
-            time_s=np.arange(len(states), dtype=np.float64) * step_s,
+            time_s=self._begin_s + np.arange(len(states), dtype=np.float64) * step_s,
             position_m=np.stack([state.position_m for state in states]),
             speed_mps=np.stack([state.speed_mps for state in states]),
             lateral_m=np.stack([state.lateral_m for state in states]),
@@ -180,7 +184,7 @@ class _Drive:
 
 
 class Delay(LockStep):
-    """Remembers what was, each roll-out with its own delay; before the beginning all cars drove at a steady speed."""
+    """Remembers ego and trailing car, each roll-out with its own delay; before the beginning they kept their speed."""
 
     def __init__(self, position_m: Floats, speed_mps: Floats, delay_s: Floats, step_s: float) -> None:
         rollouts = position_m.shape[1]
@@ -190,9 +194,10 @@ class Delay(LockStep):
         self._columns = np.arange(rollouts)
         before = np.arange(-self._size, 0)[:, np.newaxis] * step_s
         # What is seen together lies together: with delays of their own, roll-outs read from all over the memory.
-        self._past = np.zeros((self._size, rollouts, 3))
-        self._past[..., 0] = position_m[EGO] + before * speed_mps[EGO]
-        self._past[..., 1] = speed_mps[EGO]
+        self._past = np.zeros((self._size, rollouts, 6))
+        for first, car in ((0, EGO), (3, REAR)):
+            self._past[..., first] = position_m[car] + before * speed_mps[car]
+            self._past[..., first + 1] = speed_mps[car]
         self._head = -1
 
     def keep(self, columns: NDArray[np.int64]) -> None:
@@ -201,14 +206,19 @@ class Delay(LockStep):
         self._steps = self._steps[columns]
         self._columns = np.arange(len(columns))
 
-    def see(self, state: State, ego_acceleration: Floats) -> Seen:
-        """Remember the present, and return it beside what the driver behind reacts to."""
+    def see(self, state: State, ego_acceleration: Floats, rear_acceleration: Floats) -> Seen:
+        """Remember the present, and return it beside what was a reaction time ago."""
+        # A brake that holds a car at rest does not slow it down.
+        own_acceleration = np.where(state.speed_mps[REAR] > 0, rear_acceleration, np.maximum(rear_acceleration, 0.0))
+        ego = Motion(state.position_m[EGO], state.speed_mps[EGO], ego_acceleration)
+        own = Motion(state.position_m[REAR], state.speed_mps[REAR], own_acceleration)
         self._head = (self._head + 1) % self._size
         now = self._past[self._head]
-        now[:, 0], now[:, 1], now[:, 2] = state.position_m[EGO], state.speed_mps[EGO], ego_acceleration
+        for first, car in ((0, ego), (3, own)):
+            now[:, first], now[:, first + 1], now[:, first + 2] = car.position_m, car.speed_mps, car.acceleration_mps2
         if self._same:
             then = self._past[(self._head - self._steps[0]) % self._size]
         else:
             then = self._past[(self._head - self._steps) % self._size, self._columns]
         then = np.ascontiguousarray(then.T)
-        return Seen(then[0], then[1], then[2], state.position_m[REAR], state.speed_mps[REAR])
+        return Seen(ego, own, Motion(*then[:3]), Motion(*then[3:]))

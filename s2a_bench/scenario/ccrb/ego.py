@@ -15,7 +15,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.plan.skillset import GAPS, Gap
 from s2a_bench.policy import Schedule
 from s2a_bench.scenario.ccrb.braking import needed
-from s2a_bench.scenario.ccrb.cars import EGO_JERK_MPS3, EGO_LEAST_MPS2, EGO_LOOP_S, EGO_MOST_MPS2, Cars, DrivingPlan
+from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, EGO_LOOP_S, EGO_MOST_MPS2, Cars, DrivingPlan
 from s2a_bench.scenario.lockstep import LockStep
 
 if TYPE_CHECKING:
@@ -28,13 +28,13 @@ PHASES: Final = ("waiting", "acting", "gap", "done")
 REFLEX_MPS2, REFLEX_TTC_S = 4.0, 1.5
 """The reflex brakes fully where more than this is required, or contact is nearer."""
 
-BETWEEN: dict[Gap, Callable[[Floats, Floats, Floats], Floats]] = {
-    "stop": lambda speed, _slope, _first: np.full(speed.shape, EGO_LEAST_MPS2),
-    "coast": lambda speed, _slope, _first: np.zeros(speed.shape),
-    "hold": lambda _speed, slope, _first: slope,
-    "cruise": lambda speed, _slope, first: (first - speed) / EGO_LOOP_S,
+BETWEEN: dict[Gap, Callable[[Floats, Floats, Floats, Floats], Floats]] = {
+    "stop": lambda _speed, _slope, _first, hard: -hard,
+    "coast": lambda speed, _slope, _first, _hard: np.zeros(speed.shape),
+    "hold": lambda _speed, slope, _first, _hard: slope,
+    "cruise": lambda speed, _slope, first, _hard: (first - speed) / EGO_LOOP_S,
 }
-"""Gap behaviour -> wanted acceleration, of the speed, the last skill's slope, and v0."""
+"""Gap behaviour -> wanted acceleration, of the speed, the last skill's slope, v0, and how hard *stop* brakes."""
 
 
 class Ego(LockStep):
@@ -50,6 +50,8 @@ class Ego(LockStep):
         self._points = np.broadcast_to(plan.set_point_mps, (shape[0] + 1, rollouts))
         self._lanes = (0, *plan.lane)
         self._gaps = gaps
+        self._hard_mps2 = np.broadcast_to(np.asarray(cars.gap_decel_mps2, float), (rollouts,))
+        self._jerk_mps3 = np.broadcast_to(np.asarray(cars.ego_jerk_mps3, float), (rollouts,))
         self._between = {gap: rule for gap, rule in BETWEEN.items() if (gaps == gap).any()}
         self._reflex = Reflex(rollouts) if cars.reflex else None
         self._index = np.full(rollouts, -1)
@@ -80,11 +82,12 @@ class Ego(LockStep):
         between = self.phase == GAP
         if between.any():
             for gap, rule in self._between.items():
-                wish = np.where(between & (self._gaps == gap), rule(speed, self._slope, self._points[0]), wish)
+                wanted = rule(speed, self._slope, self._points[0], self._hard_mps2)
+                wish = np.where(between & (self._gaps == gap), wanted, wish)
         wish = np.clip(wish, EGO_LEAST_MPS2, EGO_MOST_MPS2)
         if self._reflex is not None:
             wish = self._reflex.limit(wish, speed, gap_m, lead_mps, lead_decel)
-        most = EGO_JERK_MPS3 * step_s
+        most = self._jerk_mps3 * step_s
         self.acceleration_mps2 = self.acceleration_mps2 + np.clip(wish - self.acceleration_mps2, -most, most)
         return self.acceleration_mps2
 

@@ -1,15 +1,19 @@
-"""The car behind: it acts on what it saw a reaction time ago, by a law that the rear outcome hangs on.
+"""The car behind: laws by their published names, all with one brake; the rear outcome hangs on them.
 
-``careful``, in the manner of UN Regulation 157: from the ego's state tau ago, extrapolated over tau with the
+``careful`` (ours, in the manner of UN Regulation 157): from the ego's state tau ago, extrapolated over tau with the
 deceleration it had then, it computes the braking it needs to stay 1 m behind (`braking.needed`), and brakes with that,
 at most 7 m/s^2, once the ego brakes by more than .5 or more than .7 is needed, until it is no faster than the ego.
 
-``idm``: the Intelligent Driver Model (Treiber, Hennecke and Helbing 2000) on the ego of tau ago, extrapolated at
-steady speed (as in their Human Driver Model of 2006: without that, the delay alone makes it run into standing cars).
-Its time headway is what keeps the rear gap of the scenario at v0, so that it is at ease in the beginning. At rest
-behind a car at rest it stays.
+``idm``: the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62 (2000) 1805): no delay.
 
-Either way brake force builds up at 7 / .6 and goes at 7 / .2 m/s^3.
+``hdm``: the delay and the temporal anticipation of the Human Driver Model for one leader, without its estimation errors
+(Treiber, Kesting and Helbing, Physica A 360 (2006) 71): the IDM on s - tau dv, v + tau a, and dv, all of tau ago.
+
+``hybrid`` (ours, called ``idm`` at first): the IDM on its own state now, and the ego of tau ago extrapolated at steady
+speed. It knows its own speed at once, but its closing speed in part late.
+
+The IDM's time headway is what keeps the rear gap of the scenario at v0, so that it is at ease in the beginning; at rest
+behind a car at rest it stays. Every brake gives at most 7 m/s^2, builds up at 7 / .6 and goes at 7 / .2 m/s^3.
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ if TYPE_CHECKING:
     from s2a_bench.policy import Floats
 
 MOST_MPS2: Final = 7.0
-BUILD_S, RELEASE_S = 0.6, 0.2
+RELEASE_S: Final = 0.2
 SPARE_M: Final = 1.0
 """How far behind the ego the careful driver means to stay."""
 ACTS_MPS2: Final = 0.7
@@ -46,18 +50,27 @@ IDM_HASTE: Final = 1.2
 """Desired speed over v0: nobody keeps a steady gap at the speed that they would have alone."""
 IDM_LEAST_HEADWAY_S: Final = 0.1
 
+AT_EASE: Final = "headway such that it keeps its gap at first"
+BRAKE: Final = "at most 7 m/s\N{SUPERSCRIPT TWO}, built up in 0.6 s"
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How a car moves, arrays of shape (M,)."""
+
+    position_m: Floats
+    speed_mps: Floats
+    acceleration_mps2: Floats
+
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the driver acts on, arrays of shape (M,)."""
+    """What a driver can act on: ego and own car as they are, and as they were a reaction time ago."""
 
-    ego_position_m: Floats
-    ego_speed_mps: Floats
-    ego_acceleration_mps2: Floats
-    """These three as they were a reaction time ago."""
-    position_m: Floats
-    speed_mps: Floats
-    """Its own, as they are."""
+    ego: Motion
+    own: Motion
+    ego_then: Motion
+    own_then: Motion
 
 
 class Follower(Protocol):
@@ -75,51 +88,62 @@ class Follower(Protocol):
         ...
 
 
+class Brake(LockStep):
+    """The trailing car's brake: its force builds up slowly and goes fast."""
+
+    def __init__(self, cars: Cars, rollouts: int) -> None:
+        self._build_mps3 = MOST_MPS2 / np.broadcast_to(np.asarray(cars.build_s, float), (rollouts,))
+        self.force_mps2 = np.zeros(rollouts)
+
+    def press(self, want_mps2: Floats, step_s: float) -> Floats:
+        """Return the force after a step towards the wanted one."""
+        change = np.minimum(want_mps2, MOST_MPS2) - self.force_mps2
+        self.force_mps2 += np.clip(change, -MOST_MPS2 / RELEASE_S * step_s, self._build_mps3 * step_s)
+        return self.force_mps2.copy()
+
+
 class Careful(LockStep):
     """The careful driver."""
 
     law: ClassVar[str] = (
-        "careful follower: brakes as needed to stay 1 m behind the ego, seen {reaction:g} s ago and "
-        "extrapolated; at most 7 m/s\N{SUPERSCRIPT TWO}, built up in 0.6 s"
+        "careful follower (ours): brakes as needed to stay 1 m behind the ego, seen {reaction:g} s ago and "
+        f"extrapolated; {BRAKE}"
     )
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
         self._reaction_s = np.broadcast_to(np.asarray(cars.reaction_s, float), (rollouts,))
         self._far_m = np.broadcast_to(np.asarray(cars.rear_gap_m, float), (rollouts,))
         self._braking = np.zeros(rollouts, bool)
-        self._force = np.zeros(rollouts)
+        self._brake = Brake(cars, rollouts)
 
     def acceleration(self, seen: Seen, step_s: float) -> Floats:
         """Predict the ego, and brake as needed."""
-        decel = np.maximum(-seen.ego_acceleration_mps2, 0.0)
+        ego, own = seen.ego_then, seen.own
+        decel = np.maximum(-ego.acceleration_mps2, 0.0)
         until_rest = np.divide(
-            seen.ego_speed_mps,
+            ego.speed_mps,
             decel,
             out=np.full(decel.shape, np.inf),
             where=decel > 1e-6,  # noqa: PLR2004 - none
         )
         ahead_s = np.minimum(self._reaction_s, until_rest)
-        ahead_m = seen.ego_position_m + seen.ego_speed_mps * ahead_s - decel * ahead_s * ahead_s / 2
-        ahead_mps = np.maximum(seen.ego_speed_mps - decel * ahead_s, 0.0)
-        gap_m = ahead_m - seen.position_m
-        need = needed(seen.speed_mps, gap_m - SPARE_M, ahead_mps, decel)
+        ahead_m = ego.position_m + ego.speed_mps * ahead_s - decel * ahead_s * ahead_s / 2
+        ahead_mps = np.maximum(ego.speed_mps - decel * ahead_s, 0.0)
+        gap_m = ahead_m - own.position_m
+        need = needed(own.speed_mps, gap_m - SPARE_M, ahead_mps, decel)
         alarmed = decel > BRAKES_MPS2
-        faster = seen.speed_mps > ahead_mps + 1e-9
+        faster = own.speed_mps > ahead_mps + 1e-9
         self._braking |= alarmed | (need > ACTS_MPS2)
         self._braking &= faster | alarmed
-        want = np.where(self._braking, np.minimum(need, MOST_MPS2), 0.0)
-        self._force = apply_brake(self._force, want, step_s)
-        idle = ~self._braking & (self._force <= 0) & (seen.speed_mps < seen.ego_speed_mps) & (gap_m > self._far_m)
-        return np.where(idle, CATCH_UP_MPS2, -self._force)
+        force = self._brake.press(np.where(self._braking, need, 0.0), step_s)
+        idle = ~self._braking & (force <= 0) & (own.speed_mps < ego.speed_mps) & (gap_m > self._far_m)
+        return np.where(idle, CATCH_UP_MPS2, -force)
 
 
 class Idm(LockStep):
-    """The Intelligent Driver Model with delay."""
+    """The Intelligent Driver Model, without delay."""
 
-    law: ClassVar[str] = (
-        "IDM follower on the ego seen {reaction:g} s ago, headway such that it keeps its gap at first; "
-        "at most 7 m/s\N{SUPERSCRIPT TWO}, built up in 0.6 s"
-    )
+    law: ClassVar[str] = f"IDM follower on the present, without delay; {AT_EASE}; {BRAKE}"
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
         speed = np.broadcast_to(np.asarray(cars.speed_mps, float), (rollouts,))
@@ -127,33 +151,60 @@ class Idm(LockStep):
         self._desired_mps = IDM_HASTE * speed
         at_ease_m = np.asarray(cars.rear_gap_m, float) * np.sqrt(1 - IDM_HASTE**-IDM_EXPONENT)
         self._headway_s = np.maximum((at_ease_m - IDM_STANDSTILL_M) / speed, IDM_LEAST_HEADWAY_S)
-        self._force = np.zeros(rollouts)
+        self._brake = Brake(cars, rollouts)
 
     def acceleration(self, seen: Seen, step_s: float) -> Floats:
-        """Balance the urge to go against the gap, as it would be had the ego kept its speed."""
-        ahead_m = seen.ego_position_m + seen.ego_speed_mps * self._reaction_s
-        gap_m = ahead_m - seen.position_m
-        wish = idm_acceleration(gap_m, seen.speed_mps, seen.ego_speed_mps, self._desired_mps, self._headway_s)
-        self._force = apply_brake(self._force, np.clip(-wish, 0.0, MOST_MPS2), step_s)
-        standing = (seen.speed_mps <= 0) & (seen.ego_speed_mps <= 0)
+        """Balance the urge to go against the gap."""
+        gap_m, speed, closing, ahead = self._perceived(seen)
+        wish = idm_acceleration(gap_m, speed, closing, self._desired_mps, self._headway_s)
+        force = self._brake.press(np.maximum(-wish, 0.0), step_s)
+        standing = (seen.own.speed_mps <= 0) & (ahead.speed_mps <= 0)
         going = np.where(standing, 0.0, np.maximum(wish, 0.0))
-        return np.where(self._force > 0, -self._force, going)
+        return np.where(force > 0, -force, going)
+
+    def _perceived(self, seen: Seen) -> tuple[Floats, Floats, Floats, Motion]:
+        """Return gap, own speed, closing speed, and the ego, as the law is given them."""
+        ego, own = seen.ego, seen.own
+        return ego.position_m - own.position_m, own.speed_mps, own.speed_mps - ego.speed_mps, ego
+
+
+class Hdm(Idm):
+    """The Human Driver Model's delay and temporal anticipation, for one leader and without estimation errors."""
+
+    law: ClassVar[str] = (
+        "HDM follower: IDM on the gap s - T' dv, the speed v + T' a and dv of T' = {reaction:g} s ago, one leader, no "
+        f"estimation errors; {AT_EASE}; {BRAKE}"
+    )
+
+    def _perceived(self, seen: Seen) -> tuple[Floats, Floats, Floats, Motion]:
+        ego, own, ago_s = seen.ego_then, seen.own_then, self._reaction_s
+        closing = own.speed_mps - ego.speed_mps
+        gap_m = ego.position_m - own.position_m - ago_s * closing
+        return gap_m, np.maximum(own.speed_mps + ago_s * own.acceleration_mps2, 0.0), closing, ego
+
+
+class Hybrid(Idm):
+    """The IDM on its own state now, and the ego of a reaction time ago extrapolated at steady speed."""
+
+    law: ClassVar[str] = (
+        "hybrid follower (ours): IDM on its own state now and the ego seen {reaction:g} s ago, extrapolated at steady "
+        f"speed; {AT_EASE}; {BRAKE}"
+    )
+
+    def _perceived(self, seen: Seen) -> tuple[Floats, Floats, Floats, Motion]:
+        ego, own = seen.ego_then, seen.own
+        gap_m = ego.position_m + ego.speed_mps * self._reaction_s - own.position_m
+        return gap_m, own.speed_mps, own.speed_mps - ego.speed_mps, ego
 
 
 def idm_acceleration(
-    gap_m: Floats, speed_mps: Floats, ahead_mps: Floats, desired_mps: Floats, headway_s: Floats
+    gap_m: Floats, speed_mps: Floats, closing_mps: Floats, desired_mps: Floats, headway_s: Floats
 ) -> Floats:
-    """Return a (1 - (v / v_des)^4 - (s* / s)^2) with s* = s0 + v T + v (v - w) / (2 sqrt(a b))."""
-    approach = speed_mps * (speed_mps - ahead_mps) / (2 * np.sqrt(IDM_ACCEL_MPS2 * IDM_COMFORT_MPS2))
+    """Return a (1 - (v / v_des)^4 - (s* / s)^2) with s* = s0 + v T + v dv / (2 sqrt(a b))."""
+    approach = speed_mps * closing_mps / (2 * np.sqrt(IDM_ACCEL_MPS2 * IDM_COMFORT_MPS2))
     wanted_m = np.maximum(IDM_STANDSTILL_M + speed_mps * headway_s + approach, 0.0)
     share = wanted_m / np.maximum(gap_m, 0.01)
     return np.asarray(IDM_ACCEL_MPS2 * (1 - (speed_mps / desired_mps) ** IDM_EXPONENT - share * share))
-
-
-def apply_brake(force_mps2: Floats, want_mps2: Floats, step_s: float) -> Floats:
-    """Return the brake force after a step towards the wanted one: it builds up slowly and goes fast."""
-    change = np.clip(want_mps2 - force_mps2, -MOST_MPS2 / RELEASE_S * step_s, MOST_MPS2 / BUILD_S * step_s)
-    return force_mps2 + change
 
 
 def follower(cars: Cars, rollouts: int) -> Follower:

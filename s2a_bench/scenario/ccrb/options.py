@@ -18,6 +18,7 @@ from s2a_bench.scenario.ccrb.cars import (
     plan_decel,
     start_deadline,
 )
+from s2a_bench.scenario.ccrb.words import law
 
 if TYPE_CHECKING:
     from s2a_bench.plan import Skill
@@ -81,6 +82,11 @@ class CcrbOptions(Options):
             follower=self.follower,
             reflex=self.reflex,
         )
+
+    @property
+    def follower_law(self) -> str:
+        """Return how the car behind drives, in words."""
+        return law(self.model_dump())
 
     @property
     def decel_mps2(self) -> float:

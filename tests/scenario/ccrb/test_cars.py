@@ -13,6 +13,7 @@ from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.scenario import simulator
+from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.braking import needed
 from s2a_bench.scenario.ccrb.cars import SAFETY_M, Cars, braking_plan, start_deadline
 from s2a_bench.scenario.ccrb.drive import drive
@@ -93,14 +94,14 @@ def test_our_idm_is_highway_envs() -> None:
         mine.COMFORT_ACC_MAX, mine.COMFORT_ACC_MIN = 1.5, -IDM_COMFORT_MPS2
         mine.DISTANCE_WANTED, mine.TIME_WANTED, mine.DELTA = IDM_STANDSTILL_M, 0.6, 4.0
         theirs = mine.acceleration(mine, Vehicle(road, np.array([100.0 + gap, 0.0]), speed=ahead))
-        ours = idm_acceleration(*(np.array([value]) for value in (gap, speed, ahead, IDM_HASTE * 13.9, 0.6)))
+        ours = idm_acceleration(*(np.array([value]) for value in (gap, speed, speed - ahead, IDM_HASTE * 13.9, 0.6)))
         assert ours[0] == pytest.approx(theirs, rel=1e-6)
 
 
-def test_at_steady_speed_neither_follower_does_anything() -> None:
+def test_at_steady_speed_no_follower_does_anything() -> None:
     from s2a_bench.policy import Schedule
 
-    for follower in ("careful", "idm"):
+    for follower in FOLLOWERS:
         cars = Cars(follower=follower, front_gap_m=1000.0, lead_decel_mps2=0.01)
         later = Schedule(np.array([[20.0]]), np.array([[2.0]]))
         path = drive(simulator("longitudinal"), cars, braking_plan(cars, 1, 2.0), later, record=True).trajectory

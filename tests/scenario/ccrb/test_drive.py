@@ -17,6 +17,7 @@ from s2a_bench.policy.clairvoyant import Clairvoyant
 from s2a_bench.policy.naive import Naive
 from s2a_bench.policy.wait_then_act import WaitThenAct
 from s2a_bench.scenario import EGO, LEAD, REAR, simulator
+from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import Cars, braking_plan
 from s2a_bench.scenario.ccrb.drive import Driven, drive
 from s2a_bench.scenario.ccrb.ego import ACTING, GAP, WAITING
@@ -32,7 +33,7 @@ LISTED = {
 
 MANY = 40
 seeds = pytest.mark.parametrize("seed", range(2))
-laws = pytest.mark.parametrize("follower", ["careful", "idm"])
+laws = pytest.mark.parametrize("follower", list(FOLLOWERS))
 
 
 def schedule(policy: str, rate: float = 4.8, n_skills: int = 5, t_nom_s: float = 0.8) -> Schedule:
@@ -70,7 +71,7 @@ def test_the_bare_integrator_agrees_with_the_full_simulator(policy: str, gap: st
     assert np.abs(bare.trajectory.speed_mps[:steps] - full.trajectory.speed_mps[:steps]).max() < 0.15
 
 
-@pytest.mark.parametrize("follower", ["careful", "idm"])
+@laws
 def test_in_lock_step_roll_outs_come_out_as_alone(follower: str) -> None:
     gaps, delays = np.array([8.0, 14.0, 20.0, 26.0]), np.array([0.9, 1.3, 1.3, 1.7])
     alone = []
@@ -111,8 +112,8 @@ def test_the_reflex_layer_saves_the_one_who_waits() -> None:
     assert reflex.min_front_gap_m[0] > 0
 
 
-def test_idm_turns_the_rear_outcome_round() -> None:
-    naive, stream = (driven("longitudinal", policy, follower="idm").outcomes for policy in ("naive", "stream"))
+def test_the_hybrid_follower_turns_the_rear_outcome_round() -> None:
+    naive, stream = (driven("longitudinal", policy, follower="hybrid").outcomes for policy in ("naive", "stream"))
     assert stream.name(0) == "rear"
     assert not naive.rear_impact_mps[0] > stream.rear_impact_mps[0] - 0.5
 
@@ -160,7 +161,7 @@ def test_a_world_for_one_refuses_many() -> None:
     ("changed", "message"),
     [
         ({"gap": "panic"}, "`gap`: 'panic'"),
-        ({"follower": "drunk"}, "`follower`: 'drunk' is none of careful, idm"),
+        ({"follower": "drunk"}, "`follower`: 'drunk' is none of careful, hdm, idm, hybrid"),
     ],
 )
 def test_names_that_there_are_not_are_refused(changed: dict[str, str], message: str) -> None:

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import Run
 
+FOLLOWER_LAW: Final = "follower_law"
+"""What a manifest says since followers have their published names."""
+EARLIER_FOLLOWERS: Final = {"idm": "hybrid"}
 _TIMES: Final = ("start", "end", "stall", "deadline")
 
 
@@ -44,7 +47,8 @@ class Share:
 def rollouts_of(run: Run, study: str) -> pd.DataFrame:
     """Return the roll-outs of the operating point (point), the phase diagram (phase) or random scenarios (random)."""
     rows = run.table(ROLLOUTS)
-    return rows[rows["study"] == study].reset_index(drop=True)
+    rows = rows[rows["study"] == study].reset_index(drop=True)
+    return rows if FOLLOWER_LAW in run.manifest else rows.replace({"follower": EARLIER_FOLLOWERS})
 
 
 def cells_of(run: Run) -> list[dict[str, Any]]:
@@ -104,9 +108,11 @@ def has(run: Run, study: str) -> bool:
 
 
 def configuration(run: Run) -> dict[str, Any]:
-    """Return what was asked for."""
+    """Return what was asked for, the follower by the name that it has now."""
     found: dict[str, Any] = run.manifest["configuration"]
-    return found
+    if FOLLOWER_LAW in run.manifest:
+        return found
+    return {**found, "follower": EARLIER_FOLLOWERS.get(found["follower"], found["follower"])}
 
 
 def token_times_s(run: Run) -> list[float]:
