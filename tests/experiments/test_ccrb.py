@@ -32,6 +32,7 @@ from s2a_bench.experiments.ccrb.view.sentences import findings, origin_notes
 from s2a_bench.experiments.ccrb.view.tables import ccrb_json, ccrb_tables
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.options import CcrbOptions
+from s2a_bench.scenario.ccrb.words import MARK, NO_SCORE
 from s2a_bench.store.run import Run, read_run
 
 GRID = {"phase": True, "phase_points": (21, 13)}
@@ -91,6 +92,29 @@ def test_with_the_hybrid_follower_the_operating_point_turns_round(made: Callable
     assert share_of(scenes_of(run, "phase", "stop"), "paper").value < 0.02
 
 
+@pytest.mark.parametrize(("follower", "passes"), [("careful", True), ("hdm", True), ("idm", True), ("hybrid", False)])
+def test_a_rear_outcome_behind_which_no_ego_is_safe_says_nothing(
+    made: Callable[..., Run], follower: str, passes: bool
+) -> None:
+    run = made(scenario=CcrbOptions(follower=follower))
+    assert all(cell["follower_survives"] is passes for cell in cells_of(run))
+    table = ccrb_tables(run)["outcomes"]
+    marked = [row[1] for row in table.rows if MARK in row[1]]
+    assert marked == ([] if passes else [f"hit from behind {MARK}"] * 2)
+    assert any("rear outcomes say nothing" in note for note in table.notes) is not passes
+    assert NO_SCORE in table.notes
+
+
+def test_the_diagram_says_where_the_follower_passes_its_check(made: Callable[..., Run]) -> None:
+    careful, hybrid = (
+        share_of(scenes_of(made(scenario=CcrbOptions(follower=name), **GRID), "phase", "stop"), "survives").value
+        for name in ("careful", "hybrid")
+    )
+    assert hybrid < 0.3 < 0.7 < careful
+    rows = {row[0]: row[1] for row in ccrb_tables(made(scenario=CcrbOptions(follower="careful"), **GRID))["phase"].rows}
+    assert rows["follower survives fast tokens"] == f"{careful:.1%}"
+
+
 def test_a_folder_from_before_reads_its_idm_as_the_hybrid_that_it_was(made: Callable[..., Run]) -> None:
     new = made(scenario=CcrbOptions(follower="idm"))
     assert configuration(new)["follower"] == "idm"
@@ -129,7 +153,7 @@ def test_what_never_stalls_comes_out_alike_with_every_gap_behaviour(made: Callab
 
 def test_studies_are_driven_fast_enough_to_be_of_use(made: Callable[..., Run]) -> None:
     studies = made(**GRID).manifest["studies"]
-    assert studies["rollouts"] == 21 * 13 * 6
+    assert studies["rollouts"] == 21 * 13 * 7  # the check on the car behind included
     assert studies["rollouts_per_cpu_s"] > 0
 
 

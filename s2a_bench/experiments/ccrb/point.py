@@ -56,5 +56,6 @@ def _about(config: CcrbConfig, ready: Prepared, world: Simulator) -> dict[str, A
         "lead_decel_mps2": asked.lead_decel_mps2,
         "rear_gap_m": asked.rear_gap_m,
         "reaction_s": asked.reaction_s,
+        "follower_survives": asked.follower_survives,
         "deadline_ns": to_ns(asked.deadline_s),
     }

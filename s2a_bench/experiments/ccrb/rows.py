@@ -49,6 +49,10 @@ class RolloutRow:
     lead_decel_mps2: NonNegative
     rear_gap_m: NonNegative
     reaction_s: NonNegative
+    follower_survives: Annotated[
+        bool | None,
+        about("Whether the car behind stops behind an ego whose tokens come at once; if not, rear says nothing."),
+    ]
     start_ns: int
     end_ns: int
     stalls: Count

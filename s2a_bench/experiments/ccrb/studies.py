@@ -22,7 +22,7 @@ from s2a_bench.policy.clairvoyant import Clairvoyant
 from s2a_bench.policy.naive import Naive
 from s2a_bench.policy.wait_then_act import WaitThenAct
 from s2a_bench.scenario.ccrb.cars import start_deadline
-from s2a_bench.scenario.ccrb.studies import Scenes, draw, drive_along, plane
+from s2a_bench.scenario.ccrb.studies import Scenes, draw, drive_along, plane, survived
 from s2a_bench.scenario.longitudinal import Longitudinal
 
 FORMS: Final[dict[str, Policy]] = {
@@ -56,6 +56,8 @@ def studies(config: CcrbConfig) -> Iterator[tuple[str, Scenes]]:
 def study_rows(config: CcrbConfig, study: str, scenes: Scenes) -> Iterator[tuple[int, list[RolloutRow]]]:
     """Drive every scenario with every gap behaviour and policy: how many were driven, and their rows, piece by piece.
 
+    The check on the car behind is one more drive of each.
+
     What never stalls has no gap to behave in: it is driven once, and stands in a row for every gap behaviour.
     """
     for first in range(0, len(scenes), SCENES):
@@ -74,7 +76,7 @@ def _piece(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[Ro
     gaps = np.repeat([gap for _, gap in cases], len(scenes))
     every = scenes.times(len(cases))
     cars = every.cars(gaps, asked)
-    schedule = _schedules(config, scenes, [name for name, _ in cases])
+    schedule = schedules(config, scenes, [name for name, _ in cases])
     deadline_s = start_deadline(cars, every.numbers["plan_decel_mps2"])
     about: dict[str, Any] = {
         **every.numbers,
@@ -84,6 +86,7 @@ def _piece(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[Ro
         "board": "",
         "title": "",
         "emulated": True,
+        "follower_survives": np.tile(survived(scenes, scenes.cars(gaps[: len(scenes)], asked)), len(cases)),
         "simulator": Longitudinal.name,
         "follower": asked.follower,
         "gap_behaviour": gaps,
@@ -100,10 +103,10 @@ def _piece(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[Ro
         for row in rows
         if row.policy != "naive"
     ]
-    return len(rows), rows + again
+    return len(scenes) + len(rows), rows + again
 
 
-def _schedules(config: CcrbConfig, scenes: Scenes, names: Sequence[str]) -> Schedule:
+def schedules(config: CcrbConfig, scenes: Scenes, names: Sequence[str]) -> Schedule:
     """Ask the policies, and put the answers side by side; a shorter plan goes on with skills of no length."""
     at, count = scenes.numbers, len(scenes)
     longest = int(at["n_skills"].max())

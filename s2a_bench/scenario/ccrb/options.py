@@ -88,6 +88,13 @@ class CcrbOptions(Options):
         """Return how the car behind drives, in words."""
         return law(self.model_dump())
 
+    @cached_property
+    def follower_survives(self) -> bool:
+        """Return whether the car behind stops behind an ego whose tokens come at once."""
+        from s2a_bench.scenario.ccrb.check import follower_survives
+
+        return bool(follower_survives(self.cars, self.driving, self.skills, self.durations.nominal_s)[0])
+
     @property
     def decel_mps2(self) -> float:
         """Return a_p, what the plan brakes with."""

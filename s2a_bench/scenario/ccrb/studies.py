@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.policy import Schedule
-from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, LEAST_IMPACT_MPS, Cars, braking_plan, plan_decel
+from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, LEAST_IMPACT_MPS, Cars, DrivingPlan, braking_plan, plan_decel
+from s2a_bench.scenario.ccrb.check import follower_survives
 from s2a_bench.scenario.ccrb.drive import drive
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.outcome import Outcomes
@@ -17,6 +18,8 @@ from s2a_bench.scenario.longitudinal import Longitudinal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from s2a_bench.policy import Floats
 
 RESTING_MPS: Final = LEAST_IMPACT_MPS
 """The trailing car counts as stopped: at rest the ego cannot be hit any more, but the gap still shrinks."""
@@ -70,9 +73,23 @@ def plane(
     tokens_per_skill: int,
 ) -> Scenes:
     """Lay rate and rear gap, each from and to, out as a grid, the rate on a logarithmic scale; the rest as asked."""
+    axes = (np.linspace(0.0, 1.0, number) for number in points)
+    share = np.stack([values.ravel() for values in np.meshgrid(*axes, indexing="ij")], axis=1)
+    return spread(asked, rates, gaps_m, share, prompt_s=prompt_s, tokens_per_skill=tokens_per_skill)
+
+
+def spread(
+    asked: CcrbOptions,
+    rates: Sequence[float],
+    gaps_m: Sequence[float],
+    share: Floats,
+    *,
+    prompt_s: float,
+    tokens_per_skill: int,
+) -> Scenes:
+    """Return scenarios at points of that plane, given as shares of its sides, shape (M, 2)."""
     (slow, fast), (near, far) = rates, gaps_m
-    axes = np.geomspace(slow, fast, points[0]), np.linspace(near, far, points[1])
-    rate, gap = (values.ravel() for values in np.meshgrid(*axes, indexing="ij"))
+    rate, gap = slow * (fast / slow) ** share[:, 0], near + (far - near) * share[:, 1]
     cars = asked.cars
     fixed = {
         "prompt_s": prompt_s,
@@ -109,10 +126,18 @@ def draw(rng: np.random.Generator, count: int) -> Scenes:
     return Scenes(numbers)
 
 
+def survived(scenes: Scenes, cars: Cars) -> NDArray[np.bool_]:
+    """Return in which scenarios the trailing car passes its check."""
+    return follower_survives(cars, _plan(scenes, cars), scenes.numbers["n_skills"], scenes.numbers["t_nom_s"])
+
+
 def drive_along(scenes: Scenes, cars: Cars, schedule: Schedule) -> Outcomes:
     """Drive the scenarios with the bare integrator; there is no least rear gap but that of an impact."""
-    at = scenes.numbers
-    plan = braking_plan(cars, int(at["n_skills"].max()), at["t_nom_s"], decel_mps2=at["plan_decel_mps2"])
-    outcomes = drive(Longitudinal(), cars, plan, schedule, resting_mps=RESTING_MPS).outcomes
+    outcomes = drive(Longitudinal(), cars, _plan(scenes, cars), schedule, resting_mps=RESTING_MPS).outcomes
     outcomes.min_rear_gap_m[np.isnan(outcomes.rear_impact_mps)] = np.nan
     return outcomes
+
+
+def _plan(scenes: Scenes, cars: Cars) -> DrivingPlan:
+    at = scenes.numbers
+    return braking_plan(cars, int(at["n_skills"].max()), at["t_nom_s"], decel_mps2=at["plan_decel_mps2"])

@@ -8,11 +8,11 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from s2a_bench.experiments.ccrb.rows import TRAJECTORIES
-from s2a_bench.experiments.ccrb.view.outcomes import configuration, has, rollouts_of, token_times_s
+from s2a_bench.experiments.ccrb.view.outcomes import configuration, has, rollouts_of, survives_of, token_times_s
 from s2a_bench.experiments.ccrb.view.phase_figure import build_phase
 from s2a_bench.experiments.ccrb.view.sentences import origin_notes
 from s2a_bench.experiments.timeline.rows import SKILLS
-from s2a_bench.scenario.ccrb.words import SAID, operating_point
+from s2a_bench.scenario.ccrb.words import operating_point, said
 from s2a_bench.writers.figures import LINE_CHARS, new_figure
 from s2a_bench.writers.style import WIDTH_IN
 
@@ -42,7 +42,8 @@ _AFTER_S: Final = 1.0
 
 def build_scenario(run: Run) -> Figure:
     """Draw the operating point: a column a policy; positions, speeds and gaps over time."""
-    rows = rollouts_of(run, "point").to_dict("records")
+    found = rollouts_of(run, "point")
+    survives, rows = survives_of(found), found.to_dict("records")
     paths = {row["policy"]: _path(run, row) for row in rows}
     skills = dict(list(run.table(SKILLS).groupby("cell", sort=False)))
     chars = round(LINE_CHARS * WIDE_IN / WIDTH_IN)
@@ -55,7 +56,7 @@ def build_scenario(run: Run) -> Figure:
     for column, row in enumerate(rows):
         path, cell = paths[row["policy"]], row["cell"]
         above = grid[0, column]
-        above.set_title(f"{row['policy']}: {_verdict(row)}", loc="left", pad=3)
+        above.set_title(f"{row['policy']}: {_verdict(row, survives)}", loc="left", pad=3)
         for axes in grid[:, column]:
             _shade(axes, path, skills[cell])
             axes.set_xlim(0, until_s)
@@ -139,8 +140,8 @@ def _draw_gaps(axes: Axes, path: pd.DataFrame, row: dict[Any, Any]) -> None:
             axes.annotate(f"{speed:.1f} m/s", (at_s, 0), (3, 6), textcoords="offset points", fontsize=7, color=colour)
 
 
-def _verdict(row: dict[Any, Any]) -> str:
-    return SAID[row["outcome"]] + (" (late)" if row["late"] is True else "")
+def _verdict(row: dict[Any, Any], survives: bool) -> str:
+    return said(row["outcome"], survives) + (" (late)" if row["late"] is True else "")
 
 
 def _title(run: Run) -> str:

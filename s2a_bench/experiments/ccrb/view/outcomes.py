@@ -62,6 +62,7 @@ def scenes_of(run: Run, study: str, gap: str) -> pd.DataFrame:
     ``paper``: naive is hit from behind only, wait-then-act hits the lead only, stream-to-act nobody. ``wait_worse``,
     ``wait_better``, ``naive_worse``, ``naive_better``: against stream-to-act, an impact faster by more than .5 m/s
     (none counts as 0); ``naive_rear_worse`` and ``naive_rear_better``: the same for impacts from behind alone.
+    ``survives``: the car behind stops behind an ego whose tokens come at once; null in folders from before.
     """
     import pandas as pd
 
@@ -75,6 +76,7 @@ def scenes_of(run: Run, study: str, gap: str) -> pd.DataFrame:
     found["paper"] = pd.concat([policies[name]["outcome"] == outcome for name, outcome in PAPER.items()], axis=1).all(
         axis=1
     )
+    found["survives"] = mine["follower_survives"]
     for short, name in (("wait", "wait-then-act"), ("naive", "naive")):
         found[f"{short}_worse"], found[f"{short}_better"] = _compared(policies[name], mine, "impact_speed_mps")
     found["naive_rear_worse"], found["naive_rear_better"] = _compared(policies["naive"], mine, "rear_impact_mps")
@@ -84,6 +86,11 @@ def scenes_of(run: Run, study: str, gap: str) -> pd.DataFrame:
 def share_of(scenes: pd.DataFrame, ordering: str) -> Share:
     """Count the scenarios in which an ordering holds."""
     return Share(int(scenes[ordering].sum()), len(scenes))
+
+
+def survives_of(rows: pd.DataFrame) -> bool:
+    """Return whether the car behind passes its check at the operating point; True in folders from before."""
+    return bool(rows["follower_survives"].fillna(True).all())
 
 
 def rate_span(run: Run, gap: str) -> tuple[float, float] | None:

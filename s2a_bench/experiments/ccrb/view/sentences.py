@@ -12,9 +12,10 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     rollouts_of,
     scenes_of,
     share_of,
+    survives_of,
 )
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.ccrb.words import SAID, law
+from s2a_bench.scenario.ccrb.words import check, law, said
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
@@ -23,11 +24,13 @@ if TYPE_CHECKING:
 
 def ccrb_sentences(run: Run) -> list[str]:
     """Return what became of the cars, and where that ordering of the policies holds."""
-    said = [
-        f"{row['policy']}: {SAID[row['outcome']]}, {row['stalls']} stalls of {row['stall_ns'] / 1e9:.2f} s."
-        for row in rollouts_of(run, "point").to_dict("records")
+    rows = rollouts_of(run, "point")
+    survives = survives_of(rows)
+    told = [
+        f"{row['policy']}: {said(row['outcome'], survives)}, {row['stalls']} stalls of {row['stall_ns'] / 1e9:.2f} s."
+        for row in rows.to_dict("records")
     ]
-    return said + [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
+    return told + [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
 
 
 def ccrb_notes(run: Run) -> list[str]:
@@ -44,6 +47,7 @@ def origin_notes(run: Run) -> tuple[str, ...]:
     asked = configuration(run)
     notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
     notes.append(f"Rear: {law(asked)}.")
+    notes.append(check(asked, survives_of(rollouts_of(run, "point"))))
     notes.append(f"Front: while no skill is valid the ego does '{asked['gap']}'; the reflex layer is {_switch(asked)}.")
     return tuple(notes)
 

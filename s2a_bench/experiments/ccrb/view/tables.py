@@ -19,12 +19,16 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 )
 from s2a_bench.experiments.ccrb.view.sentences import origin_notes
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.ccrb.words import ORDERING, SAID, law, operating_point
+from s2a_bench.scenario.ccrb.words import NO_SCORE, ORDERING, law, operating_point, said
 from s2a_bench.writers.as_json import frame
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, number
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import pandas as pd
+
     from s2a_bench.experiments import Metric
     from s2a_bench.store.run import Run
 
@@ -33,12 +37,12 @@ def outcome_table(run: Run) -> TextTable:
     """Lay out what became of the three cars under each policy."""
     rows = []
     for cell in cells_of(run):
-        said = SAID[cell["outcome"]] + (" (late)" if cell.get("late") else "")
-        rows.append((cell["policy"], said, *(_entry(cell, metric) for metric in OUTCOMES)))
+        outcome = said(cell["outcome"], cell.get("follower_survives", True)) + (" (late)" if cell.get("late") else "")
+        rows.append((cell["policy"], outcome, *(_entry(cell, metric) for metric in OUTCOMES)))
     asked = configuration(run)
     title = f"CCRB with a car behind, {asked['simulator']} simulator: {operating_point(asked)}"
     header = ("policy", "outcome", *map(_title, OUTCOMES))
-    return TextTable(title, header, rows, 2, notes=(*origin_notes(run), *_deadline_note(run)))
+    return TextTable(title, header, rows, 2, notes=(*origin_notes(run), *_deadline_note(run), NO_SCORE))
 
 
 def margin_table(run: Run) -> TextTable:
@@ -54,7 +58,10 @@ def margin_table(run: Run) -> TextTable:
 def phase_table(run: Run) -> TextTable:
     """Lay out at which share of the diagram each ordering holds, a column a gap behaviour."""
     scenes = {gap: scenes_of(run, "phase", gap) for gap in GAPS}
-    rows = [(said, *(f"{share_of(scenes[gap], name).value:.1%}" for gap in GAPS)) for name, said in ORDERINGS.items()]
+    rows = [
+        (text, *(f"{share_of(scenes[gap], name).value:.1%}" for gap in GAPS))
+        for name, text in _shares(scenes.values()).items()
+    ]
     asked = configuration(run)
     rows.append(("R of the paper's ordering", *(_span(rate_span(run, gap)) for gap in GAPS)))
     rows.append((f"  at a rear gap of {asked['rear_gap_m']:g} m", *(_span(rate_span_here(run, gap)) for gap in GAPS)))
@@ -62,17 +69,26 @@ def phase_table(run: Run) -> TextTable:
     title = (
         f"Phase diagram: R {low:g} to {high:g} tokens/s, rear gap {near:g} to {far:g} m, {asked['follower']} follower"
     )
-    rules = frozenset({len(ORDERINGS)})
+    rules = frozenset({len(rows) - 2})
     return TextTable(title, ("share of the diagram", *GAPS), rows, 1, rules, _ordering_notes())
 
 
 def random_table(run: Run) -> TextTable:
     """Lay out in which share of random scenarios each ordering holds, with its interval."""
     scenes = {gap: scenes_of(run, "random", gap) for gap in GAPS}
-    rows = [(said, *(_with_interval(share_of(scenes[gap], name)) for gap in GAPS)) for name, said in ORDERINGS.items()]
+    rows = [
+        (text, *(_with_interval(share_of(scenes[gap], name)) for gap in GAPS))
+        for name, text in _shares(scenes.values()).items()
+    ]
     asked = configuration(run)
     title = f"{asked['random']} random scenarios: % [95 % Clopper-Pearson], {asked['follower']} follower"
     return TextTable(title, ("ordering", *GAPS), rows, 1, notes=_ordering_notes())
+
+
+def _shares(scenes: Iterable[pd.DataFrame]) -> dict[str, str]:
+    """Return what is counted: the orderings, and the check on the car behind where the run has it."""
+    checked = all(found["survives"].notna().all() for found in scenes)
+    return {**ORDERINGS, **({"survives": "follower survives fast tokens"} if checked else {})}
 
 
 def ccrb_tables(run: Run) -> dict[str, TextTable]:
@@ -128,6 +144,7 @@ def _ordering_notes() -> tuple[str, ...]:
     return (
         Note(ORDERING, PAPERS),
         "Worse, better: than stream-to-act, by an impact more than 0.5 m/s faster or slower; behind: from there alone.",
+        "Where the follower hits even an ego whose tokens come at once, a rear impact says nothing of the policy.",
     )
 
 
