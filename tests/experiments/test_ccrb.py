@@ -110,7 +110,8 @@ def test_the_diagram_says_where_the_follower_passes_its_check(made: Callable[...
         share_of(scenes_of(made(scenario=CcrbOptions(follower=name), **GRID), "phase", "stop"), "survives").value
         for name in ("careful", "hybrid")
     )
-    assert hybrid < 0.3 < 0.7 < careful
+    assert hybrid < 0.3
+    assert careful > 0.7
     rows = {row[0]: row[1] for row in ccrb_tables(made(scenario=CcrbOptions(follower="careful"), **GRID))["phase"].rows}
     assert rows["follower survives fast tokens"] == f"{careful:.1%}"
 
