@@ -14,6 +14,7 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.rounds import Task, run_requests
 from s2a_bench.progress import NullProgress
+from s2a_bench.provenance import Provenance
 from s2a_bench.store.run import read_run
 from s2a_bench.testing.transport import wiring
 from s2a_bench.trace import Remote, Trace
@@ -141,7 +142,13 @@ def test_facts_of_marks_are_checked_in_name_and_value() -> None:
 @pytest.mark.parametrize("odd", [{"stamps": [1, 2]}, {"stamps": [-1]}, {"fact_names": ["a"]}])
 def test_ros_marks_that_can_be_none_fail_their_sample(odd: dict[str, list[Any]]) -> None:
     plain: dict[str, Any] = {"stages": ["a"], "stamps": [1], "token_stamps": [], "frame_stages": [], "frame_stamps": []}
-    lists = {**plain, "fact_names": [], "fact_values": [], **odd}
+    lists = {
+        **plain,
+        "fact_names": [],
+        "fact_values": [],
+        "provenance": SimpleNamespace(**Provenance().to_dict()),
+        **odd,
+    }
     arrays = {name: np.array(value) for name, value in lists.items() if "stamps" in name or name == "fact_values"}
     with pytest.raises(RequestFailed, match="the server's marks are none"):
         remote_of(SimpleNamespace(**{"clock": "c", "frame_stamp": -1, **lists, **arrays}))

@@ -48,6 +48,7 @@ TOKENS = st.lists(st.tuples(WHOLE, TEXTS), max_size=3)
 def write(root: Path, samples: list[dict[str, Any]], tokens: list[tuple[int, str]], note: str) -> RunWriter:
     """Write a run in which some samples are as any other, and some as given; it stays open."""
     run = RunWriter.create(root, "latency", {"note": note, "asked": {note: {"url": note}}})
+    run.update(asked={note: {"dialect": note}, f"another {note}": {}})
     for block in range(3):
         run.sample(row_of("http/as-deployed", BLACK_BOX, block, marks=marks_of(BLACK_BOX, 10**9), n_tokens=1))
     for block, facts in enumerate(samples, 3):
@@ -77,7 +78,7 @@ def test_it_can_be_read_while_it_runs_and_when_it_is_done(
             errors = [as_kept(facts.get("error", "")) for facts in samples]
             assert running.samples.error[3:].tolist() == errors
         done = read_run(run.path)
-        assert done.manifest["note"] == note
+        assert done.manifest["note"] == as_kept(note)
         assert done.samples.equals(running.samples)
         assert done.tokens.text.tolist() == running.tokens.text.tolist() == [as_kept(text) for _, text in tokens]
         for text in done.samples.facts:
