@@ -27,7 +27,6 @@ PATHS = {
     AS_DEPLOYED: "/v1/chat/completions",
     BEST_EFFORT: "/best-effort/v1/chat/completions",
     BINARY: "/binary/v1/chat/completions",
-    LLAMA_SERVER: "/v1/chat/completions",
 }
 """Variant -> path on our own server; a black box is always asked at the first."""
 
