@@ -45,7 +45,7 @@ SILENCE_S = 30.0
 """Over ROS the last messages of an answer may be lost: a client hears nothing, and asks again."""
 WARM_UP = 0.2
 """Of the minutes, before them."""
-HOSTILE = {"http": http.CLIENTS, "ros": ros.SERVER_CLIENTS}
+HOSTILE = {"http": http.CLIENTS, "ros": ros.CLIENTS}
 WARM_UP_ONLY = frozenset({"a prompt of 16 MiB", "8 requests of 16 MiB"})
 """Over ROS requests are received on many threads, and glibc keeps the most that each ever held (machine/tuning.py):
 with these the memory swings by 150 MiB, which would hide growth."""

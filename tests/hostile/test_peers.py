@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from s2a_bench.testing.hostile import HostileSuite, http, ros
+from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers
 
 
 class TestHttp(HostileSuite):
@@ -13,10 +13,10 @@ class TestHttp(HostileSuite):
 
 class TestRosTopic(HostileSuite):
     name = "ros/topic"
-    clients = ros.SERVER_CLIENTS
-    servers = ros.TOPIC_SERVERS
+    clients = ros.CLIENTS
+    servers = ros_servers.TOKENS
 
 
 class TestRosAction(HostileSuite):
     name = "ros/action"
-    servers = ros.ACTION_SERVERS
+    servers = ros_servers.GOALS

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from threading import Event, Lock, Thread, active_count
+from threading import Event, Lock, Thread
 from typing import Any
 
 import httpx
@@ -19,15 +19,11 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, EngineError, RequestFailed
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.ros import QoS
-from s2a_bench.ros import messages as ros
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Client, Handler, open_client, open_server
+from s2a_bench.transport import Handler, open_client, open_server
 from s2a_bench.transport.http.own import PATHS
 from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.transport.ros.joining import join
-from s2a_bench.transport.ros.wire import request_message
 from s2a_bench.transport.turns import Queued, Turn, Turns
 from s2a_bench.types import Request, Token
 
@@ -302,58 +298,3 @@ def test_a_ros_request_too_many_is_refused_at_once() -> None:
         gate.go.set()
         for client in clients:
             client.close()
-
-
-def test_the_threads_of_ros_requests_that_waited_end() -> None:
-    go = Event()
-
-    def answer(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        go.wait(30)
-        yield Token(0, "a")
-
-    queued = Queued.around(answer)
-    with serving(queued, "ros/topic") as address:
-        middleware = join(wiring("ros/topic", address), "crowd")
-        publisher = middleware.publisher(address + "/request", ros.REQUEST, QoS(depth=0))
-        until(lambda: bool(publisher.matched()))
-        for index in range(30):
-            publisher.send(publisher.pack(request_message(Request(str(index), "a", max_tokens=1))))
-        until(lambda: queued.turns.waiting == 29)
-        most = active_count()
-        go.set()
-        until(lambda: active_count() <= most - 28)
-        middleware.close()
-
-
-def is_answered(client: Client, prompt: str) -> bool:
-    try:
-        return len(ask(client, Request("afterwards", prompt))[0]) == 1
-    except RequestFailed:
-        return False
-
-
-def test_the_bytes_of_ros_requests_are_bounded_and_given_back() -> None:
-    go = Event()
-
-    def answer(request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        yield Token(0, "a")
-        assert go.wait(30) or request.id == "first"
-
-    limits, long = Limits(body_mib=1, in_flight_mib=1.5), "a" * 1_000_000
-    with ExitStack() as stack:
-        address = stack.enter_context(serving(Queued.around(answer), "ros/topic", limits))
-        first, second, goals = (open_client(wiring(f"ros/{way}", address)) for way in ("topic", "topic", "action"))
-        for client in (first, second, goals):
-            stack.callback(client.close)
-        with pytest.raises(RequestFailed, match="larger than 1048576 bytes"):
-            ask(second, Request("too long", 2 * long))
-        tokens = first.request(Request("first", long), Trace())
-        next(iter(tokens))
-        with pytest.raises(RequestFailed, match="1572864 bytes are under way already"):
-            ask(second, Request("second", long))
-        with pytest.raises(RequestFailed, match="rejected"):
-            ask(goals, Request("goal", long))
-        go.set()
-        assert len([*tokens]) == 0
-        for client in (second, goals, second):
-            until(lambda client=client: is_answered(client, long))  # type: ignore[misc]  # bound at once

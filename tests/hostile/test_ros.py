@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack
+from threading import Event, active_count
 from typing import Any
 
 import numpy as np
@@ -13,15 +14,16 @@ import pytest
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.ros import Accepted, Feedback, Middleware, Rejected, Result, open_middleware
+from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Rejected, Result, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace
-from s2a_bench.transport import open_client
+from s2a_bench.transport import Client, open_client
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.ros.camera import picture_of
+from s2a_bench.transport.ros.joining import join
 from s2a_bench.transport.ros.wire import READER_QOS, REQUEST_QOS, TOKEN_QOS, request_message, token_message
 from s2a_bench.transport.turns import Queued
 from s2a_bench.types import Request, Token
@@ -204,3 +206,58 @@ def test_a_goal_has_no_more_tokens_than_the_limit(goals: Callable[[], Any]) -> N
         client.send(client.pack(generate_goal("a b c d e f", [])))
         assert client.unpack_result(next_of(client, Result).packed).response.text.split() == ["a", "b", "c"]
         assert not isinstance(client.next_event(0.1), Feedback)
+
+
+def test_the_threads_of_ros_requests_that_waited_end() -> None:
+    go = Event()
+
+    def answer(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        go.wait(30)
+        yield Token(0, "a")
+
+    queued = Queued.around(answer)
+    with serving(queued, "ros/topic") as address:
+        middleware = join(wiring("ros/topic", address), "crowd")
+        publisher = middleware.publisher(address + "/request", ros.REQUEST, QoS(depth=0))
+        until(lambda: bool(publisher.matched()))
+        for index in range(30):
+            publisher.send(publisher.pack(request_message(Request(str(index), "a", max_tokens=1))))
+        until(lambda: queued.turns.waiting == 29)
+        most = active_count()
+        go.set()
+        until(lambda: active_count() <= most - 28)
+        middleware.close()
+
+
+def is_answered(client: Client, prompt: str) -> bool:
+    try:
+        return len(ask(client, Request("afterwards", prompt))[0]) == 1
+    except RequestFailed:
+        return False
+
+
+def test_the_bytes_of_ros_requests_are_bounded_and_given_back() -> None:
+    go = Event()
+
+    def answer(request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        yield Token(0, "a")
+        assert go.wait(30) or request.id == "first"
+
+    limits, long = Limits(body_mib=1, in_flight_mib=1.5), "a" * 1_000_000
+    with ExitStack() as stack:
+        address = stack.enter_context(serving(Queued.around(answer), "ros/topic", limits))
+        first, second, goals = (open_client(wiring(f"ros/{way}", address)) for way in ("topic", "topic", "action"))
+        for client in (first, second, goals):
+            stack.callback(client.close)
+        with pytest.raises(RequestFailed, match="larger than 1048576 bytes"):
+            ask(second, Request("too long", 2 * long))
+        tokens = first.request(Request("first", long), Trace())
+        next(iter(tokens))
+        with pytest.raises(RequestFailed, match="1572864 bytes are under way already"):
+            ask(second, Request("second", long))
+        with pytest.raises(RequestFailed, match="rejected"):
+            ask(goals, Request("goal", long))
+        go.set()
+        assert len([*tokens]) == 0
+        for client in (second, goals, second):
+            until(lambda client=client: is_answered(client, long))  # type: ignore[misc]  # bound at once

@@ -170,6 +170,8 @@ def _streams(*values: Any, **more: Any) -> Trap:
     return _answers(STREAM, *(event(value) for value in values), then="goes", **more)
 
 
+CONTROL = "\x1b[2J\r\nOK: all is well\x07\x00"
+
 SERVERS: tuple[Case[Trap], ...] = (
     *servers("http://"),
     Case("headers, then silence", _answers(STREAM), "^RequestFailed: .*silent"),
@@ -201,5 +203,14 @@ SERVERS: tuple[Case[Trap], ...] = (
         "a gzip of 1 GiB",
         _answers(STREAM[:-2] + b"Content-Encoding: gzip\r\n\r\n", gzip.compress(bytes(1 << 20)) * 1024),
         FAILED,
+    ),
+    Case("endless tokens", _answers(STREAM, again=[event(token()) * 1000]), FAILED),
+    Case("endless events of nothing", _answers(STREAM, again=[event({}) * 1000]), FAILED),
+    Case("endless interim answers", _answers(again=[said(status="103 Early Hints") * 1000]), FAILED),
+    Case("an error that forges lines", _streams({"error": {"message": CONTROL}}), "^RequestFailed: .*all is well"),
+    Case(
+        "a refusal that forges lines",
+        _answers(said(status="400 No"), CONTROL.encode(), then="goes"),
+        "^RequestFailed: .*all is well",
     ),
 )

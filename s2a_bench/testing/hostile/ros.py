@@ -1,38 +1,33 @@
-"""Hostile peers of our ROS server and clients: participants of the same domain."""
+"""Hostile peers of our ROS server: participants of the same domain."""
 
 from __future__ import annotations
 
 import socket
 import struct
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
-from itertools import count
-from threading import Event, Thread
+from contextlib import closing, suppress
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import TransportError
-from s2a_bench.ros import Middleware, QoS, Rejected, Result, ServerGoal
+from s2a_bench.ros import QoS, Rejected, Result
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, text_result, token_feedback
-from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
+from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
+from s2a_bench.testing.hostile import Attack, Case
 from s2a_bench.testing.hostile.http import bomb
 from s2a_bench.testing.hostile.tcp import NOISE
-from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.ros.action import ACTION, MARKS
-from s2a_bench.transport.ros.camera import CAMERA, CAMERA_QOS, POLL_S
+from s2a_bench.transport.ros.action import ACTION
+from s2a_bench.transport.ros.camera import CAMERA, POLL_S
 from s2a_bench.transport.ros.joining import domain_of, join, wait_until
-from s2a_bench.transport.ros.wire import READER_QOS, TOKEN_QOS, marks_message, request_message, token_message
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.transport.ros.wire import READER_QOS, request_message
+from s2a_bench.types import Frame, Request
 
 Messages: TypeAlias = "Callable[[], Iterable[bytes | bytearray]]"
 CDR = b"\x00\x01\x00\x00"
 MATCHES_S = 10.0
 RELIABLE = QoS(depth=0)
-_numbers = count()
 
 
 def publishes(
@@ -169,7 +164,7 @@ def datagrams(told: Wiring[Any]) -> str:
     return ""
 
 
-SERVER_CLIENTS: tuple[Case[Attack], ...] = (
+CLIENTS: tuple[Case[Attack], ...] = (
     Case("noise as datagrams", datagrams),
     Case("noise as requests", publishes(lambda: [CDR + NOISE[: 4 * n] for n in range(1, 200)], answers=0)),
     Case("nothing as a request", publishes(lambda: [CDR] * 9, answers=0)),
@@ -207,139 +202,3 @@ SERVER_CLIENTS: tuple[Case[Attack], ...] = (
     ),
 )
 """What our server outlives; both variants' clients are served by one."""
-
-
-@contextmanager
-def _running(middleware: Middleware, over: Event, end: Any, run: Callable[[], None]) -> Iterator[None]:
-    """Run on a thread of its own for as long as the context lasts."""
-    thread = Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        with suppress(Exception):  # it may have left already, and Cyclone raises what it likes then
-            end.interrupt()
-        thread.join()
-        middleware.close()
-
-
-Reply: TypeAlias = "Callable[[str, Event], Iterable[bytes | bytearray | None]]"
-"""What a hostile server publishes on /token to a request of this id, until the event is set; None: it leaves."""
-
-
-def tokens(reply: Reply) -> Trap:
-    """Return a server of the topic variant."""
-
-    @contextmanager
-    def trap(told: Wiring[Any]) -> Iterator[str]:
-        namespace, over = f"/hostile_{next(_numbers)}", Event()
-        middleware = join(told, "server")
-        requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
-        publisher = middleware.publisher(namespace + "/token", ros.TOKEN, TOKEN_QOS)
-        kept = middleware.subscription(namespace + CAMERA, ros.IMAGE, CAMERA_QOS["reliable"])
-
-        def run() -> None:
-            while not over.is_set():
-                if (packed := requests.take(POLL_S)) is not None:
-                    for piece in reply(requests.unpack(packed).id, over):
-                        if piece is None:
-                            middleware.close()
-                            return
-                        with suppress(TransportError):  # it has left
-                            publisher.send(bytearray(piece))
-
-        with _running(middleware, over, requests, run):
-            yield namespace
-        del kept  # the client waits until it has matched all
-
-    return trap
-
-
-def _token(request_id: str, index: int, text: str = "go", **more: Any) -> bytearray:
-    message = token_message(request_id, Token(index, text, -1), **{"last": False, **more})
-    return ros.serialise(message, ros.TOKEN)
-
-
-def _marks(request_id: str, **fields: Any) -> Any:
-    marks = marks_message(request_id, Trace().to_remote())
-    for name, value in fields.items():
-        setattr(marks, name, value)
-    return marks
-
-
-TOPIC_SERVERS: tuple[Case[Trap], ...] = (
-    Case("silence", tokens(lambda _id, _over: ()), "^RequestFailed: no token for 2 s"),
-    Case("noise as tokens", tokens(lambda _id, _over: [CDR + NOISE[:400]] * 9), FAILED),
-    Case("a text of 1 GiB announced", tokens(lambda _id, _over: [CDR + struct.pack("<I", 1 << 30)] * 9), FAILED),
-    Case(
-        "tokens of somebody else",
-        tokens(lambda _id, _over: [_token("other", n) for n in range(99)]),
-        "^RequestFailed: no token",
-    ),
-    Case("one token, then silence", tokens(lambda name, _over: [_token(name, 0)]), "^RequestFailed: no token"),
-    Case("one token, then gone", tokens(lambda name, _over: [_token(name, 0), None]), FAILED),
-    Case("tokens that are lost", tokens(lambda name, _over: [_token(name, 0), _token(name, 2)]), "^MessagesLost: "),
-    Case("every token twice", tokens(lambda name, _over: [_token(name, n // 2) for n in range(8)]), "^MessagesLost: "),
-    Case("a token of 16 MiB, then silence", tokens(lambda name, _over: [_token(name, 0, "a" * (16 << 20))]), FAILED),
-    Case("an error", tokens(lambda name, _over: [_token(name, 0, "", last=True, error="no")]), "^RequestFailed: .*no$"),
-)
-
-
-def goals(answer: Callable[[ServerGoal, Event, Callable[[], None]], None]) -> Trap:
-    """Return a server of the action variant; what answers a goal may also leave."""
-
-    @contextmanager
-    def trap(told: Wiring[Any]) -> Iterator[str]:
-        namespace, over = f"/hostile_{next(_numbers)}", Event()
-        middleware = join(told, "server")
-        server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE)
-        kept = [
-            middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS),
-            middleware.subscription(namespace + CAMERA, ros.IMAGE, CAMERA_QOS["reliable"]),
-        ]
-
-        def run() -> None:
-            while not over.is_set():
-                if (goal := server.next_goal(POLL_S)) is not None:
-                    with suppress(TransportError):  # it was cancelled, or we have left
-                        answer(goal, over, middleware.close)
-
-        with _running(middleware, over, server, run):
-            yield namespace
-        del kept  # the client waits until it has matched all
-
-    return trap
-
-
-def _starts(goal: ServerGoal, *texts: str) -> None:
-    goal.accept()
-    goal.executing()
-    for text in texts:
-        goal.feedback(token_feedback(text, 0))
-
-
-def _lies(goal: ServerGoal, *_: Any) -> None:
-    _starts(goal, "go")
-    goal.succeed(text_result("something else"))
-
-
-def _aborts(goal: ServerGoal, *_: Any) -> None:
-    _starts(goal, "go")
-    goal.abort(text_result("had enough"))
-
-
-def _leaves(goal: ServerGoal, _: Event, leave: Callable[[], None]) -> None:
-    _starts(goal, "go")
-    leave()
-
-
-ACTION_SERVERS: tuple[Case[Trap], ...] = (
-    Case("silence", goals(lambda *_: None), FAILED),
-    Case("every goal rejected", goals(lambda goal, *_: goal.reject()), "^RequestFailed: the server rejected the goal"),
-    Case("accepted, then silence", goals(lambda goal, *_: goal.accept()), "^RequestFailed: no feedback for 2 s"),
-    Case("one token, then silence", goals(lambda goal, *_: _starts(goal, "go")), "^RequestFailed: no feedback for 2 s"),
-    Case("one token, then gone", goals(_leaves), "^ServerDied: .*gone"),
-    Case("another answer than its tokens", goals(_lies), "^MessagesLost: "),
-    Case("aborted", goals(_aborts), "^RequestFailed: .*had enough"),
-)
