@@ -118,7 +118,8 @@ def test_a_request_whose_client_has_gone_lives_to_its_deadline_only() -> None:
 def test_garbage_and_guesses_beside_the_tokens_are_skipped_and_counted(stranger: Middleware, variant: str) -> None:
     topic, kind = ("/token", ros.TOKEN) if variant == "topic" else ("/marks", ros.MARKS)
     with ExitStack() as stack:
-        address = stack.enter_context(serving(engine_handler(open_engine(EngineConfig(name="echo"))), f"ros/{variant}"))
+        handler = engine_handler(open_engine(EngineConfig(name="echo")))
+        address = stack.enter_context(serving(handler, f"ros/{variant}", Limits(answer_tokens=4)))
         client = open_client(wiring(f"ros/{variant}", address))
         stack.callback(client.close)
         publisher = stranger.publisher(NAMESPACE + topic, kind, TOKEN_QOS)

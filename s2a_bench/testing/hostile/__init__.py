@@ -35,6 +35,7 @@ from s2a_bench.testing.hostile.asker import TOKENS
 from s2a_bench.testing.hostile.usage import forget_peak, usage
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.transport import Client, Wiring, open_client
+from s2a_bench.transport.bounds import PIECES, PIECES_A_TOKEN
 from s2a_bench.types import Request
 
 Attack: TypeAlias = "Callable[[Wiring[Any]], str]"
@@ -168,7 +169,7 @@ class HostileSuite:
         error = got["error"]
         assert re.search(hostile_server.says, error) if hostile_server.says else not error, error
         assert error.isprintable(), f"not one line of plain text: {error!r}"
-        assert got["tokens"] <= TOKENS
+        assert got["tokens"] <= PIECES + PIECES_A_TOKEN * TOKENS
         assert got["seconds"] < hostile_server.seconds
         assert got["peak_mib"] < hostile_server.mib
 
