@@ -23,8 +23,11 @@ LONG_S: Final = 600.0
 """Plans that take longer than this are no driving."""
 SPANS: Final = {"phase_rates": 10_000.0, "phase_gaps_m": 1000.0}
 """Fields with a span, from and to, and the most that it may reach."""
-MODELLED: Final = ("rate", "prompt_s", "phase", "random", "openscenario")
+MODELLED: Final = ("rate", "prompt_s", "phase", "random", "all_followers", "sensitivity", "openscenario")
 """Fields about tokens that are modelled, besides the profile: refused where a model answers."""
+
+DRAWN: Final = ("all_followers", "sensitivity", "seeds", "seed_points")
+"""Fields that change nothing of what else is driven; a manifest has them where they are not the default."""
 
 
 class CcrbConfig(Options):
@@ -56,6 +59,10 @@ class CcrbConfig(Options):
     phase_gaps_m: Numbers = option((6.0, 30.0), "m to the car behind in the phase diagram: from, to", flag="phase-gaps")
     phase_points: tuple[int, int] = option((41, 25), "rates and gaps of the phase diagram", hidden=True)
     random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000)
+    all_followers: bool = option(False, "also a table of every follower at Euro NCAP's four combinations")
+    sensitivity: bool = option(False, "also a figure of six numbers varied one at a time")
+    seeds: int = option(10, "draws of --all-followers and --sensitivity", ge=1, le=1000)
+    seed_points: int = option(128, "points that each of them draws", ge=1, le=65_536, hidden=True)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
     asked: Asked = Field(default_factory=Asked)
     openscenario: Path | None = option(None, "also write the scenario as an OpenSCENARIO file, its road beside it")
@@ -112,6 +119,7 @@ class CcrbConfig(Options):
     def to_manifest(self) -> dict[str, Any]:
         """Return the options as plain data, those of the scenario among them, without those of the other mode."""
         left_out = {"scenario", "asked", "openscenario"}
+        left_out |= {name for name in DRAWN if getattr(self, name) == type(self).model_fields[name].default}
         left_out |= {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"} if self.asked.live else set()
         own = {**self.model_dump(exclude=left_out), **self.scenario.to_manifest()}
         return {**own, "t_nom_s": self.scenario.durations.nominal_s, "time": "virtual"}

@@ -77,6 +77,47 @@ class RolloutRow:
 
 
 @dataclass(frozen=True, slots=True)
+class FollowerRow:
+    """What became of many points of the plane under one policy, with one follower and lead: counts.
+
+    ``seed`` drew the points over rate and rear gap; null: the operating point alone. ``survived`` counts where the
+    follower stops behind an ego whose tokens come at once, ``rear_survived`` rear impacts among those; ``paper``
+    counts where all three policies have the paper's outcome.
+    """
+
+    cell: str
+    policy: str
+    follower: str
+    gap_behaviour: str
+    front_gap_m: float
+    lead_decel_mps2: float
+    seed: int | None
+    points: int
+    survived: int
+    front: int
+    rear: int
+    rear_survived: int
+    paper: int
+
+
+@dataclass(frozen=True, slots=True)
+class SensitivityRow:
+    """At how many of the points of the plane that a seed drew the paper's ordering holds, one number changed.
+
+    ``varied`` names the number, SI units; ``rear_gap_m`` leaves the rate as the only axis.
+    """
+
+    cell: str
+    varied: str
+    value: float
+    follower: str
+    gap_behaviour: str
+    seed: int
+    points: int
+    paper: int
+
+
+@dataclass(frozen=True, slots=True)
 class TrajectoryRow:
     """The three cars of a shown roll-out at one time from the request; positions are bumper to bumper.
 
@@ -105,3 +146,11 @@ ROLLOUTS: Final[Table[RolloutRow]] = Table("rollouts", RolloutRow)
 
 TRAJECTORIES: Final[Table[TrajectoryRow]] = Table("trajectories", TrajectoryRow)
 """One row a moment of a shown roll-out."""
+
+
+FOLLOWER_STUDY: Final[Table[FollowerRow]] = Table("followers", FollowerRow)
+"""One row a policy, follower, lead and seed."""
+
+
+SENSITIVITY: Final[Table[SensitivityRow]] = Table("sensitivity", SensitivityRow)
+"""One row a value of a varied number and seed."""

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from s2a_bench.experiments.ccrb.rows import TRAJECTORIES
+from s2a_bench.experiments.ccrb.rows import SENSITIVITY, TRAJECTORIES
 from s2a_bench.experiments.ccrb.view.outcomes import configuration, has, rollouts_of, survives_of, token_times_s
 from s2a_bench.experiments.ccrb.view.phase_figure import build_phase
 from s2a_bench.experiments.ccrb.view.sentences import origin_notes
+from s2a_bench.experiments.ccrb.view.variations import build_sensitivity
 from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.scenario.ccrb.words import operating_point, said
 from s2a_bench.writers.figures import LINE_CHARS, new_figure
@@ -75,10 +76,12 @@ def build_scenario(run: Run) -> Figure:
 
 
 def ccrb_figures(run: Run) -> dict[str, Callable[[], Figure]]:
-    """Return every figure by its file's name; the phase diagram where the run has one."""
+    """Return every figure by its file's name; those of studies where the run has them."""
     builders: dict[str, Callable[[], Figure]] = {"scenario": partial(build_scenario, run)}
     if has(run, "phase"):
         builders["phase"] = partial(build_phase, run)
+    if len(run.table(SENSITIVITY)):
+        builders["sensitivity"] = partial(build_sensitivity, run)
     return builders
 
 

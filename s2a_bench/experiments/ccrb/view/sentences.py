@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from s2a_bench.experiments.ccrb.rows import SENSITIVITY
 from s2a_bench.experiments.ccrb.view.outcomes import (
     configuration,
     has,
@@ -14,6 +15,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     share_of,
     survives_of,
 )
+from s2a_bench.experiments.ccrb.view.variations import sensitivity_note
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.words import check, law, said
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
@@ -36,6 +38,8 @@ def ccrb_sentences(run: Run) -> list[str]:
 def ccrb_notes(run: Run) -> list[str]:
     """Return what the terminal says below the tables: findings, the studies' speed, and files written besides."""
     said = findings(run)
+    if len(run.table(SENSITIVITY)):
+        said.append(sensitivity_note(run))
     if studies := run.manifest.get("studies"):
         speed = studies["rollouts_per_cpu_s"]
         said.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time")

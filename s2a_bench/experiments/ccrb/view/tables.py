@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.ccrb.metrics import MARGINS, OUTCOMES
+from s2a_bench.experiments.ccrb.rows import FOLLOWER_STUDY
 from s2a_bench.experiments.ccrb.view.cell import ORDERINGS
 from s2a_bench.experiments.ccrb.view.outcomes import (
     Share,
@@ -18,6 +19,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     share_of,
 )
 from s2a_bench.experiments.ccrb.view.sentences import origin_notes
+from s2a_bench.experiments.ccrb.view.variations import follower_table
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.words import NO_SCORE, ORDERING, law, operating_point, said
 from s2a_bench.writers.as_json import frame
@@ -98,6 +100,8 @@ def ccrb_tables(run: Run) -> dict[str, TextTable]:
         tables["random"] = random_table(run)
     if has(run, "phase"):
         tables["phase"] = phase_table(run)
+    if len(run.table(FOLLOWER_STUDY)):
+        tables["followers"] = follower_table(run)
     return {**tables, "margins": margin_table(run), "outcomes": outcome_table(run)}
 
 
