@@ -257,13 +257,17 @@ def test_every_follower_meets_the_four_combinations_and_says_whether_it_survives
     run = made(all_followers=True, **FEW)
     rows = run.table(FOLLOWER_STUDY)
     assert len(rows) == 4 * 4 * 3 * (FEW["seeds"] + 1)
-    table = ccrb_tables(run)["followers"]
+    tables = ccrb_tables(run)
+    table = tables["followers"]
     assert [row[0] for row in table.rows[::4]] == list(FOLLOWERS)
     assert [row[1] for row in table.rows[:4]] == ["12 m, -2", "12 m, -6", "40 m, -2", "40 m, -6"]
     said = {(row[0], row[1]): row for row in table.rows}
-    assert said["careful", "40 m, -2"][2:5] == ("rear", "front", "none")
-    assert said["idm", "40 m, -2"][2:5] == ("none", "front", "none")
-    assert said["hybrid", "40 m, -2"][2:5] == (f"rear {MARK}", "front", f"rear {MARK}")
+    assert said["careful", "40 m, -2"][2:] == ("yes", "rear", "front", "none")
+    assert said["hdm", "40 m, -2"][2:] == ("yes", "none", "front", "none")
+    assert said["idm", "40 m, -2"][2:] == ("yes", "none", "front", "none")
+    assert said["hybrid", "40 m, -2"][2:] == ("no", f"rear {MARK}", "front", f"rear {MARK}")
+    shares = {row[:2]: row for row in tables["follower-shares"].rows}
+    assert shares["idm", "40 m, -6"][3:] == ("100", "0", "0", "0", "0")
     assert NO_SCORE in table.notes
 
 

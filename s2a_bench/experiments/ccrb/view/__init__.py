@@ -21,7 +21,7 @@ def show(run: Run, *, animation: bool = False, **_: Any) -> Shown:
     return Shown(
         sentences=ccrb_sentences(run),
         tables=tables,
-        main=[name for name in ("outcomes", "phase", "random", "followers") if name in tables],
+        main=[name for name in ("outcomes", "phase", "random", "followers", "follower-shares") if name in tables],
         notes=[*dict.fromkeys(note for table in tables.values() for note in table.notes), *ccrb_notes(run)],
         csvs=ccrb_csv(run),
         figures=ccrb_figures(run),

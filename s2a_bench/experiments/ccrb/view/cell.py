@@ -61,6 +61,10 @@ class CcrbStudy:
     orderings: Annotated[
         dict[str, OrderingShare], {"required": list(ORDERINGS), "propertyNames": {"enum": list(ORDERINGS)}}
     ]
+    follower_survives: Annotated[
+        OrderingShare | None,
+        about("Where the car behind stops behind an ego whose tokens come at once; elsewhere rear says nothing."),
+    ] = None
     paper_rates_tokens_per_s: Annotated[
         tuple[float, float] | None,
         about("Least and greatest R at which the paper's ordering holds; absent where it does nowhere."),

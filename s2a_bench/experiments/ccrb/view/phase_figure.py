@@ -55,9 +55,11 @@ def build_phase(run: Run) -> Figure:
     scene = (
         f"{ahead(asked)}, reaction {asked['reaction_s']:g} s, N = {asked['n_skills']}, L = {asked['tokens_per_skill']}"
     )
+    survives = scenes_of(run, "phase", GAPS[0])["survives"]
+    check = f" It survives an ego with fast tokens at {survives.mean():.0%}." if survives.notna().all() else ""
     lines = [
         f"Who has an impact? {scene[0].upper()}{scene[1:]}. {ORDERING}",
-        f"Rear: {law(asked)}. EMULATED: tokens come evenly.",
+        f"Rear: {law(asked)}.{check} EMULATED: tokens come evenly.",
     ]
     figure = new_figure(2.9, "\n".join(textwrap.fill(line, chars) for line in lines), WIDE_IN)
     grid = figure.subplots(1, len(GAPS), sharex=True, sharey=True)

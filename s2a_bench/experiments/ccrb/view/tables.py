@@ -19,7 +19,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     share_of,
 )
 from s2a_bench.experiments.ccrb.view.sentences import origin_notes
-from s2a_bench.experiments.ccrb.view.variations import follower_table
+from s2a_bench.experiments.ccrb.view.variations import follower_tables
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.words import NO_SCORE, ORDERING, law, operating_point, said
 from s2a_bench.writers.as_json import frame
@@ -101,7 +101,7 @@ def ccrb_tables(run: Run) -> dict[str, TextTable]:
     if has(run, "phase"):
         tables["phase"] = phase_table(run)
     if len(run.table(FOLLOWER_STUDY)):
-        tables["followers"] = follower_table(run)
+        tables |= follower_tables(run)
     return {**tables, "margins": margin_table(run), "outcomes": outcome_table(run)}
 
 
@@ -139,9 +139,13 @@ def _study(run: Run, study: str, gap: str) -> dict[str, Any]:
         share = share_of(scenes, name)
         interval = {"ci95": list(share.interval)} if study == "random" else {}
         shares[name] = {"k": share.k, "value": share.value, **interval}
+    check = {}
+    if scenes["survives"].notna().all():
+        survives = share_of(scenes, "survives")
+        check = {"follower_survives": {"k": survives.k, "value": survives.value}}
     span = rate_span(run, gap) if study == "phase" else None
     rates = {} if span is None else {"paper_rates_tokens_per_s": list(span)}
-    return {"study": study, "gap_behaviour": gap, "scenarios": len(scenes), "orderings": shares, **rates}
+    return {"study": study, "gap_behaviour": gap, "scenarios": len(scenes), "orderings": shares, **check, **rates}
 
 
 def _ordering_notes() -> tuple[str, ...]:

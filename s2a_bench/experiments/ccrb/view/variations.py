@@ -1,4 +1,4 @@
-"""How far the paper's ordering carries: the table of followers, and the figure of numbers varied one at a time."""
+"""How far the paper's ordering carries: the tables of followers, and the figure of numbers varied one at a time."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
 WIDE_IN: Final = 7.16
+SETTING: Final = ["follower", "front_gap_m", "lead_decel_mps2"]
 TITLES: Final = {
     "gap_decel_mps2": "braking in gaps (m/s\N{SUPERSCRIPT TWO})",
     "build_s": "follower's brake builds up in (s)",
@@ -31,43 +32,38 @@ TITLES: Final = {
 }
 
 
-def follower_table(run: Run) -> TextTable:
-    """Lay out each follower at Euro NCAP's combinations: the operating point's outcomes, and shares of the plane."""
+def follower_tables(run: Run) -> dict[str, TextTable]:
+    """Lay out each follower at Euro NCAP's combinations: what came of the operating point, and shares of the plane."""
     found, asked = run.table(FOLLOWER_STUDY), configuration(run)
-    point, drawn = found[found["seed"].isna()], found[found["seed"].notna()]
-    settings = ["follower", "front_gap_m", "lead_decel_mps2"]
-    points = dict(list(point.groupby(settings, sort=False)))
-    rows = []
-    for key, group in drawn.groupby(settings, sort=False):
-        here = {row["policy"]: row for row in points[key].to_dict("records")}
-        by_policy = dict(list(group.groupby("policy", sort=False)))
-        naive = by_policy["naive"]
-        follower, front_m, decel = key
-        rows.append(
-            (
-                str(follower),
-                f"{front_m:g} m, -{decel:g}",
-                *(_outcome(here[policy]) for policy in PAPER),
-                _range(naive["paper"], naive["points"]),
-                _range(naive["survived"], naive["points"]),
-                *(_range(by_policy[policy]["rear"], by_policy[policy]["points"]) for policy in PAPER),
-                _range(naive["rear_survived"], naive["survived"]),
-            )
-        )
     rate = run.manifest["boards"][0]["tokens_per_s"]
-    seeds, drawn_points = drawn["seed"].nunique(), int(drawn["points"].iloc[0])
-    header = ("follower", "lead", *PAPER, "ordering %", "survives %", "rear %: naive", "wait", "stream", "naive*")
+    where = f"R = {rate:g} tokens/s, rear gap {asked['rear_gap_m']:g} m, gap behaviour {asked['gap']}"
+    drawn = found[found["seed"].notna()]
+    seeds, points = drawn["seed"].nunique(), int(drawn["points"].iloc[0])
     notes = (
-        Note(ORDERING, PAPERS),
-        f"Outcomes: at R = {rate:g} tokens/s, rear gap {asked['rear_gap_m']:g} m; gap behaviour {asked['gap']}.",
-        f"%: of {drawn_points} points of {plane_words(asked)}, mean [least, most] over {seeds} seeds that draw them.",
         "Survives: the follower stops behind an ego whose tokens come at once, at the same gap.",
-        f"Where it does not, a rear outcome says nothing of the policy ({MARK}); naive*: of the points where it does.",
-        "Who never stalls is not hit there: it brakes like that ego, only later. A front impact ends a roll-out.",
-        *(f"{follower}: {law({**asked, 'follower': follower})}." for follower in dict.fromkeys(found["follower"])),
+        f"{MARK} It does not: a rear outcome says nothing of the policy.",
+        *(f"{law({**asked, 'follower': follower})}." for follower in dict.fromkeys(found["follower"])),
         NO_SCORE,
     )
-    return TextTable("Every follower at Euro NCAP's four CCRb combinations", header, rows, 2, notes=notes)
+    shares = (
+        Note(ORDERING, PAPERS),
+        f"Mean [least, most] of {seeds} seeds that draw {points} points of {plane_words(asked)} each.",
+        "naive*: of the points where the follower survives; nobody without stalls is hit there, as it brakes alike.",
+        "A front impact ends a roll-out.",
+        *notes,
+    )
+    header = ("follower", "lead", "ordering", "survives", "rear: naive", "wait", "stream", "naive*")
+    title = "Every follower at Euro NCAP's four CCRb combinations"
+    return {
+        "follower-shares": TextTable(f"{title}: % of the plane", header, _share_rows(drawn), 2, notes=shares),
+        "followers": TextTable(
+            f"{title}: {where}",
+            ("follower", "lead", "survives", *PAPER),
+            _point_rows(found[found["seed"].isna()]),
+            2,
+            notes=notes,
+        ),
+    }
 
 
 def build_sensitivity(run: Run) -> Figure:
@@ -115,6 +111,33 @@ def _draw(axes: Axes, group: pd.DataFrame, default: float) -> None:
     axes.fill_between(share.index, share["min"], share["max"], color="#0072B2", alpha=0.25, linewidth=0)
     axes.plot(share.index, share["mean"], "o-", color="#0072B2", linewidth=1.2, markersize=3)
     axes.axvline(default, color="#555555", linestyle=":", linewidth=1)
+
+
+def _point_rows(point: pd.DataFrame) -> list[tuple[str, ...]]:
+    """Return a row a setting with each policy's outcome."""
+    rows = []
+    for key, group in point.groupby(SETTING, sort=False):
+        here = {row["policy"]: row for row in group.to_dict("records")}
+        survives = "yes" if here["naive"]["survived"] else "no"
+        rows.append((*_names(key), survives, *(_outcome(here[policy]) for policy in PAPER)))
+    return rows
+
+
+def _share_rows(drawn: pd.DataFrame) -> list[tuple[str, ...]]:
+    """Return a row a setting with shares of the drawn points."""
+    rows = []
+    for key, group in drawn.groupby(SETTING, sort=False):
+        policies = {str(policy): mine for policy, mine in group.groupby("policy", sort=False)}
+        naive = policies["naive"]
+        of_all = (_range(naive[name], naive["points"]) for name in ("paper", "survived"))
+        rear = (_range(policies[policy]["rear"], policies[policy]["points"]) for policy in PAPER)
+        rows.append((*_names(key), *of_all, *rear, _range(naive["rear_survived"], naive["survived"])))
+    return rows
+
+
+def _names(setting: Any) -> tuple[str, str]:
+    follower, front_m, decel = setting
+    return str(follower), f"{front_m:g} m, -{decel:g}"
 
 
 def _outcome(row: dict[Any, Any]) -> str:
