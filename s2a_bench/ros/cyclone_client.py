@@ -14,7 +14,7 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import Accepted, ActionEvent, CancelResponse, Feedback, QoS, Rejected, Result
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import CANCEL_GOAL, STATUS_ARRAY, CancelCode
-from s2a_bench.ros.dds import RawReader, RawWriter, Waiter, dds_qos
+from s2a_bench.ros.dds import AT_ONCE, RawReader, RawWriter, Waiter, dds_qos
 from s2a_bench.ros.dds_service import BODY_AT, READER_QOS, ServiceClient
 
 MATCH_POLL_S = 0.01
@@ -39,6 +39,8 @@ class CycloneActionClient:
         self._results = ServiceClient(participant, prefix + "get_result", type_name + "_GetResult", version)
         self._cancels = ServiceClient(participant, prefix + "cancel_goal", CANCEL_GOAL, version)
         self._active: set[bytes] = set()
+        self._ended: deque[tuple[bytes, memoryview]] = deque()
+        """Results whose feedback is not all taken."""
         self._events: deque[ActionEvent] = deque()
         services = (self._goals, self._results, self._cancels)
         self._waiter = Waiter(participant, [*(service.reader for service in services), self._feedback])
@@ -123,10 +125,10 @@ class CycloneActionClient:
         The server sends acceptance, feedback, result, through different writers. What was sent last is taken first:
         whatever preceded it has then arrived too, and goes before it into the queue.
         """
-        results = list(iter(self._results.reply, None))
-        cancels = list(iter(self._cancels.reply, None))
-        feedback = [(bytes(packed[FEEDBACK_ID]), packed) for packed in iter(self._feedback.take, None)]
-        for goal_id, packed in iter(self._goals.reply, None):
+        self._ended.extend(self._results.replies())
+        cancels = list(self._cancels.replies())
+        feedback = [(bytes(packed[FEEDBACK_ID]), packed) for packed in self._feedback.arrived()]
+        for goal_id, packed in self._goals.replies():
             if packed[BODY_AT]:
                 self.get_result(goal_id)
                 self._events.append(Accepted(goal_id))
@@ -135,7 +137,8 @@ class CycloneActionClient:
                 self._events.append(Rejected(goal_id))
         self._events.extend(Feedback(goal_id, packed) for goal_id, packed in feedback if goal_id in self._active)
         self._events.extend(self._cancel_response(goal_id, packed) for goal_id, packed in cancels)
-        for goal_id, packed in results:
+        while self._ended and len(feedback) < AT_ONCE:  # else there may be more that preceded a result
+            goal_id, packed = self._ended.popleft()
             self._active.discard(goal_id)
             self._events.append(Result(goal_id, packed[BODY_AT], packed))
 

@@ -199,7 +199,7 @@ class CycloneActionServer:
         services = ((self._cancel, self._answer_cancel), (self._get_result, self._answer_result))
         while not self._service_waiter.interrupted:
             for service, answer in services:
-                for packed in iter(service.reader.take, None):
+                for packed in service.reader.arrived():
                     self._answer(service, answer, packed)
             with self._lock:
                 self._goals.expire(now_ns())

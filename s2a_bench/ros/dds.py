@@ -13,6 +13,7 @@ import types
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from typing import Any
 
 from cyclonedds.core import (
@@ -40,6 +41,8 @@ FOREVER_NS = 2**63 - 1
 ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
 WAIT_SLICE_NS = 500_000_000
 """A blocked wait returns to Python this often, so that Ctrl-C acts."""
+AT_ONCE = 1000
+"""More than that is not taken before what has come is looked at."""
 
 
 class _Outgoing(ct.Structure):
@@ -182,6 +185,10 @@ class RawReader:
             loan = _Loan(self._serdata.value or 0)
             if self._info.valid_data:  # else the notice that a writer has left
                 return loan.view()
+
+    def arrived(self) -> Iterator[memoryview]:
+        """Take what has arrived, `AT_ONCE` samples at most: a writer may send faster than we take."""
+        return islice(iter(self.take, None), AT_ONCE)
 
     def sender(self) -> int:
         """Return the handle of the writer whose sample was taken last."""

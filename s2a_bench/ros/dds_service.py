@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import time
+from collections.abc import Iterator
 from itertools import count
 from threading import Lock
 from typing import Any
@@ -24,7 +25,10 @@ HEADER = struct.Struct("<Qq")
 HEADER_AT = 4
 BODY_AT = 20
 
-WRITER_QOS = QoS(depth=10)
+REQUEST_QOS = QoS(depth=10)
+"""What ROS's services have; a request may hold pictures."""
+REPLY_QOS = QoS(depth=1000)
+"""Deeper than ROS's 10: all clients' replies share one writer, and one that was lost on the way can be sent again."""
 READER_QOS = QoS(depth=0)
 """Our readers keep all, whatever ROS does: history is local, and a burst overruns ROS's default of 10."""
 
@@ -57,7 +61,8 @@ class _End:
         def user_data(type_name: str) -> str:
             return f"{own}={identity};typehash={type_hash(type_name, version)};"
 
-        self.writer = RawWriter(participant, *sent, dds_qos(WRITER_QOS, user_data(sent[1])))
+        writer_qos = REQUEST_QOS if sent is request else REPLY_QOS
+        self.writer = RawWriter(participant, *sent, dds_qos(writer_qos, user_data(sent[1])))
         self.reader = RawReader(participant, *received, dds_qos(READER_QOS, user_data(received[1])))
 
     def matched(self) -> bool:
@@ -98,15 +103,14 @@ class ServiceClient(_End):
             HEADER.pack_into(packed, HEADER_AT, self._guid, number)
             self.writer.send(packed)
 
-    def reply(self) -> tuple[bytes, memoryview] | None:
-        """Take the next reply to a request of ours: (goal id, CDR)."""
-        while (packed := self.reader.take()) is not None:
+    def replies(self) -> Iterator[tuple[bytes, memoryview]]:
+        """Take what has arrived, a bounded number, and yield the replies to requests of ours: (goal id, CDR)."""
+        for packed in self.reader.arrived():
             if len(packed) <= BODY_AT:
                 continue
             guid, number = HEADER.unpack_from(packed, HEADER_AT)
             if guid == self._guid and (goal_id := self._pending.pop(number, None)) is not None:
-                return goal_id, packed
-        return None
+                yield goal_id, packed
 
     def unpack(self, packed: memoryview) -> Any:
         """Deserialise a reply's body; raises TransportError."""

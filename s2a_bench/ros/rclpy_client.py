@@ -29,6 +29,8 @@ from s2a_bench.ros.rclpy_node import Inbox, SpinningNode, qos_profile
 from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class
 
 MATCH_POLL_S = 0.01
+AT_ONCE = 10_000
+"""A server may send feedback faster than we take it; an answer has fewer pieces."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +52,11 @@ class _DrainingClient(ActionClient):  # type: ignore[misc]
         super().__init__(*arguments, **keywords)
 
     def take_data(self) -> list[dict[str, Any]]:
-        """Take until nothing is left; a kind that was not ready when the wait ended may be so by now."""
+        """Take until nothing is left, or `AT_ONCE`; a kind that was not ready when the wait ended may be so by now."""
         self._is_goal_response_ready = self._is_feedback_ready = True
-        batches = []
+        batches: list[dict[str, Any]] = []
         with self._owner.lock:
-            while batch := super().take_data():
+            while len(batches) < AT_ONCE and (batch := super().take_data()):
                 batches.append(batch)
         return batches
 

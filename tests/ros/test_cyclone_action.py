@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import Accepted, Feedback, Middleware, Rejected, Result, llama, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.testing.action import NAME, ActionSuite, event, offer, receive, send, start, text_of
+from s2a_bench.testing.action import NAME, WAIT_S, ActionSuite, event, offer, receive, send, start, text_of
 from s2a_bench.testing.middleware import Join
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
@@ -27,7 +28,7 @@ RECORDED = {(end["kind"], end["topic"]): end for end in WIRE["endpoints"] if "ge
 DISCOVERY = "ros_discovery_info"
 OURS = {
     ("reader", r"rq/generate/.*Request|rr/generate/.*Reply|rt/generate/_action/feedback"): "Policy.History.KeepAll",
-    ("writer", r"rt/generate/_action/feedback"): "Policy.History.KeepLast(depth=1000)",
+    ("writer", r"rt/generate/_action/feedback|rr/generate/.*Reply"): "Policy.History.KeepLast(depth=1000)",
 }
 """Where our history, which is local and matches any other, is deeper than ROS's."""
 
@@ -241,3 +242,24 @@ def test_client_and_server_are_two_processes(join: Join, dds_domain: int) -> Non
     while client.server_present() and now_ns() < deadline:
         client.next_event(0.01)
     assert not client.server_present()
+
+
+def test_a_server_may_send_faster_than_its_client_reads(join: Join, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The client looks at what has come, and takes no result before what was sent before it."""
+    client = (action := offer(join)).client
+    goal = start(action)
+    goal.feedback(llama.token_feedback("on", 1))
+    packed = event(client, Feedback).packed
+    goal.succeed(llama.text_result("on", [1]))
+    taken = count(1)
+
+    def never_empty() -> memoryview:
+        assert next(taken) < 100_000, "the client takes without end"
+        return packed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(client._feedback, "take", never_empty)  # type: ignore[attr-defined]
+        came = [client.next_event(WAIT_S) for _ in range(2500)]
+    assert {type(one) for one in came} == {Feedback}
+    rest = iter(lambda: client.next_event(1), None)
+    assert [type(one) for one in rest if not isinstance(one, Feedback)] == [Result]
