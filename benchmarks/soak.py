@@ -124,11 +124,8 @@ class Result:
 def served(transport: str, engine: str, name: str, log: Path) -> Iterator[Served]:
     """Run `serve`, which ends with the context; what it writes to standard error goes to ``log``."""
     line = [sys.executable, "-m", "s2a_bench", "serve", transport, "--engine", engine]
-    line += (
-        ["--port", "0"]
-        if transport == "http"
-        else ["--namespace", f"/{name}_{os.getpid()}", "--max-tokens", str(TOKENS)]
-    )
+    own = {"http": ["--port", "0"], "ros": ["--namespace", f"/{name}_{os.getpid()}", "--max-tokens", str(TOKENS)]}
+    line += own[transport]
     with (
         log.open("a") as errors,
         subprocess.Popen(line, stdout=subprocess.PIPE, stderr=errors, text=True) as process,  # noqa: S603 - ours

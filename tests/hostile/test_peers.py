@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers
+from s2a_bench.transport import Wiring
+from s2a_bench.transport.limits import Limits
 
 
 class TestHttp(HostileSuite):
     name = "http"
     clients = http.CLIENTS
     servers = http.SERVERS
+
+    @classmethod
+    def told(cls) -> Wiring[Any]:
+        return replace(super().told(), limits=Limits(head_s=2))  # one case waits for it
 
 
 class TestRosTopic(HostileSuite):

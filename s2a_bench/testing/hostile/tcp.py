@@ -114,7 +114,10 @@ def _answer(connection: socket.socket, pieces: Iterator[bytes], then: Then, over
             connection.sendall(piece)
         if then == "resets":
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
-        while then == "waits" and not over.is_set():
+            return
+        if then == "goes":
+            connection.shutdown(socket.SHUT_WR)  # closing what has come unread would reset
+        while not over.is_set():
             with suppress(TimeoutError):
                 if not connection.recv(1 << 16):
                     return
