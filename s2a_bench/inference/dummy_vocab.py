@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import string
 from dataclasses import dataclass
 from itertools import product
 
@@ -23,6 +24,7 @@ _IMAGE_SPECIAL = tuple(
     for mark in (f"<{name}>", f"</{name}>")
 )
 _RESERVED = tuple(f"<|reserved_special_token_{index}|>" for index in range(6))
+TEXT = frozenset(string.ascii_letters + string.digits + string.punctuation + " \n")
 SPECIAL = _QWEN_SPECIAL + _IMAGE_SPECIAL + _RESERVED
 
 
@@ -38,17 +40,22 @@ class Vocab:
     eos: int
     unknown: int
 
+    def texts(self) -> list[bool]:
+        """Return of each token whether it is text by itself: no control token, no byte of a longer character."""
+        unreadable = {name for byte, name in byte_names().items() if chr(byte) not in TEXT}
+        return [kind == NORMAL and token not in unreadable for token, kind in zip(self.tokens, self.types, strict=True)]
 
-def byte_alphabet() -> list[str]:
+
+def byte_names() -> dict[int, str]:
     """Return GPT-2's printable character for each of the 256 bytes (``bytes_to_unicode``), in GPT-2's order."""
     printable = [*range(33, 127), *range(161, 173), *range(174, 256)]
     others = [byte for byte in range(256) if byte not in printable]
-    return [chr(byte) for byte in printable] + [chr(256 + index) for index in range(len(others))]
+    return {byte: chr(byte) for byte in printable} | {byte: chr(256 + index) for index, byte in enumerate(others)}
 
 
 def make_vocab(*, full: bool) -> Vocab:
     """Make the vocabulary of Qwen2's size, or the byte-level one of the tiny model."""
-    alphabet = byte_alphabet()
+    alphabet = byte_names().values()
     tokens, merges = list(alphabet), ["\u0120 t"]  # llama.cpp wants at least one merge; \u0120 stands for a space
     if full:
         merges = _letter_merges(FULL_BASE - len(alphabet))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -29,12 +29,12 @@ _Q6_SCALE = 8  # keeps the half-precision factor beside it a normal number
 
 @dataclass(frozen=True, slots=True)
 class Tensor:
-    """One tensor: its shape as numpy writes it (columns last); ``value`` fills it instead of random numbers."""
+    """One tensor: its shape as numpy writes it (columns last); a ``value``, or one for each, where it is not random."""
 
     name: str
     shape: tuple[int, ...]
     kind: Kind = "f32"
-    value: float | None = None
+    value: float | Sequence[float] | None = None
 
     @property
     def nbytes(self) -> int:
@@ -58,7 +58,7 @@ class Tensor:
             if self.value is None:
                 yield draw(_random_bytes(generator, blocks * size), self.spread)
             else:
-                yield np.full(blocks, self.value, _FLOATS[self.kind]).view(np.uint8)
+                yield np.broadcast_to(np.asarray(self.value, _FLOATS[self.kind]), blocks).copy().view(np.uint8)
 
 
 def _random_bytes(generator: np.random.Generator, size: int) -> Bytes:

@@ -8,7 +8,7 @@ import pytest
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import dummy
 from s2a_bench.inference.dummy import DummyFiles, dummy_files, write_dummy
-from s2a_bench.inference.dummy_vocab import FULL_UNKNOWN, byte_alphabet, make_vocab
+from s2a_bench.inference.dummy_vocab import FULL_UNKNOWN, byte_names, make_vocab
 from s2a_bench.inference.dummy_weights import CHUNK_BYTES, KINDS, Kind, Tensor
 from s2a_bench.inference.gguf_file import read_header
 
@@ -28,7 +28,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(tmp_path: Pa
 
 def test_the_numbers_are_those_of_this_revision() -> None:
     # the caches of users hold these; raise REVISION whenever this changes
-    assert dummy.REVISION == 2
+    assert dummy.REVISION == 3
     shape, digest = dummy.SHAPES["tiny"], hashlib.sha256()
     for tensor in (*dummy._model_tensors(shape, 281, "f16"), *dummy._mmproj_tensors(shape)):
         digest.update(tensor.name.encode())
@@ -41,6 +41,16 @@ def test_tiny_is_about_13_mb_in_two_files_and_nothing_else_is_left(tmp_path: Pat
     files = write_dummy(tmp_path)
     assert 12e6 < sum(path.stat().st_size for path in files) < 14e6
     assert sorted(tmp_path.iterdir()) == sorted(files)
+
+
+def test_the_tiny_model_says_only_what_a_server_sends(tmp_path: Path) -> None:
+    """A control token, or one byte of a longer character, is no text: its delta is empty or never sent."""
+    header = gguf.GGUFReader(write_dummy(tmp_path).model)
+    (bias,) = (tensor.data for tensor in header.tensors if tensor.name == "output.bias")
+    names = header.fields["tokenizer.ggml.tokens"].contents()
+    said = {name for name, value in zip(names, bias, strict=True) if value == 0}
+    assert said == {*map(chr, range(33, 127)), "\u0120", "\u010a", "\u0120t"}
+    assert max(bias[bias != 0]) < -1000
 
 
 def test_both_files_say_that_they_are_dummies(tmp_path: Path) -> None:
@@ -95,7 +105,7 @@ def test_every_merge_joins_two_tokens_into_one_that_exists(full: bool) -> None:
 
 
 def test_the_byte_alphabet_is_gpt_2s() -> None:
-    alphabet = byte_alphabet()
+    alphabet = [*byte_names().values()]
     assert len(set(alphabet)) == 256
     assert alphabet[0] == "!"
     assert {"Ġ", "Ċ"} <= set(alphabet)  # space and new line
