@@ -19,12 +19,12 @@ from s2a_bench.inference import EngineConfig, llama_log
 from s2a_bench.inference.grammar_limits import beyond_limits
 from s2a_bench.inference.llama_decode import GreedySampler, Sampler, TokenBatch, TokenBytes
 from s2a_bench.inference.llama_gbnf import GrammarSampler, grammar_error
+from s2a_bench.inference.llama_pictures import PixelHandler
 from s2a_bench.inference.llama_settings import FLASH_ATTENTION, KV_TYPES, SAMPLINGS
 from s2a_bench.inference.models import ModelFiles, load_headers, sha256
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.types import Request, Token
 
 llama_cpp = extras.require("llama_cpp", "llama")
-chat_format = extras.require("llama_cpp.llama_chat_format", "llama")
 
 _URL = "s2a-bench:image/{:04d}/"
 _MS_NS = 1_000_000
@@ -71,45 +71,6 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
         return iter(())
 
 
-class _PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, name-defined]  # the library has no types
-    """The library's handler, except that a picture is an RGB array and not the bytes of a JPEG."""
-
-    def __init__(self, mmproj: str, *, use_gpu: bool) -> None:
-        super().__init__(clip_model_path=mmproj, verbose=False)
-        self.mtmd_ctx: Any = None
-        self.frames: tuple[Frame, ...] = ()
-        self._use_gpu = use_gpu
-
-    def _init_mtmd_context(self, llama_model: Any) -> None:
-        """Load the vision tower; the library's version puts it on a GPU whatever the user chose."""
-        if self.mtmd_ctx is not None:
-            return
-        mtmd = self._mtmd_cpp
-        params = mtmd.mtmd_context_params_default()
-        params.use_gpu = self._use_gpu
-        params.print_timings = False
-        params.n_threads = llama_model.n_threads
-        params.flash_attn_type = llama_model.context_params.flash_attn_type
-        self.mtmd_ctx = mtmd.mtmd_init_from_file(self.clip_model_path.encode(), llama_model.model, params)
-        if self.mtmd_ctx is None:
-            raise ValueError(llama_log.reason() or "MTMD cannot load it")
-        llama_model._stack.callback(self._free)  # noqa: SLF001 the library's own way to tie the two together
-
-    def _free(self) -> None:
-        self._mtmd_cpp.mtmd_free(self.mtmd_ctx)
-        self.mtmd_ctx = None
-
-    def load_image(self, image_url: str) -> Frame:
-        """Return the frame that the URL counts."""
-        return self.frames[int(image_url.rstrip("/").rpartition("/")[2])]
-
-    def _create_bitmap_from_bytes(self, image_bytes: Frame) -> Any:
-        """Hand the pixels over; MTMD copies them."""
-        pixels = np.ascontiguousarray(image_bytes.data)
-        pointer = pixels.ctypes.data_as(ctypes.POINTER(ctypes.c_uint8))
-        return self._mtmd_cpp.mtmd_bitmap_init(image_bytes.width, image_bytes.height, pointer)
-
-
 class LlamaCppEngine:
     """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names.
 
@@ -129,7 +90,7 @@ class LlamaCppEngine:
         self._llama: _Prefilled | None = None
         llama_log.silence()
         llama_log.reason()
-        self._handler = _PixelHandler(str(self._files.mmproj.path), use_gpu=config.gpu_layers != 0)
+        self._handler = PixelHandler(str(self._files.mmproj.path), use_gpu=config.gpu_layers != 0)
         self._llama = self._load(self._files)
         self._batch = TokenBatch()
 
