@@ -33,6 +33,11 @@ PROMPT_N = Fact("prompt_n", "tokens", "prompt that was evaluated, pictures inclu
 CACHE_N = Fact("cache_n", "tokens", "prompt that came from a cache")
 PROMPT_MS = Fact("prompt_ms", "ms", "evaluating the prompt, pictures included")
 PROMPT_EVAL_MS = Fact("prompt_eval_ms", "ms", "the language model's part of `prompt_ms`")
+PREPROCESS_MS = Fact("preprocess_ms", "ms", "of `prompt_ms`, before the model: template, slicing, resizing, tokenising")
+VISION_ENCODE_MS = Fact(
+    "vision_encode_ms", "ms", "of `prompt_ms`, the vision tower, over all slices; absent without picture"
+)
+FIRST_DECODE_MS = Fact("first_decode_ms", "ms", "the first token to the second: the first step after the prompt")
 PREDICTED_N = Fact("predicted_n", "tokens", "generated answer")
 PREDICTED_MS = Fact("predicted_ms", "ms", "generating the answer, from the end of the prompt to the last token")
 END_N = Fact("end_n", "tokens", "of `predicted_n`, the last that ends the answer and is never shown")
@@ -44,3 +49,9 @@ CAMERA_FRAMES = Fact("camera_frames", "frames", "camera frames that the server h
 FRAMES_PUBLISHED = Fact("frames_published", "frames", "camera frames sent, up to the one that the answer is about")
 FRAMES_LOST = Fact("frames_lost", "frames", "`frames_published` less `camera_frames`")
 HEADERS_OFF_MS = Fact("headers_off_ms", "ms", "response headers to first token, less `prompt_ms`")
+
+LLAMA: tuple[Fact, ...] = (
+    *(PROMPT_N, PROMPT_MS, PREPROCESS_MS, VISION_ENCODE_MS, PROMPT_EVAL_MS),
+    *(FIRST_DECODE_MS, PREDICTED_N, PREDICTED_MS),
+)
+"""What the llama engine tells of a request, here and behind our own servers."""

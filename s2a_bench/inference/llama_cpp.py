@@ -14,7 +14,16 @@ import numpy as np
 from s2a_bench import extras
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import BadRequest, EngineError, ModelError
-from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_EVAL_MS, PROMPT_MS, PROMPT_N
+from s2a_bench.facts import (
+    FIRST_DECODE_MS,
+    PREDICTED_MS,
+    PREDICTED_N,
+    PREPROCESS_MS,
+    PROMPT_EVAL_MS,
+    PROMPT_MS,
+    PROMPT_N,
+    VISION_ENCODE_MS,
+)
 from s2a_bench.inference import EngineConfig, llama_log
 from s2a_bench.inference.grammar_limits import beyond_limits
 from s2a_bench.inference.llama_decode import GreedySampler, Sampler, TokenBatch, TokenBytes
@@ -75,8 +84,9 @@ class LlamaCppEngine:
     """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names.
 
     ``prompt_n`` is what llama.cpp says it evaluated, pictures included; ``prompt_ms`` is the time from the request to
-    the first token's logits, slicing and vision tower included; ``prompt_eval_ms`` is the language model's part of it.
-    ``predicted_n`` tokens took ``predicted_ms`` from there to the last.
+    the first token's logits, of which ``preprocess_ms`` went before the model (slicing, resizing, tokenising),
+    ``vision_encode_ms`` into the vision tower and ``prompt_eval_ms`` into the language model. ``predicted_n`` tokens
+    took ``predicted_ms`` from there to the last, ``first_decode_ms`` of it from the first to the second.
     """
 
     def __init__(self, config: EngineConfig) -> None:
@@ -139,10 +149,13 @@ class LlamaCppEngine:
         self.facts = {
             PROMPT_N: float(perf.n_p_eval),
             PROMPT_MS: (prompt_done - started) / _MS_NS,
+            PREPROCESS_MS: (self._handler.steps.prepared_ns - started) / _MS_NS,
             PROMPT_EVAL_MS: perf.t_p_eval_ms,
             PREDICTED_N: 0.0,
             PREDICTED_MS: 0.0,
         }
+        if request.images:
+            self.facts[VISION_ENCODE_MS] = self._handler.steps.encode_ns / _MS_NS
         ignore_end = self._files.dummy and not request.grammar  # random weights end at random, counts should not
         decode = codecs.getincrementaldecoder("utf-8")("replace").decode
         llama.set_seed(request.seed & 0x7FFF_FFFF)  # 2**32-1 would mean a random seed
@@ -153,7 +166,10 @@ class LlamaCppEngine:
             for index in range(request.max_tokens):
                 if turn != self._turn:
                     raise EngineError("llama: a later request took over the engine; one request at a time")
+                asked_ns = now_ns()
                 token = next(ids)
+                if index == 1:
+                    self.facts[FIRST_DECODE_MS] = (now_ns() - asked_ns) / _MS_NS
                 if not ignore_end and llama_cpp.llama_vocab_is_eog(llama._model.vocab, token):  # noqa: SLF001
                     return
                 text = decode(pieces[token], index + 1 == request.max_tokens)

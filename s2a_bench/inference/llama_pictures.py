@@ -8,10 +8,54 @@ from typing import Any
 import numpy as np
 
 from s2a_bench import extras
+from s2a_bench.clock import now_ns
 from s2a_bench.inference import llama_log
 from s2a_bench.types import Frame
 
+llama_cpp = extras.require("llama_cpp", "llama")
 chat_format = extras.require("llama_cpp.llama_chat_format", "llama")
+mtmd_cpp = extras.require("llama_cpp.mtmd_cpp", "llama")
+
+_NO_CALLBACK = mtmd_cpp.mtmd_helper_post_decode_callback()
+
+
+class Steps:
+    """MTMD's bindings, except that what the library's handler does in one call is done and timed step by step.
+
+    ``prepared_ns`` is when the last prompt was tokens and its pictures slices, ready for the model; ``encode_ns`` is
+    what the vision tower took for them so far.
+    """
+
+    def __init__(self) -> None:
+        """Start with no prompt."""
+        self.prepared_ns = 0
+        self.encode_ns = 0
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what is not timed."""
+        return getattr(mtmd_cpp, name)
+
+    def mtmd_tokenize(self, *arguments: Any) -> int:
+        """Slice, resize and tokenise: all that comes before the model."""
+        failed: int = mtmd_cpp.mtmd_tokenize(*arguments)
+        self.prepared_ns, self.encode_ns = now_ns(), 0
+        return failed
+
+    def mtmd_helper_eval_chunk_single(
+        self, mtmd: Any, llama: Any, chunk: Any, n_past: Any, sequence: Any, n_batch: int, _last: bool, past: Any
+    ) -> int:
+        """Run a slice through the vision tower, then through the language model, and wait for each."""
+        started_ns = now_ns()
+        failed: int = mtmd_cpp.mtmd_encode_chunk(mtmd, chunk)
+        self.encode_ns += now_ns() - started_ns
+        if failed:
+            return failed
+        made = mtmd_cpp.mtmd_get_output_embd(mtmd)
+        failed = mtmd_cpp.mtmd_helper_decode_image_chunk(
+            mtmd, llama, chunk, made, n_past, sequence, n_batch, past, _NO_CALLBACK, None
+        )
+        llama_cpp.llama_synchronize(llama)
+        return failed
 
 
 class PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, name-defined]  # the library has no types
@@ -20,6 +64,7 @@ class PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, nam
     def __init__(self, mmproj: str, *, use_gpu: bool) -> None:
         """Prepare; the vision tower is loaded with the model that it belongs to."""
         super().__init__(clip_model_path=mmproj, verbose=False)
+        self._mtmd_cpp = self.steps = Steps()
         self.mtmd_ctx: Any = None
         self.frames: tuple[Frame, ...] = ()
         self._use_gpu = use_gpu

@@ -16,7 +16,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from s2a_bench.errors import EngineError
-from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_EVAL_MS, PROMPT_MS, PROMPT_N
+from s2a_bench.facts import LLAMA
 from s2a_bench.inference import Engine, EngineConfig
 from s2a_bench.types import Request, Token
 
@@ -125,7 +125,7 @@ def _close(tokens: object) -> None:
 class Llama(OneThreadEngine):
     """The llama engine, on a thread of its own."""
 
-    tells = (PROMPT_N, PROMPT_MS, PROMPT_EVAL_MS, PREDICTED_N, PREDICTED_MS)
+    tells = LLAMA
 
     def __init__(self, config: EngineConfig) -> None:
         """Load the model."""

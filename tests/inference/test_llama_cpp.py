@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import BadRequest, EngineError, ModelError
+from s2a_bench.facts import LLAMA
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.dummy import write_dummy
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.llama_gbnf import GrammarSampler
+from s2a_bench.inference.llama_pictures import Steps, mtmd_cpp
 from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
 from s2a_bench.types import Frame, Request
 
@@ -104,11 +106,38 @@ def test_a_repeated_frame_is_evaluated_in_full_again(shared: LlamaCppEngine) -> 
 def test_facts_tell_what_the_last_request_cost(shared: LlamaCppEngine) -> None:
     ask(shared, max_tokens=5)
     facts = dict(shared.facts)
-    assert set(facts) == {"prompt_n", "prompt_ms", "prompt_eval_ms", "predicted_n", "predicted_ms"}
+    assert set(facts) == set(LLAMA) - {"vision_encode_ms"}  # there was no picture
     assert facts["prompt_eval_ms"] <= facts["prompt_ms"]
+    assert facts["first_decode_ms"] <= facts["predicted_ms"]
     assert facts["predicted_n"] == 5
     assert facts["prompt_n"] > 10
     assert min(facts["prompt_ms"], facts["predicted_ms"]) > 0
+
+
+def test_preprocessing_vision_tower_and_language_model_are_parts_of_the_prompt(shared: LlamaCppEngine) -> None:
+    ask(shared, images=(rgb_frame(5, 640, 480),), max_tokens=1)
+    facts = dict(shared.facts)
+    parts = [facts[name] for name in ("preprocess_ms", "vision_encode_ms", "prompt_eval_ms")]
+    assert min(parts) > 0
+    assert sum(parts) <= facts["prompt_ms"] * 1.001 + 1  # llama.cpp's own clock has whole microseconds
+    assert "first_decode_ms" not in facts  # one token: nothing was decoded
+
+
+def test_the_vision_tower_of_a_request_before_is_not_counted_again(shared: LlamaCppEngine) -> None:
+    ask(shared, images=(rgb_frame(5, 640, 480),))
+    ask(shared)
+    assert "vision_encode_ms" not in shared.facts
+    assert shared._handler.steps.encode_ns == 0
+
+
+def test_timing_a_picture_step_by_step_changes_no_token(
+    shared: LlamaCppEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures = (rgb_frame(5, 640, 480), rgb_frame(6))
+    said = ask(shared, images=pictures, max_tokens=24)
+    monkeypatch.setattr(Steps, "mtmd_helper_eval_chunk_single", lambda _, *rest: single(*rest))
+    single = mtmd_cpp.mtmd_helper_eval_chunk_single
+    assert ask(shared, images=pictures, max_tokens=24) == said
 
 
 def test_the_bitmap_holds_exactly_the_pixels(shared: LlamaCppEngine) -> None:

@@ -14,10 +14,10 @@ from uuid import uuid4
 from s2a_bench.facts import (
     CACHE_N,
     END_N,
+    LLAMA,
     PREDICTED_MS,
     PREDICTED_N,
     PREDICTED_STEPS,
-    PROMPT_EVAL_MS,
     PROMPT_MS,
     PROMPT_N,
     THINKING_N,
@@ -152,7 +152,7 @@ class Own(OpenAI):
     """Our own server: it wants the request's id, and sends empty tokens, token ids and its marks."""
 
     name = OWN
-    tells = (PROMPT_N, PROMPT_MS, PROMPT_EVAL_MS, PREDICTED_N, PREDICTED_MS)  # our engines behind it
+    tells = LLAMA  # our engines behind it
     payloads = (*OpenAI.payloads, "raw")
 
     def _extra(self, request: Request) -> dict[str, Any]:
