@@ -58,7 +58,7 @@ def test_in_process_http_and_ros_stand_beside_llama_bench(tmp_path: Path) -> Non
     for cell in whole["cells"]:
         assert (cell["n"], cell["warmups"], cell["errors"], cell["t_eval"]) == (2, 1, 0, "engine")
         assert cell["itl_ms"]["n"] == 2 * 39
-        assert {"image_ms", "prompt_eval_ms", "prefill_tokens_per_s", "ttft_ms"} <= set(cell)
+        assert {"vision_encode_ms", "prompt_eval_ms", "first_decode_ms", "ttft_ms"} <= set(cell)
         assert [place["first"] for place in cell["positions"]] == [0, 32]
     compared = {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]}
     assert compared == {

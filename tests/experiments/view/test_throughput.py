@@ -108,6 +108,16 @@ def test_both_rates_by_hand(make: Make) -> None:
     assert list(speed.cell.itl_ms()) == [20.0] * 12
 
 
+def test_the_parts_of_the_prompt_stand_side_by_side(make: Make) -> None:
+    parts = {"preprocess_ms": 10.0, "vision_encode_ms": 130.0, "prompt_eval_ms": 50.0, "first_decode_ms": 21.0}
+    run = make({"in-process": [20] * 4}, facts={"in-process": {"prompt_ms": 200.0, "prompt_n": 30.0, **parts}})
+    assert {name: list(only(run).values(name)) for name in parts} == {name: [ms] * 3 for name, ms in parts.items()}
+    table = throughput_tables(run)["prompt"]
+    assert table.rows == [("in-process", "30.0", "10.0", "130", "50.0", "200", "150", "21.0", "100", "100")]
+    (cell,) = throughput_json(run)["cells"]
+    assert {name: cell[name]["median"] for name in parts} == parts
+
+
 def test_a_server_that_tells_nothing_has_the_clients_rate_and_no_zeros(make: Make) -> None:
     run = make({"http/as-deployed": [10] * 4})
     speed = only(run)

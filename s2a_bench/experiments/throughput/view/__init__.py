@@ -21,7 +21,7 @@ def show(run: Run, *, against: str = "", **_: Any) -> Shown:
     return Shown(
         sentences=throughput_sentences(run),
         tables=tables,
-        main=["throughput"],
+        main=["throughput", "prompt"],
         notes=[" ".join(tables["throughput"].notes)],
         csvs=throughput_csv(run),
         figures=throughput_figures(run, against_paper=against == "paper"),

@@ -37,10 +37,17 @@ class ThroughputCell(RequestsCell):
     prompt_ms: Annotated[Summary | None, about("Picture and prompt in the engine, up to the first token's logits.")] = (
         None
     )
+    preprocess_ms: Annotated[
+        Summary | None, about("The part of prompt_ms before the model: template, slicing, resizing, tokenising.")
+    ] = None
+    vision_encode_ms: Annotated[Summary | None, about("The vision tower's part of prompt_ms, over all slices.")] = None
     image_ms: Annotated[
         Summary | None, about("The part of prompt_ms outside the language model: slicing, vision tower, tokenising.")
     ] = None
     prompt_eval_ms: Annotated[Summary | None, about("The language model's part of prompt_ms.")] = None
+    first_decode_ms: Annotated[
+        Summary | None, about("The first token to the second in the engine: the first step after the prompt.")
+    ] = None
     prompt_tokens: Annotated[Summary | None, about("Prompt tokens evaluated, pictures included.")] = None
     prefill_tokens_per_s: Annotated[Summary | None, about("prompt_tokens / prompt_ms.")] = None
     tokens_per_joule: Annotated[

@@ -17,12 +17,15 @@ from s2a_bench.experiments.latency.view.cells import Cell, by_launch, cells_of, 
 from s2a_bench.experiments.throughput.rows import REFERENCE
 from s2a_bench.facts import (
     END_N,
+    FIRST_DECODE_MS,
     PREDICTED_MS,
     PREDICTED_N,
     PREDICTED_STEPS,
+    PREPROCESS_MS,
     PROMPT_EVAL_MS,
     PROMPT_MS,
     PROMPT_N,
+    VISION_ENCODE_MS,
 )
 from s2a_bench.machine.resources.rows import ENERGY_J
 from s2a_bench.stats.change import ratio_of_launches
@@ -40,8 +43,11 @@ METRICS = (
     "decode_tokens_per_s",
     "ttft_ms",
     "prompt_ms",
+    "preprocess_ms",
+    "vision_encode_ms",
     "image_ms",
     "prompt_eval_ms",
+    "first_decode_ms",
     "prompt_tokens",
     "prefill_tokens_per_s",
     "tokens_per_joule",
@@ -129,6 +135,7 @@ def _metrics(facts: dict[str, float], events: int, span_s: float) -> dict[str, A
     """
     tokens = int((facts.get(PREDICTED_N) or events) - facts.get(END_N, 0))
     found: dict[str, Any] = {"tokens": tokens, "events": events}
+    found |= {str(fact): facts[fact] for fact in (PREPROCESS_MS, VISION_ENCODE_MS, FIRST_DECODE_MS) if fact in facts}
     if tokens > 1 and span_s > 0:
         found["decode_tokens_per_s"] = (tokens - 1) / span_s
     found["told"] = bool(facts.get(PREDICTED_MS))

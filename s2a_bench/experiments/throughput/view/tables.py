@@ -59,15 +59,23 @@ def speed_table(run: Run) -> TextTable:
 
 
 def prompt_table(run: Run) -> TextTable:
-    """Lay out what happens before the first token: medians."""
-    metrics = ("prompt_tokens", "image_ms", "prompt_eval_ms", "prompt_ms", "prefill_tokens_per_s", "ttft_ms")
+    """Lay out what happens before the first token, part by part, and the step after it: medians."""
+    metrics = (
+        *("prompt_tokens", "preprocess_ms", "vision_encode_ms", "prompt_eval_ms", "prompt_ms"),
+        *("prefill_tokens_per_s", "first_decode_ms", "ttft_ms"),
+    )
     rows = []
     for speed in speeds_of(run):
         p99 = summary_of(speed.values("ttft_ms"))
         row = [_median(speed.values(metric)) for metric in metrics]
         rows.append((speed.name, *row, number(p99.p99) if p99 else ABSENT))
-    header = ("cell", "prompt tokens", "image", "prompt eval", "both", "prefill tokens/s", "TTFT", "TTFT p99")
-    return TextTable("Before the first token: medians, in ms", header, rows, 1)
+    header = (
+        "cell",
+        *("tokens", "preprocess", "vision encode", "prefill", "all", "tokens/s", "1st decode"),
+        "TTFT",
+        "p99",
+    )
+    return TextTable("The prompt and the first step after it: medians, in ms", header, rows, 1)
 
 
 def gap_table(run: Run) -> TextTable:
