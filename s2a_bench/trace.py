@@ -40,12 +40,14 @@ STAGES: dict[str, str] = {
     "yuv_decode": "decode",
     "channel_swap": "decode",
     "queue": "queue",
+    "preprocess": "inference",
     "inference": "inference",
     "server": "server",
     "return": "return",
 }
 """Fine stage -> group, in the order of the path: those that any transport may have; it declares the others itself.
-`connect` appears where a client is built per request, `server` where the server is a black box that tells nothing
+`connect` appears where a client is built per request, `preprocess` (what an engine does before its model: slicing,
+resizing, tokenising) where the engine tells it, `server` where the server is a black box that tells nothing
 (last byte packed -> first token)."""
 
 
@@ -169,14 +171,21 @@ class Budget:
 
     @property
     def inference_ns(self) -> int | None:
-        """Return the inference stage, or None where the chain has none."""
-        return self.stages_ns.get("inference")
+        """Return what the engine took, preprocessing included, or None where the chain has no such stage."""
+        inference = self.stages_ns.get("inference")
+        return None if inference is None else inference + self.stages_ns.get("preprocess", 0)
 
     @property
     def e2e_without_inference_ns(self) -> int | None:
         """Return e2e minus inference: what the paper's 101.8 and 15.5 ms can only be."""
         inference = self.inference_ns
         return None if inference is None else self.e2e_ns - inference
+
+    @property
+    def e2e_without_model_ns(self) -> int | None:
+        """Return e2e minus what the model computed, or None where the engine does not tell its preprocessing apart."""
+        known = {"preprocess", "inference"} <= self.stages_ns.keys()
+        return self.e2e_ns - self.stages_ns["inference"] if known else None
 
     @property
     def residual_share(self) -> float | None:

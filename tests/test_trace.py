@@ -44,6 +44,19 @@ def test_a_chain_by_hand() -> None:
     assert spent.groups_ns(STAGES) == {"capture": 10, "encode": 30, "network": 55, "inference": 700, "return": 50}
 
 
+def test_preprocessing_is_inference_and_not_the_model() -> None:
+    chain = [("", 100), ("capture", 110), ("network", 200), ("preprocess", 250), ("inference", 900), ("return", 950)]
+    spent = budget(chain)
+    assert spent.inference_ns == 700
+    assert spent.e2e_without_inference_ns == 150
+    assert spent.e2e_without_model_ns == 200
+    assert spent.groups_ns(STAGES)["inference"] == 700
+
+
+def test_where_preprocessing_is_not_told_the_model_is_not_either() -> None:
+    assert budget([("", 0), ("inference", 7), ("return", 9)]).e2e_without_model_ns is None
+
+
 def test_a_stage_marked_twice_is_the_sum() -> None:
     assert budget([("", 0), ("image_decode", 5), ("", 6), ("image_decode", 9)]).stages_ns == {"image_decode": 8}
 
@@ -58,7 +71,8 @@ def test_own_stages_come_last_on_the_way_out_and_first_on_the_way_in() -> None:
     own = [{"wrap": "encode", "json": "pack"}, {"accept": "network", "unwrap": "decode", "teleport": "network"}]
     assert [*path_of(own)] == [
         *("capture", "convert", "image_encode", "wrap", "json", "connect", "network", "accept", "teleport"),
-        *("unwrap", "image_decode", "yuv_decode", "channel_swap", "queue", "inference", "server", "return"),
+        *("unwrap", "image_decode", "yuv_decode", "channel_swap", "queue"),
+        *("preprocess", "inference", "server", "return"),
     ]
     assert path_of([]) == STAGES
 

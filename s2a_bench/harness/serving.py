@@ -18,6 +18,7 @@ from typing import Any
 
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import S2AError
+from s2a_bench.facts import PREPROCESS_MS
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
@@ -33,10 +34,11 @@ GRACE_S = 4.0
 
 
 def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMITS) -> Queued:
-    """Make the handler that lets one request at a time into the engine and marks `queue` and `inference`.
+    """Make the handler that lets one request at a time into the engine and marks `queue`, `preprocess`, `inference`.
 
-    ``limits`` bound the queue and the time of an answer. With ``pixels`` it also tells the checksum of the picture,
-    once all tokens are on their way and the engine is free.
+    `preprocess` is there where the engine tells ``preprocess_ms`` by its first token. ``limits`` bound the queue and
+    the time of an answer. With ``pixels`` it also tells the checksum of the picture, once all tokens are on their way
+    and the engine is free.
     """
 
     def answer(request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
@@ -46,6 +48,9 @@ def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMI
                 now = now_ns()
                 turn.alive(now)
                 if not trace.token_ns:
+                    if preprocess_ms := engine.facts.get(PREPROCESS_MS):
+                        handed_ns = trace.marks[-1][1]
+                        trace.marks.append(("preprocess", min(handed_ns + round(preprocess_ms * 1e6), now)))
                     trace.marks.append(("inference", now))
                 trace.token_ns.append(now)
                 yield token

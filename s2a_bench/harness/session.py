@@ -25,7 +25,7 @@ from s2a_bench.machine.resources.sampler import Sampler
 from s2a_bench.provenance import UNKNOWN, Provenance
 from s2a_bench.secrets import struck_pieces
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
-from s2a_bench.trace import Mark, Trace
+from s2a_bench.trace import STAGES, Mark, Trace
 from s2a_bench.transport import Client
 from s2a_bench.transport.options import LOSSLESS
 from s2a_bench.transport.pipeline import Pipeline
@@ -241,10 +241,10 @@ class Session:
 
 
 def inference_start_ns(trace: Trace) -> int | None:
-    """Return when the request was handed to the engine: the mark before `inference`, where there is one."""
+    """Return when the request was handed to the engine: the mark before the first of `inference`'s group."""
     chain: list[Mark] = trace.chain()
     for (_, before_ns), (stage, _) in pairwise(chain):
-        if stage == "inference":
+        if STAGES.get(stage) == "inference":
             return before_ns
     return None
 

@@ -96,10 +96,19 @@ def _derive_sample(row: SampleRow) -> dict[str, Value]:
         **_stage_values(spent),
         "e2e_ns": spent.e2e_ns,
         "e2e_without_inference_ns": spent.e2e_without_inference_ns,
+        "e2e_without_model_ns": _without_model_ns(row, spent),
         "ttft_ns": spent.e2e_ns - spent.stages_ns.get("capture", 0),
         "residual_ns": spent.residual_ns,
         "residual_share": spent.residual_share,
     }
+
+
+def _without_model_ns(row: SampleRow, spent: Budget) -> int | None:
+    """Return e2e minus what the model computed; a llama-server, whose `ingest` preprocesses, tells that itself."""
+    if "ingest" not in spent.stages_ns:
+        return spent.e2e_without_model_ns
+    told_ms = row.server_prompt_ms
+    return spent.e2e_ns - round(told_ms * 1e6) if told_ms and 0 < told_ms * 1e6 <= spent.e2e_ns else None
 
 
 def _derive_frame(row: FrameRow) -> dict[str, Value]:
@@ -127,6 +136,7 @@ def samples_table(stages: Mapping[str, str]) -> Table[SampleRow]:
     derived: dict[str, Kind] = {
         "e2e_ns": "int64",
         "e2e_without_inference_ns": "int64",
+        "e2e_without_model_ns": "int64",
         "ttft_ns": "int64",
         "residual_ns": "int64",
         "residual_share": "float64",

@@ -33,6 +33,7 @@ def test_it_is_measured_beside_our_own_cells(tmp_path: Path) -> None:
     theirs = run.samples[run.samples["cell"] == "http/llama-server"]
     assert (theirs["error"] == "").all()
     assert theirs["ingest_ns"].notna().all()
+    assert run.samples["e2e_without_model_ns"].notna().all()
     assert set(theirs["engine"]) == {"llama-server"}
     assert (theirs["cache_n"] == 0).all()
     assert run.origins.of("http/llama-server").weights == "dummy"

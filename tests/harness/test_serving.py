@@ -53,6 +53,18 @@ def test_inference_is_marked_at_the_first_token_and_facts_are_kept() -> None:
     assert trace.facts == {"prompt_n": 4.0}
 
 
+@pytest.mark.parametrize(("told_ms", "longest_ns"), [(1e-6, 1), (1e9, 10**18)])
+def test_preprocessing_that_an_engine_tells_is_a_stage_before_inference(told_ms: float, longest_ns: int) -> None:
+    engine = Engine()
+    engine.go.set()
+    engine.facts["preprocess_ms"] = told_ms
+    trace = Trace()
+    list(engine_handler(engine)(Request("a", "hi"), trace))
+    assert [stage for stage, _ in trace.marks] == ["", "preprocess", "inference"]
+    (_, handed_ns), (_, prepared_ns), (_, first_ns) = trace.marks
+    assert handed_ns < prepared_ns <= min(handed_ns + longest_ns, first_ns)
+
+
 def test_a_second_request_waits_and_says_so() -> None:
     engine = Engine()
     handle = engine_handler(engine)

@@ -112,8 +112,21 @@ def test_derived_columns_are_the_budget_of_the_chain(tmp_path: Path) -> None:
     assert row["residual_ns"] == 50
     assert row["e2e_ns"] == 11_850
     assert row["e2e_without_inference_ns"] == 1_850
+    assert pd.isna(row["e2e_without_model_ns"])
     assert row["ttft_ns"] == 11_750
     assert row["residual_share"] == 50 / 1_850
+
+
+def test_a_llama_servers_model_time_is_what_it_reports(tmp_path: Path) -> None:
+    marks = [("", 0), ("capture", 2_000_000), ("ingest", 12_000_000), ("inference", 50_000_000)]
+    told = {"half": 30.0, "none": None, "more than there was": 51.0, "nothing": 0.0}
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        for name, prompt_ms in told.items():
+            run.sample(sample(name, marks=marks, server_prompt_ms=prompt_ms))
+    samples = read_run(run.path).samples
+    assert samples["e2e_without_inference_ns"].tolist() == [12_000_000] * 4
+    assert samples["e2e_without_model_ns"].iloc[0] == 20_000_000
+    assert samples["e2e_without_model_ns"].iloc[1:].isna().all()
 
 
 def test_an_absent_stage_is_null_and_never_zero(tmp_path: Path) -> None:

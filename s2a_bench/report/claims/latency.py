@@ -105,7 +105,7 @@ def _serialisation(part: Part) -> Said:
 def _conversions(part: Part) -> Said:
     ros = part.cells[1]
     share = _share(ros, _COLOURS, part.run.bootstrap_seed)
-    spent = {stage: float(_spent(ros, [stage]).sum()) for stage in ros.stages if stage != "inference"}
+    spent = {stage: float(_spent(ros, [stage]).sum()) for stage, of in ros.stages.items() if of != "inference"}
     longest = max(spent, key=lambda stage: spent[stage])
     said = (
         f"{ros.name}: YUYV to BGR and BGR to RGB take {_percent(share)} of "

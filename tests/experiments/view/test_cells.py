@@ -5,8 +5,9 @@ import pytest
 
 from s2a_bench.experiments.latency.view.cells import cells_of, engine_note, groups_present, ratios, stages_present
 from s2a_bench.stats import summary_of
-from s2a_bench.store.requests import SampleRow
+from s2a_bench.store.requests import EARLIER_STAGES, SampleRow
 from s2a_bench.store.run import Run
+from s2a_bench.trace import path_of
 from s2a_bench.writers.tables import Note
 
 MakeRun = Callable[..., Run]
@@ -105,10 +106,22 @@ def test_cells_of_which_one_lacks_a_sample_are_compared_without_pairs(
     assert first[3].low == pytest.approx(3)
 
 
-def test_a_llama_server_is_compared_end_to_end_only(make_run: MakeRun) -> None:
-    server = {"capture": 0.1, "json_pack": 0.3, "ingest": 20.0, "inference": 95.0}
-    cells = cells_of(make_run({"http/as-deployed": server, "ros/topic": HAND["ros/topic"]}, n=3))
+LLAMA_SERVER = {"capture": 0.1, "json_pack": 0.3, "ingest": 20.0, "inference": 95.0}
+
+
+def test_a_llama_server_and_an_engine_that_tells_no_preprocessing_are_compared_end_to_end_only(
+    make_run: MakeRun,
+) -> None:
+    cells = cells_of(make_run({"http/as-deployed": LLAMA_SERVER, "ros/topic": HAND["ros/topic"]}, n=3))
     assert [metric for metric, *_ in ratios(cells, 0)] == ["e2e"]
+
+
+def test_a_llama_server_is_compared_without_model_where_both_tell_it(make_run: MakeRun) -> None:
+    ours = {"capture": 0.4, "cdr_pack": 2.0, "network": 5.0, "preprocess": 20.0, "inference": 80.0, "return": 0.6}
+    cells = {"http/llama-server": LLAMA_SERVER, "ros/topic": ours}
+    run = make_run(cells, n=3, spread=0, manifest={"stages": path_of([EARLIER_STAGES])}, server_prompt_ms=80.0)
+    found = {metric: ratio.value for metric, _, _, ratio in ratios(cells_of(run), 0)}
+    assert found == {"e2e_without_model": pytest.approx(35.4 / 28), "e2e": pytest.approx(115.4 / 108)}
 
 
 def test_a_black_box_has_no_ratio_without_inference(make_run: MakeRun, black_box: Any) -> None:

@@ -16,8 +16,9 @@ from s2a_bench.experiments.latency.view import show
 from s2a_bench.experiments.latency.view.as_csv import csv_texts
 from s2a_bench.experiments.latency.view.tables import group_table, stage_table, summary_table
 from s2a_bench.stats import Ratio, Summary
-from s2a_bench.store.requests import SampleRow
+from s2a_bench.store.requests import EARLIER_STAGES, SampleRow
 from s2a_bench.store.run import Run
+from s2a_bench.trace import path_of
 from s2a_bench.writers.tables import interval, mean_sd, number, to_latex, to_markdown
 from s2a_bench.writers.terminal import lay_out
 
@@ -39,6 +40,31 @@ def printed(run: Run) -> str:
         console.print(note)
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
+
+
+def test_without_model_reads_as_a_sum_where_it_is_told(make_run: MakeRun) -> None:
+    ours = {"capture": 1, "network": 3, "preprocess": 20, "inference": 80, "return": 0.5}
+    theirs = {"capture": 1, "json_pack": 2, "ingest": 30, "inference": 81}
+    cells = {"http/llama-server": theirs, "ros/topic": ours}
+    run = make_run(cells, n=4, spread=0, manifest={"stages": path_of([EARLIER_STAGES])}, server_prompt_ms=80.0)
+    assert stage_table(run, full=False).rows[-5:] == [
+        ("", "e2e without inference", "33.0", "4.50"),
+        ("", "preprocess", NONE, "20.0"),
+        ("", "e2e without model", "34.0", "24.5"),
+        ("", "inference", "81.0", "80.0"),
+        ("", "e2e", "114", "104"),
+    ]
+    assert group_table(run).header[-5:] == ("e2e w/o infer.", "preproc.", "e2e w/o model", "infer.", "e2e")
+    text = printed(run)
+    assert "End to end without model in ms" in text
+    assert "e2e less the prompt_ms it reports, assumed to be all" in " ".join(text.split())
+    assert show(run).sentences[-1].startswith("Without model, http/llama-server takes 1.39 times as long as ros/topic")
+
+
+def test_an_engine_that_tells_no_preprocessing_has_no_rows_about_it(make_run: MakeRun) -> None:
+    run = make_run(HAND, n=4, spread=0)
+    assert not {"preprocess", "e2e without model"} & {row[1] for row in stage_table(run).rows}
+    assert "summary-model" not in show(run).tables
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def show(run: Run, *, against: str = "", verbose: bool = False, **_: Any) -> Sho
     return Shown(
         sentences=latency_sentences(run),
         tables=tables,
-        main=["summary", "stages"],
+        main=[name for name in ("summary", "summary-model", "stages") if name in tables],
         printed=[name for name in tables if name in printed],
         narrow={"stages": stages},
         notes=[" ".join(dict.fromkeys((*stages.notes, *compared.notes))), *(_verbose(run) if verbose else ())],
@@ -46,7 +46,10 @@ def show(run: Run, *, against: str = "", verbose: bool = False, **_: Any) -> Sho
 
 
 def _printed(run: Run) -> set[str]:
-    """Return the tables for the terminal: the stages, and what is compared; end to end too where a model answers."""
+    """Return the tables for the terminal: the stages, and what is compared; end to end too where a model answers.
+
+    Without model is printed where a llama-server stands beside our own, which it alone can be compared with.
+    """
     from s2a_bench.experiments.latency.view.cells import cells_of
 
     cells = cells_of(run)
@@ -56,6 +59,8 @@ def _printed(run: Run) -> set[str]:
         names.add("summary")
     if not all(known) or any(cell.about["engine"] != "echo" for cell in cells):
         names.add("summary-e2e")
+    if any(cell.has_ingest for cell in cells):
+        names.add("summary-model")
     return names
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 RATIOS = ("metric", "of", "to", "value", "ci95_low", "ci95_high", "launches", "launch_sd", "emulated")
 """The columns of a table of ratios."""
 
-_METRICS = ("e2e_without_inference", "e2e", "ttft", "frame_age")
+_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e", "ttft", "frame_age")
 
 
 def csv_texts(run: Run) -> dict[str, CsvTable]:

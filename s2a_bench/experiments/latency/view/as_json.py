@@ -41,7 +41,7 @@ def about_cell(cell: Cell, run: Run) -> dict[str, Any]:
 
 def _cell(cell: Cell, run: Run) -> dict[str, Any]:
     """Return one cell's numbers; a metric that no sample has is an absent key."""
-    metrics = ("e2e", "e2e_without_inference", "ttft", "frame_age")
+    metrics = ("e2e", "e2e_without_inference", "e2e_without_model", "ttft", "frame_age")
     numbers = [
         *((f"{metric}_ms", cell.values_ms(metric)) for metric in metrics),
         ("itl_ms", cell.itl_ms()),

@@ -45,6 +45,13 @@ class LatencyCell(RequestsCell):
     e2e_without_inference_ms: Annotated[
         Summary | None, about("Absent behind a black box that does not tell its inference time.")
     ] = None
+    e2e_without_model_ms: Annotated[
+        Summary | None,
+        about(
+            "e2e less what the model computes up to the first token; preprocessing is left in. Of a llama-server: "
+            "e2e less the prompt_ms it reports."
+        ),
+    ] = None
     frame_age_ms: Annotated[Summary | None, about("Age of the frame when inference starts.")] = None
     token_delay_ms: Annotated[Summary | None, about("From a token's leaving the engine to the client's seeing it.")] = (
         None

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     Floats: TypeAlias = NDArray[np.float64]
 
-RATIO_METRICS = ("e2e_without_inference", "e2e")
+RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
 """What cells are compared by: columns of the samples, less the unit."""
 
 EARLIER_PAYLOADS = {"bgr": "raw", "compressed": "jpeg"}
@@ -178,7 +178,7 @@ def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | Non
     """Divide the medians of two cells, launch by launch and block by block.
 
     None where they cannot be compared: a llama-server's `ingest` slices and resizes the picture, which our engine
-    counts as inference, so that only e2e means the same on both sides.
+    counts as inference, so that e2e without inference does not mean the same on both sides.
     """
     if metric == "e2e_without_inference" and cell.has_ingest != base.has_ingest:
         return None

@@ -69,7 +69,10 @@ _GROUP: Final = "group."
 COMPARED: Final = Compared(
     metrics=by_name(
         [
-            *(Metric(name, "ms") for name in ("e2e_without_inference", "e2e", "ttft", "frame_age")),
+            *(
+                Metric(name, "ms")
+                for name in ("e2e_without_inference", "e2e_without_model", "e2e", "ttft", "frame_age")
+            ),
             *TOKEN_METRICS,
             Metric("residual", "ms"),
             *(Metric(f"{_GROUP}{name}", "ms") for name in GROUPS),

@@ -40,7 +40,12 @@ def latency_sentences(run: Run) -> list[str]:
         for of, cell, base, ratio in ratios(cells, run.bootstrap_seed)
         if of == metric and not declared(base.pipeline).in_process
     ]
-    return said + found[:_MOST]
+    beside = [
+        f"Without model, {_times(cell.name, base.name, ratio)}"
+        for of, cell, base, ratio in ratios(cells, run.bootstrap_seed)
+        if of == "e2e_without_model" and cell.has_ingest and not declared(base.pipeline).in_process
+    ]
+    return said + found[:_MOST] + beside[:_MOST]
 
 
 def counts(counts: Sequence[int], what: str) -> str:

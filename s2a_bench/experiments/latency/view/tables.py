@@ -26,17 +26,30 @@ if TYPE_CHECKING:
     from s2a_bench.stats import Ratio, Summary
     from s2a_bench.store.run import Run
 
-TITLES = {"e2e_without_inference": "End to end without inference", "e2e": "End to end"}
+TITLES = {
+    "e2e_without_inference": "End to end without inference",
+    "e2e_without_model": "End to end without model",
+    "e2e": "End to end",
+}
 """What is compared, and how it is called."""
 
 
-_FOOT = ("residual", "e2e_without_inference", "inference", "e2e")
+_FOOT = {
+    "residual": "residual",
+    "e2e_without_inference": "e2e w/o infer.",
+    "preprocess": "preproc.",
+    "e2e_without_model": "e2e w/o model",
+    "inference": "infer.",
+    "e2e": "e2e",
+}
+"""What stands below the stages, each with its short name; what the engines of a run do not tell is left out."""
 
 
 def stage_table(run: Run, *, full: bool = True) -> TextTable:
     """Lay out the stages in the order of the path, a column a cell: the median, and mean ± sd where ``full``.
 
-    Inference stands below the residual, so that what is compared, e2e without inference, reads as one sum.
+    Inference stands below the residual, so that what is compared, e2e without inference, reads as one sum, and so do
+    e2e without model and e2e below it.
     """
     cells = cells_of(run)
     rows: list[tuple[str, ...]] = []
@@ -46,12 +59,11 @@ def stage_table(run: Run, *, full: bool = True) -> TextTable:
         rows.append((group, name, *(_entry(summary_of(found), full) for found in values)))
 
     for stage in stages_present(cells):
-        if stage != "inference":
-            group = run.stages[stage]
+        if (group := run.stages[stage]) != "inference":
             add("" if group == last else group, stage, [cell.values_ms(stage) for cell in cells])
             last = group
     below = len(rows)
-    for metric in _FOOT:
+    for metric in _foot(cells):
         add("", metric.replace("_", " "), [cell.values_ms(metric) for cell in cells])
     title = "Stages in ms: median (mean ± sd)" if full else "Stages in ms: medians"
     return TextTable(
@@ -68,12 +80,13 @@ def group_table(run: Run) -> TextTable:
     """Lay out the groups as columns and the cells as rows: for runs of many cells."""
     cells = cells_of(run)
     groups = [group for group in groups_present(cells) if group != "inference"]
+    foot = _foot(cells)[1:]
     rows = []
     for cell in cells:
         values = [cell.group_ms(group) for group in groups]
-        values += [cell.values_ms(metric) for metric in _FOOT[1:]]
+        values += [cell.values_ms(metric) for metric in foot]
         rows.append((cell.name, *(_entry(summary_of(found), full=False) for found in values)))
-    header = ("cell", *groups, "e2e w/o infer.", "infer.", "e2e")
+    header = ("cell", *groups, *(_FOOT[metric] for metric in foot))
     return TextTable("Groups of stages in ms: medians", header, rows, 1, notes=_notes(run, cells))
 
 
@@ -131,6 +144,12 @@ def fact_table(run: Run) -> TextTable | None:
     return TextTable("Facts: medians", header, rows, 2, notes=_notes(run, cells)) if rows else None
 
 
+def _foot(cells: list[Cell]) -> list[str]:
+    """List what stands below the stages: preprocessing and e2e without model only where somebody tells them."""
+    told = {"preprocess", "e2e_without_model"}
+    return [name for name in _FOOT if name not in told or any(cell.values_ms(name).size for cell in cells)]
+
+
 def _entry(summary: Summary | None, full: bool) -> str:
     """Write one entry of the stage table."""
     if summary is None:
@@ -171,7 +190,9 @@ def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
     notes += _engine_notes(run, cells)
     if any(cell.has_ingest for cell in cells):
         notes.append(
-            "A llama-server's ingest slices and resizes the picture, which our engine counts as inference: compare e2e."
+            "A llama-server's ingest slices and resizes the picture, which our engine counts as inference: compare e2e "
+            "or e2e without model. Of a llama-server that is e2e less the prompt_ms it reports, assumed to be all that "
+            "its model computes before the first token that it sends."
         )
     if flagged := sum(cell.flagged() for cell in cells):
         notes.append(
@@ -192,6 +213,8 @@ def _engine_notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
 def latency_tables(run: Run) -> dict[str, TextTable]:
     """Return every table of a latency run by its file's name."""
     tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
+    if any(cell.values_ms("e2e_without_model").size for cell in cells_of(run)):
+        tables["summary-model"] = summary_table(run, "e2e_without_model")
     if tokens := token_table(run):
         tables["tokens"] = tokens
     if frames := frame_table(run):
