@@ -1,0 +1,52 @@
+"""Null experiment: e2e without model of the same requests, by our marks and as of a llama-server.
+
+``python -m benchmarks.same_work [--runs N]``. Our engine answers behind our HTTP as deployed. From inside, e2e without
+model is what the marks leave beside the model; from outside, as where a server tells its times only, it is e2e less
+the time that the engine reports for its prompt. What differs is what a black box hides: changing threads, choosing the
+first token.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import s2a_bench as s2a
+from s2a_bench.facts import PREPROCESS_MS, PROMPT_MS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+RUNS = 50
+
+
+def both(output: Path, runs: int = RUNS, **options: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return e2e without model in ms of every request, from inside and from outside."""
+    run = s2a.latency(transports=["http/as-deployed"], engine="llama", runs=runs, output=output, tune=True, **options)
+    good = run.samples[~run.samples["warmup"] & (run.samples["error"] == "")]
+    facts = [json.loads(str(told)) for told in good["facts"]]
+    model_ms = np.array([told[PROMPT_MS] - told[PREPROCESS_MS] for told in facts])
+    inside, e2e = (good[f"{name}_ns"].to_numpy(dtype=float) / 1e6 for name in ("e2e_without_model", "e2e"))
+    return inside, e2e - model_ms
+
+
+def main() -> None:
+    """Print medians and differences in ms."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=RUNS, help="requests")
+    with tempfile.TemporaryDirectory() as folder:
+        inside, outside = both(Path(folder), parser.parse_args().runs)
+    hidden = np.median(outside - inside)
+    print(f"e2e without model, n = {inside.size}, medians in ms")
+    print(f"{np.median(inside):9.3f}  by our marks")
+    print(f"{np.median(outside):9.3f}  e2e less the engine's own time for its prompt")
+    print(f"{hidden:9.3f}  between them in a request ({hidden / np.median(inside):.1%})")
+
+
+if __name__ == "__main__":
+    main()
