@@ -210,7 +210,7 @@ def test_it_describes_model_and_build(shared: LlamaCppEngine, tiny: EngineConfig
     assert facts["model"] == str(tiny.model)
     assert facts["threads"] == 1
     assert len(str(facts["model_sha256"])) == len(str(facts["mmproj_sha256"])) == 64
-    assert facts["parameters"] == 3_293_952
+    assert facts["parameters"] == 3_294_233
     assert facts["quantisation"] == "F16"
     assert isinstance(facts["gpu_offload_supported"], bool)
 
