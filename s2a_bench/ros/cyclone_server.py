@@ -11,7 +11,6 @@ from typing import Any
 from cyclonedds.domain import DomainParticipant
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import CANCEL_GOAL, STATUS_ARRAY, Goals, Status, status_array
@@ -214,8 +213,8 @@ class CycloneActionServer:
             if service.await_client(service.reader.sender()):
                 with self._lock:
                     answer(request, HEADER.unpack_from(packed, HEADER_AT))
-        except TransportError as error:
-            _log.warning("%s: dropped a request: %s", self._name, error)
+        except Exception as error:  # noqa: BLE001 - one thread answers all: the next request may fare better
+            _log.warning("%s: dropped a request: %s", self._name, error or type(error).__name__)
 
     def _answer_result(self, request: Any, header: tuple[int, int]) -> None:
         """Send a result, or remember who wants it; a goal nobody knows has status 0 and an empty result."""

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import ctypes as ct
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
@@ -135,6 +136,13 @@ def user_data(endpoint: Any) -> dict[str, str]:
     return dict(item.split("=", 1) for item in text.split(";") if "=" in item)
 
 
+def _matched(ask: Callable[[], list[int]]) -> list[int]:
+    """Return handles of matched endpoints; cyclonedds asks how many first, and fails where one more has come since."""
+    while True:
+        with suppress(IndexError):
+            return ask()
+
+
 class RawWriter:
     """A DataWriter that sends ready CDR; callable from any thread."""
 
@@ -153,11 +161,11 @@ class RawWriter:
 
     def matched(self) -> int:
         """Count matched readers."""
-        return len(self.entity.get_matched_subscriptions())
+        return len(_matched(self.entity.get_matched_subscriptions))
 
     def peers(self) -> Iterator[dict[str, str]]:
         """Yield what each matched reader announces in USER_DATA."""
-        for handle in self.entity.get_matched_subscriptions():
+        for handle in _matched(self.entity.get_matched_subscriptions):
             endpoint = self.entity.get_matched_subscription_data(handle)
             yield {} if endpoint is None else user_data(endpoint)
 
@@ -196,11 +204,15 @@ class RawReader:
 
     def matched(self) -> int:
         """Count matched writers."""
-        return len(self.entity.get_matched_publications())
+        return len(self.senders())
+
+    def senders(self) -> list[int]:
+        """Return the handles of matched writers."""
+        return _matched(self.entity.get_matched_publications)
 
     def peers(self) -> Iterator[dict[str, str]]:
         """Yield what each matched writer announces in USER_DATA."""
-        for handle in self.entity.get_matched_publications():
+        for handle in self.senders():
             yield self.peer(handle) or {}
 
     def peer(self, handle: int) -> dict[str, str] | None:

@@ -150,7 +150,7 @@ class ServiceServer(_End):
             client = peer.get("clientid")
             if client is None or any(reader.get("clientid") == client for reader in self.writer.peers()):
                 if len(self._reachable) >= REMEMBERED_CLIENTS:
-                    self._reachable.intersection_update(self.reader.entity.get_matched_publications())
+                    self._reachable.intersection_update(self.reader.senders())
                 self._reachable.add(sender)
                 return True
             if now_ns() > deadline_ns:

@@ -18,7 +18,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import Accepted, Feedback, Middleware, Rejected, Result, llama, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.testing.action import NAME, WAIT_S, ActionSuite, event, offer, receive, send, start, text_of
+from s2a_bench.testing.action import NAME, WAIT_S, Action, ActionSuite, event, offer, receive, send, start, text_of
 from s2a_bench.testing.middleware import Join
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
@@ -43,6 +43,11 @@ def join(dds_domain: int) -> Iterator[Join]:
             return middleware
 
         yield join
+
+
+@pytest.fixture
+def action(join: Join) -> Action:
+    return offer(join)
 
 
 class TestCycloneActions(ActionSuite):
@@ -263,3 +268,37 @@ def test_a_server_may_send_faster_than_its_client_reads(join: Join, monkeypatch:
     assert {type(one) for one in came} == {Feedback}
     rest = iter(lambda: client.next_event(1), None)
     assert [type(one) for one in rest if not isinstance(one, Feedback)] == [Result]
+
+
+def test_peers_that_come_while_they_are_counted_do_no_harm(action: Action, monkeypatch: pytest.MonkeyPatch) -> None:
+    """cyclonedds reads past its list where a peer has joined between two calls: the service thread died of it."""
+    readers = action.server._get_result.writer  # type: ignore[attr-defined]
+    real, calls = readers.entity.get_matched_subscriptions, count()
+
+    def grows() -> list[int]:
+        if not next(calls) % 2:
+            raise IndexError("invalid index")
+        return list(real())
+
+    monkeypatch.setattr(readers.entity, "get_matched_subscriptions", grows)
+    goal = start(action)
+    goal.succeed(llama.text_result("on", [1]))
+    assert event(action.client, Result).goal_id == goal.id
+    assert next(calls)
+
+
+def test_a_request_that_breaks_the_service_leaves_its_thread(action: Action, monkeypatch: pytest.MonkeyPatch) -> None:
+    service = action.server._get_result  # type: ignore[attr-defined]
+    real, calls = service.await_client, count()
+
+    def breaks(sender: int) -> bool:
+        if not next(calls):
+            raise ValueError("whatever")
+        return bool(real(sender))
+
+    monkeypatch.setattr(service, "await_client", breaks)
+    first = start(action)
+    first.succeed(llama.text_result("on", [1]))
+    second = start(action)
+    second.succeed(llama.text_result("on", [1]))
+    assert event(action.client, Result).goal_id == second.id
