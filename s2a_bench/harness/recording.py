@@ -16,6 +16,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.record import Recorder
 from s2a_bench.transport.ros import ROS
 from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA, FRAME_ID
+from s2a_bench.transport.ros.options import NAMESPACE
 from s2a_bench.transport.ros.wire import request_message, token_message
 from s2a_bench.types import Frame, Request, Token
 
@@ -24,9 +25,9 @@ class RunRecorder:
     """The recording of one run. Use as a context manager."""
 
     def __init__(self, path: Path, options: Options, *, live: bool) -> None:
-        """Create the file, for the namespace that ROS's among ``options`` have; raises StoreError, naming the path."""
+        """Create the file, under the namespace that ROS has among ``options``; raises StoreError, naming the path."""
         self._recorder = Recorder(path, live=live)
-        self._namespace = getattr(options, ROS.name).namespace
+        self._namespace = getattr(options, ROS.name).namespace or NAMESPACE
         self._offset_ns = realtime_offset_ns()
 
     def frame(self, frame: Frame) -> None:

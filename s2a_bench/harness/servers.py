@@ -67,7 +67,7 @@ class ServerSet:
             if server.process is not None:
                 server.process.wait_ready()
                 server.address = server.process.address
-                facts[server.name] = {**server.process.facts, "pid": server.process.pid}
+                facts[server.name] = {**server.process.facts, "address": server.address, "pid": server.process.pid}
         return facts
 
     def _launch(self, pipeline: Pipeline) -> _Running:

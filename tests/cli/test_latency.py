@@ -18,6 +18,7 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.experiments.latency.view.cells import cells_of
+from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.trace import budget
 
@@ -265,15 +266,22 @@ def test_a_killed_harness_takes_its_servers_along_and_leaves_a_readable_run(tmp_
         Event().wait(0.02)
 
 
-def test_two_servers_of_one_namespace_are_noticed(tmp_path: Path) -> None:
-    process, _ = start_long(tmp_path / "first", "--transport", "ros")
+def test_a_run_beside_another_has_a_namespace_of_its_own_unless_it_is_told_that_of_the_other(tmp_path: Path) -> None:
+    process, first = start_long(tmp_path / "first", "--transport", "ros/topic,ros/action,http/as-deployed")
     try:
-        said = run(*SMALL, "--transport", "ros", output=tmp_path / "second", code=1).stderr
+        run(*SMALL, "--transport", "ros/topic,ros/action,http/as-deployed", output=tmp_path / "second")
+        taken = read_run(first).manifest["servers"]["ros"]["address"]
+        said = run(*SMALL, "--transport", "ros", "--namespace", taken, output=tmp_path / "third", code=1).stderr
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
-    assert "another server answers under /s2a_bench" in said
-    assert "ROS_DOMAIN_ID" in said
+    second = only_run(tmp_path / "second")
+    assert (second.samples["error"] == "").all()
+    assert second.manifest["servers"]["ros"]["address"] != taken
+    assert (check_kept(first, "interrupted").samples["error"].isin({"", INTERRUPTED})).all()
+    last = said.strip().splitlines()[-1]
+    assert last.startswith(f"error: another server answers under {taken} in DDS domain")
+    assert last.endswith("ROS_DOMAIN_ID or another --namespace")
 
 
 def test_a_port_in_use_is_one_clear_line(tmp_path: Path) -> None:

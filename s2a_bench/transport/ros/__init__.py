@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from itertools import count
+from secrets import token_hex
 
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CAMERA_FRAMES, PAYLOAD_BYTES, Fact
 from s2a_bench.transport import Client, Handler, Server, Transport, Wiring
-from s2a_bench.transport.ros.options import RosOptions
+from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
 TOPIC, ACTION = VARIANTS = ("topic", "action")
 UNREADABLE_N = Fact("unreadable_n", "messages", "of strangers, that could not be read while the request was under way")
@@ -93,7 +94,9 @@ class Ros(Transport[RosOptions]):
         return options.action
 
     def bind(self, options: RosOptions, taken: Sequence[str]) -> str:
-        """Return the namespace, with a number where another server of ours has it."""
+        """Return the namespace, with a number where another server of ours has it; unless told, one nobody else has."""
+        if not options.namespace:
+            return f"{NAMESPACE}_{token_hex(4)}"
         numbered = (f"{options.namespace}_{number}" for number in count(2))
         return options.namespace if options.namespace not in taken else next(n for n in numbered if n not in taken)
 

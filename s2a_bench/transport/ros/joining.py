@@ -12,7 +12,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.ros.options import RosOptions
+from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
 MATCH_TIMEOUT_S = 15.0
 MATCH_POLL_NS = 10_000_000
@@ -22,7 +22,7 @@ SETTLE_S = 0.3
 
 def namespace_of(wiring: Wiring[RosOptions]) -> str:
     """Return where our topics are; somebody else's action is not under it."""
-    return wiring.options.namespace if wiring.options.action else wiring.address or wiring.options.namespace
+    return (not wiring.options.action and wiring.address) or wiring.options.namespace or NAMESPACE
 
 
 def domain_of(wiring: Wiring[RosOptions]) -> int:

@@ -10,6 +10,9 @@ from pydantic import field_validator
 from s2a_bench.options import option
 from s2a_bench.transport.options import SERVER, SERVING, Options
 
+NAMESPACE = "/s2a_bench"
+"""Where topics are unless told; servers of a run get this and something of their own."""
+
 NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 """ROS 2's rules for an absolute name."""
 
@@ -22,7 +25,7 @@ class RosOptions(Options):
         "an action that runs already, as /llama/generate_response of llama_ros (a black box)",
         side=SERVER,
     )
-    namespace: str = option("/s2a_bench", "namespace of the topics", side=SERVER)
+    namespace: str = option("", "namespace of the topics [default: a new one for each run]", side=SERVER)
     domain_id: int | None = option(None, "DDS domain [default: ROS_DOMAIN_ID, else 0]", ge=0, le=232, side=SERVER)
     middleware: str = option("", "cyclonedds, rclpy [default: rclpy in a sourced ROS 2 environment]", side=SERVER)
     qos: Literal["reliable", "sensor_data"] = option(
