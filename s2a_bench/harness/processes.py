@@ -206,11 +206,12 @@ class WheelServer(OwnProcess):
         files = load_headers(engine)
         job = llama_wheel.told(engine, program.port, ignore_end=files.dummy and not has_grammar)
         super().__init__("llama-server", llama_wheel.__name__, json.dumps(job), log)
-        self._files = files
+        self._files, self._job = files, job
 
     def wait_ready(self) -> None:
         """Read the one line it answers."""
         super().wait_ready()
+        self.facts["told"] = self._job
         self.facts["engine"] = {"engine": "llama-server", **_described(self._files)}
 
 

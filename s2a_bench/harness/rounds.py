@@ -16,6 +16,7 @@ from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.frames.stamp import Stamped, new_nonce
 from s2a_bench.harness.backoff import Backoff
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
+from s2a_bench.harness.flash_attention import decided
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet
@@ -74,16 +75,20 @@ def run_requests(task: Task, config: RequestsConfig, output: Path, progress: Pro
         progress.opened(writer.path)
         needed = config.own_engine or config.starts_program or task.needs_model
         if needed and config.engine.name == "llama" and extras.installed("gguf"):  # else nobody here reads the files
-            config = _with_model(config, progress)
+            config = _with_model(config, writer, progress)
         _measure(task, config, sources, writer, progress)
         return writer.path
 
 
-def _with_model(config: RequestsConfig, progress: Progress) -> RequestsConfig:
-    """Find or make the model files, so that every server gets the same."""
+def _with_model(config: RequestsConfig, writer: RunWriter, progress: Progress) -> RequestsConfig:
+    """Find or make the model files, and decide about flash attention, so that every server gets the same."""
     progress.stage("reading the model's headers" if config.engine.model else "the tiny dummy model, made on first use")
     model, mmproj = resolve(config.engine)
-    return config.model_copy(update={"engine": config.engine.but(model=model, mmproj=mmproj)})
+    engine, told = decided(
+        config.engine.but(model=model, mmproj=mmproj), progress.stage, writer.path / "flash-attention.log"
+    )
+    writer.update(**told)
+    return config.model_copy(update={"engine": engine})
 
 
 def _manifest(config: RequestsConfig, *, malloc_tuned: bool) -> dict[str, Any]:

@@ -72,7 +72,9 @@ class EngineConfig(Options):
     context: int = option(4096, "context length in tokens", ge=LEAST_CONTEXT, le=LARGEST)
     batch: int = option(512, "the most prompt tokens evaluated at once", ge=LEAST_BATCH, le=LARGEST)
     kv_type: Annotated[str, one_of(lambda: KV_TYPES)] = option("f16", "KV cache: f32, f16, q8_0, q4_0")
-    flash_attention: Annotated[str, one_of(lambda: FLASH_ATTENTION)] = option("auto", "auto, on, off")
+    flash_attention: Annotated[str, one_of(lambda: FLASH_ATTENTION)] = option(
+        "auto", "auto (what is faster here, measured once), on, off"
+    )
     sampling: Annotated[str, one_of(lambda: SAMPLINGS)] = option(
         "model", "model (as its authors recommend), greedy (the likeliest token)"
     )

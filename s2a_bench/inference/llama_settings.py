@@ -6,7 +6,7 @@ KV_TYPES = {"f32": 0, "f16": 1, "q8_0": 8, "q4_0": 2}
 """Type of the KV cache -> ggml's number (``ggml_type``)."""
 
 FLASH_ATTENTION = {"auto": -1, "on": 1, "off": 0}
-"""``llama_flash_attn_type``; auto: where the device has a kernel for it."""
+"""``llama_flash_attn_type``; auto: where the device has a kernel for it. Runs measure instead."""
 
 SAMPLINGS: dict[str, dict[str, float]] = {
     "model": {"temp": 0.7, "top_p": 0.8, "top_k": 100, "min_p": 0.0},

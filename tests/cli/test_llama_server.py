@@ -39,6 +39,10 @@ def test_it_is_measured_beside_our_own_cells(tmp_path: Path) -> None:
     assert run.origins.of("http/llama-server").weights == "dummy"
     server = next(told for told in run.manifest["servers"].values() if "version" in told)
     assert server["version"].startswith("xllamacpp ")
+    winner = run.manifest["flash_attention"]["chosen"]
+    ours = next(told for told in run.manifest["servers"].values() if "version" not in told)
+    assert winner in {"on", "off"}
+    assert winner == server["told"]["flash_attention"] == ours["engine"]["flash_attention"]
     assert "http/llama-server" in done.stdout
 
 

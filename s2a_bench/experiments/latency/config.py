@@ -16,7 +16,8 @@ class LatencyConfig(RequestsConfig):
     """The settings of a latency run: all of a run of requests, and of the engine what matters to transports."""
 
     engine: EngineConfig = group(
-        EngineConfig, only=("name", "profile", "gaps", "model", "mmproj", "threads", "gpu_layers", "context")
+        EngineConfig,
+        only=("name", "profile", "gaps", "model", "mmproj", "threads", "gpu_layers", "context", "flash_attention"),
     )
     wire: str = option("", "gone: see --payload", hidden=True)
 

@@ -21,8 +21,10 @@ from s2a_bench.experiments.profile_capture.config import LEAST_GAPS, CaptureConf
 from s2a_bench.frames import open_source
 from s2a_bench.frames.convert import bgr_to_rgb, to_bgr
 from s2a_bench.frames.stamp import Stamped
+from s2a_bench.harness.flash_attention import decided
 from s2a_bench.harness.warnings import Counters, before_run
 from s2a_bench.inference import Engine, EngineConfig, need_engine
+from s2a_bench.inference.models import resolve
 from s2a_bench.machine import environment
 from s2a_bench.machine.board import board_facts
 from s2a_bench.machine.tuning import limit_threads
@@ -46,6 +48,7 @@ _MODEL_FACTS = (
     "threads",
     "gpu_layers",
     "context",
+    "flash_attention",
 )
 
 
@@ -101,8 +104,10 @@ def capture(config: CaptureConfig, progress: Progress) -> dict[str, Any]:
     progress.expect(config.warmup + config.requests)
     warnings = before_run()
     with ExitStack() as stack:
+        model, mmproj = resolve(config.engine)
+        decided_engine, _ = decided(config.engine.but(model=model, mmproj=mmproj), progress.stage)
         progress.stage("loading the model")
-        engine = open_model(config.engine)
+        engine = open_model(decided_engine)
         stack.callback(engine.close)
         before = Counters.read(watches_udp=False)
         asked = answers(engine, config)

@@ -17,6 +17,7 @@ from s2a_bench.experiments.timeline.to_rows import Setting
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped, new_nonce
 from s2a_bench.harness.feed import RequestFeed
+from s2a_bench.harness.flash_attention import decided
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Measured, Place, Session
@@ -110,7 +111,9 @@ class Link:
 
     def connect(self, stack: ExitStack, source: FrameSource, robot: str) -> None:
         """Start the server or find the one that runs, and open a client; ``robot`` is who will act, for the record."""
-        requests = self.requests
+        engine, told = decided(self.requests.engine, self.progress.stage, self.writer.path / "flash-attention.log")
+        self.writer.update(**told)
+        self.requests = requests = self.requests.but(engine=engine)
         (self.cell,) = requests.pipelines
         self.warnings += before_run(requests)
         self.servers = ServerSet(requests, stack, self.writer.path)
