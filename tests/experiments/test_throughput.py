@@ -62,6 +62,21 @@ def test_a_reference_needs_what_llama_bench_can_do(tmp_path: Path, fields: dict[
             REQUESTS.but(reference=wrong)
 
 
+def test_the_engine_llama_server_is_llama_cpps_own_beside_ours() -> None:
+    config = ThroughputConfig(engine={"name": "llama-server", "threads": 1}, options={"http": {"llama_server": "/x"}})
+    assert [pipeline.name for pipeline in config.pipelines] == ["loopback", "http/llama-server"]
+    assert (config.engine.name, config.engine.threads, config.greedy) == ("llama", 1, False)
+    assert config.but(runs=3).pipelines == config.pipelines
+    with pytest.raises(UsageError, match="`engine` llama-server is `transport` in-process,http/llama-server; leave"):
+        ThroughputConfig(engine={"name": "llama-server"}, transports="ros")
+    with pytest.raises(UsageError, match="`sampling` greedy is our own engine's; leave it out with `llama_server`"):
+        ThroughputConfig(
+            engine={"name": "llama-server", "sampling": "greedy"}, options={"http": {"llama_server": "/x"}}
+        )
+    with pytest.raises(UsageError, match="'llamaserver' is none of llama, echo, replay"):
+        ThroughputConfig(engine={"name": "llamaserver"})
+
+
 @given(st.integers(1, 4), st.integers(0, 2), st.integers(0, 2), st.integers(1, 6), st.integers(0, 99))
 def test_every_block_gives_everyone_one_turn_and_the_others_are_last_at_first(
     n_turns: int, n_others: int, warmup: int, runs: int, seed: int
