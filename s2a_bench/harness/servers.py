@@ -121,9 +121,10 @@ class ServerSet:
         return found
 
     def model(self, facts: dict[str, Any]) -> dict[str, Any]:
-        """Return what the engine says about the model: the same in every server of ours."""
-        described = [server["engine"] for server in facts.values() if "engine" in server]
-        return next(iter(described), self._local_engine or {})
+        """Return what our engine says about the model, the same in every server of ours; else what others' is known."""
+        own = {server.name for server in self._servers.values() if isinstance(server.process, OwnServer)}
+        names = sorted(facts, key=lambda name: name not in own)
+        return self._local_engine or next((facts[name]["engine"] for name in names if "engine" in facts[name]), {})
 
     def origin(self, pipeline: Pipeline) -> Provenance:
         """Return where a cell's numbers come from: what its engine says of itself; a server of others is unknown."""

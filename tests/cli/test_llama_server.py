@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -44,6 +45,28 @@ def test_it_is_measured_beside_our_own_cells(tmp_path: Path) -> None:
     assert winner in {"on", "off"}
     assert winner == server["told"]["flash_attention"] == ours["engine"]["flash_attention"]
     assert "http/llama-server" in done.stdout
+
+
+def test_throughput_lets_it_answer_in_turn_with_our_engine(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "s2a_bench", "throughput", "--engine", "llama-server", *SMALL, "--threads", "1"]
+    command += ["--runs", "2", "--json", "--output", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    whole = json.loads(done.stdout)
+    theirs, ours = sorted(whole["cells"], key=lambda cell: str(cell["engine"]), reverse=True)
+    assert [(cell["cell"], cell["engine"], cell["t_eval"], cell["errors"]) for cell in (ours, theirs)] == [
+        ("in-process", "llama", "engine", 0),
+        ("http/llama-server", "llama-server", "engine", 0),
+    ]
+    assert {(ratio["metric"], ratio["of"], ratio["to"]) for ratio in whole["ratios"]} >= {
+        ("tokens_per_s", "http/llama-server", "in-process")
+    }
+    (folder,) = tmp_path.iterdir()
+    manifest = read_run(folder).manifest
+    assert manifest["configuration"]["transports"] == ["in-process", "http/llama-server"]
+    (server,) = manifest["servers"].values()
+    assert (manifest["model"]["engine"], manifest["model"]["sampling"]) == ("llama", "model")
+    assert manifest["model"]["model_sha256"] == server["engine"]["model_sha256"]
 
 
 def test_a_grammar_is_obeyed(tmp_path: Path) -> None:

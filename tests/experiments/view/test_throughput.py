@@ -28,6 +28,7 @@ from s2a_bench.experiments.throughput.view.figures import (
     build_throughput_bars,
     throughput_figures,
 )
+from s2a_bench.experiments.throughput.view.sentences import throughput_sentences
 from s2a_bench.experiments.throughput.view.tables import position_table, speed_table, throughput_csv, throughput_tables
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
@@ -59,7 +60,8 @@ def make(tmp_path: Path, make_row: MakeRow) -> Make:
         with RunWriter.create(tmp_path, "throughput", manifest) as run:
             for block in range(-1, n):
                 for name, ms in gaps.items():
-                    row = make_row(name, PATHS.get(name, PATHS["http/as-deployed"]), block, engine="llama")
+                    engine = "llama-server" if name == "http/llama-server" else "llama"
+                    row = make_row(name, PATHS.get(name, PATHS["http/as-deployed"]), block, engine=engine)
                     pipeline = "loopback" if name == "in-process" else name.partition("/")[0]
                     told = dict((facts or {}).get(name, {}))
                     row = _with(row, pipeline=pipeline, warmup=block < 0, n_tokens=len(ms) + 1, facts=told)
@@ -116,6 +118,23 @@ def test_the_parts_of_the_prompt_stand_side_by_side(make: Make) -> None:
     assert table.rows == [("in-process", "30.0", "10.0", "130", "50.0", "200", "150", "21.0", "100", "100")]
     (cell,) = throughput_json(run)["cells"]
     assert {name: cell[name]["median"] for name in parts} == parts
+
+
+def test_another_engine_is_compared_by_the_engines_own_figures_too(make: Make) -> None:
+    names = ("in-process", "http/as-deployed", "http/llama-server")
+    facts = {name: {"predicted_n": 5.0, "predicted_ms": ms} for name, ms in zip(names, (50.0, 50.0, 62.5), strict=True)}
+    run = make(dict.fromkeys(names, [10] * 4), facts=facts)
+    found = [(ratio["metric"], ratio["of"], ratio["value"]) for ratio in throughput_json(run)["ratios"]]
+    assert found == [
+        ("decode_tokens_per_s", "http/as-deployed", 1.0),
+        ("decode_tokens_per_s", "http/llama-server", 1.0),
+        ("tokens_per_s", "http/llama-server", 0.8),
+    ]
+    assert "tokens_per_s,http/llama-server,in-process,0.8" in throughput_csv(run)["ratios.csv"].text(run.origins)
+    said = throughput_sentences(run)[-1]
+    assert said == "By their own figures the engine of http/llama-server has 0.800 of the rate of in-process."
+    untold = make(dict.fromkeys(names, [10] * 4), facts={"in-process": facts["in-process"]})
+    assert {ratio["metric"] for ratio in throughput_json(untold)["ratios"]} == {"decode_tokens_per_s"}
 
 
 def test_a_server_that_tells_nothing_has_the_clients_rate_and_no_zeros(make: Make) -> None:

@@ -13,7 +13,7 @@ from s2a_bench.experiments.throughput.view.cells import (
     METRICS,
     RATIO_METRIC,
     Speed,
-    ratios_of,
+    every_ratio_of,
     reference_depths,
     reference_values,
     speeds_of,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def throughput_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
     speeds = speeds_of(run)
-    ratios = [ratio_entry(RATIO_METRIC, of, to, ratio) for of, to, ratio in ratios_of(run, speeds)]
+    ratios = [ratio_entry(*found) for found in every_ratio_of(run, speeds)]
     more = {"reference": _reference(run)} if reference_values(run) else {}
     return frame(run, [_cell(speed, run) for speed in speeds], ratios, **more)
 

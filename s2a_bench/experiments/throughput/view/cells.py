@@ -57,6 +57,9 @@ METRICS = (
 RATIO_METRIC = "decode_tokens_per_s"
 """What cells and the reference are compared by."""
 
+ENGINE_METRIC = "tokens_per_s"
+"""What engines are compared by besides: sending is not in it."""
+
 LLAMA_BENCH: Final = "llama-bench"
 """How the reference is called where cells are listed."""
 
@@ -195,7 +198,7 @@ def reference_depths(run: Run) -> list[int]:
 def ratios_of(run: Run, speeds: list[Speed]) -> Iterator[tuple[str, str, Ratio]]:
     """Yield cell, base and ratio: every cell to llama-bench where it ran, and every other cell to in-process."""
     reference = reference_by_launch(run)
-    base = next((speed for speed in speeds if declared(speed.cell.pipeline).in_process), None)
+    base = _in_process(speeds)
     for speed in speeds:
         values = speed.by_launch(RATIO_METRIC)
         if ratio := ratio_of_launches(values, reference, run.bootstrap_seed):
@@ -204,3 +207,23 @@ def ratios_of(run: Run, speeds: list[Speed]) -> Iterator[tuple[str, str, Ratio]]
             ratio = ratio_of_launches(values, base.by_launch(RATIO_METRIC), run.bootstrap_seed)
             if ratio:
                 yield speed.name, base.name, ratio
+
+
+def engine_ratios_of(run: Run, speeds: list[Speed]) -> Iterator[tuple[str, str, Ratio]]:
+    """Yield cell, base and ratio of the engines' own rates: every cell that another engine answered to in-process."""
+    base = _in_process(speeds)
+    for speed in speeds:
+        if base is not None and base.told and speed.told and speed.cell.about["engine"] != base.cell.about["engine"]:
+            rates, others = speed.by_launch(ENGINE_METRIC), base.by_launch(ENGINE_METRIC)
+            if ratio := ratio_of_launches(rates, others, run.bootstrap_seed):
+                yield speed.name, base.name, ratio
+
+
+def every_ratio_of(run: Run, speeds: list[Speed]) -> Iterator[tuple[str, str, str, Ratio]]:
+    """Yield metric, cell, base and ratio."""
+    yield from ((RATIO_METRIC, *found) for found in ratios_of(run, speeds))
+    yield from ((ENGINE_METRIC, *found) for found in engine_ratios_of(run, speeds))
+
+
+def _in_process(speeds: list[Speed]) -> Speed | None:
+    return next((speed for speed in speeds if declared(speed.cell.pipeline).in_process), None)

@@ -14,6 +14,7 @@ from s2a_bench.experiments.throughput.view.cells import (
     METRICS,
     RATIO_METRIC,
     Speed,
+    every_ratio_of,
     ratios_of,
     reference_depths,
     reference_values,
@@ -134,7 +135,7 @@ def throughput_csv(run: Run) -> dict[str, CsvTable]:
         for (first, last), rates in speed.by_position().items()
     ]
     emulated = any(speed.cell.emulated for speed in speeds)  # one engine answers in all cells of a run
-    ratios = [(RATIO_METRIC, of, to, *astuple(ratio), emulated) for of, to, ratio in ratios_of(run, speeds)]
+    ratios = [(*names, *astuple(ratio), emulated) for *names, ratio in every_ratio_of(run, speeds)]
     return {
         "throughput.csv": CsvTable.of(("cell", "metric", *SUMMARY, "emulated"), summaries),
         "positions.csv": CsvTable.of(("cell", "first", "last", *SUMMARY, "emulated"), positions),
