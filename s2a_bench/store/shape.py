@@ -52,6 +52,7 @@ class _Manifest(_Shape):
     servers: dict[str, Facts] = {}
     model: Facts | None = None
     tuning: Facts | None = None
+    flash_attention: Facts | None = None
 
 
 class _SweepConfiguration(_Shape):

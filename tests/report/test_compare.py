@@ -206,6 +206,11 @@ def test_versions_and_settings_are_told_and_not_refused(launch: Launch) -> None:
     assert not any(one.fatal for one in found)
 
 
+def test_flash_attention_that_auto_found_otherwise_is_told(launch: Launch) -> None:
+    sides = (launch(i, n=6, manifest={**MANIFEST, "flash_attention": {"chosen": way}}) for i, way in enumerate("ab"))
+    assert [(str(one), one.fatal) for one in differences(*sides)] == [("flash attention chosen: a against b", False)]
+
+
 def test_a_fact_that_only_one_run_knows_is_told_and_not_refused(launch: Launch) -> None:
     found = opened(
         launch(1, n=6), launch(2, n=6, manifest=with_(MANIFEST, "environment", power_mode="MAXN"))

@@ -47,6 +47,7 @@ def differences(baseline: Run, other: Run) -> list[Difference]:
     sides = baseline.manifest, other.manifest
     machines = [manifest.get("environment", {}) for manifest in sides]
     models = [manifest.get("model") or {} for manifest in sides]
+    ways = [(manifest.get("flash_attention") or {}).get("chosen") for manifest in sides]
     found = [
         *_of("", *({name: facts[name] for name in _MACHINE if name in facts} for facts in machines), fatal=True),
         *_of("", *(_gpus(facts, "name") for facts in machines), fatal=True),
@@ -56,6 +57,7 @@ def differences(baseline: Run, other: Run) -> list[Difference]:
         *_of("", *(_rest(facts, (*_MACHINE, *_PASSING)) for facts in machines), fatal=False),
         *_of("", *(_gpus(facts, "driver") for facts in machines), fatal=False),
         *_of("package ", *(facts.get("packages", {}) for facts in machines), fatal=False),
+        *_of("flash attention ", *({"chosen": way} for way in ways), fatal=False),
         *_of("configuration ", *(_flat(manifest.get("configuration", {})) for manifest in sides), fatal=False),
     ]
     return sorted(found, key=lambda difference: not difference.fatal)
