@@ -20,6 +20,16 @@ class TestHttp(HostileSuite):
         return replace(super().told(), limits=Limits(head_s=2))  # one case waits for it
 
 
+class TestHttpBestEffort(HostileSuite):
+    name = "http/best-effort"
+    servers = http.SERVERS
+
+
+class TestHttpBinary(HostileSuite):
+    name = "http/binary"
+    servers = http.SERVERS
+
+
 class TestRosTopic(HostileSuite):
     name = "ros/topic"
     clients = ros.CLIENTS

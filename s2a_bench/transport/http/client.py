@@ -1,4 +1,4 @@
-"""The HTTP client on httpx: encode, pack, send, read the answer, and mark each step, in every dialect.
+"""The HTTP client: encode, pack, send, read the answer, and mark each step, in every dialect.
 
 Our own server sends its marks with the last event. A black box sends none: where its response headers are known to
 leave when inference starts (llama-server), they end the stage `ingest` and the first token ends `inference`; anywhere
@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from typing import Any
 
 import httpx
 
@@ -27,6 +28,7 @@ from s2a_bench.transport.http.detect import body_of, detected, getter
 from s2a_bench.transport.http.dialects import OWN, Dialect, Event, Picture, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
 from s2a_bench.transport.http.dialects.decoder import Decoder
+from s2a_bench.transport.http.lean import LeanClient, LeanResponse
 from s2a_bench.transport.http.merge import merged, read_patch
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.http.refusals import advice_for, refusal
@@ -76,11 +78,12 @@ class HttpClient:
     @contextmanager
     def _asking(self) -> Iterator[BoundedClient]:
         """Lend the kept client, or one for the moment."""
-        client = self._client or self._new_client()
+        kept = self._client
+        client = kept if isinstance(kept, BoundedClient) else self._new_httpx()
         try:
             yield client
         finally:
-            if client is not self._client:
+            if client is not kept:
                 client.close()
 
     def _authorization(self) -> dict[str, str]:
@@ -91,8 +94,13 @@ class HttpClient:
         found = {"model": self._model} if self._model not in {self._wiring.options.served_model, NO_MODEL} else {}
         return {"url": self._url, "dialect": self._dialect.name, **found}
 
-    def _new_client(self) -> BoundedClient:
-        """Build the client; its TLS context alone takes about 20 ms, which is why it is normally built once."""
+    def _new_client(self) -> BoundedClient | LeanClient:
+        """Build the client of the variant; over TLS, and maybe a proxy, httpx is that of all."""
+        lean = self._wiring.variant in {own.BEST_EFFORT, own.BINARY} and self._wiring.address.startswith("http:")
+        return LeanClient(self._bounds(0), self._wiring.timeout_s) if lean else self._new_httpx()
+
+    def _new_httpx(self) -> BoundedClient:
+        """Build httpx's client; its TLS context alone takes about 20 ms, which is why it is normally built once."""
         # a kept connection stays kept, however long a turn of the other cells takes
         limits = httpx.Limits(keepalive_expiry=None)
         # a cloud may be behind a proxy and with certificates that the environment names; what is measured here is not
@@ -130,21 +138,25 @@ class HttpClient:
                 client.close()
 
     def _send(
-        self, client: httpx.Client, body: bytes, headers: dict[str, str], stack: ExitStack, trace: Trace
-    ) -> httpx.Response:
+        self, client: BoundedClient | LeanClient, body: Any, headers: dict[str, str], stack: ExitStack, trace: Trace
+    ) -> httpx.Response | LeanResponse:
         """Send the request; once more if the server had just closed the kept connection, as HTTP clients do.
 
         llama-server announces keep-alive and yet closes after every streamed answer.
         """
+
+        def asked() -> AbstractContextManager[httpx.Response | LeanResponse]:
+            return client.stream("POST", self._url, content=body, headers=headers)
+
         try:
-            return stack.enter_context(client.stream("POST", self._url, content=body, headers=headers))
+            return stack.enter_context(asked())
         except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
             if self._options.connection != "keep-alive":
                 raise
             trace.facts[RECONNECTS] = 1.0
-            return stack.enter_context(client.stream("POST", self._url, content=body, headers=headers))
+            return stack.enter_context(asked())
 
-    def _pack(self, request: Request, trace: Trace) -> tuple[bytes, dict[str, str]]:
+    def _pack(self, request: Request, trace: Trace) -> tuple[Any, dict[str, str]]:
         """Build the body, marking each stage."""
         if self._wiring.variant == own.BINARY:
             body, headers = self._pack_binary(request, trace)
@@ -161,7 +173,7 @@ class HttpClient:
         trace.facts[PAYLOAD_BYTES] = len(body)
         return body, headers
 
-    def _pack_binary(self, request: Request, trace: Trace) -> tuple[bytes, dict[str, str]]:
+    def _pack_binary(self, request: Request, trace: Trace) -> tuple[Any, dict[str, str]]:
         """Build our own binary variant: the picture is the body, all else a header."""
         media_type, data = "application/octet-stream", None
         for frame in request.images[:1]:
@@ -170,9 +182,11 @@ class HttpClient:
         fields |= {**own.own_parameters(request), "prompt": request.prompt}
         header = json.dumps(fields)  # headers are ASCII, which the standard library's JSON is
         headers = {**self._headers, "content-type": media_type, own.PARAMETERS_HEADER: header}
-        return data.tobytes() if data is not None else b"", headers
+        return (data.reshape(-1).data if data is not None else b""), headers
 
-    def _tokens(self, response: httpx.Response, trace: Trace, headers_ns: int, packed_ns: int) -> Iterator[Token]:
+    def _tokens(
+        self, response: httpx.Response | LeanResponse, trace: Trace, headers_ns: int, packed_ns: int
+    ) -> Iterator[Token]:
         """Yield the tokens of an answer; after the last, complete the trace."""
         first_ns, thinking_ns, thoughts, index, finished = 0, 0, 0, 0, False
         for event in self._events(response):
@@ -213,7 +227,7 @@ class HttpClient:
         else:
             trace.marks.append(("server", first_ns))
 
-    def _events(self, response: httpx.Response) -> Iterator[Event]:
+    def _events(self, response: httpx.Response | LeanResponse) -> Iterator[Event]:
         """Yield the events of an answer; comments and drops of an event do not count as a sign of life for ever."""
         decoder = Decoder(self._dialect, self._codec.loads)
         heard_ns, patience_ns = now_ns(), int(self._wiring.timeout_s * 1e9)

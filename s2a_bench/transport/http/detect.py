@@ -17,6 +17,7 @@ from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.http.bounded import BoundedClient
 from s2a_bench.transport.http.dialects import OWN
 from s2a_bench.transport.http.dialects.common import NO_LIST, Get, first_model
+from s2a_bench.transport.http.lean import LeanResponse
 
 OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": OWN}
 """``owned_by`` of the first model -> dialect. Ollama says ``library``, clouds their names: plain OpenAI."""
@@ -77,7 +78,7 @@ def _text(url: str, client: BoundedClient, headers: dict[str, str]) -> str:
         raise ServerDied(f"nothing answers at {url}: {error}") from error
 
 
-def body_of(response: httpx.Response, limit: int, patience_s: float) -> str:
+def body_of(response: httpx.Response | LeanResponse, limit: int, patience_s: float) -> str:
     """Return a body's first ``limit`` bytes, or what came of it in time, as text."""
     pieces, size, deadline = [], 0, now_ns() + int(patience_s * 1e9)
     for piece in response.iter_raw():

@@ -13,6 +13,7 @@ import httpx
 from s2a_bench.errors import RequestFailed
 from s2a_bench.secrets import struck
 from s2a_bench.transport.http.dialects.decoder import error_in
+from s2a_bench.transport.http.lean import LeanResponse
 from s2a_bench.transport.http.options import HttpOptions
 
 NO_MODEL = re.compile(
@@ -25,7 +26,9 @@ QUOTED = 200
 """Characters that are shown of a body that is no error object."""
 
 
-def refusal(url: str, response: httpx.Response, body: str, options: HttpOptions, expected: str) -> RequestFailed:
+def refusal(
+    url: str, response: httpx.Response | LeanResponse, body: str, options: HttpOptions, expected: str
+) -> RequestFailed:
     """Describe an answer whose status or content type is wrong."""
     try:
         value = json.loads(body)
@@ -59,7 +62,7 @@ def advice_for(status: int, said: str, options: HttpOptions, *, moved: str = "")
     }.get(status, "")
 
 
-def _retry_after_s(response: httpx.Response, body: Any) -> float | None:
+def _retry_after_s(response: httpx.Response | LeanResponse, body: Any) -> float | None:
     """Return how long the server asks to wait: the header (RFC 9110, 10.2.3), or Google's RetryInfo in the body."""
     text = response.headers.get("retry-after", "").strip()
     try:
