@@ -71,7 +71,7 @@ def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
     return f"image/{payload}", data
 
 
-def decoded(media_type: str, data: bytes, trace: Trace, limits: Limits = LIMITS) -> Frame:
+def decoded(media_type: str, data: bytes | memoryview, trace: Trace, limits: Limits = LIMITS) -> Frame:
     """Turn received bytes into an ``rgb8`` frame; marks `image_decode` or `channel_swap`. Raises RequestFailed."""
     try:
         if media_type.startswith(RAW_MIME):

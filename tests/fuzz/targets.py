@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,6 +19,7 @@ import numpy as np
 from starlette.testclient import TestClient
 
 from s2a_bench.boards.file import parse_profile
+from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.bag import Recording
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
@@ -37,6 +39,7 @@ from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
 from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS
+from s2a_bench.transport.http.reading import of_json, of_picture
 from s2a_bench.transport.http.server import _received, application
 from s2a_bench.transport.limits import LIMITS
 from s2a_bench.transport.pictures import decoded
@@ -102,13 +105,11 @@ def client() -> TestClient:
 
 
 def ask_server(data: bytes) -> None:
-    for variant, path in PATHS.items():
-        if variant == "binary":
-            header = data.replace(b"\r", b" ").replace(b"\n", b" ").replace(b"\0", b" ")
-            answer = client().post(path, headers={PARAMETERS_HEADER.encode(): header})
-        else:
-            answer = client().post(path, content=data, headers={"content-type": "application/json"})
-        assert answer.status_code in {200, 400, 413}, answer.text
+    answer = client().post(PATHS["as-deployed"], content=data, headers={"content-type": "application/json"})
+    assert answer.status_code in {200, 400, 413}, answer.text
+    for headers, body in (([(PARAMETERS_HEADER.encode(), data)], b""), ([], data)):
+        with suppress(RequestFailed):
+            (of_picture if headers else of_json)(headers, body, Trace(), LIMITS)
 
 
 def cdrs() -> list[bytes]:

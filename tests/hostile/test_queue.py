@@ -27,7 +27,8 @@ from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.turns import Queued, Turn, Turns
 from s2a_bench.types import Request, Token
 
-CHAT = PATHS["as-deployed"]
+CHAT, BEST_EFFORT = PATHS["as-deployed"], PATHS["best-effort"]
+paths = pytest.mark.parametrize("path", [CHAT, BEST_EFFORT])
 
 
 @contextmanager
@@ -201,8 +202,9 @@ def test_requests_end_in_the_order_of_their_acceptance(name: str) -> None:
     assert sum(queued) > 25
 
 
+@paths
 @pytest.mark.parametrize("stream", [True, False])
-def test_200_clients_at_once_are_answered_or_refused_and_none_hangs(stream: bool) -> None:
+def test_200_clients_at_once_are_answered_or_refused_and_none_hangs(stream: bool, path: str) -> None:
     async def ask_all(url: str) -> list[int]:
         limits = httpx.Limits(max_connections=None)
         async with httpx.AsyncClient(timeout=60, limits=limits) as client:
@@ -218,34 +220,35 @@ def test_200_clients_at_once_are_answered_or_refused_and_none_hangs(stream: bool
             return await asyncio.gather(*(one() for _ in range(200)))
 
     with serving(engine_handler(open_engine(EngineConfig(name="echo")))) as url:
-        statuses = asyncio.run(ask_all(url + CHAT))
+        statuses = asyncio.run(ask_all(url + path))
         assert set(statuses) <= {200, 503}
         assert statuses.count(200) >= 65
         assert httpx.post(url + CHAT, json=body(max_tokens=3)).status_code == 200
 
 
-def ask_and_go(url: str, *, stream: bool, request_id: str) -> socket.socket:
+def ask_and_go(url: str, *, stream: bool, request_id: str, path: str = CHAT) -> socket.socket:
     """Send a request over a socket of its own, and do not read."""
     import json
 
     host, port = url.removeprefix("http://").split(":")
     data = json.dumps(body(stream=stream, request_id=request_id)).encode()
-    head = f"POST {CHAT} HTTP/1.1\r\nHost: a\r\nContent-Type: application/json\r\nContent-Length: {len(data)}\r\n\r\n"
+    head = f"POST {path} HTTP/1.1\r\nHost: a\r\nContent-Type: application/json\r\nContent-Length: {len(data)}\r\n\r\n"
     connection = socket.create_connection((host, int(port)))
     connection.sendall(head.encode() + data)
     return connection
 
 
+@paths
 @pytest.mark.parametrize("stream", [True, False])
-def test_an_answer_whose_client_has_gone_stops_and_a_waiter_who_has_gone_never_begins(stream: bool) -> None:
+def test_an_answer_whose_client_has_gone_stops_and_a_waiter_who_has_gone_never_begins(stream: bool, path: str) -> None:
     gate = Gate()
     queued = Queued.around(gate)
     with serving(queued) as url:
-        first = ask_and_go(url, stream=stream, request_id="first")
+        first = ask_and_go(url, stream=stream, request_id="first", path=path)
         until(lambda: gate.began == ["first"])
-        waiting = ask_and_go(url, stream=stream, request_id="waiting")
+        waiting = ask_and_go(url, stream=stream, request_id="waiting", path=path)
         until(lambda: queued.turns.waiting == 1)
-        last = ask_and_go(url, stream=stream, request_id="last")
+        last = ask_and_go(url, stream=stream, request_id="last", path=path)
         until(lambda: queued.turns.waiting == 2)
         waiting.close()
         until(lambda: queued.turns.waiting == 1)
@@ -257,8 +260,9 @@ def test_an_answer_whose_client_has_gone_stops_and_a_waiter_who_has_gone_never_b
         until(lambda: gate.ended == ["first", "last"])
 
 
+@paths
 @pytest.mark.parametrize("stream", [True, False])
-def test_a_token_that_cannot_be_sent_frees_the_engine(stream: bool) -> None:
+def test_a_token_that_cannot_be_sent_frees_the_engine(stream: bool, path: str) -> None:
     def surrogates(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
         yield Token(0, "a")
         yield Token(1, "\ud800")
@@ -267,10 +271,26 @@ def test_a_token_that_cannot_be_sent_frees_the_engine(stream: bool) -> None:
     with serving(queued) as url:
         for _ in range(3):
             try:
-                httpx.post(url + CHAT, json=body(stream=stream), timeout=10)
+                httpx.post(url + path, json=body(stream=stream), timeout=10)
             except httpx.RemoteProtocolError:
                 assert stream  # broken off: its status was sent
         until(lambda: queued.turns.silent_s() == 0)
+
+
+@paths
+def test_a_client_that_does_not_read_does_not_hold_the_engine(path: str) -> None:
+    def much(request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        for index in range(request.max_tokens):
+            yield Token(index, "a" * 1000)
+
+    queued = Queued.around(much)
+    with serving(queued) as url:
+        deaf = [ask_and_go(url, stream=True, request_id="deaf", path=path) for _ in range(3)]
+        answer = httpx.post(url + path, json=body(max_tokens=20_000), timeout=60)
+        assert answer.text.endswith("data: [DONE]\n\n")
+        until(lambda: queued.turns.silent_s() == 0)
+        for connection in deaf:
+            connection.close()
 
 
 def test_health_says_when_the_engine_is_stuck(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from starlette.responses import JSONResponse
 
 from s2a_bench.errors import UsageError
 from s2a_bench.transport.credentials import read_key
+from s2a_bench.transport.http import own
 from s2a_bench.transport.http.options import HttpOptions
 
 OPEN = "/health"
@@ -34,17 +35,16 @@ def keyed(app: App, key: str) -> App:
     expected = key.encode()
 
     async def wrapped(scope: Any, receive: Any, send: Any) -> None:
-        if scope["type"] != "http" or scope["path"] == OPEN or _allowed(scope["headers"], expected):
+        if scope["type"] != "http" or scope["path"] == OPEN or allowed(scope["headers"], expected):
             await app(scope, receive, send)
             return
         message = "this server wants its key: Authorization: Bearer KEY"
-        error = {"error": {"message": message, "type": "invalid_request_error", "code": 401}}
-        await JSONResponse(error, 401, {"WWW-Authenticate": "Bearer"})(scope, receive, send)
+        await JSONResponse(own.error_json(401, message), 401, {"WWW-Authenticate": "Bearer"})(scope, receive, send)
 
     return wrapped if key else app
 
 
-def _allowed(headers: list[tuple[bytes, bytes]], expected: bytes) -> bool:
+def allowed(headers: list[tuple[bytes, bytes]], expected: bytes) -> bool:
     """Whether the one Authorization header has the key, compared in constant time (RFC 6750, 2.1)."""
     said = [value for name, value in headers if name == b"authorization"]
     scheme, _, token = said[0].partition(b" ") if len(said) == 1 else (b"", b"", b"")

@@ -16,6 +16,7 @@ from typing import Any
 import orjson
 import pybase64
 
+from s2a_bench.errors import BadRequest, Busy, EngineError, Overdue, S2AError
 from s2a_bench.trace import Remote
 from s2a_bench.transport.http import VARIANTS
 from s2a_bench.transport.http.dialects.common import TEMPERATURE, TOP_P
@@ -39,7 +40,7 @@ class Codec:
     """The JSON and Base64 functions of a variant."""
 
     dumps: Callable[[Any], bytes]
-    loads: Callable[[str | bytes], Any]
+    loads: Callable[[Any], Any]
     to_base64: Callable[[Any], str]
     from_base64: Callable[[str], bytes]
 
@@ -62,6 +63,21 @@ FAST = Codec(
     from_base64=lambda text: pybase64.b64decode(text, validate=True),
 )
 CODECS = {AS_DEPLOYED: STANDARD, BEST_EFFORT: FAST, BINARY: FAST, LLAMA_SERVER: STANDARD}
+
+
+STATUSES = ((Busy, 503), (Overdue, 504), (BadRequest, 400), (EngineError, 500))
+"""By what an error is, the first that fits; every other one is 400."""
+
+
+def status_of(error: S2AError) -> int:
+    """Return the status of an error that is told before the answer begins."""
+    return next((status for kind, status in STATUSES if isinstance(error, kind)), 400)
+
+
+def error_json(status: int, message: str) -> dict[str, Any]:
+    """Return an error in OpenAI's form."""
+    shown = message.encode(errors="backslashreplace").decode()
+    return {"error": {"message": shown, "type": "invalid_request_error", "code": status}}
 
 
 def data_uri(media_type: str, encoded: str) -> str:
