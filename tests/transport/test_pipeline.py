@@ -76,7 +76,9 @@ def test_cells_share_a_server_unless_it_would_be_told_something_else() -> None:
 
 
 def test_two_servers_of_one_transport_do_not_collide() -> None:
-    http, ros = one_pipeline("http", port=8000), one_pipeline("ros")
+    http, ros = one_pipeline("http", port=8000), one_pipeline("ros?namespace=/mine")
     assert http.transport.bind(http.options, []) == "127.0.0.1:8000"
     assert http.transport.bind(http.options, ["127.0.0.1:8000"]) == "127.0.0.1:0"
-    assert ros.transport.bind(ros.options, ["/s2a_bench", "/s2a_bench_2"]) == "/s2a_bench_3"
+    assert ros.transport.bind(ros.options, ["/mine", "/mine_2"]) == "/mine_3"
+    unnamed = one_pipeline("ros")
+    assert len({unnamed.transport.bind(unnamed.options, []) for _ in range(9)}) == 9
