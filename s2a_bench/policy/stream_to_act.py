@@ -227,7 +227,7 @@ class OnlineStepper:
         if self.watch is None:
             return self.prior.learned(float(max(self.tokens - 1, 0)), self.last_token_s - self.first_token_s)
         mean_s, variance = self.watch.learned
-        return float(mean_s[0]), float(variance[0])
+        return mean_s.item(), variance.item()
 
     def _start_s(self) -> float:
         """Return the start time as things stand now; infinity where only another token can tell."""

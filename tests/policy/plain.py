@@ -6,7 +6,9 @@ Each function takes lists of one plan, in seconds, and follows the words of the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 Seconds = Sequence[float]
 
@@ -68,3 +70,30 @@ def fluidity(stall: Seconds, nominal: Seconds, tolerance: float) -> float:
         else:
             missed += int(late // budget) + 1
     return met / (met + missed)
+
+
+def learned(mean: float, plan: float, token: float, gaps: Seconds) -> tuple[float, float]:
+    """Weigh the mean that was believed and each gap by their precision; both variances are relative to the mean."""
+    precision = 1 / plan + len(gaps) / token
+    return (mean / plan + sum(gaps) / token) / precision, 1 / precision
+
+
+def watched(mean: float, plan_cv: float, token_cv: float, tokens: Seconds) -> list[tuple[float, float, bool]]:
+    """Say after each token what is learned of the gaps, and whether the plan has slowed down (docs/shift.md)."""
+    told: list[tuple[float, float, bool]] = []
+    slow, first, believed = False, 0, (mean, plan_cv**2)
+    for now in range(len(tokens)):
+        gaps = [later - earlier for earlier, later in pairwise(tokens[first : now + 1])]
+        surprises = [(0.0, 0, mean)]
+        for last in range(1, min(8, len(gaps)) + 1):
+            expected, variance = learned(*believed, token_cv**2, gaps[:-last])
+            deviation = expected * math.sqrt(last * token_cv**2 + last**2 * variance)
+            surprises.append(((sum(gaps[-last:]) - last * expected) / deviation, last, expected))
+        most, last, expected = max(surprises)
+        if most > 4:
+            slow, first, believed = True, now - last, (expected, 1.0)
+        elif slow and min(surprises)[0] < -4:
+            slow, first, believed = False, 0, (mean, plan_cv**2)
+        gaps = [later - earlier for earlier, later in pairwise(tokens[first : now + 1])]
+        told.append((*learned(*believed, token_cv**2, gaps), slow))
+    return told

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from s2a_bench.experiments.study.shift import SHIFTS
 from s2a_bench.experiments.study.worlds import World, generator
@@ -14,6 +16,7 @@ from s2a_bench.policy.conformal import calibrate, stalled
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import measure, stalls
 from s2a_bench.policy.stream_to_act import StreamToAct
+from tests.policy import plain
 
 PRIOR = GapPrior(0.2, 0.1, 0.2)
 WORLD = World(4.8, 0.5, 6, 8, 1.0)
@@ -28,6 +31,44 @@ def test_without_a_change_it_is_the_plain_estimate() -> None:
     mean_s, variance = learned_along(PRIOR, token_s)
     for row, at_s in enumerate(token_s[:, 0]):
         assert (mean_s[row, 0], variance[row, 0]) == pytest.approx(PRIOR.learned(float(row), float(at_s - 1.0)))
+
+
+STRETCHES = st.lists(st.tuples(st.sampled_from([0.02, 0.1, 0.2, 0.4, 0.9]), st.integers(1, 12)), min_size=1, max_size=6)
+"""Gaps in s, and how many of them follow one another."""
+
+
+@settings(deadline=None, max_examples=80)
+@given(stretches=STRETCHES, plan_cv=st.floats(0.02, 1.0), token_cv=st.floats(0.05, 0.5), seed=st.integers(0, 99))
+def test_it_is_the_plain_rule_for_plans_side_by_side(
+    stretches: list[tuple[float, int]], plan_cv: float, token_cv: float, seed: int
+) -> None:
+    gaps = np.array([0.0, *(gap for gap, count in stretches for _ in range(count))])
+    token_s = 1.0 + np.cumsum(np.array([gaps, gaps[::-1]]).T, axis=0)
+    token_s += np.random.default_rng(seed).uniform(0, 0.01, token_s.shape).cumsum(axis=0)
+    prior = GapPrior(0.2, plan_cv, token_cv)
+    watch, found = Watch(prior, 2), []
+    for at_s in token_s:
+        watch.token(at_s)
+        found.append((*watch.learned, watch.slow.copy()))
+    for column in range(2):
+        told = plain.watched(0.2, plan_cv, token_cv, token_s[:, column].tolist())
+        for row, (mean_s, variance, slow) in enumerate(told):
+            assert found[row][0][column] == pytest.approx(mean_s)
+            assert found[row][1][column] == pytest.approx(variance)
+            assert found[row][2][column] == slow
+
+
+def test_a_plan_that_is_as_fast_again_learns_from_all_its_tokens() -> None:
+    gaps = [0.2] * 20 + [0.4] * 6 + [0.2] * 20
+    watch = Watch(PRIOR)
+    slow = []
+    for at_s in even(*gaps):
+        watch.token(at_s)
+        slow.append(bool(watch.slow[0]))
+    assert any(slow)
+    assert not slow[-1]
+    mean_s, variance = PRIOR.learned(46.0, sum(gaps))
+    assert (watch.learned[0][0], watch.learned[1][0]) == (pytest.approx(mean_s), pytest.approx(variance))
 
 
 def test_a_rate_that_halves_is_learned_within_two_tokens_and_forgotten_when_it_recovers() -> None:

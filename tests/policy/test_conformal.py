@@ -18,6 +18,7 @@ from s2a_bench.experiments.study.worlds import World
 from s2a_bench.policy import Plans
 from s2a_bench.policy.conformal import GRID, Tracker, calibrate, choose, coarse, scores, stalled, take, upper_bound
 from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy.naive import Naive
 from s2a_bench.policy.stream_to_act import StreamToAct
 
 WORLD = World(4.8, 0.5, 2, 4, 0.25)
@@ -30,8 +31,16 @@ def fitted(plans: Plans) -> StreamToAct:
     return StreamToAct(GapPrior.fit(plans.token_s))
 
 
-def test_cautions_are_tried_in_ascending_order() -> None:
-    assert all(less < more for less, more in pairwise(GRID))
+def test_cautions_are_quarters_to_4_then_coarser_to_32() -> None:
+    assert [*GRID[:17]] == [0.25 * quarter for quarter in range(17)]
+    assert all(1.1 * less < more <= 1.5 * less for less, more in pairwise(GRID[16:]))
+    assert GRID[-1] == 32
+
+
+def test_a_gap_between_skills_that_is_longer_than_a_microsecond_is_a_stall() -> None:
+    arrival_s = np.array([[0.0, 0.0], [1 + 0.5e-6, 1 + 2e-6]])
+    column = np.ones((2, 1))
+    assert stalled(Naive(), Plans(arrival_s, column, column, column)).tolist() == [False, True]
 
 
 def test_a_plan_s_score_is_the_least_caution_from_which_on_it_never_stalls() -> None:
@@ -104,6 +113,7 @@ def test_among_exchangeable_plans_no_more_stall_than_promised(gaps: Markov | Non
 
 
 def test_too_few_plans_are_refused_with_what_would_do() -> None:
+    assert choose(np.zeros(99)).caution == 0
     with pytest.raises(UsageError, match=r"98 calibration plans promise 0\.01 at best.*take 99 or more"):
         choose(np.zeros(98))
     assert choose(np.zeros(98), 0.02).caution == 0
@@ -116,6 +126,25 @@ def test_too_few_plans_are_refused_with_what_would_do() -> None:
 def test_the_upper_bound_is_scipy_s(stalls: int, plans: int) -> None:
     interval = stats.binomtest(stalls, plans).proportion_ci(0.95, "exact")
     assert upper_bound(stalls, plans, 0.975) == pytest.approx(interval.high)
+
+
+def test_where_all_stall_any_share_may_and_where_none_does_it_is_little() -> None:
+    assert upper_bound(50, 50, 0.999) == 1.0
+    assert upper_bound(0, 50, 0.999) == pytest.approx(1 - 0.001 ** (1 / 50))
+
+
+def test_the_level_moves_by_a_step_of_what_went_otherwise_than_epsilon_says() -> None:
+    tracker = Tracker([0.0, 1.0, 2.0], 0.25, step=0.5)
+    tracker.learn(3.0, stalled=False)
+    assert tracker.level == 0.25 + 0.5 * 0.25
+    assert tracker.caution == 3.0  # floor(4 x .375) - 1 = 0 scores may lie above
+    tracker.learn(math.inf, stalled=True)
+    assert tracker.level == 0.375 - 0.5 * 0.75
+    assert tracker.state() == {"epsilon": 0.25, "step": 0.5, "level": 0.0, "scores": [2.0, 3.0, None]}
+    for _ in range(9):
+        tracker.learn(3.0, stalled=False)
+    assert tracker.level == 0.5
+    assert Tracker([1.0]).state() == {"epsilon": 0.01, "step": 0.002, "level": 0.01, "scores": [1.0]}
 
 
 @given(stalls=st.lists(st.booleans(), min_size=1, max_size=3000), step=st.floats(0.001, 0.05))

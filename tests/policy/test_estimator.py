@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.boards.gaps import Lognormal, Markov
+from s2a_bench.boards.gaps import Constant, Lognormal, Markov
 from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
 from s2a_bench.policy.estimator import GapPrior
@@ -118,6 +118,21 @@ def test_a_profile_tells_rate_and_spreads() -> None:
     assert prior.mean_s == 1 / 4.8
     assert prior.plan_cv == 0.1
     assert prior.token_cv == pytest.approx(0.2, rel=0.05)
+
+
+def test_a_profile_s_own_spread_of_rates_is_taken_and_steady_gaps_still_let_plans_teach() -> None:
+    prior = GapPrior.of_profile(Profile("x", "X", "measured", 5.0, 0.5, 0.15, Constant(0.2), rate_cv=0.03))
+    assert prior.plan_cv == 0.03
+    assert 0 < prior.token_cv <= 1e-6
+
+
+def test_the_least_that_can_be_fitted_by_hand() -> None:
+    # Plan means 1 and 3, gaps (0.5, 1.5) and (2, 4): within, variances .5 and 2 of a gap; between, 2 of the means.
+    prior = GapPrior.fit(np.array([[0.0, 1.0], [0.5, 3.0], [2.0, 7.0]]))
+    token = (0.5 + 2) / 2 / 2**2
+    assert prior.mean_s == 2
+    assert prior.token_cv == pytest.approx(token**0.5)
+    assert prior.plan_cv == pytest.approx((2 / 2**2 - token / 2) ** 0.5)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.policy import Plans, Schedule, policy
-from s2a_bench.policy.metrics import fluidity, measure, queue_wait, stalls
+from s2a_bench.policy.metrics import Metrics, fluidity, measure, queue_wait, stalls
 from s2a_bench.testing.policy import draw
 from tests.policy import plain
 
@@ -56,6 +57,15 @@ def test_wait_then_act_by_hand() -> None:
     assert found.end_regret == [2 / 7]
     assert found.end_regret_of_wait == [1.0]
     assert found.fluidity == [1.0]
+
+
+@pytest.mark.parametrize("name", ["naive", "wait-then-act"])
+def test_shares_are_the_same_for_a_plan_of_a_sixteenth_of_the_time(name: str) -> None:
+    short = Plans(PLANS.arrival_s / 16, PLANS.nominal_s / 16, PLANS.least_s / 16, PLANS.most_s / 16)
+    found, slow = (measure(plans, policy(name).schedule(plans)) for plans in (short, PLANS))
+    for field in fields(Metrics):
+        value, long = getattr(found, field.name), getattr(slow, field.name)
+        assert value == (long / 16 if field.name.endswith("_s") else long), field.name
 
 
 def test_stream_to_act_acts_on_older_plans_than_naive() -> None:

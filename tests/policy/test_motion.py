@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import cmath
+import math
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from s2a_bench.policy.motion import jerk, peak_jerk, rms_jerk, sparc, speed_profile
 
@@ -39,6 +45,33 @@ def test_a_profile_of_two_samples_has_no_jerk() -> None:
 def test_sparc_is_that_of_its_authors_on_their_example() -> None:
     t = np.arange(-1, 1, 0.01)
     assert sparc(np.exp(-5 * t**2), 0.01) == pytest.approx(-1.41403, abs=5e-6)
+
+
+def arc_length(speed: list[float], sample_s: float, padding: int, cutoff_hz: float, threshold: float) -> float:
+    """Follow the words of the definition, with the sum that a Fourier transform is."""
+    size = 2 ** (math.ceil(math.log2(len(speed))) + padding)
+    turn = -2j * math.pi / size
+    amplitude = [abs(sum(v * cmath.exp(turn * k * i) for i, v in enumerate(speed))) for k in range(size // 2 + 1)]
+    curve = [(k / (size * sample_s), one / max(amplitude)) for k, one in enumerate(amplitude)]
+    last = max(k for k, (hz, one) in enumerate(curve) if hz <= cutoff_hz and one >= threshold)
+    first = min(k for k, (_, one) in enumerate(curve) if one >= threshold)
+    band = curve[first : last + 1]
+    width_hz = band[-1][0] - band[0][0]
+    return -sum(math.hypot((hz2 - hz1) / width_hz, two - one) for (hz1, one), (hz2, two) in pairwise(band))
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    speed=st.lists(st.floats(0.1, 2.0), min_size=3, max_size=20),
+    cutoff_hz=st.sampled_from([1.0, 2.5, 6.0]),
+    threshold=st.sampled_from([0.02, 0.05, 0.2]),
+    padding=st.integers(1, 3),
+)
+def test_sparc_is_the_length_of_the_spectrum_s_curve_up_to_the_cutoff(
+    speed: list[float], cutoff_hz: float, threshold: float, padding: int
+) -> None:
+    found = sparc(np.array(speed), 0.05, padding=padding, cutoff_hz=cutoff_hz, threshold=threshold)
+    assert found == pytest.approx(arc_length(speed, 0.05, padding, cutoff_hz, threshold))
 
 
 def test_sparc_does_not_depend_on_how_far_the_motion_goes() -> None:

@@ -108,6 +108,14 @@ class Wrong(Queue):
         return self.answer
 
 
+@dataclass
+class AsTold(Wrong):
+    """Starts whatever has arrived with the same answer."""
+
+    def decide(self, now_s: float) -> Start | float:
+        return self.answer if isinstance(Queue.decide(self, now_s), Start) else math.inf
+
+
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
@@ -119,6 +127,20 @@ class Wrong(Queue):
 def test_what_no_robot_can_do_is_refused(answer: Start | float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         follow(Wrong(answer=answer), Stream([], [1.0], [SKILL]), 1)
+
+
+@pytest.mark.parametrize(("duration_s", "latest_s"), [(-1.0, 2.0), (2.0, 1.0), (math.nan, 1.0)])
+def test_a_skill_that_takes_less_than_nothing_or_longer_than_its_bound_is_refused(
+    duration_s: float, latest_s: float
+) -> None:
+    with pytest.raises(ValueError, match=f"a skill that takes {duration_s} s, {latest_s} s at most"):
+        follow(AsTold(answer=Start(duration_s, latest_s)), Stream([], [1.0], [SKILL]), 1)
+
+
+def test_a_skill_may_take_no_time_and_its_bound_may_be_less_by_a_rounding() -> None:
+    stream = Stream([], [1.0, 2.0], [SKILL, SKILL])
+    assert follow(AsTold(answer=Start(0.0, 0.0)), stream, 2) == ([1.0, 2.0], [0.0, 0.0])
+    assert follow(AsTold(answer=Start(2.0, 2 - 1e-12)), stream, 3) == ([1.0, 3.0], [2.0, 2.0])
 
 
 def test_a_stepper_that_gives_up_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,9 +38,24 @@ def test_it_never_stalls_when_gaps_keep_the_bound(seed: int, n_skills: int, shar
 
 
 @settings(deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), n_skills=st.integers(1, 8))
-def test_with_a_bound_its_steps_and_arrays_agree(seed: int, n_skills: int) -> None:
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_skills=st.integers(1, 8),
+    more=st.integers(-1, 2),
+    parsing_s=st.sampled_from([0.0, 0.3]),
+    trailing_s=st.sampled_from([0.0, 0.7]),
+)
+def test_its_steps_and_arrays_agree_whatever_is_expected_and_however_fragments_lag(
+    seed: int, n_skills: int, more: int, parsing_s: float, trailing_s: float
+) -> None:
     plans = draw(seed, n_skills, 2, 1.2, 2)
+    assert plans.token_s is not None
+    plans = replace(
+        plans,
+        arrival_s=plans.arrival_s + parsing_s,
+        token_s=np.vstack([plans.token_s, plans.token_s[-1] + trailing_s]),
+        shape=PlanShape(n_skills + more, 2, Timing(1.0, 0.8, 1.5)),
+    )
     policy = RobustStart(BOUND)
     stepped = stepping.schedule(policy, plans)
     np.testing.assert_allclose(stepped.start_s, policy.schedule(plans).start_s, rtol=0, atol=EXACT)

@@ -93,6 +93,48 @@ def test_the_start_is_when_mean_meets_nominal_and_caution_meets_stretched(cautio
         assert isinstance(stepper(caution).decide(max(demands) + 1e-12), Start)
 
 
+@pytest.mark.parametrize("caution", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("spend", "within", "start_caution", "used"),
+    [(0.0, math.inf, 1.0, 0.0), (0.5, math.inf, 1.0, 0.5), (0.5, 0.31, 0.5, 0.5), (1.0, 0.2, 2.0, 0.0)],
+)
+def test_an_early_start_spends_a_share_of_the_stretch_where_it_comes_soon_enough(
+    spend: float, within: float, start_caution: float, used: float, caution: float
+) -> None:
+    robot = EarlyStart(PRIOR, caution, spend=spend, within=within, start_caution=start_caution).stepper(
+        PlanShape(4, 3, Timing(1.6, 1.2, 2.4), expected_cv=0.2)  # whole: 1.2 + 3 x 1.6 = 6 s
+    )
+    robot.token(1.0)
+    robot.token(1.6)
+    robot.fragment(1.6, Timing(1.2, 1.0, 1.5))
+    demands = [
+        1.6 + forecast(3 + 3 * unknown, unknown, lam, each) - (first + unknown * each)
+        for unknown in range(3)
+        for lam, first, each in ((0.0, 1.2 + used * 0.3, 1.6 + used * 0.8), (start_caution * caution, 1.5, 2.4))
+    ]
+    assert robot.decide(1.6) == pytest.approx(max(demands))
+
+
+@pytest.mark.parametrize("caution", [0.0, 0.5, 3.0])
+@pytest.mark.parametrize("most_s", [0.9, 1.0, 1.05, 1.07, 1.1, 1.2, 1.4, 1.7])
+def test_a_robot_holds_where_not_even_a_favourable_forecast_can_be_met(most_s: float, caution: float) -> None:
+    robot = StreamToAct(PRIOR, caution, detect=True).stepper(PlanShape(2, 3, Timing(1.0, 0.8, 1.5)))
+    assert isinstance(robot, OnlineStepper)
+    robot.token(1.0)
+    robot.token(1.6)
+    robot.fragment(1.6, Timing(0.8, 0.7, most_s))
+    robot.due_s = 1.6  # it has begun
+    favourable = 1.6 + forecast(3, 0, -2.0, 0.0) - most_s
+    cautious = 1.6 + forecast(3, 0, caution, 0.0) - most_s
+    answer = robot.decide(1.6)
+    if favourable <= 1.6 or cautious <= 1.6:
+        assert isinstance(answer, Start)
+    elif forecast(2, 0, caution, 0.0) > most_s:
+        assert answer == math.inf  # only the next token can tell
+    else:
+        assert answer == pytest.approx(cautious)
+
+
 @pytest.mark.parametrize("now_s", [1.7, 2.0, 2.2, 2.4])
 def test_a_skill_is_stretched_to_the_worst_forecast_which_a_late_token_pushes(now_s: float) -> None:
     robot = stepper(1.0)

@@ -11,7 +11,7 @@ import pytest
 
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.study.worlds import World, generator
-from s2a_bench.policy import Plans
+from s2a_bench.policy import Plans, tracking
 from s2a_bench.policy.conformal import stalled, take
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import EarlyStart, StreamToAct
@@ -41,6 +41,17 @@ def test_arrays_are_plans_one_after_another(policy: StreamToAct) -> None:
         np.testing.assert_array_equal(alone.policy.schedule(plan).start_s[:, 0], schedule.start_s[:, column])
         alone.learn(plan, stalled=bool(stalled(alone.policy, plan)[0]))
     assert together.state() == alone.state()
+
+
+def test_plans_that_do_not_fit_the_memory_at_once_are_the_same_plans(monkeypatch: pytest.MonkeyPatch) -> None:
+    plans, whole, parts = slow(20), begin(), begin()
+    cautions, schedule = whole.follow(plans)
+    monkeypatch.setattr(tracking, "AT_ONCE", 6)
+    again, in_parts = parts.follow(plans)
+    assert again.tolist() == cautions.tolist()
+    np.testing.assert_array_equal(in_parts.start_s, schedule.start_s)
+    np.testing.assert_array_equal(in_parts.duration_s, schedule.duration_s)
+    assert parts.state() == whole.state()
 
 
 def test_it_goes_on_from_its_state() -> None:
