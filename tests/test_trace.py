@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import timeit
+from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -106,6 +109,46 @@ def test_marks_of_another_clock_are_not_mixed_in() -> None:
     trace.marks = [("", 10), ("return", 90)]
     trace.receive(Remote("another host", [("network", 40)]))
     assert trace.chain() == [("", 10), ("return", 90)]
+
+
+def test_a_trace_that_knows_nothing_tells_that_there_is_no_frame() -> None:
+    assert Trace().to_remote() == Remote(clock_id(), [], [], -1, [], {}, {})
+    assert Remote("any").frame_stamp_ns == -1
+
+
+def test_what_a_server_says_of_itself_is_a_number_that_floats_count_exactly_or_odd() -> None:
+    trace = Trace()
+    trace.learn({"most": 2**53, "least": -(2**53), "half": 0.5, "n" * 63: 1})
+    assert (trace.facts, trace.odd) == ({"most": 2**53, "least": -(2**53), "half": 0.5, "n" * 63: 1}, set())
+    trace.learn({"more": 2**53 + 1, "less": -(2**53) - 1, "nan": math.nan, "inf": math.inf, "yes": True, "text": "1"})
+    assert trace.odd == {"more", "less", "nan", "inf", "yes", "text"}
+    trace.learn({"n" * 64: 1, "a b": 1, 5: 1})  # type: ignore[dict-item]
+    assert trace.odd == {"more", "less", "nan", "inf", "yes", "text", "a name that is none"}
+    assert len(trace.facts) == 4
+
+
+REMOTE = Remote("clock", [("network", 2**62 - 1)], [0], -1, [("queue", 0)], {}, {})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"clock": 5}, "stages are no text"),
+        ({"marks": [(5, 1)]}, "stages are no text"),
+        ({"frame_marks": [(None, 1)]}, "stages are no text"),
+        ({"marks": [("network", 2**62)]}, "times are none"),
+        ({"frame_marks": [("queue", -1)]}, "times are none"),
+        ({"token_ns": [1.0]}, "times are none"),
+        ({"token_ns": [True]}, "times are none"),
+        ({"frame_stamp_ns": 2**62}, "times are none"),
+        ({"facts": []}, "facts without names"),
+        ({"provenance": "llama"}, "a provenance without names"),
+    ],
+)
+def test_what_can_be_no_server_s_marks_is_refused(wrong: dict[str, Any], said: str) -> None:
+    assert REMOTE.check() is REMOTE
+    with pytest.raises(ValueError, match=said):
+        replace(REMOTE, **wrong).check()
 
 
 def test_a_mark_costs_a_few_readings_of_the_clock() -> None:

@@ -77,7 +77,8 @@ class GapPrior:
         if not mean > 0:
             raise UsageError("a prior needs tokens that arrive one after another, not all at once")
         size = max(1, min(round(count**0.5), count // 2))
-        blocks = gaps[: count // size * size].reshape(-1, size, plans).sum(axis=1)
+        number = count // size
+        blocks = gaps[: number * size].reshape(number, size, plans).sum(axis=1)
         # Unbiased within each plan, then the mean over plans: a variance a gap, relative to the mean squared.
         token = float(blocks.var(axis=0, ddof=1).mean()) / size / mean**2
         plan = float(means.var(ddof=1)) / mean**2 - token / count

@@ -1,4 +1,6 @@
+import errno
 import json
+import math
 import os
 import re
 import signal
@@ -7,18 +9,22 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from datetime import datetime, timezone
 from io import FileIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import pandas as pd
+import pyarrow as pa
 import pytest
+from pyarrow import parquet
 
 from s2a_bench.errors import StoreError
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.files import read_csv, read_parquet
 from s2a_bench.store.requests import EARLIER_STAGES, TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
 from s2a_bench.store.room import RESERVE, RESERVE_BYTES, why
-from s2a_bench.store.run import RunWriter, read_run
+from s2a_bench.store.run import Run, RunWriter, fits, read_run
 
 CHAIN = [
     ("", 1_000),
@@ -163,6 +169,14 @@ def test_a_sample_without_a_token_has_no_end_to_end(tmp_path: Path) -> None:
     assert pd.isna(read_run(run.path).samples["e2e_ns"][0])
 
 
+@pytest.mark.parametrize("end", ["return", "ingest", "server"])
+def test_where_nothing_is_captured_the_first_token_counts_from_the_start(tmp_path: Path, end: str) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample(marks=[("", 100), ("network", 150), (end, 900)]))
+    row = read_run(run.path).samples.iloc[0]
+    assert (row["e2e_ns"], row["ttft_ns"]) == (800, 800)
+
+
 def test_csv_and_parquet_hold_the_same_columns_and_values(tmp_path: Path) -> None:
     texts = [
         "plain",
@@ -240,6 +254,7 @@ def test_a_torn_last_record_is_dropped(open_run: Callable[..., RunWriter]) -> No
     assert read_run(run.path).tokens["text"].tolist() == ["a\nb"]
     tokens.write_bytes(whole[:5])  # not even a header
     assert read_run(run.path).tokens.empty
+    assert read_run(run.path).row_counts() == {"samples": 1}
     assert read_run(run.path).manifest["state"] == "running"
 
 
@@ -289,6 +304,47 @@ def test_an_output_that_is_no_folder_is_refused_by_name(tmp_path: Path, where: s
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match=r"`output` .*file.*is not a folder"):
         RunWriter.create(tmp_path / where, "latency", {})
+
+
+def test_the_second_folder_of_a_second_gets_a_2_and_a_strange_host_is_spelled_out(
+    tmp_path: Path, open_run: Callable[..., RunWriter], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noon = datetime(2026, 1, 2, 12, tzinfo=timezone.utc)
+    monkeypatch.setattr("s2a_bench.store.run.datetime", SimpleNamespace(now={timezone.utc: noon}.get))
+    names = []
+    for host in ("orin", "orin", "orin", "a b/c!", "--", ""):
+        monkeypatch.setattr(socket, "gethostname", lambda host=host: host)
+        names.append(open_run(tmp_path).path.name)
+    stem = "20260102T120000Z-latency-"
+    spelled = ["orin", "orin-2", "orin-3", "a-b-c", "unnamed", "unnamed-2"]
+    assert names == [stem + name for name in spelled]
+
+
+def test_an_output_without_write_permission_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    with pytest.raises(StoreError, match=f"`output` {tmp_path}: cannot create a folder there: permission denied"):
+        RunWriter.create(tmp_path, "latency", {})
+
+
+def test_a_disk_without_room_for_the_reserve_ends_the_run_before_it_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(folder: Path) -> None:
+        (folder / RESERVE).touch()
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr("s2a_bench.store.run.reserve", full)
+    with pytest.raises(StoreError, match=f"cannot write into {tmp_path}: Input/output error"):
+        RunWriter(tmp_path, {})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("wrong", [ZeroDivisionError, AttributeError, KeyError, TypeError, ValueError])
+def test_rows_that_do_not_fit_their_manifest_are_told_with_their_folders(wrong: type[Exception]) -> None:
+    runs = [Run(Path(name), {}) for name in ("one", "two")]
+    said = rf"^one, two: rows and manifest do not fit: {wrong.__name__}\('x'\)$"
+    with pytest.raises(StoreError, match=said), fits(*runs):
+        raise wrong("x")
 
 
 def test_an_output_that_cannot_be_written_is_refused_by_name() -> None:
@@ -412,17 +468,54 @@ def test_a_damaged_csv_is_an_error_and_not_a_number(open_run: Callable[..., RunW
     run.sample(sample())
     path = run.path / "samples.csv"
     path.write_bytes(path.read_bytes().replace(b"11850", b"many"))
-    with pytest.raises(StoreError, match=r"samples\.csv is damaged"):
+    with pytest.raises(StoreError, match=r"samples\.csv is damaged: .") as error:
         _ = read_run(run.path).samples
+    assert len(str(error.value).splitlines()) == 1
+
+
+def _words(path: Path) -> None:
+    parquet.write_table(pa.table({"index": ["many"]}), path)
+
+
+def _zeros(path: Path) -> None:
+    whole = path.read_bytes()
+    path.write_bytes(whole[:4] + bytes(200) + whole[204:])
+
+
+@pytest.mark.parametrize("damage", [_words, _zeros, lambda path: path.write_bytes(b"PAR1")])
+def test_a_damaged_parquet_file_is_one_line_with_the_way_out(tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.tokens([token(0, "a")])
+    damage(run.path / "tokens.parquet")
+    with pytest.raises(StoreError, match=r"tokens\.parquet is damaged: .+; remove it to read the CSV$") as error:
+        _ = read_run(run.path).tokens
+    assert len(str(error.value).splitlines()) == 1
+    (run.path / "tokens.parquet").unlink()
+    assert read_run(run.path).tokens["text"].tolist() == ["a"]
+
+
+@pytest.mark.parametrize("torn", ["r1,torn", ""])
+def test_a_run_that_was_killed_goes_on_after_its_last_whole_record(tmp_path: Path, torn: str) -> None:
+    samples = samples_table(EARLIER_STAGES)
+    with RunWriter.create(tmp_path, "latency", {}) as run:
+        run.sample(sample("r1"))
+    path = run.path / "samples.csv"
+    path.write_text(path.read_text() + torn if torn else "")  # without torn: not even the header came
+    again = RunWriter.reopen(run.path, [samples])
+    again.sample(sample("r2"))
+    assert read_run(run.path).samples["request_id"].tolist() == (["r1", "r2"] if torn else ["r2"])
+    again.finish("finished")
 
 
 def test_the_manifest_holds_only_strict_json(tmp_path: Path) -> None:
-    facts = {"configuration": {"path": Path("/x"), "loss": float("nan"), "t": (1,)}}
+    facts = {"configuration": {"path": Path("/x"), "loss": float("nan"), "t": (1,), "on": True, "most": -math.inf}}
     with RunWriter.create(tmp_path, "latency", facts) as run:
-        run.update(row=token(0, "a"))
+        run.update(row=token(0, "a"), kind=TokenRow)
     manifest = read_run(run.path).manifest
-    assert manifest["configuration"] == {"path": "/x", "loss": None, "t": [1]}
+    assert manifest["configuration"] == {"path": "/x", "loss": None, "t": [1], "on": True, "most": None}
     assert manifest["row"]["token_id"] == 100
+    assert manifest["kind"] == str(TokenRow)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00", manifest["started"])
     assert not (run.path / "manifest.json.part").exists()
 
 
@@ -443,6 +536,7 @@ WRONG = {
     "seeds": (2**70, "seeds: 1180591620717411303424 should be a valid dictionary"),
     "argv": ({}, "argv: {} should be a valid list"),
     "configuration": ([], "configuration: [] should be a valid dictionary"),
+    "servers": ({"http": 5, "ros": 6}, "servers.http: 5 should be a valid dictionary"),
     "stages": ({"capture\x1b[2J": 5}, r"stages.capture\x1b[2J: 5 should be a valid string"),
 }
 

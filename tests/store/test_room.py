@@ -1,0 +1,34 @@
+"""Where there is no room, that is said with what helps."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from s2a_bench.store.room import release, reserve, why
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_where_there_is_no_room_the_file_system_and_what_is_free_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    monkeypatch.setattr(os.path, "ismount", lambda path: path == tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=12_345 if path == tmp_path else 0))
+    full = OSError(number, os.strerror(number))
+    told = f"{full.strerror} (file system {tmp_path}, 12,345 bytes free; make room, or choose another `output`)"
+    assert why(full, tmp_path / "a" / "b.csv") == told
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: (_ for _ in ()).throw(OSError()))
+    assert why(full, tmp_path) == told.replace(", 12,345 bytes free", "")
+    assert why(OSError(errno.EIO, "broken"), tmp_path) == "broken"
+    assert why(OSError("own words"), tmp_path) == "own words"
+
+
+def test_the_reserve_is_given_back_once(tmp_path: Path) -> None:
+    reserve(tmp_path)
+    assert release(tmp_path)
+    assert not release(tmp_path)
