@@ -45,7 +45,7 @@ TESTS = {
     "plan": ["tests/plan"],
     "runtime": ["tests/runtime"],
     "store": ["tests/store", "tests/sweep/test_sweep.py"],
-    "report/claims": ["tests/report/test_claims.py", "tests/report/test_claim_cases.py"],
+    "report/claims": [f"tests/report/test_claim{part}.py" for part in ("_rules", "_texts", "s", "_cases")],
 }
 """Package -> the tests that belong to it."""
 WITH_ARGUMENTS = ("VariableReplacer", "VariableInserter")

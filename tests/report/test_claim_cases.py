@@ -232,17 +232,17 @@ EVIDENCE: dict[str, tuple[Made, dict[str, str]]] = {
         {"AGX Orin: stream-to-act eliminates stalls": UNDECIDED},
     ),
     "a careless stream-to-act": (
-        lambda kit: _stalling(kit.timeline(profiles=("jetson-agx-orin",), jitter="lognormal:cv=0.2"), every=20),
+        lambda kit: stalling(kit.timeline(profiles=("jetson-agx-orin",), jitter="lognormal:cv=0.2"), every=20),
         {"AGX Orin: stream-to-act eliminates stalls": CONTRADICTED},
     ),
     "a stream-to-act that promises little": (
-        lambda kit: _stalling(
+        lambda kit: stalling(
             kit.timeline(profiles=("jetson-agx-orin",), jitter="lognormal:cv=0.2", epsilon=0.3), every=20
         ),
         {"AGX Orin: stream-to-act eliminates stalls": CONTRADICTED},
     ),
     "a few stalls, as promised": (
-        lambda kit: _stalling(kit.timeline(profiles=("jetson-agx-orin",), jitter="lognormal:cv=0.2"), every=500),
+        lambda kit: stalling(kit.timeline(profiles=("jetson-agx-orin",), jitter="lognormal:cv=0.2"), every=500),
         {"AGX Orin: stream-to-act eliminates stalls": SUPPORTED},
     ),
     "table II's rate": (lambda kit: kit.rates(34.0, REAL, GPU), {"RTX 4080: 34.2 tokens/s": SUPPORTED}),
@@ -283,7 +283,7 @@ def test_evidence_decides_by_its_intervals(kit: Kit, case: str) -> None:
     assert {text: found[text].verdict for text in wanted} == wanted
 
 
-def _stalling(run: Run, every: int) -> Run:
+def stalling(run: Run, every: int) -> Run:
     """Let every so-manieth plan of stream-to-act stall, and no other."""
     rows = run.table(TIMELINES).copy()
     ours = rows["policy"] == "stream-to-act"

@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -22,7 +21,6 @@ from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.report.claims.ccrb import CHOSEN
 from s2a_bench.report.claims.checks import CLAIMS
 from s2a_bench.report.claims.claim import CONTRADICTED, REPRODUCED, SUPPORTED, UNDECIDED, Need, Part
-from s2a_bench.report.claims.needs import is_board, machine_of
 from s2a_bench.report.claims.verdicts import Judged, claim_table, judge, judge_claims
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run, read_run
@@ -142,37 +140,6 @@ def test_bodies_of_unlike_pictures_are_not_compared(make_run: MakeRun, make_row:
     assert not claim_of("1.3333", make_run({}, extra=tuple(rows))).findings
 
 
-@pytest.mark.parametrize(
-    ("environment", "name", "same"),
-    [
-        (ORIN, "Jetson AGX Orin", True),
-        (ORIN, "Jetson Orin Nano", False),
-        ({"board": "NVIDIA Jetson Orin Nano Super Developer Kit"}, "Jetson AGX Orin", False),
-        (RTX, "RTX 4080", True),
-        ({"gpus": [{"name": "NVIDIA GeForce RTX 4080 SUPER"}]}, "RTX 4080", False),
-        ({"gpus": [{"name": "NVIDIA GeForce RTX 4080 Laptop GPU"}]}, "RTX 4080", False),
-        ({"gpus": [{"name": "NVIDIA GeForce RTX 40800"}]}, "RTX 4080", False),
-        ({}, "RTX 4080", False),
-    ],
-)
-def test_a_board_is_known_by_its_whole_name(
-    make_run: MakeRun, environment: dict[str, Any], name: str, same: bool
-) -> None:
-    assert is_board(make_run({}, manifest={"environment": environment}), name) == same
-
-
-@pytest.mark.parametrize(
-    ("environment", "named"),
-    [
-        (RTX | {"cpu": "AMD Ryzen 9"}, "AMD Ryzen 9, NVIDIA GeForce RTX 4080"),
-        (ORIN | {"gpus": []}, "NVIDIA Jetson AGX Orin Developer Kit"),
-        ({}, "a machine that is not known"),
-    ],
-)
-def test_a_machine_is_named_by_what_is_known_of_it(make_run: MakeRun, environment: dict[str, Any], named: str) -> None:
-    assert machine_of(make_run({}, manifest={"environment": environment})) == named
-
-
 def test_a_path_without_colour_conversions_contradicts_that_they_are_most_of_it(make_run: MakeRun) -> None:
     cells = {**EVEN, "ros/topic": {"network": 3, "inference": 5, "return": 0}}
     judged = claim_of("colour conversions", make_run(cells, payloads=PAYLOADS))
@@ -224,6 +191,26 @@ def test_always_and_never_are_not_intermittent(timelines: Run) -> None:
         assert claim_of("intermittent", replace(timelines, tables=tables)).verdict == verdict
 
 
+@pytest.mark.parametrize(
+    ("stalls", "intermittent"), [(0, CONTRADICTED), (1, SUPPORTED), (9, SUPPORTED), (10, CONTRADICTED)]
+)
+def test_a_tenth_of_the_gaps_and_nine_tenths_are_intermittent(tmp_path: Path, stalls: int, intermittent: str) -> None:
+    config = TimelineConfig(profiles=("jetson-agx-orin",), policies=("naive",), n_skills=(11,))
+    run = read_run(run_timeline(config, tmp_path, NullProgress()))
+    tables = run.tables | {"timelines": run.table(TIMELINES).assign(stalls=stalls)}
+    judged = claim_of("intermittent", replace(run, tables=tables))
+    assert judged.verdict == intermittent
+    assert f"Naive stalls at {stalls}0% at L = 6".replace(" 00%", " 0%") in judged.evidence[0]
+
+
+def test_half_of_the_gaps_are_not_frequent(tmp_path: Path) -> None:
+    config = TimelineConfig(profiles=("jetson-orin-nano",), policies=("naive",), n_skills=(11,))
+    run = read_run(run_timeline(config, tmp_path, NullProgress()))
+    for stalls, verdict in ((5, CONTRADICTED), (6, SUPPORTED)):
+        tables = run.tables | {"timelines": run.table(TIMELINES).assign(stalls=stalls)}
+        assert claim_of("frequent", replace(run, tables=tables)).verdict == verdict
+
+
 def test_frequent_means_most_of_the_gaps_at_every_granularity(timelines: Run) -> None:
     rows = timelines.table(TIMELINES)
     naive = rows["policy"] == "naive"
@@ -238,6 +225,8 @@ def test_frequent_means_most_of_the_gaps_at_every_granularity(timelines: Run) ->
     [
         ((3, 2, 1, 0.5), SUPPORTED),
         ((3, 0, 0, 0), SUPPORTED),
+        ((0.03, 0.02, 0.01, 0), SUPPORTED),
+        ((0.02, 0.01, 0, 0), UNDECIDED),  # 20 ms cannot be seen
         ((3, 3, 1, 0), CONTRADICTED),
         ((2, 3, 1, 0), CONTRADICTED),
         ((0, 0, 0, 0), UNDECIDED),  # nothing to compare
