@@ -309,6 +309,8 @@ def test_where_skills_cannot_end_early_the_papers_line_is_not_tried(tmp_path: Pa
     run = read_run(run_boundary(BoundaryConfig(t_min=1.0), tmp_path, NullProgress()))
     assert claim_of("suffices", run).verdict == SUPPORTED
     assert claim_of("Below R", run).needs_run
+    told = replace(run, manifest=run.manifest | {"configuration": {}})  # an older folder: T_min was T_nom
+    assert claim_of("Below R", told).needs_run
 
 
 def test_the_operating_point_is_reproduced_and_the_diagram_does_not_bear_all_of_it_out(ccrb: Run) -> None:

@@ -14,7 +14,16 @@ from s2a_bench.clock import VirtualClock
 from s2a_bench.policy import Plans, PlanShape, Start, Stepper, policy
 from s2a_bench.policy.naive import Naive, Queue
 from s2a_bench.policy.schedule import safe_start
-from s2a_bench.runtime.events import AbortAsked, Event, Requested, SkillCame, StreamBroke, StreamEnded, TokenCame
+from s2a_bench.runtime.events import (
+    AbortAsked,
+    Event,
+    Requested,
+    ScriptedInbox,
+    SkillCame,
+    StreamBroke,
+    StreamEnded,
+    TokenCame,
+)
 from s2a_bench.runtime.executor import Executor
 from s2a_bench.runtime.record import Record
 from s2a_bench.runtime.timed import TimedRobot
@@ -122,6 +131,17 @@ def test_a_dead_stream_lets_the_skill_under_way_end_and_starts_no_other() -> Non
     assert (record.outcome, record.why) == ("stream-error", "cable pulled")
     assert (starts(record), ends(record)) == ([1.0], [2.0])
     assert robot.told == [(-1.0, "cruise"), (1.0, "start skill0 until 2"), (2.0, "hold")]
+
+
+def test_unless_told_otherwise_silence_is_a_minute_and_a_skill_may_overrun_by_ten_seconds() -> None:
+    for events, why in (
+        ([Requested(ns(0))], "no token for 60 s"),
+        (plan([1.0]), "skill0() went on for 10 s after its end"),
+    ):
+        clock = VirtualClock(ns(0))
+        inbox = ScriptedInbox(clock, events)
+        record = Executor(Naive(), shape(1), SelfPaced(clock, off_s=float("inf")), inbox, clock).run()
+        assert record.why == why
 
 
 def test_silence_counts_from_the_last_token() -> None:

@@ -125,6 +125,18 @@ class TestFunctions:
         assert motion.wait()
         assert motion.remaining_s == 0
 
+    def test_waiting_for_longer_than_the_end_ends_with_it(self) -> None:
+        end_ns = now_ns() + 20 * NS
+        assert Motion(CUP, end_ns).wait(3600)
+        assert now_ns() >= end_ns
+
+    def test_what_remains_is_in_seconds_and_never_less_than_none(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        motion = Motion(CUP, 3_500_000_000)
+        monkeypatch.setattr("s2a_bench.runtime.callables.now_ns", lambda: 1_000_000_000)
+        assert motion.remaining_s == 2.5
+        motion.retime(999_999_999)
+        assert motion.remaining_s == 0
+
     def test_waiting_a_while_does_not_wait_for_the_end(self) -> None:
         motion = Motion(CUP, now_ns() + 3600 * 10**9)
         assert motion.wait(0.001)
@@ -161,9 +173,12 @@ class TestPlugIns:
         with pytest.raises(UsageError, match="`robot`: 'arm' of the package somebodys_robot:arm does not load"):
             ROBOTS["arm"]
 
-    @pytest.mark.parametrize("name", ["timed", "ros"])
-    def test_ours_are_found(self, name: str) -> None:
+    @pytest.mark.parametrize(("name", "several"), [("timed", True), ("ros", False)])
+    def test_ours_are_found_and_only_the_one_that_moves_nothing_may_be_had_several_times(
+        self, name: str, several: bool
+    ) -> None:
         assert callable(ROBOTS[name])
+        assert getattr(ROBOTS[name], "several", False) is several
 
 
 class TestRosActions:
@@ -205,7 +220,8 @@ class TestRosActions:
             goal.accept()
             assert goal.executing()
             success = answer == "succeed"
-            result = default(EXECUTE_SKILL + "_Result", success=success, message="" if success else "jammed")
+            quiet = success or answer.startswith("mute")
+            result = default(EXECUTE_SKILL + "_Result", success=success, message="" if quiet else "jammed")
             if answer == "cancel":
                 assert begun is not None
                 begun.set()
@@ -213,7 +229,7 @@ class TestRosActions:
                     server.next_goal(0.01)
                 goal.canceled(result)
                 self.cancelled.set()
-            elif answer == "abort":
+            elif answer.endswith("abort"):
                 goal.abort(result)
             else:
                 goal.succeed(result)
@@ -236,12 +252,26 @@ class TestRosActions:
         assert [(skill, arguments) for skill, arguments, _ in asked] == [("wave", ["cup"]), ("wave", ["box"])]
         assert all(0 <= duration_s <= 0.04 for _, _, duration_s in asked)
 
+    @pytest.mark.parametrize(("left_s", "least_s", "most_s"), [(3600.0, 3000.0, 3600.0), (-1.0, 0.0, 0.0)])
+    def test_a_goal_is_told_the_time_that_is_left_and_the_skill_s_bounds(
+        self, server: ActionServer, robot: ActionRobot, left_s: float, least_s: float, most_s: float
+    ) -> None:
+        robot.start(CUP, now_ns() + round(left_s * 1e9), lambda _: None)
+        deadline_ns = now_ns() + 10 * 10**9
+        while (goal := server.next_goal(0.1)) is None:
+            assert now_ns() < deadline_ns
+        wanted = goal.unpack()
+        assert least_s <= wanted.duration <= most_s
+        assert (wanted.duration_least, wanted.duration_most) == (pytest.approx(0.02), pytest.approx(0.06))
+
     @pytest.mark.parametrize(
         ("answer", "why"),
         [
             ("abort", "wave(cup): the goal ended ABORTED: jammed"),
             ("reject", "wave(cup): the robot rejected the goal"),
             ("fail", "wave(cup): jammed"),
+            ("mute abort", "wave(cup): the goal ended ABORTED"),
+            ("mute", "wave(cup): the robot reports no success"),
         ],
     )
     def test_a_goal_that_goes_wrong_fails_the_plan(
@@ -275,5 +305,7 @@ class TestRosActions:
     def test_a_robot_that_is_not_there_is_missed(self, dds_domain: int, stack: ExitStack) -> None:
         middleware = open_middleware("cyclonedds", domain_id=dds_domain)
         stack.callback(middleware.close)
-        with pytest.raises(TransportError, match="`robot`: ros: no server of the action /nowhere/execute_skill"):
+        with pytest.raises(
+            TransportError, match=r"`robot`: ros: no server of the action /nowhere/execute_skill .* in 0\.2 s"
+        ):
             ActionRobot(middleware, "/nowhere", server_timeout_s=0.2)
