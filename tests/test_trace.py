@@ -153,4 +153,4 @@ def test_what_can_be_no_server_s_marks_is_refused(wrong: dict[str, Any], said: s
 
 def test_a_mark_costs_a_few_readings_of_the_clock() -> None:
     reading = min(timeit.repeat(now_ns, number=10_000, repeat=5)) / 10_000 * 1e9
-    assert min(mark_cost_ns() for _ in range(5)) < 20 * reading
+    assert 0.2 * reading < min(mark_cost_ns() for _ in range(5)) < 20 * reading

@@ -96,6 +96,23 @@ def test_codes_that_would_merge_are_not_taken() -> None:
     assert choose_format(many(3), 1, capitals_merge).texts == ("Z", "a", "b")
 
 
+def test_codes_that_would_merge_with_another_are_not_taken_nor_are_two_of_one_token() -> None:
+    def a_and_b_merge(text: str) -> list[int]:
+        return [hash(piece) for piece in re.findall("AB|.", text)]
+
+    def capitals_are_small(text: str) -> list[int]:
+        return [ord(char.lower()) for char in text]
+
+    assert choose_format(many(3), 1, a_and_b_merge).texts == ("A", "C", "D")
+    assert choose_format(many(27), 1, capitals_are_small).texts[25:] == ("Z", "0")
+
+
+def test_there_are_letters_for_62_words_and_codes_for_94_calls(of_bytes: Tokenizer) -> None:
+    assert choose_format(many(62), 3, of_bytes).name == "letters"
+    assert choose_format(many(63), 3, of_bytes).name == "codes, filled up"
+    assert choose_format(many(94), 2, of_bytes).name == "codes"
+
+
 def test_lines_that_cost_something_else_in_a_row_are_not_taken() -> None:
     def line_ends_merge(text: str) -> list[int]:
         return [hash(piece) for piece in re.findall(r"\n[a-zA-Z]|.|\n", text)]

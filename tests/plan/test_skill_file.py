@@ -44,6 +44,24 @@ def test_the_calls_are_all_there_are() -> None:
     assert str(calls[-1]) == "home()"
 
 
+def test_what_is_just_allowed_is_read() -> None:
+    word = 64 * "k"
+    text = ARM.replace("küche", word).replace('"home"', f'"{word}"').replace("t_nom_s = 2", "t_nom_s = 1e9")
+    lift, home = parse_skills(text, "arm.toml").skills
+    assert lift.arguments[0].values == ("cup", word)
+    assert (lift.durations.nominal_s, home.name) == (1e9, word)
+    numbers = ARM.replace("{ from = 0.1, to = 0.3, step = 0.1 }", "[-1, 2.5, 3.0]")
+    assert parse_skills(numbers, "arm.toml").vocabularies["height"] == (-1, 2.5, 3)
+    single = ARM.replace('["cup", "küche"]', '["cup"]').replace("to = 0.3", "to = 0.1")
+    assert len(parse_skills(single, "arm.toml").calls) == 2
+    many = single.replace("to = 0.1", "to = 102.3")
+    assert len(parse_skills(many, "arm.toml").calls) == 1024
+    with pytest.raises(UsageError, match="1025 calls are possible, at most 1024"):
+        parse_skills(many.replace("102.3", "102.4"), "arm.toml")
+    steady = ARM.replace("t_min_s = 1\n", "t_min_s = 1.5\n")
+    assert parse_skills(steady, "arm.toml").skills[1].durations == Durations(1.5, 1.5, 1.5)
+
+
 def test_whole_numbers_stay_whole() -> None:
     skills = load_skills("driving")
     assert skills.vocabularies["speed"] == tuple(range(0, 65, 5))
@@ -112,6 +130,12 @@ def test_the_household_speaks_the_papers_plan() -> None:
             "step = 0.1, unit = 1",
             "vocabulary.height: a range has the numbers from, to, step, and nothing else",
         ),
+        (
+            "to = 0.3",
+            "to = 102.5",
+            "vocabulary.height: 1025 values; at most 1024 calls are allowed, use a coarser step",
+        ),
+        ('["cup", "küche"]', "[true]", "vocabulary.thing: should be a list of texts"),
         ("to = 0.3", "to = 100000", "vocabulary.height: 1000000 values; at most 1024"),
         ("to = 0.3", "to = 30", "skill: 1201 calls are possible, at most 1024"),
         ("[[skill]]", "[[skills]]", "skills: there is no such key; did you mean skill?"),
@@ -133,5 +157,5 @@ def test_a_choice_that_is_neither_a_name_nor_a_file_is_told(tmp_path: Path) -> N
         load_skills("/no/such.toml")
     latin = tmp_path / "latin.toml"
     latin.write_bytes("name = 'küche'".encode("latin-1"))
-    with pytest.raises(UsageError, match="not UTF-8 text"):
+    with pytest.raises(UsageError, match=r"not UTF-8 text \(invalid start byte at byte 9\)"):
         load_skills(str(latin))

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from importlib.metadata import EntryPoint
 from threading import Event as Flag
 from threading import Thread
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -18,7 +18,7 @@ from s2a_bench.plan import Call, Gap, SkillSet, load_skills, parse_skills
 from s2a_bench.policy import PlanShape, Timing, policy
 from s2a_bench.ros import ActionServer, Middleware, ServerGoal, open_middleware
 from s2a_bench.ros.messages import default
-from s2a_bench.runtime import ROBOTS, Robot
+from s2a_bench.runtime import ROBOTS, Robot, actions
 from s2a_bench.runtime.actions import EXECUTE_SKILL, ActionRobot
 from s2a_bench.runtime.callables import Action, CallableRobot, Motion
 from s2a_bench.runtime.events import AbortAsked, LiveInbox, Requested, SkillCame, StreamEnded
@@ -301,6 +301,19 @@ class TestRosActions:
         while (packed := listener.take(0.5)) is not None:
             heard.append(listener.unpack(packed).data)
         assert heard[-1] == "coast"
+
+    def test_whoever_finds_no_robot_leaves_the_domain(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        left: list[bool] = []
+        middleware = SimpleNamespace(close=lambda: left.append(True))
+
+        def interrupted(_: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(actions, "open_middleware", lambda **_: middleware)
+        monkeypatch.setattr(actions, "ActionRobot", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            actions.open_ros(QUICK)
+        assert left == [True]
 
     def test_a_robot_that_is_not_there_is_missed(self, dds_domain: int, stack: ExitStack) -> None:
         middleware = open_middleware("cyclonedds", domain_id=dds_domain)

@@ -15,6 +15,7 @@ from scipy.signal import lfilter
 
 from s2a_bench.stats.batches import Launch, Memory, Rows
 from s2a_bench.stats.change import change_between, holm
+from s2a_bench.stats.power import Noise
 
 Floats: TypeAlias = NDArray[np.float64]
 LEVEL = 0.05
@@ -119,6 +120,10 @@ def test_the_means_of_ten_batches_of_one_value_are_compared_as_welchs_t_does() -
         pytest.approx(high, abs=0.2),
     )
     assert change.relative == pytest.approx(2 / 15)
+    assert change.noise is not None
+    reach = float(stats.t.ppf(0.975, change.noise.freedom)) * change.noise.error * 15  # a share of the baseline, -15
+    assert change.difference.high == pytest.approx(2 + reach)
+    assert not change.noise.logarithmic
 
 
 def test_interval_and_p_value_agree() -> None:
@@ -192,6 +197,7 @@ def test_too_few_values_have_no_interval_and_no_p(n: int, statistic: str, testab
 def test_what_does_not_vary_is_certain() -> None:
     same = change_between([rows_of([2] * 9)], [rows_of([2] * 9)], "median", seed=0)
     more = change_between([rows_of([2] * 9)], [rows_of([3] * 9)], "median", seed=0)
+    assert same.noise == more.noise == Noise(0.0, math.inf)
     assert (same.p, same.bounds) == (1.0, (0.0, 0.0))
     assert (more.p, more.bounds) == (0.0, (pytest.approx(0.5), pytest.approx(0.5)))
 
@@ -207,6 +213,8 @@ def test_something_out_of_nothing_has_no_size() -> None:
     assert change.difference.value == 0.5
     assert change.p is not None
     assert change.p < 0.01
+    slow = change_between([rows_of([0.0] * 20)], [rows_of([0.0] * 10 + [1.0] * 10)], "mean", seed=0)
+    assert slow.noise is None  # no share of nothing
 
 
 @pytest.mark.parametrize(
@@ -222,6 +230,27 @@ def test_bounds_without_a_ratio_are_those_of_the_difference(
 @pytest.mark.parametrize(("rows", "dependent"), [(59, True), (61, False)])
 def test_rows_remember_about_one_plus_r_over_one_minus_r_rows(rows: int, dependent: bool) -> None:
     assert Memory(r=0.5, n=rows, k=20).dependent is dependent  # 3 rows, and batches of n / k
+
+
+@pytest.mark.parametrize(("r", "dependent"), [(0.63, False), (0.64, True)])
+def test_neighbours_that_are_alike_by_chance_are_not_dependent(r: float, dependent: bool) -> None:
+    assert Memory(r, n=10, k=5).dependent is dependent  # 2 / sqrt(10) = .632
+
+
+def test_a_series_remembers_from_nothing_to_almost_all() -> None:
+    assert Memory.of(np.arange(1000.0)) == Memory(0.95, 1000, 10)
+    assert Memory.of(np.array([1.0, 9, 1, 9, 1, 9, 1])) == Memory(0.0, 7, 7)
+    assert Memory.of(np.ones(12)) == Memory(0.0, 12, 10)
+    assert Memory(0.3, 1, 1).hidden == 1.0
+
+
+def test_one_launch_beside_several_tells_a_superiority_without_an_interval() -> None:
+    one, three = [rows_of(range(1, 11))], [rows_of(range(2, 12)) for _ in range(3)]
+    for sides in ((one, three), (three, one)):
+        change = change_between(*sides, "median", seed=0)
+        assert change.p is not None
+        assert change.superiority.value == pytest.approx(0.595 if sides[0] is one else 0.405)
+        assert change.superiority.low is None
 
 
 @pytest.mark.parametrize("last", [6, 600])

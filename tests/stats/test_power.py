@@ -36,6 +36,15 @@ def test_what_does_not_vary_hides_nothing_and_much_noise_stays_a_number() -> Non
     assert Noise(0.0, math.inf).detectable(0.05) == 0
     assert math.isfinite(Noise(9.0, 1).detectable(0.05 / 48))
     assert Noise(0.0, math.inf).power(0.01, 0.05) == 1
+    assert Noise(0.0, math.inf).power(0.0, 0.05) == 0
+
+
+def test_power_is_that_of_a_share_where_there_is_no_logarithm() -> None:
+    noise = Noise(0.05, 8, logarithmic=False)
+    smallest = noise.detectable(0.05)
+    assert noise.power(smallest, 0.05) == pytest.approx(0.8, abs=0.005)
+    assert noise.power(-smallest, 0.05) == pytest.approx(0.8, abs=0.005)
+    assert noise.detectable(0.05, power=0.5) < smallest
 
 
 def test_the_noise_of_a_change_is_that_of_its_test() -> None:

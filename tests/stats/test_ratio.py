@@ -42,7 +42,8 @@ def width(found: Ratio) -> float:
 
 
 def test_the_ratio_is_that_of_the_medians() -> None:
-    assert ratio([2, 4, 60], [1, 2, 3]) == Ratio(2.0, None, None)
+    assert ratio([2, 4, 60], [1, 2, 3]) == Ratio(2.0, None, None, launches=1)
+    assert ratio_of_blocks(blocks_of([2, 4, 60]), blocks_of([1, 2, 3]), 1, "mean") == Ratio(11.0, None, None)
 
 
 @pytest.mark.parametrize(
@@ -172,6 +173,16 @@ def test_over_launches_the_ratio_is_the_geometric_mean_with_students_interval() 
         2,
         pytest.approx(sd),
     )
+
+
+def test_over_launches_means_are_divided_where_means_are_asked_for() -> None:
+    above, below = (
+        {n: blocks_of([1.0, 1.0, 10.0]) for n in range(2)},
+        {n: blocks_of([1.0, 1.0, 4.0]) for n in range(2)},
+    )
+    found = ratio_of_launches(above, below, 0, "mean")
+    assert found == Ratio(pytest.approx(2.0), pytest.approx(2.0), pytest.approx(2.0), 2, 0.0)  # type: ignore[arg-type]
+    assert ratio_of_launches(above, {n: blocks_of([0.0]) for n in range(2)}, 0) == Ratio(None, None, None, 2)
 
 
 def test_a_launch_in_which_a_cell_has_nothing_does_not_count() -> None:
