@@ -65,6 +65,7 @@ def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_ro
         "Timelines of one skill, of varying duration (Orin: naive|V-E: |IV-F: )": lambda: elsewhere(
             kit.timeline(**jitter, n_skills=(1,), t_nom_cv=0.1), **ORIN
         ),
+        "Timelines of two skills (IV-F: )": lambda: kit.timeline(**orin, n_skills=(2,), t_max=1.0),
         "Timelines of ours alone (Orin: naive|More tokens|at the end)": lambda: elsewhere(
             kit.timeline(**orin, policies=("stream-to-act",)), **ORIN
         ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from importlib.metadata import EntryPoint
@@ -301,6 +302,10 @@ class TestRosActions:
         while (packed := listener.take(0.5)) is not None:
             heard.append(listener.unpack(packed).data)
         assert heard[-1] == "coast"
+
+    def test_who_listens_keeps_no_process_alive(self, robot: ActionRobot) -> None:
+        del robot
+        assert [thread.daemon for thread in threading.enumerate() if thread.name == "skills"] == [True]
 
     def test_whoever_finds_no_robot_leaves_the_domain(self, monkeypatch: pytest.MonkeyPatch) -> None:
         left: list[bool] = []
