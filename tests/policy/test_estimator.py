@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from s2a_bench.boards.gaps import Constant, Lognormal, Markov
 from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
-from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy.estimator import VAGUE, GapPrior
 
 
 def by_integration(prior: GapPrior, gaps: list[float]) -> tuple[float, float]:
@@ -49,6 +49,13 @@ def test_learning_at_every_token_and_at_once_is_the_same(gaps: list[float], plan
         precision = 1 / variance + 1 / token_cv**2
         mean, variance = (mean / variance + gap / token_cv**2) / precision, 1 / precision
     assert prior.learned(float(len(gaps)), math.fsum(gaps)) == pytest.approx((mean, variance))
+
+
+def test_where_nothing_is_known_two_gaps_tell_the_rate() -> None:
+    mean, relative = VAGUE.learned(2.0, 2.0)
+    assert mean == pytest.approx(0.2 + 9 / (0.2**2 + 2 * 9) * (2.0 - 2 * 0.2))
+    assert mean == pytest.approx(1.0, rel=0.01)
+    assert relative == pytest.approx(0.2**2 * 9 / (0.2**2 + 2 * 9))
 
 
 def test_arrays_of_plans_learn_as_each_plan_does() -> None:

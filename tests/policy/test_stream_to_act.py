@@ -93,6 +93,12 @@ def test_the_start_is_when_mean_meets_nominal_and_caution_meets_stretched(cautio
         assert isinstance(stepper(caution).decide(max(demands) + 1e-12), Start)
 
 
+def test_the_caution_is_what_was_asked_for_else_the_99_per_cent_quantile() -> None:
+    cautions = [StreamToAct(PRIOR, asked).stepper(SHAPE).caution for asked in (None, 0.0, 1.5)]  # type: ignore[attr-defined]
+    assert cautions == [2.33, 0.0, 1.5]
+    assert QuantileStart().caution == 2.33
+
+
 @pytest.mark.parametrize("caution", [0.0, 1.0])
 @pytest.mark.parametrize(
     ("spend", "within", "start_caution", "used"),
@@ -102,7 +108,7 @@ def test_an_early_start_spends_a_share_of_the_stretch_where_it_comes_soon_enough
     spend: float, within: float, start_caution: float, used: float, caution: float
 ) -> None:
     robot = EarlyStart(PRIOR, caution, spend=spend, within=within, start_caution=start_caution).stepper(
-        PlanShape(4, 3, Timing(1.6, 1.2, 2.4), expected_cv=0.2)  # whole: 1.2 + 3 x 1.6 = 6 s
+        PlanShape(4, 3, Timing(1.6, 1.2, 2.4))  # whole: 1.2 + 3 x 1.6 = 6 s
     )
     robot.token(1.0)
     robot.token(1.6)

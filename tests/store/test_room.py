@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from s2a_bench.store.room import release, reserve, why
+from s2a_bench.store.room import RESERVE, release, reserve, why
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
@@ -30,5 +30,6 @@ def test_where_there_is_no_room_the_file_system_and_what_is_free_are_told(
 
 def test_the_reserve_is_given_back_once(tmp_path: Path) -> None:
     reserve(tmp_path)
+    assert (tmp_path / RESERVE).stat().st_size == 256 * 1024
     assert release(tmp_path)
     assert not release(tmp_path)
