@@ -99,7 +99,8 @@ def test_the_groups_are_the_cards_seven_and_those_the_design_adds() -> None:
 def test_both_sides_join_in_order_of_time() -> None:
     trace = Trace()
     trace.marks = [("", 10), ("json_pack", 20), ("return", 90)]
-    trace.receive(Remote(clock_id(), [("network", 40), ("inference", 80)], facts={"prompt_n": 3.0}))
+    came = "".join([*clock_id()])  # as over a wire: equal, and not the same object
+    trace.receive(Remote(came, [("network", 40), ("inference", 80)], facts={"prompt_n": 3.0}))
     assert [name for name, _ in trace.chain()] == ["", "json_pack", "network", "inference", "return"]
     assert trace.facts == {"prompt_n": 3.0}
 

@@ -44,7 +44,7 @@ def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, rule: Rule) -> S
         if rule.elastic:
             if rule.detect and i:
                 now_s[:] = _resume(known, stream, now_s, most_sum, i)
-            late_s = np.maximum(now_s - (start_s[0] + nominal_sum[i]), 0.0)
+            late_s = now_s - (start_s[0] + nominal_sum[i])
             least = np.minimum(np.maximum(1 - late_s / nominal_s[i], least_s[i] / nominal_s[i]), 1.0)
             demand = _demand(known, stream, now_s, nominal_sum, i)
             duration_s[i] *= np.minimum(np.maximum(demand, least), most_s[i] / nominal_s[i])

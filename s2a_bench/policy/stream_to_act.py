@@ -274,7 +274,7 @@ class OnlineStepper:
             pushed_s = now_s + self._forecast(tokens - 1, unknown, self.caution, unknown_s)
             arrival_s = self.last_token_s + self._forecast(tokens, unknown, self.caution, unknown_s)
             demand = max(demand, (max(arrival_s, pushed_s) - now_s) / (known_s + unknown * unknown_s))
-        late_s = max(now_s - self.due_s, 0.0)
+        late_s = now_s - self.due_s
         least = min(max(1 - late_s / timing.nominal_s, timing.least_s / timing.nominal_s), 1.0)
         return min(max(demand, least), timing.most_s / timing.nominal_s)
 

@@ -130,6 +130,20 @@ def test_the_upper_bound_is_scipy_s(stalls: int, plans: int) -> None:
     assert upper_bound(stalls, plans, 0.975) == pytest.approx(interval.high)
 
 
+def test_durations_of_all_plans_in_one_column_stay_one_when_some_plans_are_taken() -> None:
+    column = np.ones((2, 1))
+    plans = Plans(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), column, column, column)
+    some = take(plans, np.array([0, 2]))
+    assert some.arrival_s.tolist() == [[1.0, 3.0], [4.0, 6.0]]
+    assert some.nominal_s is column
+    assert take(some, np.array([1])).arrival_s.tolist() == [[3.0], [6.0]]
+
+
+@pytest.mark.parametrize(("scores_", "caution"), [(98, math.inf), (99, 98.0)])
+def test_with_too_few_scores_for_epsilon_the_next_plan_is_waited_for(scores_: int, caution: float) -> None:
+    assert Tracker(np.arange(float(scores_)), 0.01).caution == caution
+
+
 def test_where_all_stall_any_share_may_and_where_none_does_it_is_little() -> None:
     assert upper_bound(50, 50, 0.999) == 1.0
     assert upper_bound(0, 50, 0.999) == pytest.approx(1 - 0.001 ** (1 / 50))

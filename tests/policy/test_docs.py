@@ -42,6 +42,10 @@ def test_the_table_names_every_parameter() -> None:
     early = {("stream-to-act-early", parameter) for parameter in ("spend", "within", "start_caution")}
     both = {(name, parameter) for name in names for parameter in ("caution", "detect")}
     assert documented == both | early | {("s2a-robust", "gap_bound_s")}
+    for names, parameter, default in re.findall(r"^\| ([a-z0-9, -]+) \| `(\w+)` \| ([\w, ]+) \|", PAGE, re.MULTILINE):
+        for place, name in enumerate(named := names.split(", ")):
+            each = default.split(", ")[place if len(named) == default.count(", ") + 1 else 0]
+            assert list(policies([f"{name}?{parameter}={each}"])) == [name]
     written = {"detect": "True", "spend": "0.7"}
     for name, parameter in documented:
         asked = f"{name}?{parameter}={written.get(parameter, '7')}"

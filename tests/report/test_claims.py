@@ -261,6 +261,14 @@ def test_fast_and_smooth_means_against_waiting(timelines: Run) -> None:
     assert all("no plan stalls" in text for text in fast.evidence)
 
 
+def test_what_ends_with_stream_to_act_or_before_it_does_not_end_later(timelines: Run) -> None:
+    rows = timelines.table(TIMELINES).copy()
+    rows.loc[rows["policy"] == "wait-then-act", "end_ns"] = 1_000_000_000
+    early = replace(timelines, tables=timelines.tables | {"timelines": rows})
+    assert claim_of("AGX Orin: wait-then-act", early).verdict == CONTRADICTED
+    assert claim_of("preferable for fast and smooth control", early).verdict == CONTRADICTED
+
+
 def test_s0_is_minimal_with_fixed_durations_and_not_with_elastic_ones(timelines: Run) -> None:
     assert claim_of("with fixed durations", timelines).verdict == SUPPORTED
     elastic = claim_of("up to T_max", timelines)

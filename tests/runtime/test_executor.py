@@ -199,6 +199,7 @@ def test_a_skill_is_extended_while_the_next_is_missing_and_compressed_when_it_co
     assert robot.told[1:5] == list(zip([1.0, 2.0, 2.2, 2.2], words, strict=True))
     assert [command.what for command in record.commands][1:5] == ["start", "extend", "compress", "end"]
     assert (record.stalls_ns, ends(record)) == ([0], [2.2, 3.2])
+    assert [(skill.duration_ns, skill.latest_ns) for skill in record.skills] == [(10**9, 3 * 10**9 // 2)] * 2
 
 
 def test_a_skill_is_extended_no_longer_than_allowed() -> None:

@@ -257,7 +257,8 @@ class TestRosActions:
     def test_a_goal_is_told_the_time_that_is_left_and_the_skill_s_bounds(
         self, server: ActionServer, robot: ActionRobot, left_s: float, least_s: float, most_s: float
     ) -> None:
-        robot.start(CUP, now_ns() + round(left_s * 1e9), lambda _: None)
+        running = robot.start(CUP, now_ns() + round(left_s * 1e9), lambda _: None)
+        assert not running.ended()  # its result will say so
         deadline_ns = now_ns() + 10 * 10**9
         while (goal := server.next_goal(0.1)) is None:
             assert now_ns() < deadline_ns
@@ -281,6 +282,18 @@ class TestRosActions:
         self.serve(server, 1, answer)
         record = execute(robot, [CUP, BOX])
         assert (record.outcome, record.why, len(record.skills)) == ("skill-failed", why, 1)
+
+    @pytest.mark.parametrize(("answer", "why"), [("succeed", "no type"), ("abort", "the goal ended ABORTED")])
+    def test_a_result_that_cannot_be_read_fails_the_plan(
+        self, server: ActionServer, robot: ActionRobot, monkeypatch: pytest.MonkeyPatch, answer: str, why: str
+    ) -> None:
+        def refuse(_: object) -> None:
+            raise TransportError("no type")
+
+        monkeypatch.setattr(robot._client, "unpack_result", refuse)
+        self.serve(server, 1, answer)
+        record = execute(robot, [CUP])
+        assert (record.outcome, record.why) == ("skill-failed", f"wave(cup): {why}")
 
     def test_an_abort_cancels_the_goal(self, server: ActionServer, robot: ActionRobot) -> None:
         begun = Flag()

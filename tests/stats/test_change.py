@@ -156,6 +156,24 @@ def test_the_probability_of_superiority_by_hand() -> None:
     assert change.superiority.low <= 0.25 <= change.superiority.high
 
 
+def test_the_interval_of_superiority_is_that_of_resampled_batches_written_out() -> None:
+    rng = np.random.default_rng(4)
+    below, above = rng.normal(0, 1, 30), rng.normal(0.5, 1, 25).round(1)
+    change = change_between([rows_of(below.round(1))], [rows_of(above)], "median", seed=9, confidence=0.9)
+    again = np.random.default_rng(9)
+    sides = [Launch(rows_of(values)) for values in (below.round(1), above)]
+    draws = [side.draw(again) for side in sides]
+    found = []
+    for counts in zip(*draws, strict=True):
+        one, two = (
+            np.concatenate([np.tile(batch, n) for batch, n in zip(side.batches, drawn, strict=True)])
+            for side, drawn in zip(sides, counts, strict=True)
+        )
+        found.append(((two[:, None] > one).mean() + (two[:, None] >= one).mean()) / 2)
+    low, high = np.quantile(found, (0.05, 0.95))
+    assert (change.superiority.low, change.superiority.high) == (pytest.approx(low), pytest.approx(high))
+
+
 @settings(max_examples=50, deadline=None)
 @given(
     rows=st.lists(st.lists(st.floats(0.1, 100), min_size=1, max_size=4), min_size=5, max_size=23),
@@ -166,6 +184,7 @@ def test_a_resample_has_the_statistic_of_its_values_written_out(
     rows: list[list[float]], statistic: str, seed: int
 ) -> None:
     cut = Launch([np.array(row) for row in rows])
+    assert cut.levels.tolist() == [np.median(row) for row in rows]
     drawn = cut.draw(np.random.default_rng(seed))[:20]
     quick = cut.replicate(statistic, drawn)
     share = {"median": 50, "p90": 90, "p99": 99}
@@ -258,13 +277,14 @@ def test_memory_is_the_correlation_of_neighbouring_ranks(last: float) -> None:
     assert Memory.of(np.array([1.0, 2, 3, 4, 5, last])).r == pytest.approx(8.75 / 17.5)  # ranks less 3.5
 
 
+@pytest.mark.parametrize("k", [2, 20])
 @pytest.mark.parametrize("r", [0.0, 0.3, 0.8])
-def test_what_batches_hide_of_the_variance_is_that_of_the_means_of_a_series_of_order_one(r: float) -> None:
+def test_what_batches_hide_of_the_variance_is_that_of_the_means_of_a_series_of_order_one(r: float, k: int) -> None:
     def variance(m: int) -> float:
         return float(np.mean(r ** np.abs(np.subtract.outer(np.arange(m), np.arange(m)))))
 
-    between = (variance(6) - variance(120)) / 19  # of the means of 20 batches of 6 rows, around the whole mean
-    assert Memory(r, 120, 20).hidden == pytest.approx(variance(120) / between)
+    between = (variance(120 // k) - variance(120)) / (k - 1)  # of the means of k batches, around the whole mean
+    assert Memory(r, 120, k).hidden == pytest.approx(variance(120) / between)
 
 
 def test_a_launch_that_remembers_longer_than_a_batch_is_told() -> None:

@@ -39,7 +39,7 @@ def _rate(claim: PaperThroughput, part: Part) -> Said:
     import numpy as np
 
     values = part.cells.values(_METRIC)
-    found = change(values, np.full(len(values), claim.tokens_per_s), part.run.bootstrap_seed, paired=True)
+    found = change(values, np.full(len(values), claim.tokens_per_s), part.run.bootstrap_seed)
     rate = summarise(values)
     said = f"{part.name}: {mean_sd(rate)} tokens/s (n = {rate.n}); the paper: {claim.tokens_per_s:g}."
     verdict, said = near(found.ratio, said)
