@@ -190,6 +190,9 @@ def test_more_skills_than_announced_are_counted_and_not_carried_out(name: str) -
 def test_a_missing_skill_is_a_stall_that_is_counted_as_it_happened() -> None:
     record, robot = run(plan([1.0, 4.0]), 2)
     assert record.stalls_ns == [2_000_000_000]
+    assert [(command.what, command.index) for command in record.commands] == [
+        *(("hold", -1), ("start", 0), ("end", 0), ("hold", 0), ("start", 1), ("end", 1), ("hold", 1)),
+    ]
     assert robot.told[1:4] == [(1.0, "start skill0 until 2"), (2.0, "hold"), (4.0, "start skill1 until 5")]
 
 

@@ -316,9 +316,12 @@ class TestRosActions:
             heard.append(listener.unpack(packed).data)
         assert heard[-1] == "coast"
 
-    def test_who_listens_keeps_no_process_alive(self, robot: ActionRobot) -> None:
-        del robot
-        assert [thread.daemon for thread in threading.enumerate() if thread.name == "skills"] == [True]
+    def test_who_listens_keeps_no_process_alive_and_ends_when_closed(self, robot: ActionRobot) -> None:
+        (listener,) = [thread for thread in threading.enumerate() if thread.name == "skills"]
+        assert listener.daemon
+        robot.close()
+        assert not listener.is_alive()
+        robot.close()
 
     def test_whoever_finds_no_robot_leaves_the_domain(self, monkeypatch: pytest.MonkeyPatch) -> None:
         left: list[bool] = []
