@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.clock import clock_id, now_ns
-from s2a_bench.trace import GROUPS, RESIDUAL, STAGES, Remote, Trace, budget, mark_cost_ns, path_of
+from s2a_bench.trace import GROUPS, RESIDUAL, RESIDUAL_LIMIT, STAGES, Remote, Trace, budget, mark_cost_ns, path_of
 
 names = st.sampled_from([RESIDUAL, *STAGES])
 chains = st.lists(st.tuples(names, st.integers(0, 10**9)), max_size=40).map(
@@ -44,6 +44,7 @@ def test_a_chain_by_hand() -> None:
     assert spent.e2e_ns == 850
     assert spent.e2e_without_inference_ns == 150
     assert spent.residual_share == pytest.approx(5 / 150)
+    assert spent.residual_share < RESIDUAL_LIMIT == 0.05
     assert spent.groups_ns(STAGES) == {"capture": 10, "encode": 30, "network": 55, "inference": 700, "return": 50}
 
 

@@ -76,7 +76,7 @@ class GapPrior:
         mean = float(means.mean())
         if not mean > 0:
             raise UsageError("a prior needs tokens that arrive one after another, not all at once")
-        size = max(1, min(round(count**0.5), count // 2))
+        size = min(round(count**0.5), count // 2)
         number = count // size
         blocks = gaps[: number * size].reshape(number, size, plans).sum(axis=1)
         # Unbiased within each plan, then the mean over plans: a variance a gap, relative to the mean squared.

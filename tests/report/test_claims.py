@@ -261,6 +261,30 @@ def test_fast_and_smooth_means_against_waiting(timelines: Run) -> None:
     assert all("no plan stalls" in text for text in fast.evidence)
 
 
+@pytest.mark.parametrize(("factor", "verdict"), [(1.005, SUPPORTED), (1.02, CONTRADICTED), (0.9, SUPPORTED)])
+def test_an_end_within_one_per_cent_of_naives_is_no_penalty(timelines: Run, factor: float, verdict: str) -> None:
+    rows = timelines.table(TIMELINES).copy()
+    ours = rows["policy"] == "stream-to-act"
+    rows.loc[ours, "end_ns"] = (rows.loc[ours, "end_ns"].astype("float64") * factor).round().astype("Int64")
+    later = replace(timelines, tables=timelines.tables | {"timelines": rows})
+    assert claim_of("latency penalty: at the end", later).verdict == verdict
+
+
+def test_an_increase_that_may_be_none_decides_nothing(tmp_path: Path) -> None:
+    config = TimelineConfig(
+        profiles=("jetson-agx-orin",), policies=("naive",), tokens_per_skill=(4, 6), jitter="lognormal:cv=0.2", plans=40
+    )
+    run = read_run(run_timeline(config, tmp_path, NullProgress()))
+    rows = run.table(TIMELINES).copy()
+    rows["stall_ns"] = [
+        (plan * 7919) % 40 * 10**7 + length for plan, length in zip(rows.plan, rows.tokens_per_skill, strict=True)
+    ]
+    rows.loc[rows["tokens_per_skill"] == 6, "stall_ns"] = rows.loc[
+        rows["tokens_per_skill"] == 6, "stall_ns"
+    ].to_numpy()[::-1]
+    assert claim_of("More tokens", replace(run, tables=run.tables | {"timelines": rows})).verdict == UNDECIDED
+
+
 def test_what_ends_with_stream_to_act_or_before_it_does_not_end_later(timelines: Run) -> None:
     rows = timelines.table(TIMELINES).copy()
     rows.loc[rows["policy"] == "wait-then-act", "end_ns"] = 1_000_000_000

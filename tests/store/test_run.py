@@ -406,6 +406,16 @@ def test_the_way_out_of_the_block_is_the_state_of_the_run(tmp_path: Path) -> Non
     assert (failed["state"], failed["error"]) == ("failed", "server died")
 
 
+def test_what_goes_wrong_first_is_what_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, _table: object) -> None:
+        raise StoreError(f"cannot write {path}")
+
+    monkeypatch.setattr("s2a_bench.store.run.write_parquet", refuse)
+    with pytest.raises(RuntimeError, match="first"), RunWriter.create(tmp_path, "latency", {}) as run:
+        raise RuntimeError("first")
+    assert (read_run(run.path).manifest["state"], read_run(run.path).manifest["error"]) == ("failed", "first")
+
+
 def test_finishing_twice_keeps_the_first_state(tmp_path: Path) -> None:
     with RunWriter.create(tmp_path, "latency", {}) as run:
         run.finish("failed", "server died")
@@ -551,6 +561,13 @@ def test_a_manifest_of_the_wrong_shape_is_one_line_with_file_and_key(tmp_path: P
     with pytest.raises(StoreError) as error:
         read_run(run.path)
     assert str(error.value) == f"{path} is damaged: {said}"
+
+
+def test_a_number_as_text_is_no_number(tmp_path: Path) -> None:
+    manifest = {"schema": "s2a-bench/1", "command": "latency", "state": "finished", "environment": {"affinity": ["3"]}}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(StoreError, match=r"environment.affinity\[0\]: '3' should be a valid integer"):
+        read_run(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a": "\\ud800"}', '{"a": ' + "9" * 5000 + "}", "\xff", ""])

@@ -70,7 +70,8 @@ def figure_5(board: str, *policies: str) -> tuple[Need, ...]:
         listed = ", ".join(map(str, found)) or "none"
         return set(_LENGTHS) <= set(found), f"L = {listed} with {', '.join(policies)}"
 
-    return (_source(board), Need("settings", f"L = 6, 4, 2, 1 with {', '.join(policies)}", lengths), _T_NOM)
+    wanted = f"L = {', '.join(map(str, _LENGTHS))} with {', '.join(policies)}"
+    return (_source(board), Need("settings", wanted, lengths), _T_NOM)
 
 
 def _source(board: str) -> Need:
