@@ -44,7 +44,7 @@ PATIENCE_S, READY_S, SETTLES_S = 120.0, 300.0, 45.0
 SILENCE_S = 30.0
 """Over ROS the last messages of an answer may be lost: a client hears nothing, and asks again."""
 WARM_UP = 0.2
-"""Of the minutes, before them."""
+"""Of the minutes, before them; more where not every hostile client has come by then as often as there are attackers."""
 HOSTILE = {"http": http.CLIENTS, "ros": ros.CLIENTS}
 WARM_UP_ONLY = frozenset({"a prompt of 16 MiB", "8 requests of 16 MiB"})
 """Over ROS requests are received on many threads, and glibc keeps the most that each ever held (machine/tuning.py):
@@ -186,14 +186,17 @@ class Load:
         self._over, self._lock = Event(), Lock()
         self.attacks: Counter[str] = Counter()
 
-    def run(self, seconds: float) -> None:
-        """Load the server."""
+    def run(self, seconds: float, *, at_least: int = 0) -> None:
+        """Load the server for so long, and until each hostile client has come ``at_least`` so often."""
         names = HONEST[self._result.transport]
         threads = [Thread(target=self._honest, args=(name,)) for name in names]
         threads += [Thread(target=self._hostile, args=(seed,)) for seed in range(ATTACKERS)]
         for thread in threads:
             thread.start()
         time.sleep(seconds)
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline and any(self.attacks[case.name] < at_least for case in self._cases):
+            time.sleep(0.1)
         self._over.set()
         for thread in threads:
             thread.join()
@@ -302,7 +305,7 @@ def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = 1
                 return uses, *idle(client, other, blocks, BLOCK.get(engine, 5))
 
         bare, _, _ = quiet(None, 1)
-        Load(Result(transport, engine, minutes), server.address).run(minutes * 60 * WARM_UP)
+        Load(Result(transport, engine, minutes), server.address).run(minutes * 60 * WARM_UP, at_least=ATTACKERS)
         result.before, plain_before, relative_before = quiet(bare, blocks)
         processes, load = [*family(pid)], Load(result, server.address, WARM_UP_ONLY)
         load.run(minutes * 60)
