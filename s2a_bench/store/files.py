@@ -114,7 +114,8 @@ def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
             pa.BufferReader(data),
             # One block: a quoted line feed may stand anywhere.
             read_options=csv.ReadOptions(use_threads=False, block_size=len(data) + 1),
-            parse_options=csv.ParseOptions(newlines_in_values=True),
+            # an empty line is a row of one column that is empty
+            parse_options=csv.ParseOptions(newlines_in_values=True, ignore_empty_lines=False),
             convert_options=csv.ConvertOptions(
                 column_types=schema,
                 include_columns=list(columns),

@@ -473,6 +473,11 @@ def test_a_folder_that_is_no_run_or_anothers_is_refused(tmp_path: Path) -> None:
         read_run(tmp_path)
 
 
+def test_an_empty_line_is_a_row_of_one_empty_column(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("note\n\nx\n\n")
+    assert read_csv(tmp_path / "t.csv", {"note": "string"}).column("note").to_pylist() == ["", "x", ""]
+
+
 def test_a_damaged_csv_is_an_error_and_not_a_number(open_run: Callable[..., RunWriter]) -> None:
     run = open_run()
     run.sample(sample())
