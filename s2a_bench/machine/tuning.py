@@ -13,11 +13,14 @@ from contextlib import contextmanager
 
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
-KEEP_BYTES = (1 << 30, 1 << 25)
-"""The first that glibc takes: older ones refuse a threshold above 32 MiB.
+M_ARENA_MAX = -8
+KEEP_BYTES = 1 << 25
+"""Blocks up to this size, the most that glibc takes everywhere, stay with the process: a frame of 3840x2160 in RGB is
+smaller. Without it glibc returns every frame's memory to the kernel and each new frame faults its pages in again,
+2.6 us a page. What is larger, as a request at its limit, goes back at once."""
 
-Blocks up to this size stay with the process. Without it glibc returns every frame's memory to the kernel and each
-new frame faults its pages in again, 2.6 us a page."""
+KEEP_FREE_BYTES = 1 << 30
+"""So much may lie free at the end of the heap."""
 
 SINGLE_THREADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -42,12 +45,15 @@ def is_allowed() -> bool:
 
 
 def keep_large_blocks() -> bool:
-    """Tell glibc to keep large freed blocks; returns whether it did (not allowed, or musl, which has no mallopt)."""
+    """Tell glibc to keep large freed blocks; returns whether it did (not allowed, or musl, which has no mallopt).
+
+    All threads share them: an arena each would keep the most that each thread ever held.
+    """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if _allowed else None
     if mallopt is None:
         return False
-    trims = bool(mallopt(M_TRIM_THRESHOLD, KEEP_BYTES[0]))
-    return any(mallopt(M_MMAP_THRESHOLD, size) for size in KEEP_BYTES) and trims
+    mallopt(M_ARENA_MAX, 1)
+    return all(mallopt(*told) for told in ((M_TRIM_THRESHOLD, KEEP_FREE_BYTES), (M_MMAP_THRESHOLD, KEEP_BYTES)))
 
 
 def limit_threads() -> None:

@@ -7,6 +7,7 @@ call answers it. What comes on its connection meanwhile waits, or, if it came wi
 
 from __future__ import annotations
 
+import gc
 import json
 from asyncio import BaseProtocol, BufferedProtocol, TimerHandle
 from collections import deque
@@ -22,6 +23,9 @@ from s2a_bench.transport.limits import LIMITS, Limits
 
 EARLY_BYTES = 1 << 16
 """The most that waits for the end of an answer."""
+
+CYCLES_BYTES = 1 << 25
+"""A body from here on: errors of frameworks hold the body, and their own frames."""
 
 LINGER_S = 1.0
 """Time for a client to read a refusal; closing at once would reset the connection under it."""
@@ -167,7 +171,7 @@ class Door(HttpToolsProtocol):
     def on_response_complete(self) -> None:
         """Give back what the request held."""
         if self._unanswered:
-            self.held["bytes"] -= self._unanswered.popleft()
+            self._give_back(self._unanswered.popleft())
         super().on_response_complete()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -176,9 +180,15 @@ class Door(HttpToolsProtocol):
         self._reads = None
         if self._call is not None:
             self._call.leave()
-        self.held["bytes"] -= sum(self._unanswered)
+        self._give_back(sum(self._unanswered))
         self._unanswered.clear()
         super().connection_lost(exc)
+
+    def _give_back(self, size: int) -> None:
+        """Count bytes no more; what the application leaves of many in cycles goes, not only when Python looks."""
+        self.held["bytes"] -= size
+        if size >= CYCLES_BYTES:
+            self.loop.call_later(LINGER_S, gc.collect)
 
     def _said(self) -> int:
         """Return how long the body says that it will be."""
