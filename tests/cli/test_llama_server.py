@@ -79,6 +79,14 @@ def test_a_grammar_is_obeyed(tmp_path: Path) -> None:
     assert set("".join(read_run(folder).tokens["text"].dropna())) <= {"g", "o"}
 
 
+@pytest.mark.parametrize("connection", ["per-request", "client-per-request"])
+def test_connections_that_are_closed_after_each_answer(tmp_path: Path, connection: str) -> None:
+    done = latency(tmp_path, "--transport", "http/llama-server", "--connection", connection)
+    assert done.returncode == 0, done.stderr
+    (folder,) = tmp_path.iterdir()
+    assert (read_run(folder).samples["error"] == "").all()
+
+
 def test_killed_in_the_middle_is_one_line_and_keeps_the_samples(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, "--runs", "100000", "--output", str(tmp_path)]
     process = subprocess.Popen(
