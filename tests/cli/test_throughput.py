@@ -91,7 +91,7 @@ def test_the_engines_settings_reach_it_and_the_terminal_shows_all(tmp_path: Path
     assert {key: model[key] for key in expected} == expected
     assert "Dummy weights." in done.stdout
     text = " ".join(done.stdout.split())
-    assert all(title in text for title in ("Tokens a second", "Before the first token", "by position"))
+    assert all(title in text for title in ("Tokens a second", "The prompt", "by position"))
     assert str(kept.path) in done.stdout
     names = {path.name for path in (kept.path / "figures").iterdir()}
     assert {"throughput_bars.png", "gaps.pdf", "positions.png"} <= names
