@@ -7,6 +7,7 @@ ask for them. Where they are not allowed nothing is changed.
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -54,6 +55,14 @@ def keep_large_blocks() -> bool:
         return False
     mallopt(M_ARENA_MAX, 1)
     return all(mallopt(*told) for told in ((M_TRIM_THRESHOLD, KEEP_FREE_BYTES), (M_MMAP_THRESHOLD, KEEP_BYTES)))
+
+
+def give_back_memory() -> None:
+    """Free what lies in cycles, and give what lies free to the kernel: a block that grew in place stays in the heap."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:  # musl has none
+        trim(0)
 
 
 def limit_threads() -> None:

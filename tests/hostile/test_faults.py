@@ -16,8 +16,9 @@ WHOLE = os.environ.get("S2A_HOSTILE") == "whole"
 @pytest.fixture(scope="module")
 def came(request: pytest.FixtureRequest) -> dict[Fault, str]:
     """What came of the faults of all tests that were chosen: those of several transports happen at once."""
-    chosen = [getattr(item, "callspec", None) for item in request.session.items]
-    return outcomes([call.params["fault"] for call in chosen if call is not None and "fault" in call.params])
+    specs = [getattr(item, "callspec", None) for item in request.session.items]
+    chosen = [spec.params.get("fault") for spec in specs if spec is not None]
+    return outcomes([fault for fault in chosen if isinstance(fault, Fault)])
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ call answers it. What comes on its connection meanwhile waits, or, if it came wi
 
 from __future__ import annotations
 
-import gc
 import json
 from asyncio import BaseProtocol, BufferedProtocol, TimerHandle
 from collections import deque
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from s2a_bench.machine.tuning import give_back_memory
 from s2a_bench.transport.http import own
 from s2a_bench.transport.http.lane import Call, Lane, Reads
 from s2a_bench.transport.limits import LIMITS, Limits
@@ -188,7 +188,7 @@ class Door(HttpToolsProtocol):
         """Count bytes no more; what the application leaves of many in cycles goes, not only when Python looks."""
         self.held["bytes"] -= size
         if size >= CYCLES_BYTES:
-            self.loop.call_later(LINGER_S, gc.collect)
+            self.loop.call_later(LINGER_S, give_back_memory)
 
     def _said(self) -> int:
         """Return how long the body says that it will be."""
