@@ -591,7 +591,8 @@ def test_what_earlier_versions_did_not_write_is_absent_and_not_wrong(tmp_path: P
 
 def test_the_runs_that_earlier_versions_made_are_read() -> None:
     folders = sorted((Path(__file__).parents[2] / "results/reference").glob("*/manifest.json"))
-    assert [read_run(path.parent).manifest["state"] for path in folders] == ["finished"] * 4
+    assert {"echo-raw", "echo-jpeg", "llama-jpeg", "timeline-live"} <= {path.parent.name for path in folders}
+    assert {read_run(path.parent).manifest["state"] for path in folders} == {"finished"}
 
 
 def test_an_argument_that_is_no_utf_8_is_written_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
