@@ -7,7 +7,7 @@ Packing and sending are two calls, and so are taking and unpacking, because the 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pkgutil import resolve_name
@@ -20,11 +20,15 @@ Tuning: TypeAlias = Literal["tuned", "default"]
 
 @dataclass(frozen=True, slots=True)
 class QoS:
-    """The quality of service settings ROS 2 users know; `depth` 0 keeps all, `latched` is transient local."""
+    """The quality of service settings ROS 2 users know; `depth` 0 keeps all, `latched` is transient local.
+
+    A message older than ``lifespan_s`` is not delivered any more; 0: however old.
+    """
 
     depth: int = 10
     reliable: bool = True
     latched: bool = False
+    lifespan_s: float = 0.0
 
 
 class Publisher(Protocol):
@@ -225,6 +229,20 @@ class ActionServer(Protocol):
         ...
 
 
+class ServiceClient(Protocol):
+    """Calls one service; one thread at a time."""
+
+    def call(self, request: Any, timeout_s: float) -> Any:
+        """Wait for the server, send a request and return the response; raises TransportError where none comes."""
+        ...
+
+
+SERVICE_QOS = QoS(depth=10)
+"""What ROS's services have."""
+REQUEST_BYTES = 1 << 20
+"""A request to a service of ours that is larger is dropped; an action's goals have bounds of their own."""
+
+
 class Middleware(Protocol):
     """One node in a ROS 2 domain."""
 
@@ -234,6 +252,18 @@ class Middleware(Protocol):
 
     def subscription(self, topic: str, type_name: str, qos: QoS) -> Subscription:
         """Subscribe to the absolute ROS topic name ``/x``."""
+        ...
+
+    def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
+        """Offer the service ``/x`` of ROS type ``pkg/srv/Name``; ``answer`` turns a request into its response.
+
+        All services of a node are answered by one thread of the middleware. A request that cannot be read, that is
+        larger than `REQUEST_BYTES`, or for which ``answer`` raises, is dropped and logged.
+        """
+        ...
+
+    def service_client(self, name: str, type_name: str) -> ServiceClient:
+        """Call the service ``/x``."""
         ...
 
     def action_client(self, name: str, type_name: str, version: str = "6.0") -> ActionClient:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import os
+from collections.abc import Callable
 from importlib.metadata import version as package_version
 from threading import Lock
 from typing import Any
@@ -14,10 +15,11 @@ from cyclonedds.qos import Policy, Qos
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import QoS, Tuning
+from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
 from s2a_bench.ros.config import configuration
 from s2a_bench.ros.cyclone_client import CycloneActionClient
 from s2a_bench.ros.cyclone_server import CycloneActionServer
+from s2a_bench.ros.cyclone_service import CycloneServiceClient, CycloneServices
 from s2a_bench.ros.dds import RawReader, RawWriter, Waiter, dds_qos
 from s2a_bench.ros.graph import NodeAnnouncement
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise, type_hash
@@ -97,6 +99,7 @@ class CycloneMiddleware:
                 "or check CYCLONEDDS_URI"
             ) from error
         self._servers: list[CycloneActionServer] = []
+        self._services: CycloneServices | None = None
         atexit.register(self.close)
         self._node = NodeAnnouncement(self._participant, node_name)
 
@@ -111,6 +114,17 @@ class CycloneMiddleware:
         subscription = _CycloneSubscription(self._joined(), topic, type_name, qos)
         self._node.add(subscription.reader)
         return subscription
+
+    def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
+        """Create a service; the first starts the thread that answers all."""
+        self._services = self._services or CycloneServices(self._joined())
+        self._node.add(*self._services.offer(name, type_name, answer, qos).ends())
+
+    def service_client(self, name: str, type_name: str) -> CycloneServiceClient:
+        """Create a client's two endpoints."""
+        client = CycloneServiceClient(self._joined(), name, type_name)
+        self._node.add(*client.ends())
+        return client
 
     def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> CycloneActionClient:
         """Create a client's eight endpoints."""
@@ -143,6 +157,8 @@ class CycloneMiddleware:
             atexit.unregister(self.close)
             for server in self._servers:
                 server.close()
+            if self._services is not None:
+                self._services.close()
             participant, self._participant = self._participant, None
             participant._delete(participant._ref)  # noqa: SLF001 - __del__ may come seconds later
 

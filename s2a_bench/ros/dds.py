@@ -117,11 +117,13 @@ def dds_qos(qos: QoS, user_data: str) -> Qos:
     reliability = Policy.Reliability.Reliable(FOREVER_NS) if qos.reliable else Policy.Reliability.BestEffort
     history = Policy.History.KeepLast(qos.depth) if qos.depth else Policy.History.KeepAll
     lasting = (Policy.DurabilityService(0, history, -1, -1, -1),) if qos.latched else ()
+    mortal = (Policy.Lifespan(round(qos.lifespan_s * 1e9)),) if qos.lifespan_s else ()
     return Qos(
         reliability,
         history,
         Policy.Durability.TransientLocal if qos.latched else Policy.Durability.Volatile,
         *lasting,
+        *mortal,
         Policy.WriterDataLifecycle(autodispose=False),
         Policy.DataRepresentation(use_cdrv0_representation=True),
         Policy.Userdata(user_data.encode()),
@@ -227,11 +229,18 @@ class Waiter:
     def __init__(self, participant: DomainParticipant, readers: Sequence[RawReader]) -> None:
         """Attach the readers and a condition of our own."""
         self._guard = GuardCondition(participant)
-        self._conditions = [ReadCondition(reader.entity, ANY_STATE) for reader in readers]
+        self._conditions: list[ReadCondition] = []
         self._waitset = WaitSet(participant)
-        for condition in (*self._conditions, self._guard):
-            self._waitset.attach(condition)
+        self._waitset.attach(self._guard)
+        for reader in readers:
+            self.watch(reader)
         self.interrupted = False
+
+    def watch(self, reader: RawReader) -> None:
+        """Wait for one reader more; a wait under way may notice after its time slice only."""
+        condition = ReadCondition(reader.entity, ANY_STATE)
+        self._conditions.append(condition)
+        self._waitset.attach(condition)
 
     def wait_until(self, deadline_ns: int) -> bool:
         """Return after data, a time slice or an interrupt; False once the deadline or an interrupt has come."""

@@ -49,8 +49,15 @@ class _End:
     """What client and server have in common."""
 
     def __init__(
-        self, participant: DomainParticipant, name: str, type_name: str, version: str, role: tuple[str, str]
+        self,
+        participant: DomainParticipant,
+        name: str,
+        type_name: str,
+        version: str,
+        role: tuple[str, str],
+        qos: QoS | None = None,
     ) -> None:
+        """Create both endpoints; ``qos`` is that of both, None that of an action's services."""
         own, self._peer_key = role
         self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
         self._version = version
@@ -61,9 +68,9 @@ class _End:
         def user_data(type_name: str) -> str:
             return f"{own}={identity};typehash={type_hash(type_name, version)};"
 
-        writer_qos = REQUEST_QOS if sent is request else REPLY_QOS
+        writer_qos = qos or (REQUEST_QOS if sent is request else REPLY_QOS)
         self.writer = RawWriter(participant, *sent, dds_qos(writer_qos, user_data(sent[1])))
-        self.reader = RawReader(participant, *received, dds_qos(READER_QOS, user_data(received[1])))
+        self.reader = RawReader(participant, *received, dds_qos(qos or READER_QOS, user_data(received[1])))
 
     def matched(self) -> bool:
         """Return whether both endpoints of one peer are matched."""
@@ -120,9 +127,11 @@ class ServiceClient(_End):
 class ServiceServer(_End):
     """Takes requests and sends replies to who asked."""
 
-    def __init__(self, participant: DomainParticipant, name: str, type_name: str, version: str) -> None:
-        """Create both endpoints of the service ``/name``."""
-        super().__init__(participant, name, type_name, version, ("serviceid", "clientid"))
+    def __init__(
+        self, participant: DomainParticipant, name: str, type_name: str, version: str, qos: QoS | None = None
+    ) -> None:
+        """Create both endpoints of the service ``/name``; ``qos`` as for `_End`."""
+        super().__init__(participant, name, type_name, version, ("serviceid", "clientid"), qos)
         self._reachable: set[int] = set()
 
     def pack(self, body: Any) -> bytearray:

@@ -57,6 +57,7 @@ def _types(version: str) -> tuple[Typestore, Defaults]:
     folders = {
         "s2a_msgs": root / "s2a_msgs",
         "action_msgs": root / "interfaces" / "action_msgs",
+        "rcl_interfaces": root / "interfaces" / "rcl_interfaces",
         "llama_msgs": root / "interfaces" / VERSIONS[version],
     }
     defaults: Defaults = {}

@@ -16,11 +16,12 @@ from typing import Any
 import rclpy
 
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import QoS, Tuning
+from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
 from s2a_bench.ros.rclpy_client import RclpyActionClient
 from s2a_bench.ros.rclpy_node import Inbox, SpinningNode, qos_profile
 from s2a_bench.ros.rclpy_server import RclpyActionServer
+from s2a_bench.ros.rclpy_service import RclpyServiceClient, offer
 from s2a_bench.ros.rclpy_types import message_class
 
 
@@ -91,6 +92,14 @@ class RclpyMiddleware:
     def subscription(self, topic: str, type_name: str, qos: QoS) -> _RclpySubscription:
         """Create a raw subscription."""
         return _RclpySubscription(self._open(), topic, type_name, qos)
+
+    def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
+        """Create a service."""
+        offer(self._open(), name, type_name, answer, qos)
+
+    def service_client(self, name: str, type_name: str) -> RclpyServiceClient:
+        """Create a client."""
+        return RclpyServiceClient(self._open(), name, type_name)
 
     def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> RclpyActionClient:
         """Create an action client."""

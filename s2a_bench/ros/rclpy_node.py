@@ -16,6 +16,7 @@ from typing import Any, Generic, TypeVar
 
 import rclpy
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
@@ -33,6 +34,8 @@ def qos_profile(qos: QoS) -> Any:
         "reliability": ReliabilityPolicy.RELIABLE if qos.reliable else ReliabilityPolicy.BEST_EFFORT,
         "durability": DurabilityPolicy.TRANSIENT_LOCAL if qos.latched else DurabilityPolicy.VOLATILE,
     }
+    if qos.lifespan_s:
+        asked["lifespan"] = Duration(seconds=qos.lifespan_s)
     if not qos.depth:
         return QoSProfile(history=HistoryPolicy.KEEP_ALL, **asked)
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=qos.depth, **asked)

@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 
 from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError
 from s2a_bench.ros import Middleware, Publisher, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.types import Frame
 
 Join = Callable[[], Middleware]
 STRING = "std_msgs/msg/String"
+GET_TYPES = "rcl_interfaces/srv/GetParameterTypes"
+LIST = "rcl_interfaces/srv/ListParameters"
+WAIT_S = 20.0
 
 
 def text(value: str) -> Any:
@@ -98,6 +102,43 @@ class MiddlewareSuite:
         publisher.send(publisher.pack(text("x")))
         assert subscription.unpack(subscription.take(5)).data == "x"
         assert other.take(0.05) is None
+
+    def test_services_answer_who_asked(self, join: Join) -> None:
+        server = join()
+
+        def types(request: Any) -> Any:
+            return ros.default(GET_TYPES + "_Response", types=[len(name) for name in request.names])
+
+        def nothing(_request: Any) -> Any:
+            return ros.default(LIST + "_Response")
+
+        server.service("/robot/node/get_parameter_types", GET_TYPES, types)
+        server.service("/robot/node/list_parameters", LIST, nothing)
+        clients = [join().service_client("/robot/node/get_parameter_types", GET_TYPES) for _ in range(2)]
+        for names in (["a", "four"], [], ["ééé"]):
+            for client in clients:
+                got = client.call(ros.default(GET_TYPES + "_Request", names=names), WAIT_S)
+                assert got.types.tolist() == [len(name) for name in names]
+        other = join().service_client("/robot/node/list_parameters", LIST)
+        assert other.call(ros.default(LIST + "_Request"), WAIT_S).result.names == []
+
+    def test_a_service_whose_answer_fails_answers_the_next_request(self, join: Join) -> None:
+        def answer(request: Any) -> Any:
+            if not request.names:
+                raise ValueError("nothing to say")
+            return ros.default(GET_TYPES + "_Response", types=[7])
+
+        join().service("/picky", GET_TYPES, answer)
+        client = join().service_client("/picky", GET_TYPES)
+        assert client.call(ros.default(GET_TYPES + "_Request", names=["a"]), WAIT_S).types.tolist() == [7]
+        with pytest.raises(TransportError, match=r"/picky did not answer in 0\.2 s"):
+            client.call(ros.default(GET_TYPES + "_Request"), 0.2)
+        assert client.call(ros.default(GET_TYPES + "_Request", names=["a"]), WAIT_S).types.tolist() == [7]
+
+    def test_a_service_that_nobody_offers_is_named(self, join: Join) -> None:
+        client = join().service_client("/nobody", LIST)
+        with pytest.raises(TransportError, match="no server of the service /nobody appeared"):
+            client.call(ros.default(LIST + "_Request"), 0.1)
 
     def test_it_describes_itself_in_plain_data(self, join: Join) -> None:
         described = join().describe()

@@ -40,6 +40,7 @@ def generated(type_name: str, version: str = "6.0") -> Any:
     return type(type_name, (ros.typestore(version).types[type_name],), methods)
 
 
+@cache
 def service(type_name: str) -> Any:
     return SimpleNamespace(Request=generated(type_name + "_Request"), Response=generated(type_name + "_Response"))
 
@@ -111,6 +112,7 @@ class Node:
         self.topics: dict[str, list[Any]] = defaultdict(list)
         self.subscribed: dict[str, list[Any]] = defaultdict(list)
         self.waitables: list[Any] = []
+        self.services: dict[str, Any] = {}
         GRAPH.append(self)
 
     def destroy_node(self) -> None:
@@ -149,8 +151,33 @@ class Node:
     def count_publishers(self, topic: str) -> int:
         return sum(len(node.topics[topic]) for node in self.peers())
 
-    def create_client(self, _service: Any, name: str) -> Any:
-        server = name.removesuffix("/_action/cancel_goal")
+    def create_service(self, kind: Any, name: str, callback: Any, *, qos_profile: Any) -> None:
+        assert qos_profile
+        self.services[name] = (kind, callback)
+
+    def create_client(self, kind: Any, name: str) -> Any:
+        if name.endswith("/_action/cancel_goal"):
+            return self.canceller(name.removesuffix("/_action/cancel_goal"))
+
+        def servers() -> list[tuple[Node, Any]]:
+            return [(node, node.services[name]) for node in self.peers() if name in node.services]
+
+        def call_async(request: Any) -> Future:
+            assert isinstance(request, kind.Request)
+            future = Future(self.executor)
+
+            def answer(service: Any, callback: Any) -> None:
+                response = callback(request, service.Response())
+                assert isinstance(response, service.Response)
+                future.set_result(response)
+
+            for node, offered in servers():
+                node.executor.create_task(answer, *offered)
+            return future
+
+        return SimpleNamespace(call_async=call_async, service_is_ready=lambda: bool(servers()))
+
+    def canceller(self, server: str) -> Any:
 
         def call_async(request: Any) -> Future:
             future = Future(self.executor)
@@ -275,6 +302,7 @@ def modules() -> dict[str, dict[str, Any]]:
             "create_node": Node,
             "get_rmw_implementation_identifier": lambda: "rmw_stand_in",
         },
+        "rclpy.duration": {"Duration": SimpleNamespace},
         "rclpy.context": {"Context": type("Context", (), {"try_shutdown": lambda _: None})},
         "rclpy.executors": {
             "SingleThreadedExecutor": Executor,
@@ -296,4 +324,13 @@ def modules() -> dict[str, dict[str, Any]]:
 
 
 INTERFACES: dict[str, Callable[[str], Any]] = {"msg": generated, "srv": service, "action": action}
-PACKAGES = ("action_msgs", "builtin_interfaces", "llama_msgs", "s2a_msgs", "sensor_msgs", "std_msgs")
+PACKAGES = (
+    "action_msgs",
+    "builtin_interfaces",
+    "diagnostic_msgs",
+    "llama_msgs",
+    "rcl_interfaces",
+    "s2a_msgs",
+    "sensor_msgs",
+    "std_msgs",
+)

@@ -26,6 +26,16 @@ def test_type_hashes_are_those_of_a_real_ros(name: str) -> None:
     assert ros.type_hash(name) == RECORDED[name]
 
 
+SERVICES = ("DescribeParameters", "GetParameters", "GetParameterTypes", "ListParameters", "SetParameters")
+
+
+@pytest.mark.parametrize("name", [*SERVICES, "SetParametersAtomically"])
+@pytest.mark.parametrize("half", ["Request", "Response"])
+def test_type_hashes_of_the_parameter_services_are_those_of_a_real_ros(name: str, half: str) -> None:
+    name = f"rcl_interfaces/srv/{name}_{half}"
+    assert ros.type_hash(name) == RECORDED[name]
+
+
 def request(**fields: Any) -> Any:
     whole = {"id": "a", "prompt": "p", "grammar": "", "max_tokens": 1, "seed": 0, "images": [], "compressed_images": []}
     return ros.message(ros.REQUEST, **(whole | fields))

@@ -20,7 +20,7 @@ from s2a_bench.testing.middleware import Join, MiddlewareSuite
 from s2a_bench.types import Frame
 from tests.ros.rclpy_stand_in import GRAPH, INTERFACES, PACKAGES, action, generated, modules
 
-GLUE = ("client", "middleware", "node", "server", "types")
+GLUE = ("client", "middleware", "node", "server", "service", "types")
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,0 +1,68 @@
+"""Services on Cyclone DDS: named as ROS names them, and what strangers may send them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.ros import REQUEST_BYTES, Middleware, QoS, open_middleware
+from s2a_bench.ros import messages as ros
+from s2a_bench.testing.middleware import GET_TYPES, WAIT_S, Join
+
+pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
+
+NAME = "/robot/node/get_parameter_types"
+
+
+@pytest.fixture
+def join(dds_domain: int) -> Iterator[Join]:
+    with ExitStack() as stack:
+
+        def join() -> Middleware:
+            middleware = open_middleware("cyclonedds", domain_id=dds_domain)
+            stack.callback(middleware.close)
+            return middleware
+
+        yield join
+
+
+def lengths(request: Any) -> Any:
+    return ros.default(GET_TYPES + "_Response", types=[len(name) for name in request.names])
+
+
+def test_its_endpoints_are_those_of_ros(join: Join) -> None:
+    from cyclonedds.core import Policy
+
+    server, client = join(), join()
+    server.service(NAME, GET_TYPES, lengths, QoS(depth=1000))
+    ends = client.service_client(NAME, GET_TYPES).ends()  # type: ignore[attr-defined]
+    for end, topic, half in zip(ends, ("rq/%sRequest", "rr/%sReply"), ("Request", "Response"), strict=True):
+        topic_of = end.entity.topic
+        assert topic_of.name == topic % NAME[1:]
+        assert topic_of.typename == f"rcl_interfaces::srv::dds_::GetParameterTypes_{half}_"
+        user_data = bytes(end.entity.get_qos()[Policy.Userdata].data).decode()
+        assert user_data.startswith("clientid=")
+        assert user_data.endswith(f";typehash={ros.type_hash(GET_TYPES + '_' + half)};")
+
+
+def test_garbage_is_dropped_and_logged_once(join: Join, caplog: pytest.LogCaptureFixture) -> None:
+    from s2a_bench.ros.dds import RawWriter, dds_qos
+
+    server, stranger = join(), join()
+    server.service(NAME, GET_TYPES, lengths)
+    writer = RawWriter(stranger._participant, f"rq{NAME}Request", GET_TYPES + "_Request", dds_qos(QoS(), "x=y;"))  # type: ignore[attr-defined]
+    deadline = now_ns() + int(WAIT_S * 1e9)
+    while not writer.matched():
+        assert now_ns() < deadline
+    head = bytes.fromhex("00010000") + bytes(16)
+    many, endless = head + b"\xff\xff\xff\x7f", head + bytes.fromhex("01000000 ffffff7f")
+    for body in (b"\0\1\0\0", head, many, endless, head + b"\xff" * 64, head + bytes(REQUEST_BYTES)):
+        for _ in range(20):
+            writer.send(bytearray(body))
+    client = join().service_client(NAME, GET_TYPES)
+    assert client.call(ros.default(GET_TYPES + "_Request", names=["abc"]), WAIT_S).types.tolist() == [3]
+    assert sum("dropped a request" in record.getMessage() for record in caplog.records) == 1
