@@ -114,7 +114,9 @@ def main() -> int:
     try:
         keeps = job.tuned and keep_large_blocks()
         engine = open_engine(job.engine)
-        server = open_server(job.wiring, engine_handler(engine, pixels=job.pixels, limits=job.wiring.limits))
+        handler = engine_handler(engine, pixels=job.pixels, limits=job.wiring.limits)
+        handler.settings = job.engine
+        server = open_server(job.wiring, handler)
     except S2AError as error:
         print(json.dumps({"error": str(error), "kind": type(error).__name__}), file=answers, flush=True)
         return error.exit_code

@@ -23,9 +23,12 @@ from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.types import Request, Token
 
 if TYPE_CHECKING:
+    from s2a_bench.options import Options
     from s2a_bench.transport import Handler
 
 RETRY_AFTER_S = 1.0
+STUCK_S = 120
+"""Silence of an answer under way after which it counts as stuck: a long prompt on a small board takes its time."""
 POLL_S = 0.1
 """How often one who waits is asked whether it still wants an answer."""
 
@@ -149,6 +152,8 @@ class Queued:
     ) -> None:
         """Put a queue in front of ``answering``; ``provenance`` says who that is, and goes with every answer."""
         self.turns = Turns(limits)
+        self.settings: Options | None = None
+        """What the engine was told, where whoever made this says so: a node's parameters have it."""
         self.provenance = dict(provenance or {})
         self._answering = answering
 

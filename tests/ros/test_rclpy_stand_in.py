@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
+from threading import Event
 from types import ModuleType
 from typing import Any
 
@@ -15,8 +17,11 @@ import pytest
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Result, default_middleware, llama, open_middleware
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.parameters import SERVICE, Parameter, value_of
+from s2a_bench.ros.rosout import LOG, ROSOUT_QOS
 from s2a_bench.testing.action import NAME, ActionSuite
 from s2a_bench.testing.middleware import Join, MiddlewareSuite
+from s2a_bench.transport.ros.node import NodeApi
 from s2a_bench.types import Frame
 from tests.ros.rclpy_stand_in import GRAPH, INTERFACES, PACKAGES, action, generated, modules
 
@@ -175,3 +180,21 @@ def test_without_a_name_the_environment_chooses(monkeypatch: pytest.MonkeyPatch)
     middleware = open_middleware(domain_id=7)
     assert middleware.describe()["middleware"] == "rclpy"
     middleware.close()
+
+
+def test_a_node_has_parameters_and_a_log_there_too(rclpy_join: Join) -> None:
+    serving, peer = rclpy_join(), rclpy_join()
+    heard = peer.subscription("/rosout", LOG, ROSOUT_QOS)
+    told = [Parameter("depth", 3, live=True)]
+    node = NodeApi(serving, "/robot/brain", told, lambda _: None, lambda: iter(()), "info")
+    stopped = Event()
+    node.start(stopped)
+    try:
+        client = peer.service_client("/robot/brain/get_parameters", SERVICE + "GetParameters")
+        values = client.call(ros.default(SERVICE + "GetParameters_Request", names=["depth", "other"]), 5).values
+        assert [value_of(value) for value in values] == [3, None]
+        logging.getLogger("s2a_bench.x").info("hello")
+        assert "hello" in heard.unpack(heard.take(5)).msg
+    finally:
+        stopped.set()
+        node.close()

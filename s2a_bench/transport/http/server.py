@@ -34,16 +34,13 @@ from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.http.reading import of_fields
 from s2a_bench.transport.http.reply import Reply
 from s2a_bench.transport.limits import Limits
-from s2a_bench.transport.turns import Queued
+from s2a_bench.transport.turns import STUCK_S, Queued
 
 KEEP_ALIVE_S = 3600
 """A client that waits for its turn in an interleaved run keeps its connection."""
 
 CLOSING_S = 0.01
 """Time for the loop to close what is broken off."""
-
-STUCK_S = 120
-"""Silence of an answer under way after which /health says so: a long prompt on a small board takes its time."""
 
 
 class ImageUrl(BaseModel):

@@ -48,6 +48,7 @@ class Ros(Transport[RosOptions]):
         "feedback_interval": 0.002,
         "max_tokens": 512,
         "publish_tokens": True,
+        "node_api": True,
     }
 
     def client(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> Client:

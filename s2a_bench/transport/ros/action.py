@@ -196,13 +196,18 @@ class ActionFront:
         """Offer the action and create the topics."""
         namespace, options = namespace_of(wiring), wiring.options
         self.cache = cache
-        self.max_tokens = min(options.max_tokens or wiring.max_tokens, wiring.limits.answer_tokens)
-        self.feedback_interval_ns = int(options.feedback_interval * 1e9)
+        self._wiring = wiring
+        self.tune(options)
         self._server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE, options.result_timeout)
         self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS)
         self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if options.publish_tokens else None
         self._active = 0
         self._lock = Lock()
+
+    def tune(self, options: RosOptions) -> None:
+        """Follow the options that may change while it runs."""
+        self.max_tokens = min(options.max_tokens or self._wiring.max_tokens, self._wiring.limits.answer_tokens)
+        self.feedback_interval_ns = int(options.feedback_interval * 1e9)
 
     def take(self, timeout_s: float) -> ServerGoal | None:
         """Wait for the next goal."""

@@ -6,7 +6,7 @@ camera feeds the cache.
 
 from __future__ import annotations
 
-import sys
+import logging
 from dataclasses import dataclass, replace
 from threading import Lock, Thread
 from typing import Any
@@ -29,6 +29,7 @@ PIXELS = frozenset({"raw", "yuyv"})
 CAMERA_QOS = {"reliable": QoS(depth=1), "sensor_data": QoS(depth=5, reliable=False)}
 """By the names of ROS 2's profiles; a reliable subscription does not match a best-effort publisher."""
 POLL_S = 0.5
+_log = logging.getLogger(__name__)
 
 
 def picture_message(frame: Frame, payload: str, offset_ns: int, trace: Trace) -> tuple[str, Any]:
@@ -126,6 +127,11 @@ class CameraCache:
         trace.facts[CAMERA_FRAMES] = newest.count
         return (newest.frame,)
 
+    def seen(self) -> tuple[int, int | None]:
+        """Return how many frames have come, and when the newest that can be used was received (CLOCK_MONOTONIC)."""
+        newest = self._newest
+        return self._count, newest.marks[0][1] if newest else None
+
     def _watch(self, camera: Subscription) -> None:
         said = ""
         while not self._stopped:
@@ -136,7 +142,7 @@ class CameraCache:
             except Exception as error:  # noqa: BLE001 - a frame nobody can use is no reason to stop
                 if str(error) != said:  # once a kind of trouble, not thirty times a second
                     said = str(error)
-                    print(f"camera frame not used: {said}", file=sys.stderr, flush=True)  # noqa: T201 - a node's log
+                    _log.warning("camera frame not used: %s", said)
 
     def _keep(self, camera: Subscription, packed: Any) -> None:
         """Decode a frame and keep it, unless one that came later is there already."""

@@ -31,10 +31,15 @@ def domain_of(wiring: Wiring[RosOptions]) -> int:
     return domain_id(os.environ) if said is None else said
 
 
+def server_name(wiring: Wiring[RosOptions]) -> str:
+    """Return the server's node, its namespace included."""
+    return f"{namespace_of(wiring)}/{wiring.options.node_name}"
+
+
 def join(wiring: Wiring[RosOptions], role: str) -> Middleware:
-    """Join the wiring's domain as the node ``<namespace>/<role>``."""
+    """Join the wiring's domain as the node ``<namespace>/<role>``, the server under its own name."""
     tuning: Tuning = wiring.options.dds_tuning
-    name = f"{namespace_of(wiring)}/{role}"
+    name = server_name(wiring) if role == "server" else f"{namespace_of(wiring)}/{role}"
     return open_middleware(wiring.options.middleware, domain_id=domain_of(wiring), tuning=tuning, node_name=name)
 
 

@@ -15,6 +15,8 @@ NAMESPACE = "/s2a_bench"
 
 NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 """ROS 2's rules for an absolute name."""
+BASE_NAME = r"^[A-Za-z_][A-Za-z0-9_]*$"
+"""ROS 2's rules for the name of a node."""
 
 
 class RosOptions(Options):
@@ -46,6 +48,11 @@ class RosOptions(Options):
         0.0, "seconds: tokens that come faster share a feedback", ge=0, le=60, side=SERVING
     )
     publish_tokens: bool = option(False, "also publish the tokens of goals, for plotting", side=SERVING)
+    node_name: str = option("server", "name of the node, below the namespace", side=SERVING, pattern=BASE_NAME)
+    node_api: bool = option(False, "have parameters, /rosout and /diagnostics, as ROS 2 nodes do", side=SERVING)
+    log_level: Literal["debug", "info", "warn", "error", "fatal"] = option(
+        "info", "what /rosout tells: debug, info, warn, error, fatal", side=SERVING
+    )
 
     @field_validator("namespace", "action")
     @classmethod

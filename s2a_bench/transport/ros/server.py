@@ -7,8 +7,8 @@ while another waits, so that no request changes threads, and one that comes mean
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from threading import Event, Lock, Thread, current_thread
 from typing import Any, Protocol
@@ -16,16 +16,22 @@ from typing import Any, Protocol
 from s2a_bench.errors import Busy, Overdue, RequestFailed
 from s2a_bench.ros import QoS
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.diagnostics import Finding
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros.action import ActionFront
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company
+from s2a_bench.transport.ros.node import Activity, NodeApi
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.topic import TopicFront
 from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, provenance_message
 from s2a_bench.transport.turns import Queued, Turn
 from s2a_bench.types import Request, Token
+
+OLDEST_S = 1.0
+"""Diagnostics warn of a camera whose newest frame is older."""
+_log = logging.getLogger(__name__)
 
 
 class Job(Protocol):
@@ -88,15 +94,17 @@ class RosServer:
             refuse_company(wiring, self.address)
         self.middleware = join(wiring, "server")
         self._cache = CameraCache(self.middleware, self.address, wiring.options.qos, wiring.limits)
-        self._fronts: list[Front] = [
-            TopicFront(self.middleware, self.address, self._cache),
-            ActionFront(self.middleware, wiring, self._cache),
-        ]
+        self._action = ActionFront(self.middleware, wiring, self._cache)
+        self._fronts: list[Front] = [TopicFront(self.middleware, self.address, self._cache), self._action]
         self._origin = self.middleware.publisher(  # kept: what is latched goes with its writer
             self.address + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
         )
         self._origin.send(self._origin.pack(provenance_message(self._queued.provenance)))
         self._stopped = Event()
+        self._options = wiring.options
+        turns = self._queued.turns
+        self._activity = Activity(lambda: turns.waiting, wiring.limits.waiting, turns.silent_s)
+        self._node = NodeApi.of(self.middleware, wiring, self._queued.settings, self._change, self._findings)
 
     def serve(self) -> None:
         """Serve until stopped."""
@@ -104,10 +112,14 @@ class RosServer:
         self._cache.start()
         for crew in crews:
             crew.start()
+        if self._node:
+            self._node.start(self._stopped)
         self._stopped.wait()
         for crew in crews:
             crew.join()
         self._cache.join()
+        if self._node:
+            self._node.close()
         self.middleware.close()
 
     def stop(self) -> None:
@@ -120,6 +132,14 @@ class RosServer:
     def describe(self) -> dict[str, str | int]:
         """Say what carries the messages."""
         return self.middleware.describe()
+
+    def _change(self, wanted: Mapping[str, Any]) -> None:
+        """Set options while serving; raises UsageError."""
+        self._options = self._options.but(**wanted)
+        self._action.tune(self._options)
+
+    def _findings(self) -> Iterator[Finding]:
+        return self._activity.findings(*self._cache.seen(), OLDEST_S)
 
     def _take(self, front: Front) -> Callable[[], None] | None:
         """Wait for a request and give it its place in the queue; return what answers it."""
@@ -176,9 +196,11 @@ class RosServer:
                 return
             job.trace.mark("queue")
         error = ""
+        self._activity.requests += 1
         tokens = self._queued.answer(job.request, job.trace, turn)
         try:
             for token in tokens:
+                self._activity.tokens += 1
                 if self._stopped.is_set():
                     error = "the server is stopping"
                 if error or not job.token(token):
@@ -187,6 +209,8 @@ class RosServer:
             error = str(failure) or type(failure).__name__
         finally:
             tokens.close()
+        if error:
+            self._activity.failed(error)
         job.end(error)
 
 
@@ -231,8 +255,7 @@ class _Crew:
                     if self._retired():
                         return
             except Exception as error:  # noqa: BLE001 - a node stays up: the next request may fare better
-                said = f"request not answered: {error or type(error).__name__}"
-                print(said, file=sys.stderr, flush=True)  # noqa: T201 - a node's log
+                _log.error("request not answered: %s", error or type(error).__name__)
 
     def _busy(self, change: int) -> None:
         with self._count:

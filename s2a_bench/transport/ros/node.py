@@ -1,0 +1,175 @@
+"""What makes our server a node that behaves: parameters, its log on ``/rosout`` and ``/diagnostics`` once a second."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from threading import Event, Thread
+from typing import Any, Final
+
+from s2a_bench.clock import now_ns
+from s2a_bench.options import Options
+from s2a_bench.ros import Middleware, QoS
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.diagnostics import ARRAY, DIAGNOSTICS_QOS, Finding, Level, diagnostic_array
+from s2a_bench.ros.diagnostics import TOPIC as DIAGNOSTICS
+from s2a_bench.ros.parameters import SERVICE, Parameter, Parameters, of_options
+from s2a_bench.ros.rosout import Rosout
+from s2a_bench.transport import Wiring
+from s2a_bench.transport.options import sides
+from s2a_bench.transport.ros.joining import domain_of, namespace_of, server_name
+from s2a_bench.transport.ros.options import RosOptions
+from s2a_bench.transport.turns import STUCK_S
+
+LIVE: Final = ("max_tokens", "feedback_interval")
+"""The options that are read for each goal, and can be set while the node runs."""
+PERIOD_S: Final = 1.0
+PARAMETERS_QOS: Final = QoS(depth=1000)
+"""ROS's ``rmw_qos_profile_parameters``, and that of ``/parameter_events``."""
+EVENT: Final = "rcl_interfaces/msg/ParameterEvent"
+EVENTS: Final = "/parameter_events"
+LOGGER: Final = "s2a_bench"
+
+_log = logging.getLogger(__name__)
+
+
+class Activity:
+    """Counts what a server does, and turns the counts of a while into findings."""
+
+    def __init__(self, waiting: Callable[[], int], limit: int, silent_s: Callable[[], float]) -> None:
+        """Start at nothing; ``waiting`` requests of at most ``limit`` are queued, ``silent_s`` is `Turns.silent_s`."""
+        self._waiting, self._limit, self._silent_s = waiting, limit, silent_s
+        self.requests = self.tokens = self.failures = 0
+        self._before = (now_ns(), 0, 0, 0, 0)
+        self._said = ""
+
+    def failed(self, error: str) -> None:
+        """Count a failure, and log it unless it is the same again."""
+        self.failures += 1
+        if error != self._said:
+            self._said = error
+            _log.warning("a request failed: %s", error)
+
+    def findings(self, frames: int, frame_ns: int | None, oldest_s: float) -> Iterator[Finding]:
+        """Yield how requests and camera have been since the last call.
+
+        ``frames`` have come from the camera, the last at ``frame_ns``; one older than ``oldest_s`` is a warning.
+        """
+        now = (now_ns(), self.requests, self.tokens, self.failures, frames)
+        seconds = max((now[0] - self._before[0]) / 1e9, 1e-9)
+        requests, tokens, failures, came = (
+            after - before for after, before in zip(now[1:], self._before[1:], strict=True)
+        )
+        self._before = now
+        waiting, silent_s = self._waiting(), self._silent_s()
+        level, said = Level.OK, "answering" if silent_s else "idle"
+        if silent_s > STUCK_S:
+            level, said = Level.ERROR, f"the answer under way has shown no sign of life for {silent_s:.0f} s"
+        elif waiting and waiting >= self._limit:
+            level, said = Level.WARN, "the queue is full: goals are rejected"
+        elif failures:
+            level, said = Level.WARN, f"{failures} requests failed"
+        yield Finding(
+            "requests",
+            level,
+            said,
+            {
+                "requests_per_s": requests / seconds,
+                "tokens_per_s": tokens / seconds,
+                "waiting": waiting,
+                "requests": self.requests,
+                "failures": self.failures,
+            },
+        )
+        if frame_ns is None:
+            yield Finding("camera", Level.OK, "no frame has come", {"frames": frames})
+            return
+        age_s = (now[0] - frame_ns) / 1e9
+        old = age_s > oldest_s
+        said = f"the newest frame is {age_s:.1f} s old" if old else "frames come"
+        values = {"frames_per_s": came / seconds, "frame_age_s": age_s, "frames": frames}
+        yield Finding("camera", Level.WARN if old else Level.OK, said, values)
+
+
+class NodeApi:
+    """The parameters, log and diagnostics of one node."""
+
+    def __init__(
+        self,
+        middleware: Middleware,
+        name: str,
+        parameters: Sequence[Parameter],
+        change: Callable[[Mapping[str, Any]], None],
+        findings: Callable[[], Iterator[Finding]],
+        log_level: str,
+    ) -> None:
+        """Create services and topics of the node ``/namespace/name``; ``change`` as for `Parameters`."""
+        self._name, self._findings = name, findings
+        self._events = middleware.publisher(EVENTS, EVENT, PARAMETERS_QOS)
+        held = Parameters(parameters, change, lambda changed: self._tell(changed_parameters=changed))
+        for kind, answer in held.services():
+            middleware.service(f"{name}/{snake(kind)}", SERVICE + kind, answer, PARAMETERS_QOS)
+        self._tell(new_parameters=held.messages())
+        self._diagnostics = middleware.publisher(DIAGNOSTICS, ARRAY, DIAGNOSTICS_QOS)
+        console = logging.StreamHandler()
+        console.setLevel(logging.WARNING)
+        self._handlers = (Rosout(middleware, name), console)
+        self._logger = logging.getLogger(LOGGER)
+        self._logger.setLevel(log_level.upper())
+        for handler in self._handlers:
+            self._logger.addHandler(handler)
+
+    @classmethod
+    def of(
+        cls,
+        middleware: Middleware,
+        wiring: Wiring[RosOptions],
+        settings: Options | None,
+        change: Callable[[Mapping[str, Any]], None],
+        findings: Callable[[], Iterator[Finding]],
+    ) -> NodeApi | None:
+        """Return that of a server whose options are parameters, with its engine's ``settings``; None if not wanted."""
+        if not wiring.options.node_api:
+            return None
+        parameters = declared(wiring, settings)
+        return cls(middleware, server_name(wiring), parameters, change, findings, wiring.options.log_level)
+
+    def start(self, stopped: Event) -> None:
+        """Publish diagnostics until ``stopped``."""
+        self._thread = Thread(target=self._publish, args=(stopped,), name="diagnostics", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Wait for the thread's end, and log no more."""
+        self._thread.join()
+        for handler in self._handlers:
+            self._logger.removeHandler(handler)
+
+    def _publish(self, stopped: Event) -> None:
+        while not stopped.wait(PERIOD_S):
+            message = diagnostic_array(self._name, self._findings(), time.time_ns())
+            self._diagnostics.send(self._diagnostics.pack(message))
+
+    def _tell(self, **lists: Sequence[Any]) -> None:
+        """Publish a ParameterEvent."""
+        seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
+        stamp = ros.default("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+        self._events.send(self._events.pack(ros.default(EVENT, stamp=stamp, node=self._name, **lists)))
+
+
+def declared(wiring: Wiring[RosOptions], settings: Options | None) -> list[Parameter]:
+    """Return the options of `serve ros` as parameters: the transport's, the limits, and the engine's ``settings``."""
+    told = [name for name, side in sides(RosOptions) if side and name != "action"]
+    options = wiring.options.but(namespace=namespace_of(wiring), domain_id=domain_of(wiring))
+    return [
+        *of_options(options, told, LIVE),
+        *of_options(wiring.limits, type(wiring.limits).model_fields),
+        *(of_options(settings, type(settings).model_fields) if settings else ()),
+        Parameter("use_sim_time", False, "this node's clock is the system's"),
+    ]
+
+
+def snake(name: str) -> str:
+    """Return a CamelCase name as words_with_underscores."""
+    return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name).lstrip("_")
