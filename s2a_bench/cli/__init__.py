@@ -15,6 +15,7 @@ from s2a_bench import __version__
 from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import Commands
 from s2a_bench.cli.output import shown
+from s2a_bench.cli.ros_args import folded
 from s2a_bench.cli.shortage import check_limits, shortage
 from s2a_bench.errors import S2AError
 from s2a_bench.machine import tuning
@@ -70,7 +71,7 @@ def main() -> None:
     try:
         check_limits()
         with tuning.allowed():
-            code = app(standalone_mode=False)
+            code = app(args=folded(sys.argv[1:]), standalone_mode=False)
         if code == INTERRUPTED:  # newer typer turns Ctrl-C into this code itself
             _say("interrupted", INTERRUPTED)
     except S2AError as error:

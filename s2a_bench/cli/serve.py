@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import copy
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import typer
 from pydantic import create_model
 
 from s2a_bench.cli.adapter import command, flags_of
+from s2a_bench.cli.ros_args import read as read_ros_args
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Options, group, option, placed, places
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 
 ENGINE = ("name", "model", "mmproj", "threads", "gpu_layers", "context", "profile", "gaps")
 """The engine's options that a server has flags for."""
+Sorted: TypeAlias = "tuple[dict[str, Any], dict[str, Any], dict[str, Any]]"
 _NUMBER = EngineConfig.model_fields["threads"]
 
 
@@ -59,8 +62,14 @@ def _config() -> type[Options]:
         if told := _told(each):
             fields[name] = (_as_served(each), group(_as_served(each), only=told, about=f"{name}: "))
     fields["limits"] = (Limits, group(Limits, about="limit: "))
-    about = "TOML file with these flags as keys; a flag wins over it"
-    return create_model("ServeConfig", __base__=Options, **fields, config=(Path | None, option(None, about)))
+    fields["config"] = (Path | None, option(None, "TOML file with these flags as keys; a flag wins over it"))
+    fields["ros_args"] = (
+        str,
+        option(
+            "", "ros: what follows, up to -- or the end, as ROS 2 nodes take it: -r, -p, --params-file, --log-level"
+        ),
+    )
+    return create_model("ServeConfig", __base__=Options, **fields)
 
 
 def _serve(config: Any) -> None:
@@ -70,37 +79,66 @@ def _serve(config: Any) -> None:
     for other, _ in TRANSPORTS.loaded():
         if other != chosen.name and (given := [*getattr(config, other, Options()).given()]):
             raise UsageError(f"`{given[0]}` is no option of {chosen.name}; it has {', '.join(_told(chosen))}")
-    of_engine, of_transport, of_limits = _read(config.config, chosen) if config.config else ({}, {}, {})
     flags = {name: getattr(own, name) for name in own.given()} if own else {}
+    values = _toml(config.config) if config.config else {}
+    of_engine, of_transport, of_limits = _sorted(values, f"`config` {config.config}", chosen)
+    for said, into in zip(
+        _ros_args(config.ros_args, chosen, {**of_transport, **flags}),
+        (of_engine, of_transport, of_limits),
+        strict=True,
+    ):
+        into.update(said)
     engine = {name: getattr(config.engine, name) for name in config.engine.given()}
     limits = Limits(**{**of_limits, **{name: getattr(config.limits, name) for name in config.limits.given()}})
     pipeline = one_pipeline(config.pipeline, **{**chosen.serving, **of_transport, **flags})
     _run(pipeline.wiring(chosen.bind(pipeline.options, ()), limits=limits), EngineConfig(**{**of_engine, **engine}))
 
 
-def _read(path: Path, chosen: Transport[Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """Return a file's options of the engine, of the transport, and limits; raises UsageError naming the key."""
+def _toml(path: Path) -> dict[str, Any]:
+    """Read a file of options."""
     try:
         whole = loads(path.read_text(), f"`config` {path}")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"`config`: cannot read {path}: {error}") from error
-    limits = [name.replace("-", "_") for name in (flag.name for flag in flags_of(Limits))]
-    known = ["engine", *ENGINE[1:], *_told(chosen), *limits]
-    values = {key.replace("-", "_"): value for key, value in whole.items()}
+    return {key.replace("-", "_"): value for key, value in whole.items()}
+
+
+def _ros_args(text: str, chosen: Transport[Any], given: Mapping[str, Any]) -> Sorted:
+    """Read --ros-args, which rename the node that is ``given`` otherwise, and say what is left out."""
+    if not text:
+        return {}, {}, {}
+    if chosen.name != "ros":
+        raise UsageError(f"`ros_args` are for serve ros, not for serve {chosen.name}")
+    node = {name: given.get(name, getattr(_as_served(chosen)(), name)) for name in ("namespace", "node_name")}
+    read = read_ros_args(text, _known(chosen), node)
+    for note in read.notes:
+        typer.echo(f"--ros-args: {note}", err=True)
+    return _sorted(read.options, "`ros_args`", chosen)
+
+
+def _known(chosen: Transport[Any]) -> list[str]:
+    """Return the names of all options of a server, as a file has them."""
+    limits = [flag.name.replace("-", "_") for flag in flags_of(Limits)]
+    return ["engine", *ENGINE[1:], *_told(chosen), *limits]
+
+
+def _sorted(values: Mapping[str, Any], where: str, chosen: Transport[Any]) -> Sorted:
+    """Return options of the engine, of the transport, and limits; raises UsageError naming the key."""
+    known = _known(chosen)
     for name, value in values.items():
         if name not in known:
-            raise UsageError(f"`config` {path}: '{name}' is none of {', '.join(known).replace('_', '-')}")
+            raise UsageError(f"{where}: '{name}' is none of {', '.join(known).replace('_', '-')}")
         if isinstance(value, bool) and chosen.options.model_fields.get(name, _NUMBER).annotation is not bool:
-            raise UsageError(f"`config` {path}: {name} = {value} should be a number or a text")
+            raise UsageError(f"{where}: {name} = {value} should be a number or a text")
     of_engine = placed(EngineConfig, {name: value for name, value in values.items() if name in places(EngineConfig)})
     of_transport = {name: value for name, value in values.items() if name in _told(chosen)}
-    of_limits = placed(Limits, {name: value for name, value in values.items() if name in limits})
+    of_limits = placed(Limits, {name: value for name, value in values.items() if name in places(Limits)})
     try:
         EngineConfig(**of_engine)
         chosen.options(**of_transport)
         Limits(**of_limits)
     except UsageError as error:
-        raise UsageError(f"`config` {path}: {error}") from error
+        raise UsageError(f"{where}: {error}") from error
     return of_engine, of_transport, of_limits
 
 

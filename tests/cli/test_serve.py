@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import httpx
@@ -222,3 +223,52 @@ def test_latency_drives_a_node_that_runs_already(start: Start, tmp_path: Path) -
     assert (samples["n_tokens"] == 4).all()
     assert samples["server_ns"].notna().all()
     assert samples["e2e_without_inference_ns"].isna().all()
+
+
+def test_ros_args_name_the_node_its_topics_and_its_parameters(start: Start, dds_domain: int, tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_text("/robot/brain:\n  ros__parameters: {max_tokens: 3, feedback_interval: 0.0}\n")
+    rules = ["-r", "__ns:=/robot", "-r", "__node:=brain", "-r", "generate_response:=/ask", "-r", "token:=words"]
+    process, line = start(
+        "ros", "--engine", "echo", "--camera-topic", "/front/image", "--ros-args", *rules,
+        "--params-file", str(tmp_path / "robot.yaml"), "-p", "use_sim_time:=false", "--", "--max-waiting", "7"
+    )  # fmt: skip
+    assert f"action /ask, camera /front/image, in DDS domain {dds_domain}" in line
+    middleware = open_middleware(domain_id=dds_domain)
+    try:
+        type_name = "rcl_interfaces/srv/GetParameters"
+        client = middleware.service_client("/robot/brain/get_parameters", type_name)
+        asked = ros.default(type_name + "_Request", names=["max_tokens", "max_waiting", "engine"])
+        values = client.call(asked, 20).values
+        assert [value.integer_value for value in values[:2]] == [3, 7]
+        assert values[2].string_value == "echo"
+        plotted = middleware.subscription("/robot/words", ros.TOKEN, QoS(0))
+        action = open_client(replace(wiring("ros/action", action="/ask", domain_id=dds_domain), black_box=True))
+        try:
+            tokens, _ = ask(action, Request("a", "one two three four five", max_tokens=20))
+        finally:
+            action.close()
+        assert len(tokens) == 3
+        assert plotted.take(20) is not None
+    finally:
+        middleware.close()
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["http", "--ros-args", "-r", "a:=b"], "--ros-args are for serve ros, not for serve http"),
+        (["ros", "--ros-args", "-r", "a:=b c"], "--remap: 'a:=b c' should look like from:=to"),
+        (["ros", "--ros-args", "-p", "qos:=fast"], "--ros-args: --qos: 'fast'"),
+        (["ros", "--ros-args", "-p", "max_tokens:=true"], "--ros-args: max_tokens = True should be a number"),
+        (["ros", "--ros-args", "-r", "__ns:=robot"], "--namespace: 'robot' should look like /name"),
+        (["ros", "--ros-args", "-r", "__node:=a/b"], "--node-name"),
+    ],
+)
+def test_ros_args_that_are_none_are_one_line(arguments: list[str], message: str) -> None:
+    command = [sys.executable, "-m", "s2a_bench", "serve", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1

@@ -107,12 +107,12 @@ class Ros(Transport[RosOptions]):
 
     def ready(self, wiring: Wiring[RosOptions], address: str) -> str:
         """Return the names of action and camera."""
-        from s2a_bench.transport.ros.joining import domain_of
+        from s2a_bench.transport.ros.camera import CAMERA
+        from s2a_bench.transport.ros.joining import domain_of, remapped
 
-        return (
-            f"serving action {address}/generate_response, camera {address}/camera/image_raw, "
-            f"in DDS domain {domain_of(wiring)}"
-        )
+        names = remapped(wiring)
+        action, camera = (names.get(name, name) for name in (f"{address}/generate_response", address + CAMERA))
+        return f"serving action {action}, camera {camera}, in DDS domain {domain_of(wiring)}"
 
 
 ROS = Ros()

@@ -11,7 +11,9 @@ from s2a_bench.ros import Middleware, QoS, Tuning, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE
+from s2a_bench.ros.remap import Remapped, table
 from s2a_bench.transport import Wiring
+from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA
 from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
 MATCH_TIMEOUT_S = 15.0
@@ -40,7 +42,18 @@ def join(wiring: Wiring[RosOptions], role: str) -> Middleware:
     """Join the wiring's domain as the node ``<namespace>/<role>``, the server under its own name."""
     tuning: Tuning = wiring.options.dds_tuning
     name = server_name(wiring) if role == "server" else f"{namespace_of(wiring)}/{role}"
-    return open_middleware(wiring.options.middleware, domain_id=domain_of(wiring), tuning=tuning, node_name=name)
+    joined = open_middleware(wiring.options.middleware, domain_id=domain_of(wiring), tuning=tuning, node_name=name)
+    names = remapped(wiring)
+    return Remapped(joined, names) if names else joined
+
+
+def remapped(wiring: Wiring[RosOptions]) -> dict[str, str]:
+    """Return absolute name -> what stands for it."""
+    rules, camera = wiring.options.remap, wiring.options.camera_topic
+    if camera:
+        below = COMPRESSED_CAMERA.removeprefix(CAMERA)
+        rules = (*rules, f"{CAMERA[1:]}:={camera}", f"{COMPRESSED_CAMERA[1:]}:={camera}{below}")
+    return table(rules, server_name(wiring))
 
 
 def wait_until(arrived: Callable[[], bool], alive: Callable[[], bool], what: str) -> None:

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import field_validator
 
-from s2a_bench.options import option
+from s2a_bench.options import Names, option
 from s2a_bench.transport.options import SERVER, SERVING, Options
 
 NAMESPACE = "/s2a_bench"
@@ -48,13 +48,27 @@ class RosOptions(Options):
         0.0, "seconds: tokens that come faster share a feedback", ge=0, le=60, side=SERVING
     )
     publish_tokens: bool = option(False, "also publish the tokens of goals, for plotting", side=SERVING)
+    camera_topic: str = option(
+        "", "the camera's topic; compressed pictures come below it [default: NAMESPACE/camera/image_raw]", side=SERVING
+    )
+    remap: Names = option((), "topics, services and actions by other names, as FROM:=TO", side=SERVING)
     node_name: str = option("server", "name of the node, below the namespace", side=SERVING, pattern=BASE_NAME)
     node_api: bool = option(False, "have parameters, /rosout and /diagnostics, as ROS 2 nodes do", side=SERVING)
     log_level: Literal["debug", "info", "warn", "error", "fatal"] = option(
         "info", "what /rosout tells: debug, info, warn, error, fatal", side=SERVING
     )
 
-    @field_validator("namespace", "action")
+    @field_validator("remap")
+    @classmethod
+    def _are_rules(cls, rules: tuple[str, ...]) -> tuple[str, ...]:
+        from s2a_bench.ros.remap import RULE
+
+        for rule in rules:
+            if not RULE.fullmatch(rule):
+                raise ValueError(f"'{rule}' should look like from:=to, both names as name, name/name, /name or ~/name")
+        return rules
+
+    @field_validator("namespace", "action", "camera_topic")
     @classmethod
     def _is_a_name(cls, text: str) -> str:
         if text and not NAME.fullmatch(text):

@@ -1,0 +1,174 @@
+"""``--ros-args`` as every ROS 2 node takes them: they become options of `serve ros`.
+
+Of a file of parameters the sections count that are for our node, ``/**`` and other wildcards included; there, names
+that are none of ours are another node's and left out.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from s2a_bench.errors import UsageError
+
+FLAG: Final = "--ros-args"
+END: Final = "--"
+VALUED: Final = {
+    "-r": "remap",
+    "--remap": "remap",
+    "-p": "param",
+    "--param": "param",
+    "--params-file": "params_file",
+    "--log-level": "log_level",
+}
+QUIET: Final = re.compile("--(en|dis)able-(rosout|stdout|external-lib)-logs")
+"""What is understood and left out: our log goes to /rosout and, from warnings on, to stderr."""
+SIM_TIME: Final = "use_sim_time"
+OF_EVERY_NODE: Final = frozenset({SIM_TIME, "start_type_description_service"})
+"""Parameters that launch files give every node."""
+PARAMETERS: Final = "ros__parameters"
+
+
+def folded(arguments: Sequence[str]) -> list[str]:
+    """Return a command line with what stands between ``--ros-args`` and ``--`` or the end as one value of that flag."""
+    ordinary: list[str] = []
+    ours: list[str] | None = None
+    inside = False
+    for argument in arguments:
+        if not inside and argument == FLAG:
+            inside, ours = True, ours or []
+        elif inside and argument == END:
+            inside = False
+        elif inside and ours is not None:
+            ours.append(argument)
+        else:
+            ordinary.append(argument)
+    return ordinary if ours is None else [*ordinary, f"{FLAG}={shlex.join(ours)}"]
+
+
+@dataclass(slots=True)
+class Read:
+    """What the arguments say."""
+
+    options: dict[str, Any] = field(default_factory=dict)
+    """Parameters of our node: what `serve ros` has as options."""
+    notes: list[str] = field(default_factory=list)
+    """Lines about what was left out."""
+
+
+def read(text: str, known: Sequence[str], node: Mapping[str, str]) -> Read:
+    """Read the arguments for a node with ``known`` parameters; ``node`` has its namespace and node_name so far.
+
+    Raises UsageError for what is none, and for parameters that the node does not have.
+    """
+    found = Read()
+    given = list(_given(shlex.split(text)))
+    rules = [rule for kind, value in given if kind == "remap" if (rule := _pair(value, "-r", node["node_name"]))]
+    renamed = {"__ns": "namespace", "__node": "node_name", "__name": "node_name"}
+    found.options = {renamed[source]: target for source, target in rules if source in renamed}
+    if remaps := [f"{source}:={target}" for source, target in rules if source not in renamed]:
+        found.options["remap"] = remaps
+    name = "{namespace}/{node_name}".format_map({**node, **found.options})
+    for kind, value in given:
+        if kind == "param":
+            if pair := _pair(value, "-p", node["node_name"]):
+                _take(found, {pair[0]: _yaml(pair[1], f"-p {value}")}, known, "-p")
+        elif kind == "params_file":
+            _read_file(found, Path(value), known, name)
+        elif kind == "log_level":
+            found.options["log_level"] = value.rpartition(":=")[2].lower()
+    return found
+
+
+def _given(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yield kind and value of each argument."""
+    rest = iter(arguments)
+    for argument in rest:
+        if QUIET.fullmatch(argument):
+            continue
+        if argument not in VALUED:
+            raise UsageError(f"`ros_args`: {argument} is none of {', '.join(VALUED)}; {END} ends them")
+        value = next(rest, None)
+        if value is None:
+            raise UsageError(f"`ros_args`: {argument} needs a value")
+        yield VALUED[argument], value
+
+
+def _pair(text: str, flag: str, node_name: str) -> tuple[str, str] | None:
+    """Return both sides of ``[node:]left:=right``; None where it is for a node of another name."""
+    left, assigned, right = text.partition(":=")
+    if not (assigned and left and right):
+        raise UsageError(f"`ros_args`: {flag} {text} should look like {'from:=to' if flag == '-r' else 'name:=value'}")
+    of_node, separated, name = left.rpartition(":")
+    return None if separated and of_node != node_name else (name, right)
+
+
+def _take(found: Read, values: Mapping[str, Any], known: Sequence[str], where: str, *, shared: bool = False) -> None:
+    """Keep parameters; raises UsageError for unknown ones, unless they are ``shared`` with other nodes."""
+    for name, value in values.items():
+        if name in OF_EVERY_NODE:
+            if name == SIM_TIME and value is True:
+                found.notes.append(f"{SIM_TIME} is left out: this node's clock is the system's")
+        elif name in known:
+            found.options[name] = value
+        elif shared:
+            found.notes.append(f"{where}: {name} is no parameter of this node and left out")
+        else:
+            raise UsageError(f"`ros_args` {where}: '{name}' is none of {', '.join(known)}")
+
+
+def _read_file(found: Read, path: Path, known: Sequence[str], node_name: str) -> None:
+    """Keep what a file has for our node."""
+    try:
+        whole = _yaml(path.read_text(encoding="utf-8"), f"--params-file {path}")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"`ros_args`: cannot read --params-file {path}: {error}") from error
+    sections = list(_sections(whole, ""))
+    if not sections:
+        raise UsageError(f"`ros_args`: --params-file {path} has no '{PARAMETERS}'")
+    ours = [(pattern, values) for pattern, values in sections if _means(pattern, node_name)]
+    for pattern, values in ours:
+        _take(found, dict(_flat(values, "")), known, f"--params-file {path}, {pattern}", shared="*" in pattern)
+    if not ours:
+        listed = ", ".join(pattern for pattern, _ in sections)
+        found.notes.append(f"--params-file {path} has nothing for {node_name}, only for {listed}")
+
+
+def _sections(tree: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield (node pattern, parameters) of a file, whose keys may nest."""
+    for key, inner in tree.items() if isinstance(tree, dict) else ():
+        if key == PARAMETERS:
+            yield path, inner
+        else:
+            yield from _sections(inner, f"{path}/{str(key).strip('/')}")
+
+
+def _means(pattern: str, node_name: str) -> bool:
+    """Whether a pattern means a node: * stands for one part of its name, ** for any number."""
+    parts = ({"**": "(/[^/]+)*", "*": "/[^/]+"}.get(part, "/" + re.escape(part)) for part in pattern.split("/") if part)
+    return re.fullmatch("".join(parts), node_name) is not None
+
+
+def _flat(tree: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield parameters, those that nest with dots between their names."""
+    for key, value in tree.items() if isinstance(tree, dict) else ():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value
+
+
+def _yaml(text: str, where: str) -> Any:
+    """Read YAML; raises UsageError."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except (YAMLError, ValueError, RecursionError) as error:
+        said = str(error).splitlines() or [""]
+        raise UsageError(f"`ros_args`: {where} is no YAML: {said[0]}") from error
