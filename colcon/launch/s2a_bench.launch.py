@@ -11,9 +11,16 @@ ARGUMENTS = {
     "camera": ("v4l2", "v4l2: a camera by v4l2_camera; test: moving pictures of image_tools; none: one runs already"),
     "device": ("/dev/video0", "the camera of camera:=v4l2"),
     "namespace": ("/llama", "where our node answers; frames come on <namespace>/camera/image_raw"),
+    "node_name": ("server", "name of our node, below the namespace"),
     "engine": ("llama", "llama or echo"),
+    "params_file": ("", "a file of parameters, as every ROS 2 node takes it"),
     "arguments": ("", "more for `s2a-bench serve ros`, as one string"),
 }
+
+
+def _flag(name: str) -> str:
+    """Return how our command line spells an argument."""
+    return f" --{name.replace('_', '-')} "
 
 
 def _if_camera(name: str) -> IfCondition:
@@ -46,11 +53,14 @@ def generate_launch_description() -> LaunchDescription:
         remappings=[("image", image_topic)],
         condition=_if_camera("test"),
     )
-    # no Node: that would append --ros-args, which is not for our command line; the shell splits `arguments`
+    # no Node: its arguments are a list, and `arguments` is one string, which the shell splits
     program = ExecutableInPackage("s2a-bench", "s2a_bench")
-    flags = [" --namespace ", value["namespace"], " --engine ", value["engine"], " ", value["arguments"]]
+    flags = [piece for name in ("namespace", "node_name", "engine") for piece in (_flag(name), value[name])]
+    file = value["params_file"]
+    ros_args = PythonExpression(["'--ros-args --params-file \"", file, "\"' if '", file, "' else ''"])
     node = ExecuteProcess(  # noqa: S604 - the user's own words
-        cmd=[["exec ", program, " serve ros", *flags]],
+        cmd=[["exec ", program, " serve ros", *flags, " ", value["arguments"], " ", ros_args]],
+        name="s2a_bench",
         shell=True,
         output="screen",
         on_exit=Shutdown(),

@@ -39,7 +39,7 @@ def folded(arguments: Sequence[str]) -> list[str]:
     ours: list[str] | None = None
     inside = False
     for argument in arguments:
-        if not inside and argument == FLAG:
+        if argument == FLAG:
             inside, ours = True, ours or []
         elif inside and argument == END:
             inside = False

@@ -31,6 +31,7 @@ def file(tmp_path: Path) -> Path:
         ("serve ros --ros-args -r a:=b", "serve ros '--ros-args=-r a:=b'"),
         ("serve ros --ros-args -r a:=b -- --qos reliable", "serve ros --qos reliable '--ros-args=-r a:=b'"),
         ("serve ros --ros-args -r a:=b -- x --ros-args -p c:=d", "serve ros x '--ros-args=-r a:=b -p c:=d'"),
+        ("serve ros --ros-args -r a:=b --ros-args -p c:=d", "serve ros '--ros-args=-r a:=b -p c:=d'"),
         ("serve ros --ros-args", "serve ros --ros-args="),
     ],
 )

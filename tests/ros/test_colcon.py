@@ -121,7 +121,9 @@ def test_the_launch_file_starts_a_camera_and_the_node(monkeypatch: pytest.Monkey
         "camera": "v4l2",
         "device": "/dev/video0",
         "namespace": "/llama",
+        "node_name": "server",
         "engine": "llama",
+        "params_file": "",
         "arguments": "",
     }
     assert [(camera.kwargs["package"], camera.kwargs["executable"]) for camera in (v4l2, test)] == [
@@ -144,4 +146,10 @@ def test_the_launch_file_starts_a_camera_and_the_node(monkeypatch: pytest.Monkey
     ((command,),) = (node.kwargs["cmd"],)
     program, *rest = command[1:]
     assert program.args == ("s2a-bench", "s2a_bench")
-    assert "".join(map(text, rest)) == " serve ros --namespace <namespace> --engine <engine> <arguments>"
+    assert "".join(map(text, rest)) == (
+        " serve ros --namespace <namespace> --node-name <node_name> --engine <engine> <arguments> "
+        "'--ros-args --params-file \"<params_file>\"' if '<params_file>' else ''"
+    )
+    assert node.kwargs["name"] == "s2a_bench"
+    depends = {each.text for each in manifest("s2a_bench").iter("exec_depend")}
+    assert {camera.kwargs["package"] for camera in (v4l2, test)} | {"launch", "launch_ros"} <= depends
