@@ -32,6 +32,10 @@ class Frame:
     data: Pixels
 
 
+Sampling: TypeAlias = "tuple[tuple[str, float], ...]"
+"""What a client wants of sampling: llama.cpp's names of numbers, and their values; engines ignore what they cannot."""
+
+
 @dataclass(frozen=True, slots=True)
 class Request:
     """One question to a model: a prompt about zero or more pictures.
@@ -46,6 +50,7 @@ class Request:
     max_tokens: int = 32
     grammar: str = ""
     seed: int = 0
+    sampling: Sampling = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.facts import PREPROCESS_MS
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
-from s2a_bench.inference import Engine, EngineConfig, open_engine
+from s2a_bench.inference import Engine, EngineConfig, honoured_by, open_engine
 from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
 from s2a_bench.provenance import Provenance
 from s2a_bench.trace import Trace
@@ -115,7 +115,7 @@ def main() -> int:
         keeps = job.tuned and keep_large_blocks()
         engine = open_engine(job.engine)
         handler = engine_handler(engine, pixels=job.pixels, limits=job.wiring.limits)
-        handler.settings = job.engine
+        handler.settings, handler.honours = job.engine, honoured_by(job.engine.name)
         server = open_server(job.wiring, handler)
     except S2AError as error:
         print(json.dumps({"error": str(error), "kind": type(error).__name__}), file=answers, flush=True)

@@ -96,6 +96,11 @@ def told_by(name: str) -> Sequence[Fact]:
     return getattr(ENGINES[name], "tells", ())
 
 
+def honoured_by(name: str) -> Sequence[str]:
+    """Return the names in `Request.sampling` that an engine honours."""
+    return getattr(ENGINES[name], "honours", ())
+
+
 def default_engine(say: Callable[[str], None]) -> str:
     """Return llama where it is installed, else echo, and ``say`` so."""
     if extras.installed("llama_cpp"):

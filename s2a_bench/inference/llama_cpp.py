@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import ctypes
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import version
 from typing import Any
 
@@ -29,7 +29,14 @@ from s2a_bench.inference.grammar_limits import beyond_limits
 from s2a_bench.inference.llama_decode import GreedySampler, Sampler, TokenBatch, TokenBytes
 from s2a_bench.inference.llama_gbnf import GrammarSampler, grammar_error
 from s2a_bench.inference.llama_pictures import PixelHandler
-from s2a_bench.inference.llama_settings import FLASH_ATTENTION, KV_TYPES, SAMPLINGS
+from s2a_bench.inference.llama_settings import (
+    FLASH_ATTENTION,
+    KV_TYPES,
+    LAST_N,
+    PENALTY_LAST_N,
+    SAMPLER_ARGUMENTS,
+    SAMPLINGS,
+)
 from s2a_bench.inference.models import ModelFiles, load_headers, sha256
 from s2a_bench.types import Request, Token
 
@@ -62,11 +69,17 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
     def context_params(self, params: Any) -> None:
         self._context_params = params
 
-    def sampler(self, name: str, grammar: str) -> Sampler:
-        """Build the library's chain of samplers, and let a grammar judge what comes out of it."""
-        if name == "greedy" and not grammar:
+    def sampler(self, name: str, grammar: str, wanted: Mapping[str, float]) -> Sampler:
+        """Build the library's chain of samplers, and let a grammar judge what comes out of it.
+
+        ``wanted`` replaces what ``name`` says.
+        """
+        if name == "greedy" and not grammar and not wanted:
             return GreedySampler(self._n_vocab)
-        chain: Sampler = self._init_sampler(**SAMPLINGS[name])
+        last_n = int(wanted.get(PENALTY_LAST_N, LAST_N))
+        self.last_n_tokens_size = self.n_ctx() if last_n < 0 else last_n
+        told = {SAMPLER_ARGUMENTS[key]: value for key, value in wanted.items() if key in SAMPLER_ARGUMENTS}
+        chain: Sampler = self._init_sampler(**SAMPLINGS[name] | told)
         return GrammarSampler(chain, self._model.vocab, grammar, self._candidates) if grammar else chain
 
     def eval(self, tokens: list[int]) -> None:
@@ -159,7 +172,7 @@ class LlamaCppEngine:
         ignore_end = self._files.dummy and not request.grammar  # random weights end at random, counts should not
         decode = codecs.getincrementaldecoder("utf-8")("replace").decode
         llama.set_seed(request.seed & 0x7FFF_FFFF)  # 2**32-1 would mean a random seed
-        sampler = llama.sampler(self._config.sampling, request.grammar)
+        sampler = llama.sampler(self._config.sampling, request.grammar, dict(request.sampling))
         ids = self._batch.answer(llama._ctx, sampler, len(llama.prompt))  # noqa: SLF001
         count, last_ns, pieces = 0, prompt_done, self._pieces
         try:

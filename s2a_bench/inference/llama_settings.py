@@ -15,4 +15,16 @@ SAMPLINGS: dict[str, dict[str, float]] = {
 """``model`` is that of llama.cpp's ``README-minicpmv2.6.md``, without the penalty on repetition, which breaks
 structured output; ``greedy`` takes the likeliest token."""
 
+PENALTY_LAST_N, LAST_N = "penalty_last_n", 64
+"""Of how many last tokens repetition is punished: its name in `Request.sampling`, and what it is unless told."""
+
+SAMPLER_ARGUMENTS = {
+    **{name: name for name in ("temp", "top_k", "top_p", "min_p", "typical_p", "mirostat_eta", "mirostat_tau")},
+    "mirostat": "mirostat_mode",
+    "penalty_repeat": "repeat_penalty",
+    "penalty_freq": "frequency_penalty",
+    "penalty_present": "presence_penalty",
+}
+"""Name in `Request.sampling` -> the library's name."""
+
 LEAST_CONTEXT, LEAST_BATCH, LARGEST = 256, 32, 1 << 20

@@ -18,6 +18,7 @@ from typing import Any
 from s2a_bench.errors import EngineError
 from s2a_bench.facts import LLAMA
 from s2a_bench.inference import Engine, EngineConfig
+from s2a_bench.inference.llama_settings import PENALTY_LAST_N, SAMPLER_ARGUMENTS
 from s2a_bench.types import Request, Token
 
 AHEAD = 8
@@ -126,6 +127,7 @@ class Llama(OneThreadEngine):
     """The llama engine, on a thread of its own."""
 
     tells = LLAMA
+    honours = (*SAMPLER_ARGUMENTS, PENALTY_LAST_N)
 
     def __init__(self, config: EngineConfig) -> None:
         """Load the model."""

@@ -9,7 +9,7 @@ From its arrival a request has `Limits.answer_s`: then its wait, or its answer a
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Collection, Generator, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
 from contextlib import closing
@@ -154,6 +154,8 @@ class Queued:
         self.turns = Turns(limits)
         self.settings: Options | None = None
         """What the engine was told, where whoever made this says so: a node's parameters have it."""
+        self.honours: Collection[str] = ()
+        """The names in `Request.sampling` that the engine honours."""
         self.provenance = dict(provenance or {})
         self._answering = answering
 

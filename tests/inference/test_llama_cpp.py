@@ -14,6 +14,7 @@ from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.llama_gbnf import GrammarSampler
 from s2a_bench.inference.llama_pictures import Steps, mtmd_cpp
 from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
+from s2a_bench.transport.ros.sampling import BOUNDS
 from s2a_bench.types import Frame, Request
 
 PLAN = r"""
@@ -50,6 +51,23 @@ def test_a_dummy_always_writes_max_tokens(shared: LlamaCppEngine) -> None:
 
 def test_seeds_differ(shared: LlamaCppEngine) -> None:
     assert len({text(shared, seed=seed, max_tokens=16) for seed in range(4)}) == 4
+
+
+def test_what_a_request_wants_of_sampling_replaces_the_engines_own(shared: LlamaCppEngine) -> None:
+    coldest = [text(shared, seed=seed, sampling=(("temp", 0.0),)) for seed in (1, 2)]
+    assert coldest[0] == coldest[1]
+    assert text(shared, seed=1) != coldest[0]
+    assert text(shared, seed=1, sampling=(("top_k", 1),)) == coldest[0]
+    assert text(shared, seed=1, sampling=(("temp", 0.0), ("penalty_repeat", 50.0))) != coldest[0]
+
+
+@pytest.mark.parametrize("end", [0, 1])
+def test_extremes_of_sampling_are_answered(shared: LlamaCppEngine, end: int) -> None:
+    for name, bounds in BOUNDS.items():
+        assert text(shared, sampling=((name, bounds[end]),))
+    for mode in (1, 2):
+        wanted = (("mirostat", mode), ("mirostat_tau", BOUNDS["mirostat_tau"][end]), ("penalty_last_n", -1))
+        assert text(shared, sampling=wanted)
 
 
 def test_the_grammar_is_obeyed_and_ends_the_answer(shared: LlamaCppEngine) -> None:

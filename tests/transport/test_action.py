@@ -23,6 +23,7 @@ from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, t
 from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Wiring, open_client, open_server
+from s2a_bench.transport.turns import Queued
 from s2a_bench.types import Request, Token
 
 NODE = "/llama_ros/generate_response"
@@ -183,6 +184,32 @@ def test_our_server_stops_at_a_stop_word_and_borrows_no_seed(dds_domain: int) ->
         assert result.response.text == "one two three "
         np.testing.assert_array_equal(result.response.tokens, [7, 8, 9])
         assert handler.requests[0].seed == 0
+    finally:
+        middleware.close()
+        server.stop()
+        thread.join()
+
+
+def test_what_a_goal_wants_of_sampling_reaches_the_engine_or_fails_it(dds_domain: int) -> None:
+    recorder = Recorder(["x"])
+    handler = Queued.around(recorder)
+    handler.honours = ("temp",)
+    told = wiring("ros/action", "/test_sampling", domain_id=dds_domain)
+    server = open_server(told, handler)
+    thread = Thread(target=server.serve)
+    thread.start()
+    middleware = open_middleware(domain_id=dds_domain)
+    client = middleware.action_client("/test_sampling/generate_response", GENERATE_RESPONSE)
+    try:
+        assert client.wait_for_server(20)
+        ends = []
+        for wish in ({"temp": 0.25, "top_k": 3}, {"temp": -1.0}):
+            client.send(client.pack(generate_goal("p", **wish)))
+            while not isinstance(event := client.next_event(20), Result):
+                assert event is not None
+            ends.append((event.status, client.unpack_result(event.packed).response.text))
+        assert ends == [(Status.SUCCEEDED, "x"), (Status.ABORTED, "sampling_config.temp: -1 is not 0 to 100")]
+        assert [request.sampling for request in recorder.requests] == [(("temp", 0.25),)]
     finally:
         middleware.close()
         server.stop()

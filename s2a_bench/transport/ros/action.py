@@ -7,7 +7,7 @@ client cancels it after the last token that it wants; our own server has a limit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from threading import Lock
 from typing import Any
 
@@ -32,6 +32,7 @@ from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
+from s2a_bench.transport.ros.sampling import Wishes
 from s2a_bench.transport.ros.wire import (
     PROVENANCE_TOPIC,
     READER_QOS,
@@ -192,11 +193,18 @@ class GenerateClient:
 class ActionFront:
     """The server's side of the variant."""
 
-    def __init__(self, middleware: Middleware, wiring: Wiring[RosOptions], cache: CameraCache) -> None:
-        """Offer the action and create the topics."""
+    def __init__(
+        self,
+        middleware: Middleware,
+        wiring: Wiring[RosOptions],
+        cache: CameraCache,
+        honoured: Collection[str] = (),
+    ) -> None:
+        """Offer the action and create the topics; ``honoured`` are the engine's names in `Request.sampling`."""
         namespace, options = namespace_of(wiring), wiring.options
         self.cache = cache
         self._wiring = wiring
+        self.wishes = Wishes(honoured, ros.DEFAULT_VERSION)
         self.tune(options)
         self._server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE, options.result_timeout)
         self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS)
@@ -271,6 +279,7 @@ class GenerateJob:
             self._started = at_once and goal.executing()
             trace.mark("accept")
             images = tuple(picture_of(image, trace, front.cache.limits) for image in goal_images(message))
+            wishes = front.wishes.of(message.sampling_config)
         except Exception as error:  # noqa: BLE001 - the goal is accepted, so it has to end, whatever broke
             self._error = str(error) or type(error).__name__
             return
@@ -283,6 +292,7 @@ class GenerateJob:
             max_tokens=front.max_tokens,
             grammar=sampling.grammar,
             seed=0 if seed == NO_SEED else seed,
+            sampling=wishes,
         )
 
     def token(self, token: Token) -> bool:

@@ -94,7 +94,7 @@ class RosServer:
             refuse_company(wiring, self.address)
         self.middleware = join(wiring, "server")
         self._cache = CameraCache(self.middleware, self.address, wiring.options.qos, wiring.limits)
-        self._action = ActionFront(self.middleware, wiring, self._cache)
+        self._action = ActionFront(self.middleware, wiring, self._cache, self._queued.honours)
         self._fronts: list[Front] = [TopicFront(self.middleware, self.address, self._cache), self._action]
         self._origin = self.middleware.publisher(  # kept: what is latched goes with its writer
             self.address + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
