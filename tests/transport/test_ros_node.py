@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from s2a_bench.clock import now_ns
+from s2a_bench.errors import RequestFailed
 from s2a_bench.inference import EngineConfig
 from s2a_bench.ros import Middleware, QoS, Subscription, open_middleware
 from s2a_bench.ros import messages as ros
@@ -90,6 +91,7 @@ def test_a_limit_can_be_set_while_it_runs_and_everybody_hears(peer: Middleware, 
     deadline = now_ns() + int(WAIT_S * 1e9)
     while not events.matched():
         assert now_ns() < deadline
+    call(peer, "ListParameters")  # once that is answered, the server has found the subscription too
     wanted = {"max_tokens": 3, "feedback_interval": 0.25, "namespace": "/other"}
     parameters = [ros.default(PARAMETER, name=name, value=value_message(value)) for name, value in wanted.items()]
     results = call(peer, "SetParameters", parameters=parameters).results
@@ -131,6 +133,19 @@ def test_diagnostics_tell_of_requests_and_the_camera(peer: Middleware, stack: Ex
     assert camera.name == "behaves/brain: camera"
     assert float(values_of(camera)["frame_age_s"]) >= 0
     assert requests.hardware_id
+
+
+def test_a_request_that_cannot_be_prepared_is_a_failure(
+    server: RosServer, stack: ExitStack, dds_domain: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    client = open_client(wiring("ros/topic", "/behaves", domain_id=dds_domain))
+    stack.callback(client.close)
+    for _ in range(2):
+        with pytest.raises(RequestFailed):
+            ask(client, Request("a", "plan", max_tokens=0))
+    failures = [record.getMessage() for record in caplog.records if "a request failed" in record.getMessage()]
+    assert failures == ["a request failed: it could not be read or prepared"]
+    assert server._activity.failures == 2
 
 
 def values_of(status: Any) -> dict[str, str]:

@@ -9,6 +9,7 @@ from threading import Event, Thread
 from typing import Any, Final
 
 from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError
 from s2a_bench.options import Options
 from s2a_bench.ros import Middleware, QoS
 from s2a_bench.ros import messages as ros
@@ -149,7 +150,10 @@ class NodeApi:
     def _publish(self, stopped: Event) -> None:
         while not stopped.wait(PERIOD_S):
             message = diagnostic_array(self._name, self._findings(), time.time_ns())
-            self._diagnostics.send(self._diagnostics.pack(message))
+            try:
+                self._diagnostics.send(self._diagnostics.pack(message))
+            except TransportError as error:
+                _log.warning("no diagnostics this time: %s", error)
 
     def _tell(self, **lists: Sequence[Any]) -> None:
         """Publish a ParameterEvent."""

@@ -47,7 +47,8 @@ class Wishes:
 
     def of(self, config: Any) -> Sampling:
         """Return the wishes that the engine honours; raises RequestFailed for a number that makes no sense."""
-        wanted = [name for name, default in vars(self._defaults).items() if _differs(getattr(config, name), default)]
+        defaults = vars(self._defaults).items()
+        wanted = [name for name, default in defaults if _differs(getattr(config, name, default), default)]
         left_out = [name for name in wanted if name not in self._honoured and name not in self._said | ELSEWHERE]
         if left_out:
             self._said.update(left_out)

@@ -152,15 +152,20 @@ class RosServer:
         try:
             self._hold(size)
         except RequestFailed as error:
-            front.refuse(packed, str(error))
+            self._refuse(front, packed, error)
             return None
         try:
             turn = self._queued.turns.join()
         except Busy as error:
             self._hold(-size)
-            front.refuse(packed, str(error))
+            self._refuse(front, packed, error)
             return None
         return partial(self._answer_in, turn, front, packed, size, trace)
+
+    def _refuse(self, front: Front, packed: Any, error: RequestFailed) -> None:
+        """Tell who asked, and the log."""
+        self._activity.failed(str(error))
+        front.refuse(packed, str(error))
 
     def _hold(self, size: int) -> None:
         """Count what all requests hold; raises RequestFailed for one that is too large, or too large now."""
@@ -174,7 +179,10 @@ class RosServer:
     def _answer_in(self, turn: Turn, front: Front, packed: Any, size: int, trace: Trace) -> None:
         """Unpack a request, and answer it when its turn comes."""
         try:
-            if (job := front.job(packed, trace)) is not None:
+            job = front.job(packed, trace)
+            if job is None or job.request is None:
+                self._activity.failed("it could not be read or prepared")
+            if job is not None:
                 self._answer(job, turn)
         finally:
             turn.leave()
