@@ -107,8 +107,8 @@ def _ros_args(text: str, chosen: Transport[Any], given: Mapping[str, Any]) -> So
     """Read --ros-args, which rename the node that is ``given`` otherwise, and say what is left out."""
     if not text:
         return {}, {}, {}
-    if chosen.name != "ros":
-        raise UsageError(f"`ros_args` are for serve ros, not for serve {chosen.name}")
+    if "node_name" not in _told(chosen):
+        raise UsageError(f"`ros_args` are for ROS 2 nodes, not for serve {chosen.name}")
     node = {name: given.get(name, getattr(_as_served(chosen)(), name)) for name in ("namespace", "node_name")}
     read = read_ros_args(text, _known(chosen), node)
     for note in read.notes:

@@ -258,7 +258,7 @@ def test_ros_args_name_the_node_its_topics_and_its_parameters(start: Start, dds_
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["http", "--ros-args", "-r", "a:=b"], "--ros-args are for serve ros, not for serve http"),
+        (["http", "--ros-args", "-r", "a:=b"], "--ros-args are for ROS 2 nodes, not for serve http"),
         (["ros", "--ros-args", "-r", "a:=b c"], "--remap: 'a:=b c' should look like from:=to"),
         (["ros", "--ros-args", "-p", "qos:=fast"], "--ros-args: --qos: 'fast'"),
         (["ros", "--ros-args", "-p", "max_tokens:=true"], "--ros-args: max_tokens = True should be a number"),
