@@ -257,8 +257,8 @@ class Middleware(Protocol):
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Offer the service ``/x`` of ROS type ``pkg/srv/Name``; ``answer`` turns a request into its response.
 
-        All services of a node are answered by one thread of the middleware. A request that cannot be read, that is
-        larger than `REQUEST_BYTES`, or for which ``answer`` raises, is dropped and logged.
+        All services of a node are answered by one thread of the middleware. A request that cannot be read, or for
+        which ``answer`` raises, is dropped and logged; so is one of more than `REQUEST_BYTES`, where its size is known.
         """
         ...
 
