@@ -130,14 +130,14 @@ class TestTurns:
 
 
 class Slow:
-    """An engine that notes when requests end."""
+    """An engine that answers with as many tokens as the prompt says, and notes when requests end."""
 
     def __init__(self) -> None:
         self.facts: dict[str, float] = {}
         self.ended: list[str] = []
 
     def generate(self, request: Request) -> Iterator[Token]:
-        for index in range(request.max_tokens):
+        for index in range(int(request.prompt)):
             time.sleep(0.0005)
             yield Token(index, "a")
         self.ended.append(request.id)
@@ -173,7 +173,7 @@ class Accepting(Queued):
         yield from super().answer(request, trace, turn)
 
 
-@pytest.mark.parametrize("name", ["http/as-deployed", "http/binary", "ros/topic"])
+@pytest.mark.parametrize("name", ["http/as-deployed", "http/binary", "ros/topic", "ros/action"])
 def test_requests_end_in_the_order_of_their_acceptance(name: str) -> None:
     engine = Slow()
     accepting = Accepting(engine_handler(engine, pixels=False))
@@ -184,9 +184,9 @@ def test_requests_end_in_the_order_of_their_acceptance(name: str) -> None:
         lengths = random.Random(number)
         try:
             for turn in range(10):
-                request = Request(f"{number}-{turn}", "a", max_tokens=lengths.randint(1, 40))
-                tokens, trace = ask(client, request)
-                assert len(tokens) == request.max_tokens
+                length = lengths.randint(1, 40)
+                tokens, trace = ask(client, Request(f"{number}-{turn}", str(length), max_tokens=40))
+                assert len(tokens) == length
                 queued.append("queue" in budget(trace.chain()).stages_ns)
         finally:
             client.close()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack
-from threading import Event, active_count
+from random import Random
+from threading import Event, Thread, active_count
 from typing import Any
 
 import numpy as np
@@ -14,9 +16,10 @@ import pytest
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Rejected, Result, open_middleware
+from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Rejected, Result, Subscription, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.action import Status
+from s2a_bench.ros.action import STATUS_ARRAY, Status
+from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace
@@ -63,7 +66,7 @@ def goals(stranger: Middleware) -> Callable[[], Any]:
     return connect
 
 
-def test_a_goal_too_many_is_rejected_at_once(goals: Callable[[], Any]) -> None:
+def test_a_goal_too_many_is_rejected_at_once(goals: Callable[[], Any], capfd: pytest.CaptureFixture[str]) -> None:
     gate = Gate()
     queued = Queued.around(gate, Limits(waiting=1))
     with serving(queued, "ros/action"):
@@ -75,11 +78,60 @@ def test_a_goal_too_many_is_rejected_at_once(goals: Callable[[], Any]) -> None:
         until(lambda: queued.turns.waiting == 1)
         third = client.send(client.pack(generate_goal("go", [])))
         assert next_of(client, Rejected).goal_id == third
+        assert f"goal {third.hex()} rejected: 1 requests are waiting for the engine already" in capfd.readouterr().err
         gate.go.set()
         for goal_id in (first, second):
             client.cancel(goal_id)
         assert {next_of(client, Result).goal_id for _ in range(2)} == {first, second}
         until(lambda: queued.turns.silent_s() == 0)
+
+
+def test_goals_of_five_clients_wait_as_accepted_and_end_in_the_order_of_their_acceptance(stranger: Middleware) -> None:
+    go = Event()
+
+    def answer(request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        assert go.wait(60)
+        for index in range(int(request.prompt)):
+            yield Token(index, "a")
+
+    queued = Queued.around(answer)
+    with serving(queued, "ros/action") as address, ExitStack() as stack:
+        name = f"{address}/generate_response"
+        statuses = stranger.subscription(name + "/_action/status", STATUS_ARRAY, QoS(depth=0, latched=True))
+
+        clients = []  # kept: their endpoints go with them
+
+        def ten_goals(number: int) -> None:
+            lengths = Random(number)
+            middleware = open_middleware(domain_id=domain_id(os.environ), node_name=f"/client_{number}")
+            stack.callback(middleware.close)
+            client = middleware.action_client(name, GENERATE_RESPONSE)
+            clients.append(client)
+            assert client.wait_for_server(20)
+            for _ in range(10):
+                client.send(client.pack(generate_goal(str(lengths.randint(0, 20)), [])))
+
+        threads = [Thread(target=ten_goals, args=(number,)) for number in range(5)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+        until(lambda: queued.turns.waiting == 49)
+        seen: list[list[int]] = []
+        while [Status.EXECUTING] + [Status.ACCEPTED] * 49 not in seen:
+            seen.append(statuses_of(statuses))
+        go.set()
+        while [Status.SUCCEEDED] * 50 not in seen:
+            seen.append(statuses_of(statuses))
+    for listed in seen:
+        assert listed == sorted(listed, reverse=True), "a goal ended or started before one that was accepted earlier"
+
+
+def statuses_of(subscription: Subscription) -> list[int]:
+    """Return the next list of statuses, which is in the order of acceptance."""
+    packed = subscription.take(20)
+    assert packed is not None, "no status came"
+    return [entry.status for entry in subscription.unpack(packed).status_list]
 
 
 def test_a_goal_cancelled_while_it_waits_leaves_the_queue(goals: Callable[[], Any]) -> None:

@@ -7,8 +7,8 @@ client cancels it after the last token that it wants; our own server has a limit
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterator
-from threading import Lock
 from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
@@ -29,7 +29,7 @@ from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, t
 from s2a_bench.trace import Trace
 from s2a_bench.transport import CameraSink, Wiring
 from s2a_bench.transport.bounds import Bounds
-from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
+from s2a_bench.transport.ros.camera import POLL_S, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.sampling import Wishes
@@ -52,6 +52,7 @@ MEDIA_MARKER = "<__media__>"
 MARKS_TIMEOUT_S = 2.0
 NO_SEED = 2**32 - 1
 """SamplingConfig.seed of a client that does not care."""
+_log = logging.getLogger(__name__)
 
 
 class GenerateClient:
@@ -193,24 +194,16 @@ class GenerateClient:
 class ActionFront:
     """The server's side of the variant."""
 
-    def __init__(
-        self,
-        middleware: Middleware,
-        wiring: Wiring[RosOptions],
-        cache: CameraCache,
-        honoured: Collection[str] = (),
-    ) -> None:
+    def __init__(self, middleware: Middleware, wiring: Wiring[RosOptions], honoured: Collection[str] = ()) -> None:
         """Offer the action and create the topics; ``honoured`` are the engine's names in `Request.sampling`."""
         namespace, options = namespace_of(wiring), wiring.options
-        self.cache = cache
+        self.limits = wiring.limits
         self._wiring = wiring
         self.wishes = Wishes(honoured, ros.DEFAULT_VERSION)
         self.tune(options)
         self._server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE, options.result_timeout)
         self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS)
         self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if options.publish_tokens else None
-        self._active = 0
-        self._lock = Lock()
 
     def tune(self, options: RosOptions) -> None:
         """Follow the options that may change while it runs."""
@@ -222,25 +215,22 @@ class ActionFront:
         return self._server.next_goal(timeout_s)
 
     def job(self, packed: ServerGoal, trace: Trace) -> GenerateJob | None:
-        """Accept a goal and decode its pictures; one that cannot be read is rejected."""
+        """Unpack a goal; one that cannot be read is rejected."""
         try:
             goal = packed.unpack()
-        except S2AError:
-            packed.reject()
+        except S2AError as error:
+            self.refuse(packed, str(error))
             return None
         trace.mark("cdr_parse")
-        packed.accept()
-        with self._lock:
-            self._active += 1
-            alone = self._active == 1
-        return GenerateJob(self, packed, goal, trace, at_once=alone)  # from here on only `end` ends the goal
+        return GenerateJob(self, packed, goal, trace)
 
     def size_bytes(self, packed: ServerGoal) -> int:
         """Return the size of a goal."""
         return packed.size_bytes
 
-    def refuse(self, packed: ServerGoal, why: str) -> None:  # noqa: ARG002 - a rejection has no words
-        """Reject a goal."""
+    def refuse(self, packed: ServerGoal, why: str) -> None:
+        """Reject a goal; the reason goes to the log, as a rejection has no words."""
+        _log.warning("goal %s rejected: %s", packed.id.hex(), why)
         packed.reject()
 
     def plot(self, goal_id: str, token: Token) -> None:
@@ -250,8 +240,6 @@ class ActionFront:
 
     def ended(self, goal_id: str, trace: Trace) -> None:
         """Send a goal's marks, before its result."""
-        with self._lock:
-            self._active -= 1
         self._marks.send(self._marks.pack(marks_message(goal_id, trace.to_remote())))
 
     def interrupt(self) -> None:
@@ -260,14 +248,14 @@ class ActionFront:
 
 
 class GenerateJob:
-    """One goal. It is EXECUTING at once where no other is, else when its first token comes."""
+    """One goal: ACCEPTED while it waits, EXECUTING when its turn comes."""
 
-    def __init__(self, front: ActionFront, goal: ServerGoal, message: Any, trace: Trace, *, at_once: bool) -> None:
-        """Decode the pictures, or borrow the camera's newest frame where there are none."""
+    def __init__(self, front: ActionFront, goal: ServerGoal, message: Any, trace: Trace) -> None:
+        """Remember the goal."""
         self.trace = trace
-        self.request: Request | None = None
         self._front = front
         self._goal = goal
+        self._message = message
         self._id = goal.id.hex()
         self._stop = [text for text in message.stop if text]
         self._tokens: list[Token] = []
@@ -275,30 +263,42 @@ class GenerateJob:
         self._fed_ns = 0
         self._error = ""
         self._started = False
+
+    def accept(self) -> None:
+        """Accept the goal; from here on only `end` ends it."""
+        self._goal.accept()
+        self.trace.mark("accept")
+
+    def prepare(self) -> Request | None:
+        """Decode the pictures."""
+        message, limits = self._message, self._front.limits
         try:
-            self._started = at_once and goal.executing()
-            trace.mark("accept")
-            images = tuple(picture_of(image, trace, front.cache.limits) for image in goal_images(message))
-            wishes = front.wishes.of(message.sampling_config)
+            images = tuple(picture_of(image, self.trace, limits) for image in goal_images(message))
+            wishes = self._front.wishes.of(message.sampling_config)
         except Exception as error:  # noqa: BLE001 - the goal is accepted, so it has to end, whatever broke
             self._error = str(error) or type(error).__name__
-            return
+            return None
         sampling = message.sampling_config
         seed = getattr(sampling, "seed", NO_SEED)
-        self.request = Request(
+        return Request(
             id=self._id,
             prompt=message.prompt.replace(MEDIA_MARKER, ""),
-            images=images or front.cache.lend(trace),
-            max_tokens=front.max_tokens,
+            images=images,
+            max_tokens=self._front.max_tokens,
             grammar=sampling.grammar,
             seed=0 if seed == NO_SEED else seed,
             sampling=wishes,
         )
 
+    def start(self) -> bool:
+        """Let the goal be EXECUTING, unless a cancel came first."""
+        self._started = self._goal.executing()
+        self.trace.mark("accept")
+        return self._started
+
     def token(self, token: Token) -> bool:
         """Send a token as feedback; return False after a cancel or a stop word."""
-        self._started = self._started or self._goal.executing()
-        if not self._started or self._goal.cancel_requested:
+        if self._goal.cancel_requested:
             return False
         self._held.append(token.text)
         self._tokens.append(token)

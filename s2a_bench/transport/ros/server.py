@@ -2,13 +2,16 @@
 
 A front is one variant's way in. Its threads take turns in waiting for a request; the one that got it answers it
 while another waits, so that no request changes threads, and one that comes meanwhile waits for the engine (stage
-`queue`), not in the network. All fronts share one queue, which a request joins as it arrives.
+`queue`), not in the network. All fronts share one queue, which a request joins as it arrives: a front's lock is held
+until it has its place and who asked knows that, so requests are accepted, answered and ended in one order.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing
+from dataclasses import replace
 from functools import partial
 from threading import Event, Lock, Thread, current_thread
 from typing import Any, Protocol
@@ -38,8 +41,18 @@ class Job(Protocol):
     """One request on its way to the engine and back."""
 
     trace: Trace
-    request: Request | None
-    """None where it could not be prepared; then only `end` is called."""
+
+    def accept(self) -> None:
+        """Tell who asked that the request has its place in the queue."""
+        ...
+
+    def prepare(self) -> Request | None:
+        """Decode the pictures; None where that cannot be done: then only `end` is called."""
+        ...
+
+    def start(self) -> bool:
+        """Note that the request's turn has come; return whether the answer is still wanted."""
+        ...
 
     def token(self, token: Token) -> bool:
         """Send a token; return whether more are wanted."""
@@ -62,7 +75,7 @@ class Front(Protocol):
         ...
 
     def job(self, packed: Any, trace: Trace) -> Job | None:
-        """Unpack and prepare a request, marking each stage; None for what is none."""
+        """Unpack a request; None for what is none, of which who asked has been told."""
         ...
 
     def size_bytes(self, packed: Any) -> int:
@@ -78,6 +91,8 @@ class Front(Protocol):
         ...
 
 
+END_S = 5.0
+"""The longest that an answer's end waits for that of the answer before."""
 IDLE_WORKERS = 2
 """Threads of a front that wait for requests, one in the middleware; more are started while all others answer."""
 
@@ -94,8 +109,8 @@ class RosServer:
             refuse_company(wiring, self.address)
         self.middleware = join(wiring, "server")
         self._cache = CameraCache(self.middleware, self.address, wiring.options.qos, wiring.limits)
-        self._action = ActionFront(self.middleware, wiring, self._cache, self._queued.honours)
-        self._fronts: list[Front] = [TopicFront(self.middleware, self.address, self._cache), self._action]
+        self._action = ActionFront(self.middleware, wiring, self._queued.honours)
+        self._fronts: list[Front] = [TopicFront(self.middleware, self.address, wiring.limits), self._action]
         self._origin = self.middleware.publisher(  # kept: what is latched goes with its writer
             self.address + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
         )
@@ -105,6 +120,9 @@ class RosServer:
         turns = self._queued.turns
         self._activity = Activity(lambda: turns.waiting, wiring.limits.waiting, turns.silent_s)
         self._node = NodeApi.of(self.middleware, wiring, self._queued.settings, self._change, self._findings)
+        self._ended = Event()
+        """Set when the end of the last answer that was begun has been sent."""
+        self._ended.set()
 
     def serve(self) -> None:
         """Serve until stopped."""
@@ -148,24 +166,23 @@ class RosServer:
             return None
         trace = Trace()
         trace.mark("network")
-        size = front.size_bytes(packed)
-        try:
-            self._hold(size)
-        except RequestFailed as error:
-            self._refuse(front, packed, error)
-            return None
-        try:
-            turn = self._queued.turns.join()
-        except Busy as error:
-            self._hold(-size)
-            self._refuse(front, packed, error)
-            return None
-        return partial(self._answer_in, turn, front, packed, size, trace)
-
-    def _refuse(self, front: Front, packed: Any, error: RequestFailed) -> None:
-        """Tell who asked, and the log."""
-        self._activity.failed(str(error))
-        front.refuse(packed, str(error))
+        with ExitStack() as held:
+            try:
+                size = front.size_bytes(packed)
+                self._hold(size)
+                held.callback(self._hold, -size)
+                job = front.job(packed, trace)
+                if job is None:
+                    self._activity.failed("it could not be read or prepared")
+                    return None
+                turn = self._queued.turns.join()
+                held.callback(turn.leave)
+            except RequestFailed as error:
+                self._activity.failed(str(error))
+                front.refuse(packed, str(error))
+                return None
+            job.accept()
+            return partial(self._answer_in, turn, job, held.pop_all())
 
     def _hold(self, size: int) -> None:
         """Count what all requests hold; raises RequestFailed for one that is too large, or too large now."""
@@ -176,50 +193,58 @@ class RosServer:
                 raise Busy(f"requests of {self._limits.in_flight_bytes} bytes are under way already")
             self._held_bytes += size
 
-    def _answer_in(self, turn: Turn, front: Front, packed: Any, size: int, trace: Trace) -> None:
-        """Unpack a request, and answer it when its turn comes."""
-        try:
-            job = front.job(packed, trace)
-            if job is None or job.request is None:
+    def _answer_in(self, turn: Turn, job: Job, held: ExitStack) -> None:
+        """Prepare a request, answer it when its turn comes, and give back what it ``held``."""
+        with held:
+            request = job.prepare()
+            if request is None:
                 self._activity.failed("it could not be read or prepared")
-            if job is not None:
-                self._answer(job, turn)
-        finally:
-            turn.leave()
-            self._hold(-size)
+                job.end()
+            elif self._its_turn(turn, job):
+                before, self._ended = self._ended, Event()  # in our turn, so one thread at a time
+                ended = self._ended
+                try:
+                    if error := self._answer(request, job, turn):
+                        self._activity.failed(error)
+                    before.wait(END_S)
+                    job.end(error)
+                finally:
+                    ended.set()
 
-    def _answer(self, job: Job, turn: Turn) -> None:
-        """Answer one request; what goes wrong goes back to who asked."""
-        if job.request is None or self._stopped.is_set():
-            job.end("the server is stopping" if job.request else "")
-            return
-        if turn.come is not None:  # it had to wait, if only for as long as unpacking took
+    def _its_turn(self, turn: Turn, job: Job) -> bool:
+        """Wait for a request's turn; where it does not come, its job has ended."""
+        if turn.come is not None:  # it had to wait, if only for as long as its pictures took
             job.trace.mark(RESIDUAL)
             try:
-                if not turn.wait(lambda: job.unwanted() or self._stopped.is_set()):
-                    job.end("the server is stopping" if self._stopped.is_set() else "")
-                    return
+                turn.wait(lambda: job.unwanted() or self._stopped.is_set())
             except Overdue as late:
                 job.end(str(late))
-                return
+                return False
             job.trace.mark("queue")
-        error = ""
+        if self._stopped.is_set():
+            job.end("the server is stopping")
+        elif not turn.has_come or not job.start():
+            job.end()
+        else:
+            return True
+        return False
+
+    def _answer(self, request: Request, job: Job, turn: Turn) -> str:
+        """Answer a request whose turn has come; return what went wrong, for who asked."""
         self._activity.requests += 1
-        tokens = self._queued.answer(job.request, job.trace, turn)
         try:
-            for token in tokens:
-                self._activity.tokens += 1
-                if self._stopped.is_set():
-                    error = "the server is stopping"
-                if error or not job.token(token):
-                    break
+            if not request.images:
+                request = replace(request, images=self._cache.lend(job.trace))
+            with closing(self._queued.answer(request, job.trace, turn)) as tokens:
+                for token in tokens:
+                    self._activity.tokens += 1
+                    if self._stopped.is_set():
+                        return "the server is stopping"
+                    if not job.token(token):
+                        break
         except Exception as failure:  # noqa: BLE001 - who asked must hear of it, whatever broke
-            error = str(failure) or type(failure).__name__
-        finally:
-            tokens.close()
-        if error:
-            self._activity.failed(error)
-        job.end(error)
+            return str(failure) or type(failure).__name__
+        return ""
 
 
 class _Crew:

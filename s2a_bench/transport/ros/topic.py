@@ -14,8 +14,8 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.bounds import Bounds
-from s2a_bench.transport.limits import whole_number
-from s2a_bench.transport.ros.camera import POLL_S, CameraCache, CameraPublisher, picture_message, picture_of
+from s2a_bench.transport.limits import Limits, whole_number
+from s2a_bench.transport.ros.camera import POLL_S, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.wire import (
@@ -112,9 +112,9 @@ class TopicClient:
 class TopicFront:
     """The server's side of the variant: receives requests and turns each into a job for the engine's thread."""
 
-    def __init__(self, middleware: Middleware, namespace: str, cache: CameraCache) -> None:
+    def __init__(self, middleware: Middleware, namespace: str, limits: Limits) -> None:
         """Create the topics."""
-        self._cache = cache
+        self.limits = limits
         self._requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
         self._tokens = middleware.publisher(namespace + "/token", ros.TOKEN, TOKEN_QOS)
 
@@ -123,10 +123,10 @@ class TopicFront:
         return self._requests.take(timeout_s)
 
     def job(self, packed: Any, trace: Trace) -> TopicJob:
-        """Unpack a request and decode its pictures; raises TransportError for bytes that are no request."""
+        """Unpack a request; raises TransportError for bytes that are none."""
         message = self._requests.unpack(packed)
         trace.mark("cdr_parse")
-        return TopicJob(self, message, trace, self._cache)
+        return TopicJob(self, message, trace)
 
     def size_bytes(self, packed: Any) -> int:
         """Return the size of its CDR."""
@@ -151,25 +151,33 @@ class TopicFront:
 class TopicJob:
     """One request of the topic variant."""
 
-    def __init__(self, front: TopicFront, message: Any, trace: Trace, cache: CameraCache) -> None:
-        """Decode the pictures, or borrow the camera's newest frame where there are none."""
+    def __init__(self, front: TopicFront, message: Any, trace: Trace) -> None:
+        """Remember the message."""
         self.trace = trace
-        self.request: Request | None = None
         self._front = front
+        self._message = message
         self._id: str = message.id
         self._error = ""
         self._sent = 0
+
+    def accept(self) -> None:
+        """Tell nobody, as this variant has no word for it."""
+
+    def prepare(self) -> Request | None:
+        """Decode the pictures."""
+        message, limits = self._message, self._front.limits
         try:
-            whole_number("max_tokens", int(message.max_tokens), 1, cache.limits.answer_tokens, 0)
+            whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
             pictures = (*message.images, *message.compressed_images)
-            images = tuple(picture_of(picture, trace, cache.limits) for picture in pictures)
+            images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
         except S2AError as error:
             self._error = str(error)
-            return
-        images = images or cache.lend(trace)
-        self.request = Request(
-            plain(message.id), message.prompt, images, message.max_tokens, message.grammar, message.seed
-        )
+            return None
+        return Request(plain(message.id), message.prompt, images, message.max_tokens, message.grammar, message.seed)
+
+    def start(self) -> bool:
+        """Begin, as the answer is always wanted."""
+        return True
 
     def token(self, token: Token) -> bool:
         """Publish a token; return whether more are wanted, which this variant cannot tell."""
