@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from s2a_bench.clock import realtime_offset_ns
-from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, USAGE_ZERO
+from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, STALE_FRAMES, USAGE_ZERO
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Finding, Machine, examine
@@ -98,6 +98,7 @@ class SampleGuard:
     _residual: dict[str, int] = field(default_factory=dict)
     _failed: dict[str, int] = field(default_factory=dict)
     _frames_lost: dict[str, int] = field(default_factory=dict)
+    _stale: dict[str, int] = field(default_factory=dict)
     _in_a_row: dict[str, int] = field(default_factory=dict)
     _succeeded: dict[str, int] = field(default_factory=dict)
     _lost: dict[str, int] = field(default_factory=dict)
@@ -118,9 +119,7 @@ class SampleGuard:
             self._frames_lost[row.cell] = int(lost)
         self._in_a_row[row.cell] = self._in_a_row.get(row.cell, 0) + 1 if row.error else 0
         if row.error:
-            self._last[row.cell] = row.error
-            if row.error != INTERRUPTED:
-                _count(self._lost if row.error.startswith("MessagesLost") else self._failed, row.cell)
+            self._see_failure(row)
             return
         if row.cache_n:
             _count(self._cached, row.cell)
@@ -134,6 +133,14 @@ class SampleGuard:
             _count(self._headers_early if off_ms > 0 else self._headers_late, row.cell)
         if not row.warmup:
             self._see_times(row, budget(row.marks))
+
+    def _see_failure(self, row: SampleRow) -> None:
+        """Look at why a request failed."""
+        self._last[row.cell] = row.error
+        if STALE_FRAMES in row.facts:
+            _count(self._stale, row.cell)
+        elif row.error != INTERRUPTED:
+            _count(self._lost if row.error.startswith("MessagesLost") else self._failed, row.cell)
 
     def _see_times(self, row: SampleRow, spent: Budget) -> None:
         """Look at where the time of a sample that counts has gone."""
@@ -220,6 +227,12 @@ class SampleGuard:
                 "lost-frames",
                 "camera frames did not reach the server, or were overtaken there by the next (over the whole run)",
                 f"--qos reliable, --dds-tuning tuned, and sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
+            ),
+            *_told(
+                self._stale,
+                "stale-frames",
+                "requests failed, as the camera's newest frame had come to the server too long ago",
+                "see why frames did not come (--fps, lost-frames); --max-frame-age says how old one may be",
             ),
             *_told(self._lost, "lost-messages", "requests lost messages on the way", "--dds-tuning tuned"),
             *odd_facts(self._odd),

@@ -139,7 +139,10 @@ def test_the_facts_are_those_that_transport_dialect_engine_and_harness_may_tell(
     few: dict[str, Any] = {"engine": EngineConfig(name="echo"), "sample_resources_hz": 0}
     assert RequestsConfig(transports=("loopback",), **few).facts == {}
     over_ros = RequestsConfig(transports=("ros",), mode="stream", **few).facts
-    assert {*over_ros} == {"payload_bytes", "camera_frames", "unreadable_n", "frames_published", "frames_lost"}
+    assert {*over_ros} == {
+        *("payload_bytes", "camera_frames", "camera_age_ms", "camera_stamp_age_ms", "stale_frames"),
+        *("unreadable_n", "frames_published", "frames_lost"),
+    }
     assert over_ros["payload_bytes"] == {"unit": "bytes", "about": "what the payload weighs on the wire"}
     ollama = {"http": {"url": "http://x", "dialect": "ollama"}}
     asked = RequestsConfig(transports=("http",), options=ollama, sample_resources_hz=0)

@@ -46,6 +46,7 @@ def test_good_samples_raise_no_warning() -> None:
         (row("b", facts={"headers_off_ms": -97.0}, server_prompt_ms=97.5), 2, "ingest-unsure"),
         (row("b", error="MessagesLost: 3", marks=[]), 2, "lost-messages"),
         (row("b", error="RequestFailed: x", marks=[]), 2, "failed-samples"),
+        (row("b", error="RequestFailed: x", marks=[], facts={"stale_frames": 1.0}), 2, "stale-frames"),
     ],
 )
 def test_each_warning_has_its_code(second: SampleRow, fingerprint: int, code: str) -> None:

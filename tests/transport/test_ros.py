@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+import re
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from threading import Event, Thread
 from typing import Any
 
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import MessagesLost, TransportError
+from s2a_bench.errors import MessagesLost, RequestFailed, TransportError
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
@@ -28,12 +30,20 @@ def stack() -> Iterator[ExitStack]:
         yield whole
 
 
-def serve(stack: ExitStack, told: Wiring[Any], handler: Handler) -> None:
+def serve(stack: ExitStack, told: Wiring[Any], handler: Handler) -> Any:
     server = open_server(told, handler)
     thread = Thread(target=server.serve)
     thread.start()
     stack.callback(thread.join)
     stack.callback(server.stop)
+    return server
+
+
+def until(met: Callable[[], bool]) -> None:
+    deadline = now_ns() + 20_000_000_000
+    while not met():
+        assert now_ns() < deadline, "it did not come about"
+        Event().wait(0.005)
 
 
 def connect(stack: ExitStack, told: Wiring[Any]) -> Client:
@@ -102,6 +112,65 @@ def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, told: 
     frame, trace = yuyv_frame(), Trace()
     client.camera.publish(frame, trace)
     ask_until_seen(client, handler, client.camera.stamp_ns(frame))
+
+
+@pytest.mark.parametrize("variant", ["topic", "action"])
+def test_a_frame_that_came_too_long_ago_fails_the_request_and_its_age_is_told(
+    stack: ExitStack, dds_domain: int, variant: str
+) -> None:
+    told = wiring(f"ros/{variant}", "/test_age", domain_id=dds_domain, max_frame_age=0.3)
+    serve(stack, told, Recorder(["x"]))
+    client = connect(stack, told)
+    assert client.camera is not None
+    frame = replace(yuyv_frame(), stamp_ns=now_ns() - 5_000_000_000)
+    client.camera.publish(frame, Trace())
+    error, trace = ask_until_refused(client)
+    assert re.search(r"newest frame came \d+\.\d s ago, more than `max_frame_age` 0\.3 s", error)
+    assert trace.facts["stale_frames"] == 1
+    assert trace.facts["camera_age_ms"] > 300
+    assert trace.facts["camera_stamp_age_ms"] > trace.facts["camera_age_ms"] + 4_000
+
+
+def ask_until_refused(client: Client) -> tuple[str, Trace]:
+    """Ask without a picture until that fails; return why."""
+    deadline = now_ns() + 20_000_000_000
+    while now_ns() < deadline:
+        trace = Trace()
+        try:
+            list(client.request(Request("a", "plan"), trace))
+        except RequestFailed as error:
+            return str(error), trace
+    raise AssertionError("no request failed")
+
+
+def test_a_waiting_request_is_about_the_frame_that_is_the_newest_when_its_turn_comes(
+    stack: ExitStack, dds_domain: int
+) -> None:
+    go, seen = Event(), list[int]()
+
+    def handler(request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        seen.extend(image.stamp_ns for image in request.images)
+        assert go.wait(20)
+        yield Token(0, "x")
+
+    queued = Queued.around(handler)
+    told = wiring("ros/topic", "/test_turn", domain_id=dds_domain)
+    server = serve(stack, told, queued)
+    clients = [connect(stack, told) for _ in range(2)]
+    camera = clients[0].camera
+    assert camera is not None
+    threads = [Thread(target=ask, args=(client, Request("a", "plan"))) for client in clients]
+    threads[0].start()
+    until(lambda: queued.turns.silent_s() > 0)
+    threads[1].start()
+    until(lambda: bool(queued.turns.waiting))
+    frame = yuyv_frame()
+    camera.publish(frame, Trace())
+    until(lambda: server._cache._newest is not None)
+    go.set()
+    for thread in threads:
+        thread.join(20)
+    assert seen == [camera.stamp_ns(frame)]
 
 
 def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, told: Wiring[Any]) -> None:

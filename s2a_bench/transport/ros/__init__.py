@@ -8,7 +8,7 @@ from itertools import count
 from secrets import token_hex
 
 from s2a_bench.errors import UsageError
-from s2a_bench.facts import CAMERA_FRAMES, PAYLOAD_BYTES, Fact
+from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_STAMP_AGE_MS, PAYLOAD_BYTES, STALE_FRAMES, Fact
 from s2a_bench.transport import Client, Handler, Server, Transport, Wiring
 from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
@@ -30,7 +30,7 @@ class Ros(Transport[RosOptions]):
         "accept": "network",  # an action's goal is accepted before work starts
         "cdr_parse": "parse",
     }
-    tells = (PAYLOAD_BYTES, CAMERA_FRAMES, UNREADABLE_N)
+    tells = (PAYLOAD_BYTES, CAMERA_FRAMES, CAMERA_AGE_MS, CAMERA_STAMP_AGE_MS, STALE_FRAMES, UNREADABLE_N)
     order = 20
     looks = {TOPIC: ("#0072B2", "-"), ACTION: ("#56B4E9", "--")}
     packages = ("cyclonedds", "rosbags")

@@ -113,10 +113,6 @@ class GenerateClient:
         goal_id = self._client.send(packed)
         trace.facts[PAYLOAD_BYTES] = len(packed)
         yield from self._tokens(goal_id, request.max_tokens, trace)
-        if self._marks is not None:
-            self._receive_marks(goal_id.hex(), trace)
-        elif (told := self._origin.take(0)) is not None and (origin := readable(self._origin, told, trace)) is not None:
-            trace.provenance = told_by(origin)
 
     def _tokens(self, goal_id: bytes, limit: int, trace: Trace) -> Iterator[Token]:
         """Yield the tokens of a goal; it is cancelled after ``limit``, or when the caller leaves early."""
@@ -145,7 +141,10 @@ class GenerateClient:
                     raise RequestFailed("the server rejected the goal")
                 elif isinstance(event, Result):
                     ended = True
+                    told = self._learn(goal_id.hex(), trace)  # of a goal that failed, too
                     self._check(event, "".join(heard))
+                    if not told:
+                        raise RequestFailed("the server's marks did not arrive")
         finally:
             if not ended:
                 self._client.cancel(goal_id)
@@ -170,17 +169,21 @@ class GenerateClient:
                 raise ServerDied(f"the action server {self._name} is gone")
         raise RequestFailed(f"no feedback for {self._wiring.timeout_s:.0f} s")
 
-    def _receive_marks(self, goal_id: str, trace: Trace) -> None:
-        """Take the server's marks of this goal; they were sent before its result."""
+    def _learn(self, goal_id: str, trace: Trace) -> bool:
+        """Take our server's marks of a goal, which were sent before its result; of another, who it is."""
+        if self._marks is None:
+            if (told := self._origin.take(0)) and (origin := readable(self._origin, told, trace)) is not None:
+                trace.provenance = told_by(origin)
+            return True
         deadline = now_ns() + int(MARKS_TIMEOUT_S * 1e9)
-        while self._marks is not None and now_ns() < deadline:
+        while now_ns() < deadline:
             packed = self._marks.take(POLL_S)
             if packed is not None:
                 marks = readable(self._marks, packed, trace)
                 if marks is not None and marks.id == goal_id:
                     trace.receive(remote_of(marks))
-                    return
-        raise RequestFailed("the server's marks did not arrive")
+                    return True
+        return False
 
     def describe(self) -> dict[str, str]:
         """Add nothing: the wiring tells all."""

@@ -11,14 +11,15 @@ from dataclasses import dataclass, replace
 from threading import Lock, Thread
 from typing import Any
 
-from s2a_bench.clock import realtime_offset_ns
+from s2a_bench.clock import now_ns, realtime_offset_ns
 from s2a_bench.errors import RequestFailed
-from s2a_bench.facts import CAMERA_FRAMES
+from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_STAMP_AGE_MS, STALE_FRAMES
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Mark, Trace
 from s2a_bench.transport.limits import LIMITS, Limits, check_pixels
 from s2a_bench.transport.pictures import bgr_of, decoded, encoded, rgb_of
+from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.types import Frame
 
 CAMERA = "/camera/image_raw"
@@ -87,15 +88,23 @@ class CachedFrame:
     count: int
     """How many frames had arrived with this one."""
 
+    @property
+    def received_ns(self) -> int:
+        """Return when it came, on CLOCK_MONOTONIC."""
+        return self.marks[0][1]
+
 
 class CameraCache:
     """Keeps the newest frame of both camera topics, already as RGB, each topic on a thread of its own."""
 
-    def __init__(self, middleware: Middleware, namespace: str, qos: str, limits: Limits = LIMITS) -> None:
+    def __init__(self, middleware: Middleware, namespace: str, options: RosOptions, limits: Limits = LIMITS) -> None:
         """Subscribe; `start` starts the threads."""
         self.limits = limits
+        self._max_age_s = options.max_frame_age
         topics = ((CAMERA, ros.IMAGE), (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE))
-        self._cameras = [middleware.subscription(namespace + topic, kind, CAMERA_QOS[qos]) for topic, kind in topics]
+        self._cameras = [
+            middleware.subscription(namespace + topic, kind, CAMERA_QOS[options.qos]) for topic, kind in topics
+        ]
         self._threads = [Thread(target=self._watch, args=(camera,), daemon=True) for camera in self._cameras]
         self._newest: CachedFrame | None = None
         self._count = 0
@@ -119,18 +128,32 @@ class CameraCache:
             thread.join()
 
     def lend(self, trace: Trace) -> tuple[Frame, ...]:
-        """Return the newest frame for a request that carries none, and say in its trace which it is."""
+        """Return the newest frame for a request that carries none; its trace is told which it is, and how old.
+
+        Raises RequestFailed for one that came more than ``max_frame_age`` ago.
+        """
         newest = self._newest
         if newest is None:
             return ()
         trace.frame_stamp_ns, trace.frame_marks = newest.frame.stamp_ns, newest.marks
         trace.facts[CAMERA_FRAMES] = newest.count
+        at_ns = now_ns()
+        age_s = (at_ns - newest.received_ns) / 1e9
+        trace.facts[CAMERA_AGE_MS] = age_s * 1e3
+        if newest.frame.stamp_ns:  # some cameras leave it out
+            trace.facts[CAMERA_STAMP_AGE_MS] = (at_ns + realtime_offset_ns() - newest.frame.stamp_ns) / 1e6
+        if age_s > self._max_age_s:
+            trace.facts[STALE_FRAMES] = 1.0
+            raise RequestFailed(
+                f"the camera's newest frame came {age_s:.1f} s ago, more than `max_frame_age` {self._max_age_s:g} s: "
+                "see whether the camera still publishes"
+            )
         return (newest.frame,)
 
     def seen(self) -> tuple[int, int | None]:
         """Return how many frames have come, and when the newest that can be used was received (CLOCK_MONOTONIC)."""
         newest = self._newest
-        return self._count, newest.marks[0][1] if newest else None
+        return self._count, newest.received_ns if newest else None
 
     def _watch(self, camera: Subscription) -> None:
         said = ""

@@ -33,6 +33,13 @@ class RosOptions(Options):
     qos: Literal["reliable", "sensor_data"] = option(
         "reliable", "the camera topic's: reliable, sensor_data (best effort)", side=SERVER
     )
+    max_frame_age: float = option(
+        1.0,
+        "seconds since a camera topic's frame came: requests without a picture fail on an older one",
+        gt=0,
+        le=86_400,
+        side=SERVER,
+    )
     dds_tuning: Literal["tuned", "default"] = option(
         "tuned", "tuned (large datagrams and receive buffers), default (DDS as it comes)", side=SERVER
     )

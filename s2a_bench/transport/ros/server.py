@@ -32,8 +32,6 @@ from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, provenance_message
 from s2a_bench.transport.turns import Queued, Turn
 from s2a_bench.types import Request, Token
 
-OLDEST_S = 1.0
-"""Diagnostics warn of a camera whose newest frame is older."""
 _log = logging.getLogger(__name__)
 
 
@@ -108,7 +106,7 @@ class RosServer:
         if not wiring.restarted:
             refuse_company(wiring, self.address)
         self.middleware = join(wiring, "server")
-        self._cache = CameraCache(self.middleware, self.address, wiring.options.qos, wiring.limits)
+        self._cache = CameraCache(self.middleware, self.address, wiring.options, wiring.limits)
         self._action = ActionFront(self.middleware, wiring, self._queued.honours)
         self._fronts: list[Front] = [TopicFront(self.middleware, self.address, wiring.limits), self._action]
         self._origin = self.middleware.publisher(  # kept: what is latched goes with its writer
@@ -157,7 +155,7 @@ class RosServer:
         self._action.tune(self._options)
 
     def _findings(self) -> Iterator[Finding]:
-        return self._activity.findings(*self._cache.seen(), OLDEST_S)
+        return self._activity.findings(*self._cache.seen(), self._options.max_frame_age)
 
     def _take(self, front: Front) -> Callable[[], None] | None:
         """Wait for a request and give it its place in the queue; return what answers it."""
