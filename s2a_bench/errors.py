@@ -14,6 +14,7 @@ S2AError
 │   ├── RequestFailed    the server refused or broke off this one request; the next may succeed
 │   │   ├── Busy         too many requests wait for the engine
 │   │   └── MessagesLost the middleware lost messages of this request
+│   ├── MissingInterface the ROS 2 workspace has not built a message's package, or another version of it
 │   ├── PortInUse        a server cannot bind its address
 │   └── ServerDied       the server's process is gone
 ├── SimulatorError       a simulator cannot start, or goes away
@@ -86,6 +87,10 @@ class Busy(RequestFailed):
 
 class MessagesLost(RequestFailed):
     """The middleware lost messages of this request."""
+
+
+class MissingInterface(TransportError):
+    """The ROS 2 workspace has not built a message's package, or another version of it."""
 
 
 class PortInUse(TransportError):

@@ -15,7 +15,7 @@ from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 
-from s2a_bench.errors import TransportError
+from s2a_bench.errors import MissingInterface, TransportError
 from s2a_bench.ros import QoS
 from s2a_bench.ros.action import NEXT, Status
 from s2a_bench.ros.rclpy_node import Inbox, SpinningNode, qos_profile
@@ -148,12 +148,12 @@ class RclpyActionServer:
     """Goals are taken on the consuming thread; cancels and results are served by the spinning thread."""
 
     def __init__(self, node: SpinningNode, name: str, type_name: str, result_timeout_s: float, version: str) -> None:
-        """Create the server of the action ``/name``; raises TransportError for a version the workspace lacks."""
+        """Create the server of the action ``/name``; raises MissingInterface for a version the workspace lacks."""
         self._node, self._type, self._version = node, type_name, version
         self._action = interface_class(type_name)
         installed = installed_version(self._action, type_name)
         if installed != version:
-            raise TransportError(f"this workspace has llama_msgs {installed}, not {version}")
+            raise MissingInterface(f"this workspace has llama_msgs {installed}, not {version}")
         self._lock = Lock()
         self._offered: set[bytes] = set()
         self._inbox: Inbox[RclpyServerGoal] = Inbox()

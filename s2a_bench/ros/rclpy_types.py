@@ -12,17 +12,17 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.interfaces import Nodetype
 
-from s2a_bench.errors import TransportError
+from s2a_bench.errors import MissingInterface
 from s2a_bench.ros import messages as ros
 
 
 def interface_class(type_name: str) -> Any:
-    """Return the generated class of ``pkg/msg/Name`` or ``pkg/action/Name``; raises TransportError without it."""
+    """Return the generated class of ``pkg/msg/Name`` or ``pkg/action/Name``; raises MissingInterface without it."""
     package, kind, name = type_name.split("/")
     try:
         return getattr(import_module(f"{package}.{kind}"), name)
     except (ImportError, AttributeError) as error:
-        raise TransportError(
+        raise MissingInterface(
             f"{type_name} is not in this ROS 2 workspace ({error}): build its package with "
             f"`colcon build --packages-select {package}` and source install/setup.bash, or use `middleware` cyclonedds"
         ) from error
@@ -59,11 +59,11 @@ def _type_name(detail: Any) -> str:
 
 
 def message_class(type_name: str) -> Any:
-    """Return a message's generated class; raises TransportError where it is missing or has another layout than ours."""
+    """Return a message's generated class; raises MissingInterface for none, or one of another layout than ours."""
     cls = interface_class(type_name)
     if not fits(cls, type_name):
         package = type_name.split("/", maxsplit=1)[0]
-        raise TransportError(
+        raise MissingInterface(
             f"{type_name} of this ROS 2 workspace has other fields than ours: rebuild it with "
             f"`colcon build --packages-select {package}`"
         )
@@ -71,8 +71,8 @@ def message_class(type_name: str) -> Any:
 
 
 def installed_version(action: Any, type_name: str) -> str:
-    """Return the version of llama_msgs that the workspace has; raises TransportError where it is none we know."""
+    """Return the version of llama_msgs that the workspace has; raises MissingInterface where it is none we know."""
     for version in ros.VERSIONS:
         if fits(action.Goal, type_name + "_Goal", version):
             return version
-    raise TransportError(f"{type_name} of this ROS 2 workspace is none of llama_msgs {', '.join(ros.VERSIONS)}")
+    raise MissingInterface(f"{type_name} of this ROS 2 workspace is none of llama_msgs {', '.join(ros.VERSIONS)}")

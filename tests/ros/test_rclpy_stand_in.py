@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from threading import Event
 from types import ModuleType
 from typing import Any
@@ -14,15 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from s2a_bench.errors import TransportError
+from s2a_bench.errors import MissingInterface, TransportError
 from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Result, default_middleware, llama, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.parameters import SERVICE, Parameter, value_of
 from s2a_bench.ros.rosout import LOG, ROSOUT_QOS
 from s2a_bench.testing.action import NAME, ActionSuite
 from s2a_bench.testing.middleware import Join, MiddlewareSuite
+from s2a_bench.testing.transport import Recorder, ask, connector, wiring, yuyv_frame
+from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.ros.node import NodeApi
-from s2a_bench.types import Frame
+from s2a_bench.types import Frame, Request
 from tests.ros.rclpy_stand_in import GRAPH, INTERFACES, PACKAGES, action, generated, modules
 
 GLUE = ("client", "middleware", "node", "server", "service", "types")
@@ -123,6 +125,35 @@ def test_a_package_that_is_not_built_is_named_with_the_way_out(
     monkeypatch.setitem(sys.modules, "s2a_msgs.msg", None)
     with pytest.raises(TransportError, match=r"s2a_msgs/msg/Token is not in.*colcon build --packages-select s2a_msgs"):
         middleware.publisher("/token", ros.TOKEN, QoS())
+
+
+def without_llama_msgs(patch: pytest.MonkeyPatch) -> None:
+    for kind in INTERFACES:
+        patch.setitem(sys.modules, f"llama_msgs.{kind}", None)
+
+
+def test_topics_are_served_without_llama_msgs_and_the_log_says_what_is_not(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    without_llama_msgs(monkeypatch)
+    told = wiring("ros/topic", "/s2a", middleware="rclpy", domain_id=7)
+    with closing(connector(told)) as connecting:
+        client = next(connecting)(Recorder(["a ", "b"]))
+        tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),)))
+    assert [token.text for token in tokens] == ["a ", "b"]
+    said = capsys.readouterr().err
+    assert "the action is not served: llama_msgs/action/GenerateResponse is not in this ROS 2 workspace" in said
+    assert "colcon build --packages-select llama_msgs" in said
+    assert GRAPH == []
+
+
+def test_the_action_needs_llama_msgs(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_llama_msgs(monkeypatch)
+    told = wiring("ros/action", "/s2a", middleware="rclpy", domain_id=7)
+    for opened in (lambda: open_server(told, Recorder([])), lambda: open_client(told)):
+        with pytest.raises(MissingInterface, match="colcon build --packages-select llama_msgs"):
+            opened()
+    assert GRAPH == []
 
 
 def test_an_interface_with_other_fields_is_refused(rclpy_join: Join, monkeypatch: pytest.MonkeyPatch) -> None:

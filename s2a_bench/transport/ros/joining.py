@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 
 from s2a_bench.clock import SystemClock
-from s2a_bench.errors import ServerDied, TransportError
+from s2a_bench.errors import MissingInterface, ServerDied, TransportError
 from s2a_bench.ros import Middleware, QoS, Tuning, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.config import domain_id
@@ -71,12 +71,20 @@ def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
     probe = join(wiring, "probe")
     try:
         publisher = probe.publisher(namespace + "/request", ros.REQUEST, QoS())
-        action = probe.action_client(namespace + "/generate_response", GENERATE_RESPONSE)
+        offered = _action_offered(probe, namespace + "/generate_response")
         probe.subscription(namespace + "/token", ros.TOKEN, QoS()).take(SETTLE_S)
-        if publisher.matched() or action.server_present():
+        if publisher.matched() or offered():
             raise TransportError(
                 f"another server answers under {namespace} in DDS domain {domain_of(wiring)}: stop it, "
                 "or choose another domain with ROS_DOMAIN_ID or another `namespace`"
             )
     finally:
         probe.close()
+
+
+def _action_offered(probe: Middleware, name: str) -> Callable[[], bool]:
+    """Return the question whether an action is offered; a workspace without llama_msgs cannot tell, and offers none."""
+    try:
+        return probe.action_client(name, GENERATE_RESPONSE).server_present
+    except MissingInterface:
+        return lambda: False

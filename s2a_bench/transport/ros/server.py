@@ -16,12 +16,13 @@ from functools import partial
 from threading import Event, Lock, Thread, current_thread
 from typing import Any, Protocol
 
-from s2a_bench.errors import Busy, Overdue, RequestFailed
+from s2a_bench.errors import Busy, MissingInterface, Overdue, RequestFailed
 from s2a_bench.ros import QoS
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.diagnostics import Finding
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Handler, Wiring
+from s2a_bench.transport.ros import ACTION
 from s2a_bench.transport.ros.action import ActionFront
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company
@@ -107,8 +108,16 @@ class RosServer:
             refuse_company(wiring, self.address)
         self.middleware = join(wiring, "server")
         self._cache = CameraCache(self.middleware, self.address, wiring.options, wiring.limits)
-        self._action = ActionFront(self.middleware, wiring, self._queued.honours)
-        self._fronts: list[Front] = [TopicFront(self.middleware, self.address, wiring.limits), self._action]
+        self._fronts: list[Front] = [TopicFront(self.middleware, self.address, wiring.limits)]
+        self._action: ActionFront | None = None
+        try:
+            self._action = ActionFront(self.middleware, wiring, self._queued.honours)
+            self._fronts.append(self._action)
+        except MissingInterface as missing:  # of llama_msgs, which topics do not need
+            if wiring.variant == ACTION:
+                self.middleware.close()
+                raise
+            _log.warning("the action is not served: %s", missing)
         self._origin = self.middleware.publisher(  # kept: what is latched goes with its writer
             self.address + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
         )
@@ -152,7 +161,8 @@ class RosServer:
     def _change(self, wanted: Mapping[str, Any]) -> None:
         """Set options while serving; raises UsageError."""
         self._options = self._options.but(**wanted)
-        self._action.tune(self._options)
+        if self._action is not None:
+            self._action.tune(self._options)
 
     def _findings(self) -> Iterator[Finding]:
         return self._activity.findings(*self._cache.seen(), self._options.max_frame_age)
