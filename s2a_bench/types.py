@@ -11,7 +11,9 @@ if TYPE_CHECKING:
 
 Pixels: TypeAlias = "NDArray[np.uint8]"
 
-Encoding: TypeAlias = Literal["yuv422_yuy2", "bgr8", "rgb8", "mono8", "jpeg", "png"]
+Bayer: TypeAlias = Literal["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"]
+Yuv: TypeAlias = Literal["yuv422_yuy2", "yuv422", "nv12", "nv21"]
+Encoding: TypeAlias = Literal["bgr8", "rgb8", "bgra8", "rgba8", "mono8", "mono16", Yuv, Bayer, "jpeg", "png"]
 """Pixel formats by their ROS names (``sensor_msgs/image_encodings.hpp``), and the two compressed ones."""
 
 
@@ -19,8 +21,10 @@ Encoding: TypeAlias = Literal["yuv422_yuy2", "bgr8", "rgb8", "mono8", "jpeg", "p
 class Frame:
     """One picture, in the format its source delivers.
 
-    ``data`` is uint8: (height, width, 2) for ``yuv422_yuy2``, (height, width, 3) for ``bgr8`` and
-    ``rgb8``, (height, width) for ``mono8``, (n,) for ``jpeg`` and ``png``. ``stamp_ns`` is the instant
+    ``data`` is uint8: (height, width, 2) for ``yuv422_yuy2``, ``yuv422`` (UYVY) and ``mono16`` (in this machine's order
+    of bytes), (height, width, 3) for ``bgr8`` and ``rgb8``, (height, width, 4) for ``bgra8`` and ``rgba8``,
+    (height, width) for ``mono8`` and mosaics, (height * 3 / 2, width) for ``nv12`` and ``nv21``, (n,) for ``jpeg`` and
+    ``png``. ``stamp_ns`` is the instant
     of capture on CLOCK_MONOTONIC; ``index`` counts frames of one source from 0.
     """
 

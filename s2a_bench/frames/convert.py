@@ -7,7 +7,7 @@ the pixels of a row lie together; ``out`` must not overlap ``data``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias, cast
+from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
 import cv2
 import numpy as np
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 # Newer OpenCV has the decoder write RGB itself: the same pixels without another pass over the picture; 4.9 cannot.
 _DECODE_RGB: int | None = getattr(cv2, "IMREAD_COLOR_RGB", None)
+
+AS_IT_IS: Final = -1
+"""No code of OpenCV's: nothing is to be converted."""
 
 
 def yuyv_to_bgr(data: Pixels, out: Pixels | None = None) -> Pixels:
@@ -36,25 +39,50 @@ def bgr_to_rgb(data: Pixels, out: Pixels | None = None) -> Pixels:
     return _convert(data, 3, cv2.COLOR_BGR2RGB, out)
 
 
+_CODES: Final[dict[str, tuple[int, int, int]]] = {
+    "bgr8": (3, AS_IT_IS, cv2.COLOR_BGR2RGB),
+    "rgb8": (3, cv2.COLOR_RGB2BGR, AS_IT_IS),
+    "bgra8": (4, cv2.COLOR_BGRA2BGR, cv2.COLOR_BGRA2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2BGR, cv2.COLOR_RGBA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2BGR, cv2.COLOR_GRAY2RGB),
+    "mono16": (1, cv2.COLOR_GRAY2BGR, cv2.COLOR_GRAY2RGB),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2BGR_YUY2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuv422": (2, cv2.COLOR_YUV2BGR_UYVY, cv2.COLOR_YUV2RGB_UYVY),
+    "nv12": (1, cv2.COLOR_YUV2BGR_NV12, cv2.COLOR_YUV2RGB_NV12),
+    "nv21": (1, cv2.COLOR_YUV2BGR_NV21, cv2.COLOR_YUV2RGB_NV21),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2BGR, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2BGR, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2BGR, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2BGR, cv2.COLOR_BayerGRBG2RGB),
+}
+"""Raw encoding -> channels of what OpenCV converts, its code to BGR, its code to RGB."""
+
+
 def to_bgr(frame: Frame) -> Pixels:
     """Return the frame's picture as (h, w, 3) ``bgr8``: its own data where it is that already, else a new array.
 
     Raises ValueError when the data does not fit the frame's encoding.
     """
-    data = frame.data
-    match frame.encoding:
-        case "bgr8":
-            return data
-        case "yuv422_yuy2":
-            return yuyv_to_bgr(data)
-        case "rgb8":
-            return bgr_to_rgb(data)
-        case "mono8":
-            if not data.size:
-                raise ValueError("the picture is empty")
-            return cast("Pixels", cv2.cvtColor(data, cv2.COLOR_GRAY2BGR))
-        case "jpeg" | "png":
-            return _decode(data, cv2.IMREAD_COLOR)
+    if frame.encoding in _CODES:
+        channels, code, _ = _CODES[frame.encoding]
+        return _convert(_eight_bits(frame), channels, code)
+    return _decode(frame.data, cv2.IMREAD_COLOR)
+
+
+def to_rgb(frame: Frame) -> Pixels:
+    """Return the frame's picture as (h, w, 3) ``rgb8``, otherwise as `to_bgr` does."""
+    if frame.encoding in _CODES:
+        channels, _, code = _CODES[frame.encoding]
+        return _convert(_eight_bits(frame), channels, code)
+    return decode_image(frame.data)
+
+
+def _eight_bits(frame: Frame) -> Pixels:
+    """Return the frame's data, of ``mono16`` scaled as cv_bridge does: 65535 is 255."""
+    if frame.encoding != "mono16":
+        return frame.data
+    values = np.ascontiguousarray(frame.data).view(np.uint16)[..., 0]
+    return cast("Pixels", cv2.convertScaleAbs(values, alpha=255 / 65535))
 
 
 def encode_jpeg(bgr: Pixels, quality: int = 90) -> Pixels:
@@ -84,14 +112,18 @@ def resize(bgr: Pixels, width: int, height: int) -> Pixels:
     return cast("Pixels", cv2.resize(bgr, (width, height), interpolation=cv2.INTER_AREA))
 
 
-def _convert(data: Pixels, channels: int, code: int, out: Pixels | None) -> Pixels:
+def _convert(data: Pixels, channels: int, code: int, out: Pixels | None = None) -> Pixels:
     """Run one cvtColor; checked first, because OpenCV would quietly leave an unfit ``out`` untouched."""
-    if data.ndim != 3 or data.shape[2] != channels or data.dtype != np.uint8:  # noqa: PLR2004
-        raise ValueError(f"pixels should be uint8 of shape (h, w, {channels}), not {data.dtype} {data.shape}")
+    last = data.shape[2:]
+    if data.ndim < 2 or last != ((channels,) if channels > 1 else ()) or data.dtype != np.uint8:  # noqa: PLR2004
+        wanted = f"(h, w, {channels})" if channels > 1 else "(h, w)"
+        raise ValueError(f"pixels should be uint8 of shape {wanted}, not {data.dtype} {data.shape}")
     if channels == 2 and data.shape[1] % 2:  # noqa: PLR2004
         raise ValueError(f"YUYV holds pixels in pairs: the width cannot be {data.shape[1]}")
     if out is not None and (out.shape != (*data.shape[:2], 3) or out.dtype != np.uint8):
         raise ValueError(f"out should be uint8 of shape {(*data.shape[:2], 3)}, not {out.dtype} {out.shape}")
+    if code == AS_IT_IS:
+        return data
     try:
         return cast("Pixels", cv2.cvtColor(data, code, dst=out))
     except cv2.error as error:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from s2a_bench.facts import Fact
-from s2a_bench.frames.convert import bgr_to_rgb, decode_image, to_bgr, yuyv_to_rgb
+from s2a_bench.frames.convert import to_rgb
 from s2a_bench.types import Frame, Pixels
 
 if TYPE_CHECKING:
@@ -29,15 +29,7 @@ def fingerprint(frame: Frame) -> int:
 
 def rgb_fingerprint(frame: Frame) -> int:
     """Return the checksum of the RGB that a direct conversion of the frame gives."""
-    match frame.encoding:
-        case "rgb8":
-            return _checksum(frame.data)
-        case "yuv422_yuy2":
-            return _checksum(yuyv_to_rgb(frame.data))
-        case "jpeg" | "png":
-            return _checksum(decode_image(frame.data))
-        case _:
-            return _checksum(bgr_to_rgb(to_bgr(frame)))
+    return _checksum(to_rgb(frame))
 
 
 def _checksum(pixels: Pixels) -> int:

@@ -33,13 +33,26 @@ PROVENANCE = "s2a_msgs/msg/Provenance"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 
-CHANNELS: dict[str, int] = {"yuv422_yuy2": 2, "bgr8": 3, "rgb8": 3, "mono8": 1}
-"""Bytes per pixel of the raw encodings (``sensor_msgs/image_encodings.hpp``)."""
+CHANNELS: dict[str, int] = {
+    **dict.fromkeys(("bgr8", "rgb8"), 3),
+    **dict.fromkeys(("bgra8", "rgba8"), 4),
+    **dict.fromkeys(("yuv422_yuy2", "yuv422", "mono16"), 2),
+    **dict.fromkeys(("mono8", "nv12", "nv21", "bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"), 1),
+}
+"""Bytes per pixel of the raw encodings (``sensor_msgs/image_encodings.hpp``); of NV12 and NV21 those of brightness."""
+ALSO = {"yuyv": "yuv422_yuy2", "uyvy": "yuv422"}
+"""Second names since ROS 2 Iron."""
+CHROMA_BELOW = frozenset({"nv12", "nv21"})
+"""Encodings with half as many rows of colour below those of brightness."""
+DEPTH = frozenset({"16UC1", "32FC1"})
+"""Encodings of distances (REP 118)."""
 
 
 VERSIONS = {"6.0": "llama_msgs-6.0.9", "4.4": "llama_msgs-4.4.1"}
 """Version of llama_msgs -> its folder in ``interfaces``; one type store knows one version."""
 DEFAULT_VERSION = "6.0"
+SHOWN = 64
+"""Letters of an encoding that came from outside, in an error."""
 ZEROS: dict[str, Any] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
 """The zero of each basic type that is not an integer."""
 
@@ -181,16 +194,29 @@ def compressed_image_message(data: Pixels, stamp_ns: int, frame_id: str, coding:
 
 def frame_of_image(image: Any, index: int = -1) -> Frame:
     """Unwrap a sensor_msgs/Image; the pixels stay a view of the message. Raises TransportError."""
-    channels = CHANNELS.get(image.encoding)
+    encoding = ALSO.get(image.encoding, image.encoding)
+    refuse_depth(encoding)
+    channels = CHANNELS.get(encoding)
     if channels is None:
-        raise TransportError(f"image encoding '{image.encoding}' is none of {', '.join(CHANNELS)}")
+        raise TransportError(f"image encoding '{encoding[:SHOWN]}' is none of {', '.join(CHANNELS)}")
     if not (image.width and image.height):
         raise TransportError(f"image of {image.width}x{image.height} {image.encoding} is empty")
-    if image.step < image.width * channels or image.data.size < image.step * image.height:
+    height = image.height * 3 // 2 if encoding in CHROMA_BELOW else image.height
+    if image.step < image.width * channels or image.data.size < image.step * height:
         raise TransportError(f"image of {image.width}x{image.height} {image.encoding} has {image.data.size} bytes")
-    rows = image.data[: image.step * image.height].reshape(image.height, image.step)[:, : image.width * channels]
-    shape = (image.height, image.width) if channels == 1 else (image.height, image.width, channels)
-    return Frame(index, stamp_of(image.header), image.width, image.height, image.encoding, rows.reshape(shape))
+    rows = image.data[: image.step * height].reshape(height, image.step)[:, : image.width * channels]
+    pixels = rows.reshape((height, image.width) if channels == 1 else (height, image.width, channels))
+    if encoding == "mono16" and bool(image.is_bigendian) != (sys.byteorder == "big"):
+        pixels = pixels[..., ::-1]
+    return Frame(index, stamp_of(image.header), image.width, image.height, encoding, pixels)
+
+
+def refuse_depth(encoding: str) -> None:
+    """Raise TransportError for distances."""
+    if encoding in DEPTH:
+        raise TransportError(
+            f"image encoding '{encoding}' is depth, which a model cannot look at: give it the camera's colour topic"
+        )
 
 
 def stamp_of(header: Any) -> int:

@@ -7,20 +7,18 @@ from dataclasses import replace
 import numpy as np
 
 from s2a_bench.errors import RequestFailed, UsageError
-from s2a_bench.frames.convert import (
-    bgr_to_rgb,
-    decode_image,
-    encode_jpeg,
-    encode_png,
-    to_bgr,
-    yuyv_to_rgb,
-)
+from s2a_bench.frames.convert import decode_image, encode_jpeg, encode_png, to_bgr, to_rgb
 from s2a_bench.trace import Trace
 from s2a_bench.transport.limits import LIMITS, Limits, check_encoded, check_pixels
 from s2a_bench.types import Frame, Pixels
 
 JPEG_QUALITY = 90
 RAW_MIME = "application/x-raw"
+STAGES = {
+    **dict.fromkeys(("bgr8", "bgra8", "rgba8"), "channel_swap"),
+    **dict.fromkeys(("yuv422_yuy2", "yuv422", "nv12", "nv21"), "yuv_decode"),
+}
+"""Encoding -> the stage of its conversion to RGB; of all others `image_decode`."""
 PREENCODED = {"jpeg": "image/jpeg", "png": "image/png"}
 
 
@@ -34,23 +32,17 @@ def bgr_of(frame: Frame, trace: Trace) -> Frame:
 
 
 def rgb_of(frame: Frame, trace: Trace) -> Frame:
-    """Turn any raw frame into the ``rgb8`` an engine wants; marks `channel_swap` or `yuv_decode`.
+    """Turn any frame into the ``rgb8`` an engine wants; marks `channel_swap`, `yuv_decode` or `image_decode`.
 
     Raises RequestFailed for pixels that do not fit their encoding.
     """
     if frame.encoding == "rgb8":
         return frame
     try:
-        if frame.encoding == "bgr8":
-            stage, data = "channel_swap", bgr_to_rgb(frame.data)
-        elif frame.encoding == "yuv422_yuy2":
-            stage, data = "yuv_decode", yuyv_to_rgb(frame.data)
-        else:
-            stage, data = "image_decode", bgr_to_rgb(to_bgr(frame))
+        converted = replace(frame, encoding="rgb8", data=to_rgb(frame))
     except ValueError as error:
         raise RequestFailed(f"a {frame.width}x{frame.height} {frame.encoding} picture cannot be: {error}") from error
-    converted = replace(frame, encoding="rgb8", data=data)
-    trace.mark(stage)
+    trace.mark(STAGES.get(frame.encoding, "image_decode"))
     return converted
 
 

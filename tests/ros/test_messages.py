@@ -92,7 +92,9 @@ def test_rows_may_be_padded() -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"encoding": "bayer_rggb8"}, "'bayer_rggb8' is none of yuv422_yuy2, bgr8"),
+        ({"encoding": "bayer_rggb16"}, "'bayer_rggb16' is none of bgr8, rgb8, bgra8"),
+        ({"encoding": "16UC1"}, "'16UC1' is depth, .* give it the camera's colour topic"),
+        ({"encoding": "32FC1"}, "'32FC1' is depth"),
         ({"height": 3}, "image of 4x3 bgr8 has 24 bytes"),
         ({"step": 6}, "image of 4x2 bgr8"),
     ],

@@ -275,7 +275,7 @@ def test_impossible_goals_end_and_the_node_stays_up(dds_domain: int) -> None:
     empty = ros.image_message(replace(frame, encoding="mono8", data=frame.data[:1, :1, 0]), 0, "c")
     empty.width, empty.height, empty.step = 0, 5, 0
     odd = ros.image_message(frame, 0, "c")
-    odd.encoding = "bayer_rggb8"
+    odd.encoding = "bayer_rggb16"
     ends: list[tuple[int, str]] = []
     try:
         assert client.wait_for_server(20)
@@ -290,7 +290,7 @@ def test_impossible_goals_end_and_the_node_stays_up(dds_domain: int) -> None:
         thread.join()
     assert [status for status, _ in ends] == [Status.ABORTED] * 6 + [Status.SUCCEEDED]
     assert "is empty" in ends[0][1]
-    assert "bayer_rggb8" in ends[1][1]
+    assert "bayer_rggb16" in ends[1][1]
     assert ends[-1][1] == "fine"
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.facts import Fact
-from s2a_bench.frames.convert import bgr_to_rgb, to_bgr, yuyv_to_rgb
+from s2a_bench.frames.convert import to_rgb
 from s2a_bench.trace import Trace
 from s2a_bench.transport.http.dialects import Event, Picture
 from s2a_bench.transport.http.dialects.common import Chat, Get, endpoint, refuse_grammar
@@ -52,7 +52,7 @@ class OpenVla(Chat):
         """Return the pixels as RGB, height x width x 3, marking `convert`."""
         if frame.encoding == "rgb8":
             return "", frame.data
-        pixels = yuyv_to_rgb(frame.data) if frame.encoding == "yuv422_yuy2" else bgr_to_rgb(to_bgr(frame))
+        pixels = to_rgb(frame)
         trace.mark("convert")
         return "", pixels
 
