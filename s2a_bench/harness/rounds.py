@@ -144,7 +144,7 @@ def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunW
     watches_udp = any(transport.watches_udp for transport in config.used)
     warnings = before_run(config, machine)
     before = Counters.read(watches_udp=watches_udp)
-    guard = SampleGuard()
+    guard = SampleGuard({cell.name: cell.transport.against_loss(cell.options) for cell in config.pipelines})
     writer.update(warnings=[warning.to_manifest() for warning in warnings])
     with ExitStack() as stack:
         recorder: RunRecorder | None = None
@@ -154,7 +154,8 @@ def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunW
             for launch in range(config.launches):
                 _launch(launch, task, config, sources, recorder, guard, writer, progress)
         finally:
-            warnings += [*guard.warnings(), *Counters.read(watches_udp=watches_udp).warnings_since(before)]
+            advice = guard.advice(cell.name for cell in config.pipelines if cell.transport.watches_udp)
+            warnings += [*guard.warnings(), *Counters.read(watches_udp=watches_udp).warnings_since(before, advice)]
             writer.update(warnings=[warning.to_manifest() for warning in warnings])
 
 

@@ -58,8 +58,8 @@ class Counters:
             realtime_offset_ns(),
         )
 
-    def warnings_since(self, before: Counters) -> list[RunWarning]:
-        """Compare with an earlier reading."""
+    def warnings_since(self, before: Counters, against_loss: str = "") -> list[RunWarning]:
+        """Compare with an earlier reading; ``against_loss`` is what transports advise where packets are lost."""
         warnings = []
         if _rise(before.receive_buffer_errors, self.receive_buffer_errors):
             warnings.append(
@@ -67,7 +67,7 @@ class Counters:
                     "udp-receive-buffer",
                     f"the kernel dropped {_rise(before.receive_buffer_errors, self.receive_buffer_errors)} UDP packets "
                     "for want of receive buffer: DDS had to send them again, 200 ms later",
-                    f"--dds-tuning tuned, and sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
+                    against_loss or f"sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
                 )
             )
         if _rise(before.throttles, self.throttles):
@@ -89,8 +89,9 @@ class Counters:
 
 @dataclass(slots=True)
 class SampleGuard:
-    """Watches the samples of a run as they come."""
+    """Watches the samples of a run as they come; ``against_loss`` is cell -> what its transport advises then."""
 
+    against_loss: Mapping[str, str] = field(default_factory=dict)
     _frames: dict[tuple[str, int], str] = field(default_factory=dict)
     _repeated: dict[str, int] = field(default_factory=dict)
     _cached: dict[str, int] = field(default_factory=dict)
@@ -226,7 +227,7 @@ class SampleGuard:
                 self._frames_lost,
                 "lost-frames",
                 "camera frames did not reach the server, or were overtaken there by the next (over the whole run)",
-                f"--qos reliable, --dds-tuning tuned, and sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
+                self.advice(self._frames_lost),
             ),
             *_told(
                 self._stale,
@@ -234,11 +235,15 @@ class SampleGuard:
                 "requests failed, as the camera's newest frame had come to the server too long ago",
                 "see why frames did not come (--fps, lost-frames); --max-frame-age says how old one may be",
             ),
-            *_told(self._lost, "lost-messages", "requests lost messages on the way", "--dds-tuning tuned"),
+            *_told(self._lost, "lost-messages", "requests lost messages on the way", self.advice(self._lost)),
             *odd_facts(self._odd),
             *_told(self._failed, "failed-samples", "requests failed", "see the column error of samples.csv"),
             *(self._alike() if len(self._launches) == 1 else ()),
         ]
+
+    def advice(self, cells: Iterable[str]) -> str:
+        """Return what the transports of cells advise against loss, each once."""
+        return "; ".join(dict.fromkeys(self.against_loss[cell] for cell in cells if cell in self.against_loss))
 
     def _alike(self) -> list[RunWarning]:
         """Look at whether neighbouring samples are too much alike; over several launches no interval asks for more."""

@@ -253,6 +253,10 @@ class Transport(Generic[O]):
         """Return the codes of its checks that matter before a run with pictures of this size in pixels."""
         return ()
 
+    def against_loss(self, options: O) -> str:  # noqa: ARG002 - for subclasses
+        """Return what to do where pictures or messages are lost on the way."""
+        return "look at the network"
+
     def ready(self, wiring: Wiring[O], address: str) -> str:
         """Return what `serve` says once the server is bound."""
         return f"serving {wiring.transport} at {address}"

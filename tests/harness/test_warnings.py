@@ -98,6 +98,15 @@ def test_a_warning_names_cells_and_the_way_out() -> None:
     assert "synthetic" in warning.advice
 
 
+def test_what_to_do_against_loss_is_what_the_transport_of_the_cell_says() -> None:
+    guard = SampleGuard({"ros/topic": "export A=1", "http/binary": "no"})
+    guard.see(row("a", facts={"frames_lost": 2.0}), 1)
+    guard.see(row("b", error="MessagesLost: 3"), 2)
+    assert [warning.advice for warning in guard.warnings()] == ["export A=1", "export A=1"]
+    (dropped,) = Counters(receive_buffer_errors=4).warnings_since(Counters(receive_buffer_errors=0), "export A=1")
+    assert dropped.advice == "export A=1"
+
+
 @pytest.mark.parametrize(
     ("after", "code"),
     [

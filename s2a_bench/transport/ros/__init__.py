@@ -39,6 +39,7 @@ class Ros(Transport[RosOptions]):
         "dds": "s2a_bench.transport.ros.checks:dds",
         "ros": "s2a_bench.transport.ros.checks:ros",
         "middleware": "s2a_bench.transport.ros.checks:middleware",
+        "dds-buffers": "s2a_bench.transport.ros.buffers:check",
     }
     watches_udp = True
     elsewhere = ("action",)
@@ -104,6 +105,12 @@ class Ros(Transport[RosOptions]):
     def before_run(self, width: int, height: int) -> tuple[str, ...]:
         """Return the check of the receive buffer, where pictures are large."""
         return ("rmem-max",) if width * height > LARGE_PICTURE else ()
+
+    def against_loss(self, options: RosOptions) -> str:
+        """Return what the middleware in use needs."""
+        from s2a_bench.transport.ros.buffers import against_loss
+
+        return against_loss(options.middleware, os.environ)
 
     def ready(self, wiring: Wiring[RosOptions], address: str) -> str:
         """Return the names of action and camera."""

@@ -1,0 +1,82 @@
+"""What large pictures need of the DDS in use: receive buffers, fragments, quality of service."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+
+from s2a_bench.machine.doctor import Finding, Machine
+from s2a_bench.machine.doctor.robot import RMEM_WANTED
+from s2a_bench.ros import default_middleware
+from s2a_bench.ros.config import TUNED_GENERAL, TUNED_INTERNAL
+
+CYCLONE, FAST = "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp"
+DEFAULT_RMW = FAST
+"""Of Humble and Jazzy, where RMW_IMPLEMENTATION says nothing."""
+KERNEL = f"sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}"
+FRAGMENT = f'<CycloneDDS><Domain id="any"><General>{TUNED_GENERAL}</General>{TUNED_INTERNAL}</Domain></CycloneDDS>'
+LARGE_DATA = "export FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA"
+PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+
+_ELEMENT = re.compile(r"SocketReceiveBufferSize[^>]*>[^<]*")
+_SIZE = re.compile(r"([0-9]{1,12})\s*([kKMG]?)")
+_UNITS = {"": 0, "K": 10, "M": 20, "G": 30}
+
+
+def dds_of(middleware: str, environ: Mapping[str, str]) -> str:
+    """Return cyclonedds, or which RMW a middleware is; "" for the one that is taken without being told."""
+    name = middleware or default_middleware(environ)
+    return environ.get("RMW_IMPLEMENTATION") or DEFAULT_RMW if name == "rclpy" else name
+
+
+def against_loss(middleware: str, environ: Mapping[str, str]) -> str:
+    """Return what to do where frames are lost over a middleware."""
+    dds = dds_of(middleware, environ)
+    if dds == CYCLONE or (dds == "cyclonedds" and environ.get("CYCLONEDDS_URI")):
+        return f"--qos reliable, and on both sides: {cyclone_line(environ)}; {KERNEL}"
+    if dds == "cyclonedds":
+        return f"--qos reliable, --dds-tuning tuned, and {KERNEL}"
+    if dds == FAST:
+        return f"--qos reliable, and on both sides: {fast_line(environ)}; {KERNEL}"
+    return f"--qos reliable, larger receive buffers for {dds}, and {KERNEL}"
+
+
+def cyclone_line(environ: Mapping[str, str]) -> str:
+    """Return the line that gives Cyclone DDS large buffers and fragments, and keeps what it is told already."""
+    kept = '"$CYCLONEDDS_URI,"' if environ.get("CYCLONEDDS_URI") else ""
+    return f"export CYCLONEDDS_URI={kept}'{FRAGMENT}'"
+
+
+def fast_line(environ: Mapping[str, str]) -> str:
+    """Return the line that gives Fast DDS something better than UDP; Humble's has no such thing yet."""
+    if environ.get("ROS_DISTRO") == "humble":
+        return f"export {PROFILES[1]}=FILE.xml, whose UDPv4 transport has a receiveBufferSize of {RMEM_WANTED}"
+    return LARGE_DATA
+
+
+def check(machine: Machine) -> Finding | None:
+    """Return whether the DDS that a run takes has room for large pictures; our own configuration has."""
+    environ, code = machine.environ, "dds-buffers"
+    dds = dds_of("", environ)
+    if dds == CYCLONE or (dds == "cyclonedds" and environ.get("CYCLONEDDS_URI")):
+        asked = max(_asked(machine), default=0)
+        if asked >= RMEM_WANTED:
+            return Finding(code, "state", f"{dds}: CYCLONEDDS_URI asks for {asked} bytes of receive buffer")
+        told = f"{dds}: CYCLONEDDS_URI asks for no large receive buffer: pictures of 1920x1080 are lost"
+        return Finding(code, "warning", f"{told}, with best effort all of them", cyclone_line(environ))
+    if dds == FAST:
+        if "LARGE_DATA" in environ.get("FASTDDS_BUILTIN_TRANSPORTS", "") or any(map(environ.get, PROFILES)):
+            return Finding(code, "state", f"{dds} is told how to carry large pictures")
+        return Finding(code, "advice", f"{dds} has its small receive buffers: pictures may be lost", fast_line(environ))
+    return None
+
+
+def _asked(machine: Machine) -> Iterator[int]:
+    """Yield the sizes of receive buffers in CYCLONEDDS_URI, a list of files and pieces of XML."""
+    uri = machine.environ.get("CYCLONEDDS_URI", "")
+    paths = (piece.strip().removeprefix("file://") for piece in uri.split(","))
+    files = (machine.read(path.lstrip("/")) or "" for path in paths if path.startswith("/"))
+    for text in (uri, *files):
+        for element in _ELEMENT.findall(text):
+            for number, unit in _SIZE.findall(element):
+                yield int(number) << _UNITS[unit.upper()]
