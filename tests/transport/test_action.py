@@ -19,6 +19,7 @@ from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.ros import ActionServer, Result, ServerGoal, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
+from s2a_bench.ros.cyclone_server import CycloneServerGoal
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
 from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
@@ -310,6 +311,31 @@ def test_a_handler_that_breaks_fails_its_goal_only(dds_domain: int) -> None:
         for _ in range(6):
             with pytest.raises(RequestFailed, match="a bug"):
                 ask(client, Request("a", "break"))
+        assert len(ask(client, Request("a", "plan"))[0]) == 1
+    finally:
+        client.close()
+        server.stop()
+        thread.join()
+
+
+def test_a_goal_that_cannot_start_ends_and_says_why(dds_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    execute = CycloneServerGoal.executing
+    failures = [TransportError("no status can be sent")]
+
+    def executing(goal: CycloneServerGoal) -> bool:
+        if failures:
+            raise failures.pop()
+        return execute(goal)
+
+    monkeypatch.setattr(CycloneServerGoal, "executing", executing)
+    told = wiring("ros/action", "/test_start", domain_id=dds_domain)
+    server = open_server(told, Recorder(["fine"]))
+    thread = Thread(target=server.serve)
+    thread.start()
+    client = open_client(told)
+    try:
+        with pytest.raises(RequestFailed, match="no status can be sent"):
+            ask(client, Request("a", "plan"))
         assert len(ask(client, Request("a", "plan"))[0]) == 1
     finally:
         client.close()

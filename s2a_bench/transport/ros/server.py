@@ -229,18 +229,17 @@ class RosServer:
                 job.end(str(late))
                 return False
             job.trace.mark("queue")
-        if self._stopped.is_set():
-            job.end("the server is stopping")
-        elif not turn.has_come or not job.start():
-            job.end()
-        else:
-            return True
-        return False
+        if self._stopped.is_set() or not turn.has_come:
+            job.end("the server is stopping" if self._stopped.is_set() else "")
+            return False
+        return True
 
     def _answer(self, request: Request, job: Job, turn: Turn) -> str:
         """Answer a request whose turn has come; return what went wrong, for who asked."""
         self._activity.requests += 1
         try:
+            if not job.start():
+                return ""
             if not request.images:
                 request = replace(request, images=self._cache.lend(job.trace))
             with closing(self._queued.answer(request, job.trace, turn)) as tokens:
