@@ -66,7 +66,7 @@ def goals(stranger: Middleware) -> Callable[[], Any]:
     return connect
 
 
-def test_a_goal_too_many_is_rejected_at_once(goals: Callable[[], Any], capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_goal_too_many_is_rejected_at_once(goals: Callable[[], Any], caplog: pytest.LogCaptureFixture) -> None:
     gate = Gate()
     queued = Queued.around(gate, Limits(waiting=1))
     with serving(queued, "ros/action"):
@@ -78,7 +78,7 @@ def test_a_goal_too_many_is_rejected_at_once(goals: Callable[[], Any], capfd: py
         until(lambda: queued.turns.waiting == 1)
         third = client.send(client.pack(generate_goal("go", [])))
         assert next_of(client, Rejected).goal_id == third
-        assert f"goal {third.hex()} rejected: 1 requests are waiting for the engine already" in capfd.readouterr().err
+        assert f"goal {third.hex()} rejected: 1 requests are waiting for the engine already" in caplog.text
         gate.go.set()
         for goal_id in (first, second):
             client.cancel(goal_id)

@@ -133,7 +133,7 @@ def without_llama_msgs(patch: pytest.MonkeyPatch) -> None:
 
 
 def test_topics_are_served_without_llama_msgs_and_the_log_says_what_is_not(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     without_llama_msgs(monkeypatch)
     told = wiring("ros/topic", "/s2a", middleware="rclpy", domain_id=7)
@@ -141,9 +141,8 @@ def test_topics_are_served_without_llama_msgs_and_the_log_says_what_is_not(
         client = next(connecting)(Recorder(["a ", "b"]))
         tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),)))
     assert [token.text for token in tokens] == ["a ", "b"]
-    said = capsys.readouterr().err
-    assert "the action is not served: llama_msgs/action/GenerateResponse is not in this ROS 2 workspace" in said
-    assert "colcon build --packages-select llama_msgs" in said
+    assert "the action is not served: llama_msgs/action/GenerateResponse is not in this ROS 2 workspace" in caplog.text
+    assert "colcon build --packages-select llama_msgs" in caplog.text
     assert GRAPH == []
 
 
