@@ -138,13 +138,23 @@ def serialise(value: Any, type_name: str, version: str = DEFAULT_VERSION) -> byt
     The buffer is zeroed first because rosbags skips NULs and padding. Header ``00 01 00 pp``, pp = bytes of padding.
     """
     store = typestore(version)
-    definition = store.get_msgdef(type_name)
-    size = CDR_HEADER + definition.getsize_cdr(0, value, store)
+    size = _size(value, type_name, version)
     padding = -size % 4
     buffer = bytearray(size + padding)
     buffer[1], buffer[3] = 1, padding
-    definition.serialize_cdr_le(memoryview(buffer)[CDR_HEADER:], 0, value, store)
+    store.get_msgdef(type_name).serialize_cdr_le(memoryview(buffer)[CDR_HEADER:], 0, value, store)
     return buffer
+
+
+def serialised_bytes(value: Any, type_name: str, version: str = DEFAULT_VERSION) -> int:
+    """Return how many bytes `serialise` would write."""
+    size = _size(value, type_name, version)
+    return size + -size % 4
+
+
+def _size(value: Any, type_name: str, version: str) -> int:
+    store = typestore(version)
+    return CDR_HEADER + int(store.get_msgdef(type_name).getsize_cdr(0, value, store))
 
 
 def deserialise(cdr: memoryview, type_name: str, version: str = DEFAULT_VERSION) -> Any:

@@ -2,7 +2,8 @@
 
 rclpy tells a goal's acceptance, feedback and result by callbacks, newest first where several are due, and takes one
 message of each kind at a time; so a result can overtake feedback. `_DrainingClient` takes all that has arrived and
-keeps the seam's order. It overrides two methods of rclpy's Waitable interface, the same in Humble and Jazzy.
+keeps the seam's order. It overrides two methods of rclpy's Waitable interface, the same in Humble and Jazzy, which
+the consuming thread calls instead of an executor's.
 
 One lock covers sending and receiving: without it rclpy may receive an answer before it has noted the request, and
 drops it (ros2/rclpy issue 1123, in Humble and in Jazzy up to autumn 2025).
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from threading import RLock
@@ -19,14 +21,14 @@ from typing import Any
 
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
-from rclpy.serialization import deserialize_message
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import Accepted, ActionEvent, CancelResponse, Feedback, QoS, Rejected, Result
-from s2a_bench.ros.messages import serialise
-from s2a_bench.ros.rclpy_node import Inbox, SpinningNode, qos_profile
-from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class
+from s2a_bench.ros.messages import serialised_bytes
+from s2a_bench.ros.rclpy_node import SpinningNode, qos_profile
+from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
+from s2a_bench.ros.rclpy_waiter import Unserved, for_waitable, run_now
 
 MATCH_POLL_S = 0.01
 AT_ONCE = 10_000
@@ -49,7 +51,7 @@ class _DrainingClient(ActionClient):  # type: ignore[misc]
 
     def __init__(self, owner: RclpyActionClient, *arguments: Any, **keywords: Any) -> None:
         self._owner = owner
-        super().__init__(*arguments, **keywords)
+        super().__init__(*arguments, callback_group=Unserved(), **keywords)
 
     def take_data(self) -> list[dict[str, Any]]:
         """Take until nothing is left, or `AT_ONCE`; a kind that was not ready when the wait ended may be so by now."""
@@ -86,24 +88,41 @@ class RclpyActionClient:
         self._active: set[bytes] = set()
         self._early: dict[bytes, list[Feedback]] = {}
         """Feedback on goals whose acceptance is still under way."""
-        self._inbox: Inbox[ActionEvent] = Inbox()
-        self.next_event = self._inbox.get
-        self.interrupt = self._inbox.interrupt
+        self._events: deque[ActionEvent] = deque()
         self._client = _DrainingClient(
             self, node.node, self._action, name, feedback_sub_qos_profile=qos_profile(QoS(depth=0))
         )
         self._canceller = node.node.create_client(self._cancel_goal, name + "/_action/cancel_goal")
         """rclpy's action client can cancel one goal or all, but not those until a stamp."""
+        self._waiter = for_waitable(node.node, self._client)
+        self.interrupt = self._waiter.interrupt
 
-    def destroy(self) -> None:
+    def close(self) -> None:
         """Destroy the waitable, which the node does not."""
+        self._waiter.close()
         self._client.destroy()
+
+    def next_event(self, timeout_s: float) -> ActionEvent | None:
+        """Wait on this thread; None on timeout or after `interrupt`."""
+        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        more = True
+        with self._waiter.busy:
+            while more and not self._events:
+                more = self._waiter.wait_until(deadline_ns)
+                if not self._waiter.interrupted:
+                    self._take()
+            return self._events.popleft() if self._events and not self._waiter.interrupted else None
+
+    def _take(self) -> None:
+        with self._client:
+            if self._client.is_ready(self._waiter.wait_set):
+                run_now(self._client.execute(self._client.take_data()))
 
     def wait_for_server(self, timeout_s: float) -> bool:
         """Look every 10 ms; rclpy's own waiting looks four times a second."""
         deadline_ns = now_ns() + int(timeout_s * 1e9)
         while not self.server_present():
-            if now_ns() > deadline_ns or self._inbox.interrupted:
+            if now_ns() > deadline_ns or self._waiter.interrupted:
                 return False
             time.sleep(MATCH_POLL_S)
         return True
@@ -120,8 +139,8 @@ class RclpyActionClient:
         """Fill a goal of the generated class."""
         if self._version != self._installed:
             raise TransportError(f"this workspace has llama_msgs {self._installed}, not {self._version}")
-        cdr = bytes(serialise(goal, self._type + "_Goal", self._version))
-        return _Packed(deserialize_message(cdr, self._action.Goal), len(cdr))
+        told = self._type + "_Goal", self._version
+        return _Packed(to_ros(goal, self._action.Goal, *told), serialised_bytes(goal, *told))
 
     def send(self, packed: _Packed, goal_id: bytes | None = None) -> bytes:
         """Send the goal."""
@@ -148,10 +167,15 @@ class RclpyActionClient:
         request.goal_info.goal_id.uuid = list(goal_id)
         request.goal_info.stamp.sec, request.goal_info.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
         future = self._canceller.call_async(request)
-        future.add_done_callback(lambda done: self._inbox.put(_cancel_response(goal_id, done.result())))
+        future.add_done_callback(lambda done: self._answered(_cancel_response(goal_id, done.result())))
+
+    def _answered(self, response: CancelResponse) -> None:
+        """Take an answer on the spinning thread."""
+        self._events.append(response)
+        self._waiter.wake()
 
     def tell(self, feedback: list[Any]) -> None:
-        """Turn what has arrived into events; on the spinning thread, under the lock."""
+        """Turn what has arrived into events; on the consuming thread, under the lock."""
         events: list[ActionEvent] = []
         for goal_id, handle in _settled(self._asked):
             if handle.accepted:
@@ -170,7 +194,7 @@ class RclpyActionClient:
         for goal_id, response in _settled(self._results):
             self._active.discard(goal_id)
             events.append(Result(goal_id, response.status, response.result))
-        self._inbox.put(*events)
+        self._events.extend(events)
 
     def unpack_feedback(self, packed: Any) -> Any:
         """Turn into the rosbags class."""

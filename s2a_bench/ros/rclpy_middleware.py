@@ -15,14 +15,16 @@ from typing import Any
 
 import rclpy
 
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
 from s2a_bench.ros.rclpy_client import RclpyActionClient
-from s2a_bench.ros.rclpy_node import Inbox, SpinningNode, qos_profile
+from s2a_bench.ros.rclpy_node import SpinningNode, qos_profile
 from s2a_bench.ros.rclpy_server import RclpyActionServer
 from s2a_bench.ros.rclpy_service import RclpyServiceClient, offer
 from s2a_bench.ros.rclpy_types import message_class
+from s2a_bench.ros.rclpy_waiter import ONE_SUBSCRIPTION, Unserved, Waiter
 
 
 class _RclpyPublisher:
@@ -51,20 +53,30 @@ class _RclpyPublisher:
 
 
 class _RclpySubscription:
-    """Receives messages from a ROS topic; an inbox of its QoS's depth holds what the consumer has not taken."""
+    """Takes messages on the consuming thread; rmw's history, of the QoS's depth, holds what was not taken."""
 
     def __init__(self, node: SpinningNode, topic: str, type_name: str, qos: QoS) -> None:
-        self._node = node
-        self._topic = topic
-        self._type_name = type_name
-        self._inbox: Inbox[bytes] = Inbox(qos.depth)
-        self.take = self._inbox.get
-        self.interrupt = self._inbox.interrupt
-        cls = message_class(type_name)
-        self._subscription = node.node.create_subscription(cls, topic, self._receive, qos_profile(qos), raw=True)
+        self._node, self._topic, self._type_name = node, topic, type_name
+        self._class = message_class(type_name)
+        self._subscription = node.node.create_subscription(
+            self._class, topic, lambda _: None, qos_profile(qos), callback_group=Unserved(), raw=True
+        )
+        handle = self._subscription.handle
+        self._waiter = Waiter(node.node, handle, ONE_SUBSCRIPTION, lambda wait_set: wait_set.add_subscription(handle))
+        self.interrupt, self.close = self._waiter.interrupt, self._waiter.close
 
-    def _receive(self, packed: bytes) -> None:
-        self._inbox.put(packed)
+    def take(self, timeout_s: float) -> bytes | None:
+        """Take the next message's CDR."""
+        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        with self._waiter.busy:
+            more = True
+            while not self._waiter.interrupted:
+                if (taken := self._subscription.handle.take_message(self._class, True)) is not None:
+                    return bytes(taken[0])
+                if not more:
+                    break
+                more = self._waiter.wait_until(deadline_ns)
+        return None
 
     def unpack(self, packed: bytes) -> Any:
         """Deserialise; arrays are views of the bytes that rclpy gave."""
@@ -82,7 +94,7 @@ class RclpyMiddleware:
         """Join ``domain_id`` as the node ``/namespace/name``; tuning is left to the rmw's own configuration."""
         self._domain_id = domain_id
         self._node = SpinningNode(domain_id, node_name)
-        self._destroy: list[Callable[[], None]] = []
+        self._close: list[Callable[[], None]] = []
         atexit.register(self.close)
 
     def publisher(self, topic: str, type_name: str, qos: QoS) -> _RclpyPublisher:
@@ -91,7 +103,9 @@ class RclpyMiddleware:
 
     def subscription(self, topic: str, type_name: str, qos: QoS) -> _RclpySubscription:
         """Create a raw subscription."""
-        return _RclpySubscription(self._open(), topic, type_name, qos)
+        subscription = _RclpySubscription(self._open(), topic, type_name, qos)
+        self._close.append(subscription.close)
+        return subscription
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Create a service."""
@@ -104,7 +118,7 @@ class RclpyMiddleware:
     def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> RclpyActionClient:
         """Create an action client."""
         client = RclpyActionClient(self._open(), name, type_name, version)
-        self._destroy.append(client.destroy)
+        self._close.append(client.close)
         return client
 
     def action_server(
@@ -112,7 +126,7 @@ class RclpyMiddleware:
     ) -> RclpyActionServer:
         """Create an action server."""
         server = RclpyActionServer(self._open(), name, type_name, result_timeout_s, version)
-        self._destroy.append(server.destroy)
+        self._close.append(server.close)
         return server
 
     def describe(self) -> dict[str, str | int]:
@@ -133,12 +147,12 @@ class RclpyMiddleware:
         }
 
     def close(self) -> None:
-        """Stop the thread, then destroy the actions, which a node does not own, then the node."""
+        """Stop the thread, end consumers' waits, destroy the actions, which a node does not own, then the node."""
         if not self._node.closed:
             atexit.unregister(self.close)
             self._node.stop()
-            for destroy in self._destroy:
-                destroy()
+            for close in self._close:
+                close()
             self._node.destroy()
 
     def _open(self) -> SpinningNode:

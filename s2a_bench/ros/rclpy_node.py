@@ -1,18 +1,14 @@
-"""What all of rclpy's endpoints here share: a node that a thread spins, and inboxes that the consumers wait on.
+"""What all of rclpy's endpoints here share: a node that a thread spins.
 
-One SingleThreadedExecutor a node: no callback here ever blocks, and one thread keeps the order in which things came.
-An executor cannot wait for a single subscription on the consuming thread (it waits for whole nodes), so a message
-changes threads once more than with Cyclone; rmw's own wait set would avoid that but is no public interface.
+The thread serves services and the answers to cancels; topics and actions have consumers that wait for themselves
+(`rclpy_waiter`). One SingleThreadedExecutor a node: no callback here ever blocks.
 """
 
 from __future__ import annotations
 
 import logging
-from collections import deque
-from concurrent.futures import Future
-from concurrent.futures import TimeoutError as NoAnswer
-from threading import Condition, Event, Thread
-from typing import Any, Generic, TypeVar
+from threading import Event, Thread
+from typing import Any
 
 import rclpy
 from rclpy.context import Context
@@ -23,9 +19,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS
 
-ANSWER_TIMEOUT_S = 10.0
 _log = logging.getLogger(__name__)
-T = TypeVar("T")
 
 
 def qos_profile(qos: QoS) -> Any:
@@ -39,33 +33,6 @@ def qos_profile(qos: QoS) -> Any:
     if not qos.depth:
         return QoSProfile(history=HistoryPolicy.KEEP_ALL, **asked)
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=qos.depth, **asked)
-
-
-class Inbox(Generic[T]):
-    """Carries what arrives from the spinning to the consuming thread, keeping the newest ``depth`` (0: all)."""
-
-    def __init__(self, depth: int = 0) -> None:
-        self._items: deque[T] = deque(maxlen=depth or None)
-        self._condition = Condition()
-        self.interrupted = False
-
-    def put(self, *items: T) -> None:
-        """Add, and wake the consumer."""
-        with self._condition:
-            self._items.extend(items)
-            self._condition.notify_all()
-
-    def get(self, timeout_s: float) -> T | None:
-        """Wait for the next; None on timeout or after `interrupt`."""
-        with self._condition:
-            self._condition.wait_for(lambda: self._items or self.interrupted, timeout_s)
-            return None if self.interrupted or not self._items else self._items.popleft()
-
-    def interrupt(self) -> None:
-        """Make a blocked `get`, and every later one, return None."""
-        with self._condition:
-            self.interrupted = True
-            self._condition.notify_all()
 
 
 class SpinningNode:
@@ -111,22 +78,6 @@ class SpinningNode:
         """Raise TransportError once closed."""
         if self.closed:
             raise TransportError("the middleware is closed")
-
-    def call(self, function: Any, *arguments: Any) -> Any:
-        """Run ``function(*arguments, outcome)`` on the spinning thread and wait for ``outcome``, a `Future`."""
-        self.check_open()
-        outcome: Future[Any] = Future()
-        self._executor.create_task(function, *arguments, outcome)
-        return self.answer(outcome)
-
-    def answer(self, outcome: Future[Any]) -> Any:
-        """Wait for what the spinning thread answers; raises TransportError if it does not."""
-        try:
-            return outcome.result(ANSWER_TIMEOUT_S)
-        except NoAnswer as error:
-            raise TransportError(f"rclpy's executor did not answer for {ANSWER_TIMEOUT_S:.0f} s") from error
-        except RuntimeError as error:  # rclpy's RCLError and InvalidHandle are RuntimeErrors
-            raise TransportError(f"rclpy: {error}") from error
 
     def stop(self) -> None:
         """End the thread, so that nothing runs while endpoints are destroyed."""

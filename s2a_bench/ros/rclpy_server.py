@@ -1,25 +1,29 @@
 """The action server on rclpy.
 
 rclpy decides on a goal, executes it and fetches its result in callbacks on the executor's thread; the seam's goals are
-decided and worked on by whoever took them. `_PullingServer` hands a request over instead of deciding, so that nothing
-blocks a thread of the executor and nothing is polled; decisions and ends then run rclpy's own code on that thread. It
-overrides two public methods, the same in Humble and Jazzy, and reads ``_goal_handles``, the goals rclpy remembers.
+decided and worked on by whoever took them. `_PullingServer` hands a request over instead of deciding; decisions and
+ends then run rclpy's own code on the thread of whoever took the goal. A thread of the server's own, instead of an
+executor, waits for requests, and serves cancels and results. It overrides two public methods, the same in Humble and
+Jazzy, reads ``_goal_handles``, the goals rclpy remembers, and calls ``_execute_goal``, which ends a goal.
 """
 
 from __future__ import annotations
 
 import logging
-from concurrent.futures import Future
-from threading import Lock
+from collections import deque
+from collections.abc import Callable
+from threading import Condition, Lock, RLock, Thread
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import MissingInterface, TransportError
 from s2a_bench.ros import QoS
 from s2a_bench.ros.action import NEXT, Status
-from s2a_bench.ros.rclpy_node import Inbox, SpinningNode, qos_profile
+from s2a_bench.ros.rclpy_node import SpinningNode, qos_profile
 from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
+from s2a_bench.ros.rclpy_waiter import SLICE_NS, Unserved, for_waitable, run_now
 
 FEEDBACK_QOS = QoS(depth=1000)
 """As with Cyclone: deeper than ROS's 10."""
@@ -111,9 +115,11 @@ class _PullingServer(ActionServer):  # type: ignore[misc]
     def __init__(self, owner: RclpyActionServer, *arguments: Any, **keywords: Any) -> None:
         self._owner = owner
         self._verdict = GoalResponse.REJECT
+        self._in_turn = RLock()
         super().__init__(
             *arguments,
-            execute_callback=lambda _: None,  # never called: `notify_execute` gets another
+            callback_group=Unserved(),
+            execute_callback=lambda _: None,  # never called: `end` has another
             goal_callback=lambda _: self._verdict,
             handle_accepted_callback=lambda _: None,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
@@ -122,30 +128,46 @@ class _PullingServer(ActionServer):  # type: ignore[misc]
 
     async def execute(self, taken_data: dict[str, Any]) -> None:
         """Offer a goal whose id is free; everything else, rejecting a taken id included, is rclpy's own business."""
-        request = taken_data.get("goal")
-        if request and bytes(request[1].goal_id.uuid) not in self._goal_handles and self._owner.offer(request):
-            taken_data = {kind: data for kind, data in taken_data.items() if kind != "goal"}
-        await super().execute(taken_data)
+        with self._in_turn:
+            request = taken_data.get("goal")
+            if request and bytes(request[1].goal_id.uuid) not in self._goal_handles and self._owner.offer(request):
+                taken_data = {kind: data for kind, data in taken_data.items() if kind != "goal"}
+            await super().execute(taken_data)
 
-    async def decide(self, request: Any, verdict: Any, outcome: Future[Any]) -> None:
-        """Run rclpy's code for a goal request with this verdict; the outcome is the goal's handle, None if refused."""
-        self._verdict = verdict
-        try:
-            await super().execute({"goal": request})
-        except RuntimeError as error:  # Humble's first releases raise when the client has left
-            _log.warning("goal request: %s", error)
-        finally:
-            self._verdict = GoalResponse.REJECT
-        outcome.set_result(self._goal_handles.get(bytes(request[1].goal_id.uuid)))
+    def decide(self, request: Any, verdict: Any) -> Any:
+        """Run rclpy's code for a goal request with this verdict; return the goal's handle, None if refused."""
+        with self._in_turn:
+            self._verdict = verdict
+            try:
+                run_now(super().execute({"goal": request}))
+            except RuntimeError as error:  # Humble's first releases raise when the client has left
+                _log.warning("goal request: %s", error)
+            finally:
+                self._verdict = GoalResponse.REJECT
+            return self._goal_handles.get(bytes(request[1].goal_id.uuid))
+
+    def end(self, handle: Any, state: Callable[[], None], result: Any) -> None:
+        """End a goal as rclpy's programs do: in an execute callback that sets the state and returns the result."""
+        failed: list[RuntimeError] = []
+
+        def finish(_handle: Any) -> Any:
+            try:
+                state()
+            except RuntimeError as error:
+                failed.append(error)
+            return result
+
+        with self._in_turn:
+            run_now(self._execute_goal(finish, handle))
+        if failed:
+            raise TransportError(f"rclpy: {failed[0]}") from failed[0]
 
     def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:
-        """Schedule nothing when a goal starts: its work is done by whoever took it. Its end has a callback."""
-        if execute_callback is not None:
-            super().notify_execute(goal_handle, execute_callback)
+        """Schedule nothing when a goal starts: its work is done by whoever took it."""
 
 
 class RclpyActionServer:
-    """Goals are taken on the consuming thread; cancels and results are served by the spinning thread."""
+    """Goals are taken, decided and ended on the consuming threads; cancels and results have a thread here."""
 
     def __init__(self, node: SpinningNode, name: str, type_name: str, result_timeout_s: float, version: str) -> None:
         """Create the server of the action ``/name``; raises MissingInterface for a version the workspace lacks."""
@@ -156,9 +178,9 @@ class RclpyActionServer:
             raise MissingInterface(f"this workspace has llama_msgs {installed}, not {version}")
         self._lock = Lock()
         self._offered: set[bytes] = set()
-        self._inbox: Inbox[RclpyServerGoal] = Inbox()
-        self.next_goal = self._inbox.get
-        self.interrupt = self._inbox.interrupt
+        self._goals: deque[RclpyServerGoal] = deque()
+        self._came = Condition(self._lock)
+        self._interrupted = False
         self._server = _PullingServer(
             self,
             node.node,
@@ -167,10 +189,25 @@ class RclpyActionServer:
             feedback_pub_qos_profile=qos_profile(FEEDBACK_QOS),
             result_timeout=result_timeout_s,
         )
+        self._waiter = for_waitable(node.node, self._server)
+        self._thread = Thread(target=self._serve, name=f"rclpy {name}", daemon=True)
+        self._thread.start()
 
-    def destroy(self) -> None:
-        """Destroy the waitable, which the node does not."""
+    def close(self) -> None:
+        """End the thread, then destroy the waitable, which the node does not."""
+        self._waiter.interrupt()
+        self._thread.join()
         self._server.destroy()
+
+    def _serve(self) -> None:
+        """Take what comes until closed; a request that fails is reported and the next is served."""
+        while self._waiter.wait_until(now_ns() + SLICE_NS):
+            try:
+                with self._server:
+                    if self._server.is_ready(self._waiter.wait_set):
+                        run_now(self._server.execute(self._server.take_data()))
+            except Exception:  # noqa: BLE001 - whatever the request of a stranger raised
+                _log.exception("a request to the action %s failed", self._type)
 
     def offer(self, request: Any) -> bool:
         """Queue a goal; False if one of this id waits for its decision."""
@@ -179,8 +216,21 @@ class RclpyActionServer:
             if goal.id in self._offered:
                 return False
             self._offered.add(goal.id)
-        self._inbox.put(goal)
+            self._goals.append(goal)
+            self._came.notify_all()
         return True
+
+    def next_goal(self, timeout_s: float) -> RclpyServerGoal | None:
+        """Wait for the next; None on timeout or after `interrupt`."""
+        with self._came:
+            self._came.wait_for(lambda: self._goals or self._interrupted, timeout_s)
+            return None if self._interrupted or not self._goals else self._goals.popleft()
+
+    def interrupt(self) -> None:
+        """Make a blocked `next_goal`, and every later one, return None."""
+        with self._came:
+            self._interrupted = True
+            self._came.notify_all()
 
     def decide(self, request: Any, *, accepted: bool) -> Any:
         """Accept or reject a goal once, and return rclpy's handle of an accepted one."""
@@ -190,7 +240,8 @@ class RclpyActionServer:
                 raise TransportError(f"goal {goal_id.hex()} was accepted or rejected already")
             self._offered.remove(goal_id)
         verdict = GoalResponse.ACCEPT if accepted else GoalResponse.REJECT
-        return self._node.call(self._server.decide, request, verdict)
+        self._node.check_open()
+        return self._server.decide(request, verdict)
 
     def convert_goal(self, goal: Any) -> Any:
         """Turn a goal into the rosbags class."""
@@ -205,19 +256,7 @@ class RclpyActionServer:
             raise TransportError(f"rclpy could not publish feedback: {error}") from error
 
     def end(self, handle: Any, status: Status, result: Any) -> None:
-        """End a goal as rclpy's programs do: in an execute callback that sets the state and returns the result."""
+        """End a goal on the calling thread."""
         message = to_ros(result, self._action.Result, self._type + "_Result", self._version)
-        outcome: Future[None] = Future()
-
-        def finish(goal_handle: Any) -> Any:
-            try:
-                getattr(goal_handle, ENDS[status])()
-            except RuntimeError as error:
-                outcome.set_exception(error)
-            else:
-                outcome.set_result(None)
-            return message
-
         self._node.check_open()
-        self._server.notify_execute(handle, finish)
-        self._node.answer(outcome)
+        self._server.end(handle, getattr(handle, ENDS[status]), message)

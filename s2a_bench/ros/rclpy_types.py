@@ -1,19 +1,26 @@
 """Message classes of the ROS 2 workspace, and the way between them and the rosbags classes: CDR.
 
 Both sides read and write CDR, so nothing is converted field by field here: rclpy's own serialiser, which is C, fills
-the generated classes (an ``Image.data`` becomes an ``array.array('B')`` by one copy), and rosbags gives views of bytes.
+the generated classes, and rosbags gives views of bytes. Pixels go beside the CDR: into an ``array.array('B')``, which
+generated classes take as it is, by one copy, and out of it by none.
 """
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
+import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.interfaces import Nodetype
 
 from s2a_bench.errors import MissingInterface
 from s2a_bench.ros import messages as ros
+
+NO_PIXELS = np.empty(0, np.uint8)
 
 
 def interface_class(type_name: str) -> Any:
@@ -30,12 +37,41 @@ def interface_class(type_name: str) -> Any:
 
 def to_ros(message: Any, cls: Any, type_name: str, version: str) -> Any:
     """Turn a rosbags message into one of the generated class."""
-    return deserialize_message(bytes(ros.serialise(message, type_name, version)), cls)
+    with _without_pixels(message, NO_PIXELS) as pixels:
+        made = deserialize_message(bytes(ros.serialise(message, type_name, version)), cls)
+    for image, its in zip(_images(made), pixels, strict=True):
+        data = array("B")
+        data.frombytes(np.ascontiguousarray(its).data.cast("B"))
+        image.data = data
+    return made
 
 
 def from_ros(message: Any, type_name: str, version: str) -> Any:
-    """Turn a message of a generated class into a rosbags message, whose arrays are views of its CDR."""
-    return ros.deserialise(memoryview(serialize_message(message)), type_name, version)
+    """Turn a message of a generated class into a rosbags message, whose arrays are views of its CDR or pixels."""
+    with _without_pixels(message, array("B")) as pixels:
+        made = ros.deserialise(memoryview(serialize_message(message)), type_name, version)
+    for image, its in zip(_images(made), pixels, strict=True):
+        image.data = np.frombuffer(its, np.uint8)
+    return made
+
+
+def _images(message: Any) -> Sequence[Any]:
+    """Return the images of a goal of either version; other messages of actions have none."""
+    return getattr(message, "images", None) or [image for image in (getattr(message, "image", None),) if image]
+
+
+@contextmanager
+def _without_pixels(message: Any, none: Any) -> Iterator[list[Any]]:
+    """Give out the pixels of a message's images, which has ``none`` meanwhile."""
+    images = _images(message)
+    pixels = [image.data for image in images]
+    try:
+        for image in images:
+            image.data = none
+        yield pixels
+    finally:
+        for image, its in zip(images, pixels, strict=True):
+            image.data = its
 
 
 def fits(cls: Any, type_name: str, version: str = ros.DEFAULT_VERSION) -> bool:

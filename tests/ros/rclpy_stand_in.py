@@ -1,7 +1,7 @@
 """A stand-in of the part of rclpy that the glue around it uses, inside this process. It is not rclpy.
 
 It has the calls that the glue makes, with rclpy's signatures, its type checks on messages, one kind of each message
-taken at a time, done callbacks and waitables run by the executor, and the order of steps in rclpy's action server. Its
+taken at a time, done callbacks run by the executor, wait sets, and the order of steps in rclpy's action server. Its
 generated classes and its CDR are rosbags'. So it cannot show: DDS, discovery and QoS; rclpy's serialiser and the fields
 of real generated classes; threads inside rclpy, its locks, teardown and time spent; exceptions of rcl; a Humble that
 differs from Jazzy. For these tests/ros/test_rclpy.py runs the same suites on the real one.
@@ -10,14 +10,18 @@ differs from Jazzy. For these tests/ros/test_rclpy.py runs the same suites on th
 from __future__ import annotations
 
 import inspect
+from array import array
 from collections import defaultdict, deque
 from collections.abc import Callable
+from copy import copy
 from enum import Enum
 from functools import cache
 from queue import SimpleQueue
+from threading import Condition
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from s2a_bench.clock import now_ns
@@ -54,7 +58,22 @@ def action(type_name: str, version: str = "6.0") -> Any:
     )
 
 
+def with_ndarrays(value: Any) -> Any:
+    """A copy that rosbags takes: bytes of generated messages may be an ``array``."""
+    if isinstance(value, array):
+        assert value.typecode == "B"
+        return np.frombuffer(value, np.uint8)
+    if isinstance(value, list):
+        return [with_ndarrays(item) for item in value]
+    if not hasattr(value, "__msgtype__"):
+        return value
+    made = copy(value)
+    vars(made).update({name: with_ndarrays(item) for name, item in vars(value).items()})
+    return made
+
+
 def serialize_message(message: Any) -> bytes:
+    message = with_ndarrays(message)
     return bytes(ros.serialise(message, message.__msgtype__, getattr(message, "version", "6.0")))
 
 
@@ -66,7 +85,9 @@ def deserialize_message(cdr: bytes, cls: Any) -> Any:
 
 
 class Future:
-    def __init__(self, executor: Executor) -> None:
+    """rclpy's calls back at once where no executor has made it its own."""
+
+    def __init__(self, executor: Executor | None) -> None:
         self.executor, self.callbacks, self.value = executor, [], []
         self.done = lambda: bool(self.value)
         self.result = lambda: self.value[0]
@@ -74,12 +95,83 @@ class Future:
     def add_done_callback(self, callback: Callable[[Any], None]) -> None:
         self.callbacks.append(callback)
         if self.value:
-            self.executor.create_task(callback, self)
+            self.call(callback)
 
     def set_result(self, value: Any) -> None:
         self.value.append(value)
         for callback in self.callbacks:
+            self.call(callback)
+
+    def call(self, callback: Callable[[Any], None]) -> None:
+        if self.executor is None:
+            callback(self)
+        else:
             self.executor.create_task(callback, self)
+
+
+CAME = Condition()
+"""Something came to an entity that no executor serves, or a guard condition was triggered."""
+
+
+class CallbackGroup:
+    def can_execute(self, _entity: Any) -> bool:
+        return True
+
+
+class Guard:
+    def __init__(self, callback_group: CallbackGroup) -> None:
+        assert not callback_group.can_execute(self)
+        self.handle, self.triggered = self, False
+
+    def is_ready(self) -> bool:
+        ready, self.triggered = self.triggered, False  # a wait resets it
+        return ready
+
+    def trigger(self) -> None:
+        with CAME:
+            self.triggered = True
+            CAME.notify_all()
+
+
+class WaitSet:
+    """It has room for what it was made for, and forgets what it has after each wait."""
+
+    def __init__(self, *counts_and_context: Any) -> None:
+        *self.counts, context = counts_and_context
+        assert len(self.counts) == 6
+        assert context == "context handle"
+        self.clear_entities()
+
+    def clear_entities(self) -> None:
+        self.subscriptions: list[Any] = []
+        self.guards: list[Any] = []
+        self.waitables: list[Any] = []
+
+    def add_subscription(self, handle: Any) -> None:
+        self.subscriptions.append(handle)
+
+    def add_guard_condition(self, handle: Any) -> None:
+        self.guards.append(handle)
+
+    def wait(self, timeout_ns: int) -> None:
+        assert (len(self.subscriptions) + 2 * len(self.waitables), len(self.guards)) == tuple(self.counts[:2])
+        held = [*self.subscriptions, *self.waitables]
+        assert all(entity.held for entity in held), "rclpy may destroy what is not held"
+        with CAME:
+            CAME.wait_for(lambda: sum(end.is_ready() for end in (*held, *self.guards)), timeout_ns / 1e9)
+        self.clear_entities()
+
+
+class Held:
+    """Something of rclpy's that is not destroyed while it is a context."""
+
+    held = 0
+
+    def __enter__(self) -> None:
+        self.held += 1
+
+    def __exit__(self, *_: object) -> None:
+        self.held -= 1
 
 
 class Executor:
@@ -108,6 +200,7 @@ class Node:
     def __init__(self, name: str, context: Any, namespace: str, **_: bool) -> None:
         assert "/" not in name
         assert namespace.startswith("/")
+        self.context = context
         self.domain, self.executor = context.domain, Executor(context)
         self.topics: dict[str, list[Any]] = defaultdict(list)
         self.subscribed: dict[str, list[Any]] = defaultdict(list)
@@ -126,27 +219,35 @@ class Node:
         return [(node, end) for node, end in every if isinstance(end, ActionServer) and end.name == name]
 
     def deliver(self, end: Any, kind: str, data: Any) -> None:
-        async def handle() -> None:
-            await end.execute(end.take_data())
+        assert not end.callback_group.can_execute(end), "an executor would take it, too"
+        with CAME:
+            end.ready[kind].append(data)
+            CAME.notify_all()
 
-        end.ready[kind].append(data)
-        self.executor.create_task(handle)
+    def create_guard_condition(self, _callback: Any, callback_group: CallbackGroup) -> Guard:
+        return Guard(callback_group)
 
     def create_publisher(self, _cls: Any, topic: str, _qos: Any) -> Any:
-        def receivers() -> list[tuple[Node, Any]]:
-            return [(node, receive) for node in self.peers() for receive in node.subscribed[topic]]
+        def receivers() -> list[Subscribed]:
+            return [subscribed for node in self.peers() for subscribed in node.subscribed[topic]]
 
         def publish(message: bytes) -> None:
             assert isinstance(message, bytes)  # rclpy: of the class, or bytes
-            for node, receive in receivers():
-                node.executor.create_task(receive, message)
+            with CAME:
+                for receiver in receivers():
+                    receiver.messages.append(message)
+                CAME.notify_all()
 
         self.topics[topic].append(publish)
         return SimpleNamespace(publish=publish, get_subscription_count=lambda: len(receivers()), topic_name=topic)
 
-    def create_subscription(self, _cls: Any, topic: str, callback: Any, _qos: Any, *, raw: bool) -> None:
+    def create_subscription(
+        self, cls: Any, topic: str, _callback: Any, qos: Any, *, callback_group: CallbackGroup, raw: bool
+    ) -> Any:
         assert raw
-        self.subscribed[topic].append(callback)
+        assert not callback_group.can_execute(self)
+        self.subscribed[topic].append(Subscribed(cls, qos))
+        return SimpleNamespace(handle=self.subscribed[topic][-1])
 
     def count_publishers(self, topic: str) -> int:
         return sum(len(node.topics[topic]) for node in self.peers())
@@ -188,11 +289,36 @@ class Node:
         return SimpleNamespace(call_async=call_async, service_is_ready=lambda: bool(self.servers(server)))
 
 
-class Waitable:
-    def __init__(self, node: Node, kind: Any, name: str) -> None:
-        self.node, self.action, self.name = node, kind, name
+class Subscribed(Held):
+    """What rclpy calls a subscription's handle, with rmw's history."""
+
+    def __init__(self, cls: Any, qos: Any) -> None:
+        self.cls, self.messages = cls, deque[bytes](maxlen=getattr(qos, "depth", None))
+
+    def is_ready(self) -> bool:
+        return bool(self.messages)
+
+    def take_message(self, cls: Any, raw: bool) -> tuple[bytes, Any] | None:
+        assert (cls, raw) == (self.cls, True)
+        return (self.messages.popleft(), "info") if self.messages else None
+
+
+class Waitable(Held):
+    def __init__(self, node: Node, kind: Any, name: str, callback_group: CallbackGroup) -> None:
+        self.node, self.action, self.name, self.callback_group = node, kind, name, callback_group
         self.ready: dict[str, deque[Any]] = defaultdict(deque)
         node.waitables.append(self)
+
+    def get_num_entities(self) -> Any:
+        kinds = ("guard_conditions", "timers", "clients", "services", "events")
+        return SimpleNamespace(num_subscriptions=2, **{f"num_{kind}": 0 for kind in kinds})
+
+    def add_to_wait_set(self, wait_set: WaitSet) -> None:
+        wait_set.waitables.append(self)
+
+    def is_ready(self, wait_set: WaitSet | None = None) -> bool:
+        assert self.held or wait_set is None
+        return any(self.ready.values())
 
     def take_data(self) -> dict[str, Any]:
         return {kind: queue.popleft() for kind, queue in self.ready.items() if queue}
@@ -202,13 +328,15 @@ class Waitable:
 
 
 class ActionClient(Waitable):
-    def __init__(self, node: Node, kind: Any, name: str, *, feedback_sub_qos_profile: Any) -> None:
+    def __init__(
+        self, node: Node, kind: Any, name: str, *, callback_group: CallbackGroup, feedback_sub_qos_profile: Any
+    ) -> None:
         assert feedback_sub_qos_profile
-        super().__init__(node, kind, name)
+        super().__init__(node, kind, name, callback_group)
         self.server_is_ready = lambda: bool(node.servers(name))
 
     def ask(self, kind: str, request: Any) -> Future:
-        future = Future(self.node.executor)
+        future = Future(None)
         for node, end in self.node.servers(self.name):
             reply = lambda value: self.node.deliver(self, kind, (future, value))  # noqa: E731
             node.deliver(end, kind, ((self, reply), request))
@@ -232,7 +360,7 @@ class ClientGoalHandle:
 
 class ServerGoalHandle:
     def __init__(self, server: ActionServer, goal_id: Any) -> None:
-        self.server, self.goal_id, self.result = server, goal_id, Future(server.node.executor)
+        self.server, self.goal_id, self.result = server, goal_id, Future(None)
         self.id = bytes(goal_id.uuid)
         for name, end in (("succeed", Status.SUCCEEDED), ("abort", Status.ABORTED), ("canceled", Status.CANCELED)):
             setattr(self, name, lambda end=end: server.goals.end(self.id, end, None, now_ns()))
@@ -254,8 +382,17 @@ class ServerGoalHandle:
 
 
 class ActionServer(Waitable):
-    def __init__(self, node: Node, kind: Any, name: str, *, result_timeout: float, **callbacks: Any) -> None:
-        super().__init__(node, kind, name)
+    def __init__(
+        self,
+        node: Node,
+        kind: Any,
+        name: str,
+        *,
+        callback_group: CallbackGroup,
+        result_timeout: float,
+        **callbacks: Any,
+    ) -> None:
+        super().__init__(node, kind, name, callback_group)
         self.goals, self.callbacks = Goals(int(result_timeout * 1e9)), callbacks
         self._goal_handles: dict[bytes, ServerGoalHandle] = {}
 
@@ -289,8 +426,8 @@ class ActionServer(Waitable):
                 lambda done: header[1](response(status=int(handle.status), result=done.result()))
             )
 
-    def notify_execute(self, handle: ServerGoalHandle, execute_callback: Any) -> None:
-        self.node.executor.create_task(lambda: handle.result.set_result(execute_callback(handle)))
+    async def _execute_goal(self, execute_callback: Any, handle: ServerGoalHandle) -> None:
+        handle.result.set_result(execute_callback(handle))
 
 
 def modules() -> dict[str, dict[str, Any]]:
@@ -302,8 +439,11 @@ def modules() -> dict[str, dict[str, Any]]:
             "create_node": Node,
             "get_rmw_implementation_identifier": lambda: "rmw_stand_in",
         },
+        "rclpy.callback_groups": {"CallbackGroup": CallbackGroup},
+        "rclpy.impl": {},
+        "rclpy.impl.implementation_singleton": {"rclpy_implementation": SimpleNamespace(WaitSet=WaitSet)},
         "rclpy.duration": {"Duration": SimpleNamespace},
-        "rclpy.context": {"Context": type("Context", (), {"try_shutdown": lambda _: None})},
+        "rclpy.context": {"Context": type("Context", (), {"try_shutdown": lambda _: None, "handle": "context handle"})},
         "rclpy.executors": {
             "SingleThreadedExecutor": Executor,
             "ExternalShutdownException": type("ExternalShutdownException", (Exception,), {}),

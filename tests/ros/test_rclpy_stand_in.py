@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from threading import Event
+from threading import Event, Thread
 from types import ModuleType
 from typing import Any
 
@@ -27,7 +27,7 @@ from s2a_bench.transport.ros.node import NodeApi
 from s2a_bench.types import Frame, Request
 from tests.ros.rclpy_stand_in import GRAPH, INTERFACES, PACKAGES, action, generated, modules
 
-GLUE = ("client", "middleware", "node", "server", "service", "types")
+GLUE = ("client", "middleware", "node", "server", "service", "types", "waiter")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -175,6 +175,23 @@ def test_the_version_of_llama_msgs_is_the_workspaces(rclpy_join: Join, monkeypat
         client.pack(llama.generate_goal("p"))
     with pytest.raises(TransportError, match=r"this workspace has llama_msgs 4\.4, not 6\.0"):
         rclpy_join().action_server(NAME, llama.GENERATE_RESPONSE)
+
+
+def test_closing_waits_for_a_consumer_that_waits(rclpy_join: Join) -> None:
+    middleware = rclpy_join()
+    subscription = middleware.subscription("/x", "std_msgs/msg/String", QoS())
+    client = middleware.action_client(NAME, llama.GENERATE_RESPONSE)
+    got: list[Any] = []
+    consumers = [
+        Thread(target=lambda take=take: got.append(take(60))) for take in (subscription.take, client.next_event)
+    ]
+    for consumer in consumers:
+        consumer.start()
+    middleware.close()
+    for consumer in consumers:
+        consumer.join(10)
+    assert got == [None, None]
+    assert subscription.take(0) is None
 
 
 def test_a_closed_middleware_says_so(rclpy_join: Join) -> None:
