@@ -24,6 +24,8 @@ setup(
     description=PROJECT["description"],
     packages=find_packages(include=PYPROJECT["tool"]["setuptools"]["packages"]["find"]["include"]),
     package_data=PYPROJECT["tool"]["setuptools"]["package-data"],
+    install_requires=PROJECT["dependencies"],  # for `s2a-bench doctor`: colcon installs none of them
+    extras_require=PROJECT["optional-dependencies"],
     entry_points={"console_scripts": [f"{name} = {where}" for name, where in PROJECT["scripts"].items()]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/s2a_bench"]),

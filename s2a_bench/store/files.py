@@ -8,12 +8,14 @@ such line feed is torn and is dropped when read. An empty field is null, in text
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from errno import EIO
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.errors import StoreError
+from s2a_bench.errors import MissingExtra, StoreError
 from s2a_bench.store.room import why
 from s2a_bench.store.schema import Kind, Row, Table, Value
 
@@ -73,10 +75,25 @@ def _field(value: Value) -> str:
     return text
 
 
+@contextmanager
+def _loading(path: Path) -> Iterator[None]:
+    """Raise MissingExtra where pyarrow does not load, as one that wants another NumPy does not."""
+    try:
+        yield
+    except (ImportError, AttributeError, RuntimeError) as error:
+        why = str(error).strip().splitlines()[:1]
+        raise MissingExtra(
+            f"pyarrow does not load beside NumPy {version('numpy')} ({''.join(why) or type(error).__name__}): the CSV "
+            f"files in {path.parent} are whole and the rest can be made of them; beside NumPy 1, as ROS wants it, "
+            "pip install -c constraints-ros-jazzy.txt pyarrow"
+        ) from error
+
+
 def count_rows(path: Path) -> int:
     """Count the rows of a table's Parquet or CSV file without reading their values."""
     if path.suffix == ".parquet":
-        from pyarrow import parquet
+        with _loading(path):
+            from pyarrow import parquet
 
         return int(parquet.read_metadata(path).num_rows)
     quotes = records = 0
@@ -102,8 +119,9 @@ def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
 
     A column that an older run does not have is null throughout.
     """
-    import pyarrow as pa
-    from pyarrow import csv
+    with _loading(path):
+        import pyarrow as pa
+        from pyarrow import csv
 
     schema = _arrow_schema(columns)
     data = whole_records(path.read_bytes()) if path.exists() else b""
@@ -132,7 +150,8 @@ def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
 
 def write_parquet(path: Path, table: Any) -> None:
     """Write a ``pyarrow.Table``; the file appears whole or not at all."""
-    from pyarrow import parquet
+    with _loading(path):
+        from pyarrow import parquet
 
     part = path.with_suffix(".part")
     try:
@@ -146,8 +165,9 @@ def write_parquet(path: Path, table: Any) -> None:
 
 def read_parquet(path: Path, columns: dict[str, Kind]) -> Any:
     """Read a table's Parquet file as a ``pyarrow.Table``."""
-    import pyarrow as pa
-    from pyarrow import parquet
+    with _loading(path):
+        import pyarrow as pa
+        from pyarrow import parquet
 
     try:
         schema = _arrow_schema(columns)

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from s2a_bench.errors import StoreError
+from s2a_bench.errors import MissingExtra, StoreError
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.files import read_csv, read_parquet
 from s2a_bench.store.requests import EARLIER_STAGES, TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
@@ -655,3 +655,17 @@ def test_a_run_whose_parquet_files_cannot_be_written_has_failed(
         run.sample(sample())
     manifest = read_run(run.path).manifest
     assert (manifest["state"], manifest["error"]) == ("failed", f"cannot write {run.path / 'samples.parquet'}")
+
+
+def test_without_pyarrow_the_run_stays_and_its_reader_is_told_the_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        for module in ("pyarrow", "pyarrow.csv", "pyarrow.parquet"):
+            patch.setitem(sys.modules, module, None)
+        with RunWriter.create(tmp_path, "latency", {}) as run:
+            run.sample(sample())
+        assert read_run(run.path).manifest["state"] == "finished"
+        with pytest.raises(MissingExtra, match=r"pyarrow does not load beside NumPy .*: the CSV files in .* are whole"):
+            _ = read_run(run.path).samples
+    assert len(read_run(run.path).samples) == 1
