@@ -123,6 +123,10 @@ class ActionClient(Protocol):
         """Return whether a whole server is matched now."""
         ...
 
+    def other_dds(self) -> str:
+        """Return the DDS of a server that is there and cannot be spoken to, "" if there is none."""
+        ...
+
     def server_version(self) -> str | None:
         """Return the interface version whose type hash the server announces; None if it announces none.
 
@@ -184,6 +188,10 @@ class ServerGoal(Protocol):
         """Whether a client has asked to cancel this goal."""
         ...
 
+    def other_version(self) -> str:
+        """Return the version of llama_msgs that its client announces, where that is known and not the server's."""
+        ...
+
     def unpack(self) -> Any:
         """Deserialise the goal; arrays may be views of the received buffer. Raises TransportError."""
         ...
@@ -219,6 +227,9 @@ class ServerGoal(Protocol):
 
 class ActionServer(Protocol):
     """Offers one action; cancels and results are served by a thread of its own."""
+
+    version: str
+    """Of llama_msgs, as in `messages.VERSIONS`."""
 
     def next_goal(self, timeout_s: float) -> ServerGoal | None:
         """Wait for the next goal, to accept or reject; None on timeout or after `interrupt`. One thread at a time."""
@@ -271,9 +282,12 @@ class Middleware(Protocol):
         ...
 
     def action_server(
-        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = "6.0"
+        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = ""
     ) -> ActionServer:
-        """Offer the action ``/x``; results are kept for ``result_timeout_s`` after a goal ended."""
+        """Offer the action ``/x``; results are kept for ``result_timeout_s`` after a goal ended.
+
+        Without a ``version`` it is the one that the workspace has built, 6.0 where there is no workspace.
+        """
         ...
 
     def describe(self) -> dict[str, str | int]:

@@ -133,10 +133,10 @@ class CycloneMiddleware:
         return client
 
     def action_server(
-        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = DEFAULT_VERSION
+        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = ""
     ) -> CycloneActionServer:
         """Create a server's eight endpoints and its service thread."""
-        server = CycloneActionServer(self._joined(), name, type_name, result_timeout_s, version)
+        server = CycloneActionServer(self._joined(), name, type_name, result_timeout_s, version or DEFAULT_VERSION)
         self._servers.append(server)
         self._node.add(*server.endpoints())
         return server

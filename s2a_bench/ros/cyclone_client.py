@@ -66,6 +66,10 @@ class CycloneActionClient:
             service.matched() for service in services
         )
 
+    def other_dds(self) -> str:
+        """Look for readers and writers of goals that are of another DDS."""
+        return self._goals.other_dds()
+
     def server_version(self) -> str | None:
         """Compare the type hash of the server's goal reader with those of the versions we know."""
         announced = self._goals.peer_type_hash()

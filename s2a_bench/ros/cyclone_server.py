@@ -43,6 +43,14 @@ class CycloneServerGoal:
         """Ask the server's books."""
         return self._server.status(self.id) == Status.CANCELING
 
+    def other_version(self) -> str:
+        """Compare the type hash that the client's goal writer announces."""
+        service = self._server.send_goal
+        announced = (service.reader.peer(self._sender) or {}).get("typehash", "")
+        known = {ros.type_hash(service.request_type, version): version for version in ros.VERSIONS}
+        spoken = known.get(announced, f"of type hash {announced}") if announced else ""
+        return spoken if spoken != self._server.version else ""
+
     def unpack(self) -> Any:
         """Deserialise; arrays are views of the lent sample."""
         return self._server.send_goal.unpack(self._packed).goal
@@ -83,7 +91,7 @@ class CycloneActionServer:
         self, participant: DomainParticipant, name: str, type_name: str, result_timeout_s: float, version: str
     ) -> None:
         """Create the server of the action ``/name`` and start its service thread."""
-        self._name, self._version = name, version
+        self._name, self.version = name, version
         prefix = name + "/_action/"
         self.send_goal = ServiceServer(participant, prefix + "send_goal", type_name + "_SendGoal", version)
         self._get_result = ServiceServer(participant, prefix + "get_result", type_name + "_GetResult", version)
@@ -97,6 +105,7 @@ class CycloneActionServer:
         self._waiting: dict[bytes, list[tuple[int, int]]] = {}
         """Goal -> headers of the result requests to answer when it ends."""
         self._unknown = self._pack_result(Status.UNKNOWN, ros.default(type_name + "_Result", version))
+        self._told: set[str] = set()
         self._lock = RLock()
         self._goal_waiter = Waiter(participant, [self.send_goal.reader])
         self._service_waiter = Waiter(participant, [self._get_result.reader, self._cancel.reader])
@@ -122,6 +131,8 @@ class CycloneActionServer:
             if packed is None:
                 if not self._goal_waiter.wait_until(deadline_ns):
                     return None
+            elif other := self.send_goal.other_dds_of(self.send_goal.reader.sender()):
+                self._tell_once(other)
             elif len(packed) < BODY_AT + 16:
                 _log.warning("%s: dropped a goal request of %d bytes, too short for an id", self._name, len(packed))
             else:
@@ -133,6 +144,17 @@ class CycloneActionServer:
                 _log.warning("%s: rejected a goal whose id %s is taken", self._name, goal.id.hex())
                 self._reply(goal.id, packed, self.send_goal.reader.sender(), accepted=False, stamp_ns=0)
         return None
+
+    def _tell_once(self, other: str) -> None:
+        """Log that a client is there whose requests cannot be read, and which will hear nothing."""
+        if other not in self._told:
+            self._told.add(other)
+            _log.warning(
+                "%s: a client on %s waits in vain, as its services have another form on the wire: start it with "
+                "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or serve in a sourced ROS 2 of its RMW (--middleware rclpy)",
+                self._name,
+                other,
+            )
 
     def status(self, goal_id: bytes) -> Status:
         """Return a goal's status."""
@@ -157,7 +179,7 @@ class CycloneActionServer:
         if not self.send_goal.await_client(sender):
             _log.warning("%s: the client of goal %s has left", self._name, goal_id.hex())
             return
-        response = ros.default(self.send_goal.reply_type, self._version, accepted=accepted)
+        response = ros.default(self.send_goal.reply_type, self.version, accepted=accepted)
         response.stamp.sec, response.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
         self.send_goal.reply(self.send_goal.pack(response), HEADER.unpack_from(packed, HEADER_AT))
 
@@ -172,9 +194,9 @@ class CycloneActionServer:
 
     def publish_feedback(self, goal_id: bytes, feedback: Any) -> None:
         """Pack and send feedback on a goal."""
-        message = ros.default(self._feedback_type, self._version, feedback=feedback)
+        message = ros.default(self._feedback_type, self.version, feedback=feedback)
         message.goal_id.uuid[:] = memoryview(goal_id)
-        self._feedback.send(ros.serialise(message, self._feedback_type, self._version))
+        self._feedback.send(ros.serialise(message, self._feedback_type, self.version))
 
     def end(self, goal_id: bytes, status: Status, result: Any) -> None:
         """End a goal: publish the status, then answer who waits for the result."""
@@ -187,7 +209,7 @@ class CycloneActionServer:
 
     def _pack_result(self, status: Status, result: Any) -> bytearray:
         """Serialise a result reply once for all who ask."""
-        response = ros.typestore(self._version).types[self._get_result.reply_type]
+        response = ros.typestore(self.version).types[self._get_result.reply_type]
         return self._get_result.pack(response(status=int(status), result=result))
 
     def _publish_status(self) -> None:
@@ -230,9 +252,9 @@ class CycloneActionServer:
         info = request.goal_info
         stamp_ns = info.stamp.sec * 1_000_000_000 + info.stamp.nanosec
         code, chosen = self._goals.cancel(info.goal_id.uuid.tobytes(), stamp_ns)
-        response = ros.default(self._cancel.reply_type, self._version, return_code=int(code))
+        response = ros.default(self._cancel.reply_type, self.version, return_code=int(code))
         for goal in chosen:
-            entry = ros.default("action_msgs/msg/GoalInfo", self._version)
+            entry = ros.default("action_msgs/msg/GoalInfo", self.version)
             entry.goal_id.uuid[:] = memoryview(goal.id)
             entry.stamp.sec, entry.stamp.nanosec = divmod(goal.stamp_ns, 1_000_000_000)
             response.goals_canceling.append(entry)

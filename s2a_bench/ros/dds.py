@@ -130,6 +130,15 @@ def dds_qos(qos: QoS, user_data: str) -> Qos:
     )
 
 
+OTHERS = {b"\x01\x0f": "Fast DDS", b"\x01\x01": "RTI Connext DDS"}
+"""Vendor id of RTPS, with which the GUIDs of its participants begin -> whose it is; Cyclone's is 01 10."""
+
+
+def other_dds(endpoint: Any) -> str:
+    """Return which other DDS a DcpsEndpoint is of, "" for Cyclone and those that are not known."""
+    return OTHERS.get(endpoint.key.bytes[:2], "")
+
+
 def user_data(endpoint: Any) -> dict[str, str]:
     """Read the ``key=value;`` pairs that a DcpsEndpoint announces in USER_DATA."""
     if Policy.Userdata not in endpoint.qos:
@@ -165,11 +174,15 @@ class RawWriter:
         """Count matched readers."""
         return len(_matched(self.entity.get_matched_subscriptions))
 
+    def endpoints(self) -> Iterator[Any]:
+        """Yield what is known of each matched reader, a DcpsEndpoint."""
+        for handle in _matched(self.entity.get_matched_subscriptions):
+            if (endpoint := self.entity.get_matched_subscription_data(handle)) is not None:
+                yield endpoint
+
     def peers(self) -> Iterator[dict[str, str]]:
         """Yield what each matched reader announces in USER_DATA."""
-        for handle in _matched(self.entity.get_matched_subscriptions):
-            endpoint = self.entity.get_matched_subscription_data(handle)
-            yield {} if endpoint is None else user_data(endpoint)
+        return map(user_data, self.endpoints())
 
 
 class RawReader:
@@ -212,14 +225,21 @@ class RawReader:
         """Return the handles of matched writers."""
         return _matched(self.entity.get_matched_publications)
 
+    def endpoint(self, handle: int) -> Any:
+        """Return what is known of one matched writer, a DcpsEndpoint; None if it has left."""
+        return self.entity.get_matched_publication_data(handle)
+
+    def endpoints(self) -> Iterator[Any]:
+        """Yield what is known of each matched writer."""
+        return (endpoint for endpoint in map(self.endpoint, self.senders()) if endpoint is not None)
+
     def peers(self) -> Iterator[dict[str, str]]:
         """Yield what each matched writer announces in USER_DATA."""
-        for handle in self.senders():
-            yield self.peer(handle) or {}
+        return map(user_data, self.endpoints())
 
     def peer(self, handle: int) -> dict[str, str] | None:
         """Return what one matched writer announces in USER_DATA; None if it has left."""
-        endpoint = self.entity.get_matched_publication_data(handle)
+        endpoint = self.endpoint(handle)
         return None if endpoint is None else user_data(endpoint)
 
 

@@ -17,7 +17,7 @@ from cyclonedds.domain import DomainParticipant
 
 from s2a_bench.clock import now_ns
 from s2a_bench.ros import QoS
-from s2a_bench.ros.dds import RawReader, RawWriter, dds_qos
+from s2a_bench.ros.dds import RawReader, RawWriter, dds_qos, other_dds
 from s2a_bench.ros.messages import deserialise, serialise, type_hash
 
 HEADER = struct.Struct("<Qq")
@@ -80,6 +80,10 @@ class _End:
     def ends(self) -> tuple[RawWriter, RawReader]:
         """Return both endpoints."""
         return self.writer, self.reader
+
+    def other_dds(self) -> str:
+        """Return the DDS of a peer whose services have another form than `rmw_cyclonedds_cpp`'s, "" without one."""
+        return next((name for end in self.ends() for endpoint in end.endpoints() if (name := other_dds(endpoint))), "")
 
     def peer_type_hash(self) -> str:
         """Return the type hash a peer announces for what it reads; empty without one."""
@@ -146,6 +150,11 @@ class ServiceServer(_End):
     def unpack(self, packed: memoryview) -> Any:
         """Deserialise a request's body; raises TransportError."""
         return deserialise(packed, self.request_type + "__wire", self._version).body
+
+    def other_dds_of(self, sender: int) -> str:
+        """Return the DDS of the writer ``sender`` where its services have another form than ours, else ""."""
+        endpoint = None if sender in self._reachable else self.reader.endpoint(sender)
+        return "" if endpoint is None else other_dds(endpoint)
 
     def await_client(self, sender: int) -> bool:
         """Wait, 100 ms at most, until replies reach the client whose request came from writer ``sender``.

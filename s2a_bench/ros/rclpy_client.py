@@ -131,6 +131,10 @@ class RclpyActionClient:
         """Ask rclpy, for its client and for ours."""
         return not self._node.closed and bool(self._client.server_is_ready() and self._canceller.service_is_ready())
 
+    def other_dds(self) -> str:
+        """Return "": the installation's RMW finds servers of its own."""
+        return ""
+
     def server_version(self) -> str:
         """Return the version this workspace has: no other can be spoken here, whatever the server announces."""
         return self._installed

@@ -122,7 +122,7 @@ class RclpyMiddleware:
         return client
 
     def action_server(
-        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = DEFAULT_VERSION
+        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = ""
     ) -> RclpyActionServer:
         """Create an action server."""
         server = RclpyActionServer(self._open(), name, type_name, result_timeout_s, version)

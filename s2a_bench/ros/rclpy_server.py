@@ -54,6 +54,10 @@ class RclpyServerGoal:
         """Ask rclpy."""
         return self._status() == Status.CANCELING
 
+    def other_version(self) -> str:
+        """Return "": rmw tells no type hashes of clients."""
+        return ""
+
     def unpack(self) -> Any:
         """Turn into the rosbags class."""
         return self._server.convert_goal(self._request[1].goal)
@@ -170,12 +174,12 @@ class RclpyActionServer:
     """Goals are taken, decided and ended on the consuming threads; cancels and results have a thread here."""
 
     def __init__(self, node: SpinningNode, name: str, type_name: str, result_timeout_s: float, version: str) -> None:
-        """Create the server of the action ``/name``; raises MissingInterface for a version the workspace lacks."""
-        self._node, self._type, self._version = node, type_name, version
+        """Create the server of the action ``/name`` in the workspace's version; raises MissingInterface for another."""
+        self._node, self._type = node, type_name
         self._action = interface_class(type_name)
-        installed = installed_version(self._action, type_name)
-        if installed != version:
-            raise MissingInterface(f"this workspace has llama_msgs {installed}, not {version}")
+        self.version = installed_version(self._action, type_name)
+        if version not in {"", self.version}:
+            raise MissingInterface(f"this workspace has llama_msgs {self.version}, not {version}")
         self._lock = Lock()
         self._offered: set[bytes] = set()
         self._goals: deque[RclpyServerGoal] = deque()
@@ -245,11 +249,11 @@ class RclpyActionServer:
 
     def convert_goal(self, goal: Any) -> Any:
         """Turn a goal into the rosbags class."""
-        return from_ros(goal, self._type + "_Goal", self._version)
+        return from_ros(goal, self._type + "_Goal", self.version)
 
     def publish_feedback(self, handle: Any, feedback: Any) -> None:
         """Publish feedback on a goal, on the calling thread."""
-        message = to_ros(feedback, self._action.Feedback, self._type + "_Feedback", self._version)
+        message = to_ros(feedback, self._action.Feedback, self._type + "_Feedback", self.version)
         try:
             handle.publish_feedback(message)
         except RuntimeError as error:
@@ -257,6 +261,6 @@ class RclpyActionServer:
 
     def end(self, handle: Any, status: Status, result: Any) -> None:
         """End a goal on the calling thread."""
-        message = to_ros(result, self._action.Result, self._type + "_Result", self._version)
+        message = to_ros(result, self._action.Result, self._type + "_Result", self.version)
         self._node.check_open()
         self._server.end(handle, getattr(handle, ENDS[status]), message)

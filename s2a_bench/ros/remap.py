@@ -72,7 +72,7 @@ class Remapped:
         return self._middleware.action_client(self._name(name), type_name, version)
 
     def action_server(
-        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = "6.0"
+        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = ""
     ) -> ActionServer:
         """Offer an action under what stands for ``name``."""
         return self._middleware.action_server(self._name(name), type_name, result_timeout_s, version)

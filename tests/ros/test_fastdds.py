@@ -1,4 +1,4 @@
-"""Images cross between our Cyclone DDS and Fast DDS, ROS 2's default middleware, both ways.
+"""Images cross between our Cyclone DDS and Fast DDS, ROS 2's default middleware, both ways; actions are told apart.
 
 The peer is a C++ program of its own (tests/ros/fastdds) on Debian's Fast DDS: its discovery, its types by name without
 XTypes information, and Fast CDR, as in rmw_fastrtps_cpp.
@@ -17,8 +17,12 @@ import numpy as np
 import pytest
 
 from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError
 from s2a_bench.ros import Middleware, QoS, open_middleware
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.llama import GENERATE_RESPONSE
+from s2a_bench.testing.transport import wiring
+from s2a_bench.transport import open_client
 from s2a_bench.types import Frame
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
@@ -159,3 +163,39 @@ def test_our_images_reach_fast_dds(
             == f"{n} {n + 1} cyclone_{n} {width}x{height} bgr8 step {3 * width} bytes {3 * width * height} wrong 0\n"
         )
     assert peer.wait(20) == 0
+
+
+GOAL_TYPE = "llama_msgs::action::dds_::GenerateResponse_SendGoal_Request_"
+
+
+def test_a_fast_dds_client_of_our_action_is_named_in_the_log(
+    start: Start, middleware: Middleware, caplog: pytest.LogCaptureFixture
+) -> None:
+    server = middleware.action_server("/llama/generate_response", GENERATE_RESPONSE)
+    topic = f"rq/llama/generate_response/_action/send_goalRequest={GOAL_TYPE}"
+    peer = start("localhost", "pub", topic, "reliable", 8, 8, 2)
+    assert peer.stdin is not None
+    assert peer.stdout is not None
+    assert peer.stdout.readline() == "matched\n"
+    for _ in range(2):
+        peer.stdin.write("next\n")
+    peer.stdin.flush()
+    assert server.next_goal(3) is None
+    (line,) = [record.message for record in caplog.records if "Fast DDS" in record.message]
+    assert "/llama/generate_response: a client on Fast DDS waits in vain" in line
+    assert "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp" in line
+    peer.stdin.close()
+    assert peer.wait(20) == 0
+
+
+def test_a_fast_dds_server_of_an_action_is_named(
+    start: Start, dds_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("s2a_bench.transport.ros.joining.MATCH_TIMEOUT_S", 5.0)
+    topic = f"rq/llama/generate_response/_action/send_goalRequest={GOAL_TYPE}"
+    start("localhost", "sub", topic, "reliable", 1)
+    told = wiring("ros/action", action="/llama/generate_response", domain_id=dds_domain)
+    with pytest.raises(
+        TransportError, match="/llama/generate_response is on Fast DDS, whose services have another form"
+    ):
+        open_client(told)

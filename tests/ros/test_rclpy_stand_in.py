@@ -173,8 +173,9 @@ def test_the_version_of_llama_msgs_is_the_workspaces(rclpy_join: Join, monkeypat
     assert client.server_version() == "4.4"
     with pytest.raises(TransportError, match=r"this workspace has llama_msgs 4\.4, not 6\.0"):
         client.pack(llama.generate_goal("p"))
+    assert rclpy_join().action_server(NAME, llama.GENERATE_RESPONSE).version == "4.4"
     with pytest.raises(TransportError, match=r"this workspace has llama_msgs 4\.4, not 6\.0"):
-        rclpy_join().action_server(NAME, llama.GENERATE_RESPONSE)
+        rclpy_join().action_server(NAME, llama.GENERATE_RESPONSE, version="6.0")
 
 
 def test_closing_waits_for_a_consumer_that_waits(rclpy_join: Join) -> None:

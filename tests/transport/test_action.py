@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -16,12 +16,12 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError
-from s2a_bench.ros import ActionServer, Result, ServerGoal, open_middleware
+from s2a_bench.ros import ActionServer, Rejected, Result, ServerGoal, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.cyclone_server import CycloneServerGoal
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
-from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import Recorder, ask, connector, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Wiring, open_client, open_server
 from s2a_bench.transport.turns import Queued
@@ -397,3 +397,25 @@ def test_goals_of_two_clients_are_answered_one_after_the_other(dds_domain: int) 
         server.stop()
         thread.join()
     assert counts == [100, 100]
+
+
+@pytest.mark.parametrize(("served", "other"), [("4.4", "6.0"), ("6.0", "4.4")])
+def test_our_server_speaks_the_version_it_is_told_and_logs_who_speaks_another(
+    dds_domain: int, caplog: pytest.LogCaptureFixture, served: str, other: str
+) -> None:
+    told = wiring("ros/action", "/s2a", domain_id=dds_domain, llama_msgs=served)
+    with closing(connector(told)) as connecting:
+        recorder = Recorder(["a ", "b"])
+        client = next(connecting)(recorder)
+        tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),), grammar='root ::= "x"'))
+        assert [token.text for token in tokens] == ["a ", "b"]
+        assert recorder.requests[0].grammar == 'root ::= "x"'
+        foreign = open_middleware(domain_id=dds_domain, node_name="/foreign")
+        try:
+            stranger = foreign.action_client("/s2a/generate_response", GENERATE_RESPONSE, other)
+            assert stranger.wait_for_server(20)
+            stranger.send(stranger.pack(generate_goal("plan", version=other)))
+            assert isinstance(stranger.next_event(20), Rejected)
+        finally:
+            foreign.close()
+    assert f"rejected: its client speaks llama_msgs {other}, this server {served} (--llama-msgs)" in caplog.text

@@ -87,14 +87,26 @@ class GenerateClient:
         """Find the server and speak the version of llama_msgs that its type hash shows, ours where it shows none."""
         version = ros.DEFAULT_VERSION
         client = self.middleware.action_client(self._name, GENERATE_RESPONSE, version)
-        self._wait(client.server_present)
+        self._find(client)
         spoken = client.server_version() or version
         if spoken != version:
             self.middleware.close()  # a client of the other version would go on collecting what nobody reads
             self.middleware = join(self._wiring, "client")
             client = self.middleware.action_client(self._name, GENERATE_RESPONSE, spoken)
-            self._wait(client.server_present)
+            self._find(client)
         return client, spoken
+
+    def _find(self, client: ActionClient) -> None:
+        """Wait for the server; raises TransportError for one that is there and cannot be spoken to."""
+        try:
+            self._wait(client.server_present)
+        except ServerDied as absent:
+            if other := client.other_dds():
+                raise TransportError(
+                    f"the action server {self._name} is on {other}, whose services have another form on the wire: "
+                    "start it with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or use `middleware` rclpy with its RMW"
+                ) from absent
+            raise
 
     def _wait(self, arrived: Callable[[], bool]) -> None:
         absent = f"no action server appeared at {self._name} in DDS domain {domain_of(self._wiring)}"
@@ -202,9 +214,12 @@ class ActionFront:
         namespace, options = namespace_of(wiring), wiring.options
         self.limits = wiring.limits
         self._wiring = wiring
-        self.wishes = Wishes(honoured, ros.DEFAULT_VERSION)
         self.tune(options)
-        self._server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE, options.result_timeout)
+        self._server = middleware.action_server(
+            namespace + ACTION, GENERATE_RESPONSE, options.result_timeout, options.llama_msgs
+        )
+        self.version = self._server.version
+        self.wishes = Wishes(honoured, self.version)
         self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS)
         self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if options.publish_tokens else None
 
@@ -218,7 +233,10 @@ class ActionFront:
         return self._server.next_goal(timeout_s)
 
     def job(self, packed: ServerGoal, trace: Trace) -> GenerateJob | None:
-        """Unpack a goal; one that cannot be read is rejected."""
+        """Unpack a goal; one that cannot be read, or is of another version, is rejected."""
+        if other := packed.other_version():
+            self.refuse(packed, f"its client speaks llama_msgs {other}, this server {self.version} (--llama-msgs)")
+            return None
         try:
             goal = packed.unpack()
         except S2AError as error:
@@ -313,7 +331,7 @@ class GenerateJob:
     def _feed(self) -> None:
         """Send what is held as one feedback: one token, or several that came faster than ROS clients' queues hold."""
         if self._held:
-            self._goal.feedback(token_feedback("".join(self._held), self._tokens[-1].id))
+            self._goal.feedback(token_feedback("".join(self._held), self._tokens[-1].id, self._front.version))
             self._held.clear()
             self._fed_ns = now_ns()
 
@@ -335,7 +353,7 @@ class GenerateJob:
         except S2AError as failure:
             error = error or str(failure)
         text = error or "".join(token.text for token in self._tokens)
-        result = text_result(text, [token.id for token in self._tokens])
+        result = text_result(text, [token.id for token in self._tokens], self._front.version)
         started = self._started or self._goal.executing()
         if self._goal.cancel_requested:
             self._goal.canceled(result)

@@ -51,6 +51,9 @@ class RosOptions(Options):
         le=2**20,
         side=SERVING,
     )
+    llama_msgs: Literal["", "4.4", "6.0"] = option(
+        "", "version of llama_msgs that the action speaks: 4.4, 6.0 [default: the workspace's, else 6.0]", side=SERVING
+    )
     feedback_interval: float = option(
         0.0, "seconds: tokens that come faster share a feedback", ge=0, le=60, side=SERVING
     )

@@ -4,6 +4,8 @@
 //   fastdds_peer DOMAIN RANGE pub TOPIC RELIABILITY WIDTH HEIGHT COUNT   an image for each line of standard input
 //   fastdds_peer DOMAIN RANGE sub TOPIC RELIABILITY COUNT                a line for each image, ends after COUNT
 //
+// TOPIC is a ROS topic, or DDSTOPIC=DDSTYPE: an end of a service, whose content nobody reads.
+//
 // RANGE is localhost or subnet, as in ROS_AUTOMATIC_DISCOVERY_RANGE; RELIABILITY reliable or best_effort. Both say
 // "matched" when they are.
 //
@@ -64,9 +66,9 @@ uint8_t byte_of(size_t i, uint32_t n)
 class ImageType : public edds::TopicDataType
 {
 public:
-    ImageType()
+    explicit ImageType(const std::string& name)
     {
-        setName("sensor_msgs::msg::dds_::Image_");
+        setName(name.c_str());
         m_typeSize = 1024;  // only the first guess: the history's memory is reallocated
         auto_fill_type_object(false);
         auto_fill_type_information(false);
@@ -281,12 +283,15 @@ int main(int count, char** arguments)
         return 2;
     }
     auto* participant = join(static_cast<uint32_t>(std::atoi(arguments[1])), std::string(arguments[2]) == "localhost");
-    edds::TypeSupport type(new ImageType);
+    const std::string told = arguments[4];
+    const auto equals = told.find('=');
+    const bool is_topic = equals == std::string::npos;
+    edds::TypeSupport type(new ImageType(is_topic ? "sensor_msgs::msg::dds_::Image_" : told.substr(equals + 1)));
     type.register_type(participant);
     const bool publishes = std::string(arguments[3]) == "pub";
     const bool reliable = std::string(arguments[5]) == "reliable";
-    auto* topic =
-        participant->create_topic(std::string("rt") + arguments[4], type.get_type_name(), edds::TOPIC_QOS_DEFAULT);
+    auto* topic = participant->create_topic(
+        is_topic ? "rt" + told : told.substr(0, equals), type.get_type_name(), edds::TOPIC_QOS_DEFAULT);
     const int result = (publishes ? publish : subscribe)(participant, topic, reliable, arguments + 6);
     participant->delete_contained_entities();
     edds::DomainParticipantFactory::get_instance()->delete_participant(participant);
