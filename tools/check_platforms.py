@@ -1,7 +1,7 @@
-"""Check that every supported platform can install the dependencies from wheels, with the pins of constraints.txt.
+"""Check that every supported platform can install the dependencies from wheels, with the pins of its constraints file.
 
 pip resolves them as a dry run, once for each of `TARGETS`; nothing is installed. Fails when a requirement has no
-candidate, and when a package is resolved that constraints.txt does not pin there. llama-cpp-python is compiled, so it
+candidate, and when a package is resolved that the file does not pin there. llama-cpp-python is compiled, so it
 is left out and the packages it needs are resolved in its place; the pure Python packages of `NO_WHEEL` are made into
 wheels first. ``python tools/check_platforms.py [--offline-ok]``.
 """
@@ -29,7 +29,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
-CONSTRAINTS = ROOT / "constraints.txt"
+CONSTRAINTS = "constraints.txt"
 OURS = "s2a-bench"
 COMPILED = "llama-cpp-python"
 NO_WHEEL = ("empy",)
@@ -63,9 +63,14 @@ class Target:
     glibc: int
     system: str
     extras: tuple[str, ...] = ()
+    constraints: str = CONSTRAINTS
 
     def __str__(self) -> str:
-        return f"Python {self.python} on {self.machine} ({self.system})"
+        return f"Python {self.python} on {self.machine} ({self.system}), {self.constraints}"
+
+    def pinned(self) -> str:
+        """Return the text of the constraints."""
+        return (ROOT / self.constraints).read_text()
 
     def markers(self) -> dict[str, str]:
         """Return the environment markers of PEP 508 that differ between targets."""
@@ -93,6 +98,9 @@ TARGETS = (
     Target("3.12", "x86_64", 39, "Ubuntu 24.04, Jazzy", ("dev", "ray")),
     Target("3.10", "aarch64", 35, "JetPack 6", BOARD),
     Target("3.12", "aarch64", 39, "Jazzy in a container", BOARD),
+    Target("3.10", "x86_64", 35, "inside Humble", ("llama",), "constraints-ros-humble.txt"),
+    Target("3.12", "x86_64", 39, "inside Jazzy", ("llama",), "constraints-ros-jazzy.txt"),
+    Target("3.12", "aarch64", 39, "inside Jazzy", ("llama",), "constraints-ros-jazzy.txt"),
 )
 
 
@@ -140,7 +148,7 @@ def resolve(target: Target, wheels: str) -> list[str]:
     """Let pip resolve a platform, with a folder of more wheels; return what is wrong, nothing if all is well."""
     with TemporaryDirectory() as folder:
         constraints, report = Path(folder) / "constraints.txt", Path(folder) / "report.json"
-        constraints.write_text(CONSTRAINTS.read_text())
+        constraints.write_text(target.pinned())
         command = [sys.executable, "-c", AS_TARGET, json.dumps(target.markers()), "install", "--dry-run"]
         command += ["--ignore-installed", "--no-input", "--disable-pip-version-check", "--target", folder]
         command += ["--report", str(report), "-c", str(constraints), "--find-links", wheels]
@@ -148,7 +156,7 @@ def resolve(target: Target, wheels: str) -> list[str]:
         done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own interpreter
         if done.returncode:
             return reasons(done.stdout + done.stderr)
-        return unpinned(target, json.loads(report.read_text()), CONSTRAINTS.read_text())
+        return unpinned(target, json.loads(report.read_text()), target.pinned())
 
 
 def reasons(output: str) -> list[str]:
@@ -163,7 +171,7 @@ def unpinned(target: Target, report: dict[str, list[dict[str, dict[str, str]]]],
     pinned = pins(target, constraints)
     found = {canonicalize_name(item["metadata"]["name"]): item["metadata"]["version"] for item in report["install"]}
     return [
-        f"{name}=={version} is not pinned here: add it to {CONSTRAINTS.name}"
+        f"{name}=={version} is not pinned here: add it to {target.constraints}"
         for name, version in sorted(found.items())
         if pinned.get(name) != version
     ]
@@ -177,7 +185,7 @@ def has_index() -> bool:
 
 def make_wheels(folder: str) -> None:
     """Make wheels of what is published as source only, of the pinned version."""
-    wanted = [line for line in CONSTRAINTS.read_text().splitlines() if line.partition("==")[0] in NO_WHEEL]
+    wanted = [line for line in (ROOT / CONSTRAINTS).read_text().splitlines() if line.partition("==")[0] in NO_WHEEL]
     done = pip("wheel", "--wheel-dir", folder, *wanted)
     if done.returncode:
         raise SystemExit("\n".join(reasons(done.stdout + done.stderr)))

@@ -16,7 +16,9 @@ sys.path.insert(0, str(SCRIPT.parent))
 
 import check_platforms as check  # noqa: E402
 
-BY_NAME = {(target.python, target.machine): target for target in check.TARGETS}
+EVERYWHERE = [target for target in check.TARGETS if target.constraints == check.CONSTRAINTS]
+INSIDE_ROS = [target for target in check.TARGETS if target not in EVERYWHERE]
+BY_NAME = {(target.python, target.machine): target for target in EVERYWHERE}
 JETPACK, JAZZY = BY_NAME["3.10", "aarch64"], BY_NAME["3.12", "x86_64"]
 
 
@@ -44,7 +46,7 @@ def test_the_compiled_package_is_replaced_by_what_it_needs() -> None:
 
 
 def test_extras_that_take_from_others_bring_what_those_have() -> None:
-    for target in check.TARGETS:
+    for target in EVERYWHERE:
         needed = names(check.requirements(target))
         assert {"gguf", "huggingface-hub", "highway-env", "nvidia-ml-py", "json-numpy", "ray"} <= needed
         assert ("scenariogeneration" in needed) == (target.machine == "x86_64")
@@ -68,11 +70,19 @@ def test_a_package_without_a_pin_or_with_another_version_is_told() -> None:
 
 
 def test_no_pin_is_given_twice_for_one_platform() -> None:
-    text = check.CONSTRAINTS.read_text()
     for target in check.TARGETS:
-        lines = [check.Requirement(line) for line in text.splitlines() if line and not line.startswith("#")]
+        lines = [check.Requirement(line) for line in target.pinned().splitlines() if line and not line.startswith("#")]
         mine = [pin.name for pin in lines if not pin.marker or pin.marker.evaluate(target.markers())]
         assert len(mine) == len(set(mine))
+
+
+@pytest.mark.parametrize("target", INSIDE_ROS, ids=str)
+def test_beside_ros_numpy_is_1_and_all_that_is_needed_is_pinned(target: check.Target) -> None:
+    pinned = check.pins(target, target.pinned())
+    assert pinned["numpy"].startswith("1.")
+    assert int(pinned["pyarrow"].split(".")[0]) < 26, "pyarrow 26 loads beside NumPy 2 only, without saying so"
+    for wanted in map(check.Requirement, check.requirements(target)):
+        assert wanted.specifier.contains(pinned[check.canonicalize_name(wanted.name)]), wanted
 
 
 def test_wheels_of_every_older_system_are_taken() -> None:

@@ -1,0 +1,58 @@
+"""What docs/colcon.md and docs/rclpy.md say is what the scripts of tests/recipes do, which want a ROS 2."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+RECIPES = ROOT / "tests" / "recipes"
+AS_IN_DOCS = ((r"\$ROS_DISTRO|\$\{ROS_DISTRO:-jazzy\}", "jazzy"), (r"\$\{S2A_EXTRAS:-llama\}", "llama"), (r"[\"']", ""))
+"""What a script leaves open, and quotes."""
+ELSEWHERE = ("mkdir -p ~/ws/src", "cd ~/ws", "git clone", "ros2 launch")
+
+
+def commands(text: str) -> list[str]:
+    """The commands of a page's indented blocks, or of a script, one each."""
+    for pattern, instead in AS_IN_DOCS:
+        text = re.sub(pattern, instead, text)
+    lines = [line.split("  #")[0].strip() for line in text.splitlines()]
+    return [part.strip() for line in lines for part in line.split("&&")]
+
+
+@pytest.mark.parametrize("name", ["colcon", "rclpy"])
+def test_the_page_says_what_the_script_does(name: str) -> None:
+    page = (ROOT / "docs" / f"{name}.md").read_text()
+    blocks = "\n".join(line for line in page.splitlines() if line.startswith("    "))
+    said = [line for line in commands(blocks) if not line.startswith(ELSEWHERE)]
+    done = commands((RECIPES / name).read_text())
+    assert len(said) > 3
+    assert [line for line in said if line not in done] == []
+
+
+@pytest.mark.parametrize("name", ["colcon", "rclpy"])
+def test_without_ros_one_line_says_so(name: str, tmp_path: Path) -> None:
+    environ = os.environ | {"ROS_DISTRO": "nowhere"}
+    command = ["bash", str(RECIPES / name), str(tmp_path / "ws")]
+    done = subprocess.run(command, capture_output=True, text=True, env=environ, check=False)
+    assert done.returncode == 1
+    assert done.stderr == "no ROS 2 nowhere in /opt/ros: install it, or set ROS_DISTRO\n"
+    assert not (tmp_path / "ws").exists()
+
+
+@pytest.mark.slow
+def test_the_ratios_are_printed(tmp_path: Path) -> None:
+    pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
+    script = str(RECIPES / "rclpy_speed")
+    flags = ["--runs", "5", "--launches", "2", "--over", "qos=sensor_data", "--output", str(tmp_path)]
+    done = subprocess.run([sys.executable, script, *flags], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    ratio = r"ratio to cyclonedds [\d.]+ \[[\d.]+, [\d.]+\]"
+    for variant, wanted in (("topic", 1.2), ("action", 1.6)):
+        assert re.search(rf"(?m)^ros/{variant}\?qos=sensor_data: [\d.]+ ms \(capture .*; token [\d.]+ ms", done.stdout)
+        assert re.search(rf"(?m)^{ratio}, wanted at most {wanted}$", done.stdout)
