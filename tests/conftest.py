@@ -23,10 +23,19 @@ DOMAINS = range(101, 201)
 
 @pytest.fixture(scope="session", autouse=True)
 def dds_domain() -> int:
-    """Keep DDS on loopback, in a domain that another test run on this machine is unlikely to use."""
+    """Keep DDS on loopback, in a domain that another test run on this machine is unlikely to use.
+
+    In a sourced ROS 2 environment, too, the middleware is Cyclone DDS from PyPI unless a test names another.
+    """
     domain = DOMAINS[os.getpid() % len(DOMAINS)]
     os.environ["ROS_DOMAIN_ID"] = str(domain)
-    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "CYCLONEDDS_URI"):
+    for name in (
+        "ROS_AUTOMATIC_DISCOVERY_RANGE",
+        "ROS_STATIC_PEERS",
+        "CYCLONEDDS_URI",
+        "ROS_LOCALHOST_ONLY",
+        "ROS_DISTRO",
+    ):
         os.environ.pop(name, None)
     return domain
 
