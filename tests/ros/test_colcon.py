@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -73,14 +74,17 @@ def test_ros2_run_finds_the_program_and_it_has_its_files(tmp_path: Path, flags: 
         . install/local_setup.sh
         install/s2a_bench/lib/s2a_bench/s2a-bench --version || exit 1
         {sys.executable} -c "import s2a_bench; print(s2a_bench.__file__)"
+        install/s2a_bench/lib/s2a_bench/s2a-bench doctor --json
     """
     # the program takes the first Python on PATH, as in a virtual environment
     environ = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     command = ["sh", "-c", script]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environ, check=False)
     assert done.returncode == 0, done.stderr
-    version, where = done.stdout.splitlines()
+    version, where, *examined = done.stdout.splitlines()
     assert version == __version__
+    findings = {each["code"]: each for each in json.loads("\n".join(examined))["checks"]}
+    assert re.match(r"\d\d requirements, all met", findings["packages"]["message"]), findings["packages"]
     installed = Path(where).parent
     assert installed.is_relative_to(tmp_path)
     package = ROOT / "s2a_bench"
