@@ -45,10 +45,10 @@ class Activity:
         self._before = (now_ns(), 0, 0, 0, 0)
         self._said = ""
 
-    def failed(self, error: str) -> None:
-        """Count a failure, and log it unless it is the same again."""
+    def failed(self, error: str, *, told: bool = False) -> None:
+        """Count a failure, and log it unless the log was ``told`` or it is the same again."""
         self.failures += 1
-        if error != self._said:
+        if not told and error != self._said:
             self._said = error
             _log.warning("a request failed: %s", error)
 

@@ -74,7 +74,7 @@ class Front(Protocol):
         ...
 
     def job(self, packed: Any, trace: Trace) -> Job | None:
-        """Unpack a request; None for what is none, of which who asked has been told."""
+        """Unpack a request; None for what is none, of which who asked, and the log, have been told."""
         ...
 
     def size_bytes(self, packed: Any) -> int:
@@ -181,12 +181,12 @@ class RosServer:
                 held.callback(self._hold, -size)
                 job = front.job(packed, trace)
                 if job is None:
-                    self._activity.failed("it could not be read or prepared")
+                    self._activity.failed("it could not be read", told=True)
                     return None
                 turn = self._queued.turns.join()
                 held.callback(turn.leave)
             except RequestFailed as error:
-                self._activity.failed(str(error))
+                self._activity.failed(str(error), told=front is self._action)
                 front.refuse(packed, str(error))
                 return None
             job.accept()
