@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 
@@ -253,6 +255,13 @@ def test_what_makes_no_sense_is_refused(asked: dict[str, Any], message: str) -> 
 FEW: dict[str, Any] = {"seeds": 2, "seed_points": 16}
 
 
+def json_of(run: Run) -> dict[str, Any]:
+    """What --json prints, as its schema describes it."""
+    whole: dict[str, Any] = json.loads(json.dumps(ccrb_json(run)))
+    jsonschema.validate(whole, json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-1.json").read_text()))
+    return whole
+
+
 def test_every_follower_meets_the_four_combinations_and_says_whether_it_survives(made: Callable[..., Run]) -> None:
     run = made(all_followers=True, **FEW)
     rows = run.table(FOLLOWER_STUDY)
@@ -269,6 +278,9 @@ def test_every_follower_meets_the_four_combinations_and_says_whether_it_survives
     shares = {row[:2]: row for row in tables["follower-shares"].rows}
     assert shares["idm", "40 m, -6"][3:] == ("100", "0", "0", "0", "0")
     assert NO_SCORE in table.notes
+    told = json_of(run)["followers"]
+    assert (len(told), sum("seed" not in row for row in told)) == (len(rows), 4 * 4 * 3)
+    assert sum(row["rear"] for row in told) == rows["rear"].sum()
 
 
 def test_who_never_stalls_is_not_hit_where_the_follower_survives(made: Callable[..., Run]) -> None:
@@ -295,6 +307,7 @@ def test_six_numbers_are_varied_over_the_same_points(made: Callable[..., Run]) -
     assert set(show(run).figures) == {"scenario", "sensitivity"}
     assert len(build_sensitivity(run).axes) == len(VARIED)
     assert any("build" in note for note in show(run).notes)
+    assert [row["varied"] for row in json_of(run)["sensitivity"]] == list(rows["varied"])
 
 
 def test_a_lead_that_brakes_later_is_the_same_request_made_earlier() -> None:

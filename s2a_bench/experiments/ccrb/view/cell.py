@@ -1,11 +1,11 @@
-"""What ``--json`` and its schema hold of a CCRB run: a policy at the operating point, and the shares of a study."""
+"""What ``--json`` and its schema hold of a CCRB run: a policy at the operating point, and what its studies counted."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
-from s2a_bench.experiments.ccrb.rows import RolloutRow
+from s2a_bench.experiments.ccrb.rows import FollowerRow, RolloutRow, SensitivityRow
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.store.bounds import Count, Fraction, Many, NonNegative, Positive, about
 from s2a_bench.writers.as_json import cell_of_row
@@ -35,6 +35,21 @@ CcrbCell = cell_of_row(
         "stall_s": NonNegative,
         "deadline_s": Annotated[float, about(_DEADLINE)],
     },
+)
+
+CcrbFollower = cell_of_row(
+    "CcrbFollower",
+    "Counts of points of the plane under one policy, with one follower and lead; without a seed: the operating point.",
+    FollowerRow,
+    without=("cell",),
+    own={},
+)
+CcrbSensitivity = cell_of_row(
+    "CcrbSensitivity",
+    "At how many of the points that a seed drew the paper's ordering holds, one number changed.",
+    SensitivityRow,
+    without=("cell",),
+    own={},
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.ccrb.metrics import MARGINS, OUTCOMES
-from s2a_bench.experiments.ccrb.rows import FOLLOWER_STUDY
+from s2a_bench.experiments.ccrb.rows import FOLLOWER_STUDY, SENSITIVITY
 from s2a_bench.experiments.ccrb.view.cell import ORDERINGS
 from s2a_bench.experiments.ccrb.view.outcomes import (
     Share,
@@ -22,6 +22,7 @@ from s2a_bench.experiments.ccrb.view.sentences import origin_notes
 from s2a_bench.experiments.ccrb.view.variations import follower_tables
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.words import NO_SCORE, ORDERING, law, operating_point, said
+from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.as_json import frame
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, number
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.experiments import Metric
     from s2a_bench.store.run import Run
+    from s2a_bench.store.schema import Table
 
 
 def outcome_table(run: Run) -> TextTable:
@@ -128,7 +130,15 @@ def ccrb_json(run: Run) -> dict[str, Any]:
     """
     studies = [_study(run, study, gap) for study in ("phase", "random") if has(run, study) for gap in GAPS]
     live = {"live": run.manifest["live"]} if "live" in run.manifest else {}
-    return frame(run, cells_of(run), [], **live, follower_law=law(configuration(run)), studies=studies)
+    varied = {"followers": _counts(run, FOLLOWER_STUDY), "sensitivity": _counts(run, SENSITIVITY)}
+    more = {name: rows for name, rows in varied.items() if rows}
+    return frame(run, cells_of(run), [], **live, follower_law=law(configuration(run)), studies=studies, **more)
+
+
+def _counts(run: Run, table: Table[Any]) -> list[dict[str, Any]]:
+    """Return the rows of a study that counts; what one lacks is no key."""
+    rows = run.table(table).drop(columns=["cell", PROVENANCE], errors="ignore")
+    return [{str(name): value for name, value in row.dropna().items()} for _, row in rows.astype(object).iterrows()]
 
 
 def _study(run: Run, study: str, gap: str) -> dict[str, Any]:
