@@ -106,7 +106,7 @@ class RclpyActionClient:
         """Wait on this thread; None on timeout or after `interrupt`."""
         deadline_ns = now_ns() + int(timeout_s * 1e9)
         more = True
-        with self._waiter.busy:
+        with self._waiter.consuming():
             while more and not self._events:
                 more = self._waiter.wait_until(deadline_ns)
                 if not self._waiter.interrupted:

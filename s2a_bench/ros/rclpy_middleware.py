@@ -61,6 +61,8 @@ class _RclpySubscription:
         self._subscription = node.node.create_subscription(
             self._class, topic, lambda _: None, qos_profile(qos), callback_group=Unserved(), raw=True
         )
+        for handler in self._subscription.event_handlers:
+            node.adopt(handler)
         handle = self._subscription.handle
         self._waiter = Waiter(node.node, handle, ONE_SUBSCRIPTION, lambda wait_set: wait_set.add_subscription(handle))
         self.interrupt, self.close = self._waiter.interrupt, self._waiter.close
@@ -68,7 +70,7 @@ class _RclpySubscription:
     def take(self, timeout_s: float) -> bytes | None:
         """Take the next message's CDR."""
         deadline_ns = now_ns() + int(timeout_s * 1e9)
-        with self._waiter.busy:
+        with self._waiter.consuming():
             more = True
             while not self._waiter.interrupted:
                 if (taken := self._subscription.handle.take_message(self._class, True)) is not None:

@@ -74,6 +74,13 @@ class SpinningNode:
             except Exception:  # noqa: BLE001 - whatever a callback raised ends in spin_once
                 _log.exception("a callback of rclpy failed")
 
+    def adopt(self, handler: Any) -> None:
+        """Serve an event of an endpoint that has a consumer of its own: that a peer's QoS does not fit is logged."""
+        group = self.node.default_callback_group
+        group.add_entity(handler)
+        handler.callback_group = group
+        self._executor.create_task(lambda: None)  # ends spin_once, which then finds it
+
     def check_open(self) -> None:
         """Raise TransportError once closed."""
         if self.closed:

@@ -10,8 +10,10 @@ Jazzy, reads ``_goal_handles``, the goals rclpy remembers, and calls ``_execute_
 from __future__ import annotations
 
 import logging
+import time
 from collections import deque
 from collections.abc import Callable
+from inspect import signature
 from threading import Condition, Lock, RLock, Thread
 from typing import Any
 
@@ -27,6 +29,8 @@ from s2a_bench.ros.rclpy_waiter import SLICE_NS, Unserved, for_waitable, run_now
 
 FEEDBACK_QOS = QoS(depth=1000)
 """As with Cyclone: deeper than ROS's 10."""
+PAUSE_S = 0.1
+"""After a failure: a wait that fails does so at once."""
 ENDS = {Status.SUCCEEDED: "succeed", Status.ABORTED: "abort", Status.CANCELED: "canceled"}
 """How a goal ends -> the method of rclpy's goal handle."""
 
@@ -150,13 +154,16 @@ class _PullingServer(ActionServer):  # type: ignore[misc]
                 self._verdict = GoalResponse.REJECT
             return self._goal_handles.get(bytes(request[1].goal_id.uuid))
 
-    def end(self, handle: Any, state: Callable[[], None], result: Any) -> None:
-        """End a goal as rclpy's programs do: in an execute callback that sets the state and returns the result."""
+    def end(self, handle: Any, state: Callable[..., None], result: Any) -> None:
+        """End a goal as rclpy's programs do: in an execute callback that sets the state and returns the result.
+
+        From rclpy 7.1.8 on the state is set with the result, which is sent at once, and an empty one without it.
+        """
         failed: list[RuntimeError] = []
 
         def finish(_handle: Any) -> Any:
             try:
-                state()
+                state(result) if signature(state).parameters else state()
             except RuntimeError as error:
                 failed.append(error)
             return result
@@ -205,13 +212,15 @@ class RclpyActionServer:
 
     def _serve(self) -> None:
         """Take what comes until closed; a request that fails is reported and the next is served."""
-        while self._waiter.wait_until(now_ns() + SLICE_NS):
+        while not self._waiter.interrupted:
             try:
-                with self._server:
-                    if self._server.is_ready(self._waiter.wait_set):
-                        run_now(self._server.execute(self._server.take_data()))
+                if self._waiter.wait_until(now_ns() + SLICE_NS):
+                    with self._server:
+                        if self._server.is_ready(self._waiter.wait_set):
+                            run_now(self._server.execute(self._server.take_data()))
             except Exception:  # noqa: BLE001 - whatever the request of a stranger raised
                 _log.exception("a request to the action %s failed", self._type)
+                time.sleep(PAUSE_S)
 
     def offer(self, request: Any) -> bool:
         """Queue a goal; False if one of this id waits for its decision."""

@@ -7,7 +7,8 @@ waits in a wait set of its own. Wait sets are no public part of rclpy; Humble's 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from threading import Lock
 from typing import Any
 
@@ -15,6 +16,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError
 
 SLICE_NS = 500_000_000
 """A blocked wait returns to Python this often, so that Ctrl-C acts."""
@@ -40,7 +42,7 @@ class Unserved(CallbackGroup):  # type: ignore[misc]
 
 
 class Waiter:
-    """Waits for one entity; one thread at a time, which holds ``busy`` meanwhile."""
+    """Waits for one entity; one thread at a time, inside `consuming`."""
 
     def __init__(self, node: Any, entity: Any, counts: Sequence[int], add: Callable[[Any], None]) -> None:
         """``entity`` is held as a context while it is waited for; ``add`` puts its ``counts`` into a wait set."""
@@ -64,13 +66,23 @@ class Waiter:
         return left_ns > 0 and not self.interrupted
 
     def wake(self) -> None:
-        """End a wait under way, or the next one; callable from any thread."""
-        self._guard.trigger()
+        """End a wait under way, or the next one; callable from any thread, after the node has gone too."""
+        with suppress(RuntimeError):  # InvalidHandle
+            self._guard.trigger()
 
     def interrupt(self) -> None:
         """End a wait under way and every later one; callable from any thread."""
         self.interrupted = True
         self.wake()
+
+    @contextmanager
+    def consuming(self) -> Iterator[None]:
+        """Hold ``busy``; raises TransportError where rclpy fails."""
+        with self.busy:
+            try:
+                yield
+            except RuntimeError as error:  # rclpy's RCLError and InvalidHandle are RuntimeErrors
+                raise TransportError(f"rclpy: {error}") from error
 
     def close(self) -> None:
         """Interrupt, and return when nobody waits any more."""

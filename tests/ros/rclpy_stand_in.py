@@ -29,6 +29,8 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Goals, Status
 
 GRAPH: list[Node] = []
+OLD_ENDS: list[bool] = []
+"""Not empty: a goal's state is set without its result, as before rclpy 7.1.8."""
 Verdict = Enum("Verdict", ["REJECT", "ACCEPT"])
 
 
@@ -98,8 +100,9 @@ class Future:
             self.call(callback)
 
     def set_result(self, value: Any) -> None:
-        self.value.append(value)
-        for callback in self.callbacks:
+        self.value.insert(0, value)  # the last one counts, for those who ask later
+        callbacks, self.callbacks = self.callbacks, []
+        for callback in callbacks:
             self.call(callback)
 
     def call(self, callback: Callable[[Any], None]) -> None:
@@ -114,6 +117,9 @@ CAME = Condition()
 
 
 class CallbackGroup:
+    def add_entity(self, entity: Any) -> None:
+        assert entity
+
     def can_execute(self, _entity: Any) -> bool:
         return True
 
@@ -200,7 +206,8 @@ class Node:
     def __init__(self, name: str, context: Any, namespace: str, **_: bool) -> None:
         assert "/" not in name
         assert namespace.startswith("/")
-        self.context = context
+        self.context, self.default_callback_group = context, CallbackGroup()
+        self.handlers: list[Any] = []
         self.domain, self.executor = context.domain, Executor(context)
         self.topics: dict[str, list[Any]] = defaultdict(list)
         self.subscribed: dict[str, list[Any]] = defaultdict(list)
@@ -247,7 +254,8 @@ class Node:
         assert raw
         assert not callback_group.can_execute(self)
         self.subscribed[topic].append(Subscribed(cls, qos))
-        return SimpleNamespace(handle=self.subscribed[topic][-1])
+        self.handlers.append(SimpleNamespace(callback_group=callback_group))  # of an incompatible QoS
+        return SimpleNamespace(handle=self.subscribed[topic][-1], event_handlers=self.handlers[-1:])
 
     def count_publishers(self, topic: str) -> int:
         return sum(len(node.topics[topic]) for node in self.peers())
@@ -363,7 +371,17 @@ class ServerGoalHandle:
         self.server, self.goal_id, self.result = server, goal_id, Future(None)
         self.id = bytes(goal_id.uuid)
         for name, end in (("succeed", Status.SUCCEEDED), ("abort", Status.ABORTED), ("canceled", Status.CANCELED)):
-            setattr(self, name, lambda end=end: server.goals.end(self.id, end, None, now_ns()))
+            setattr(self, name, self.until_7_1_7(end) if OLD_ENDS else self.from_7_1_8(end))
+
+    def until_7_1_7(self, end: Status) -> Callable[[], None]:
+        return lambda: self.server.goals.end(self.id, end, None, now_ns())
+
+    def from_7_1_8(self, end: Status) -> Callable[..., None]:
+        def set_state(response: Any = None) -> None:
+            self.server.goals.end(self.id, end, None, now_ns())
+            self.result.set_result(response or self.server.action.Result())
+
+        return set_state
 
     status = property(lambda self: self.server.goals.status(self.id))
     is_cancel_requested = property(lambda self: self.status == Status.CANCELING)

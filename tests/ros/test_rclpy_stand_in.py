@@ -69,7 +69,12 @@ class TestRclpyGlue(MiddlewareSuite):
         return rclpy_join
 
 
+@pytest.mark.parametrize("old", [True, False], ids=["until 7.1.7", "from 7.1.8"])
 class TestRclpyActionGlue(ActionSuite):
+    @pytest.fixture(autouse=True)
+    def release(self, monkeypatch: pytest.MonkeyPatch, old: bool) -> None:
+        monkeypatch.setattr("tests.ros.rclpy_stand_in.OLD_ENDS", [True] * old)
+
     @pytest.fixture
     def join(self, rclpy_join: Join) -> Join:
         return rclpy_join
@@ -176,6 +181,13 @@ def test_the_version_of_llama_msgs_is_the_workspaces(rclpy_join: Join, monkeypat
     assert rclpy_join().action_server(NAME, llama.GENERATE_RESPONSE).version == "4.4"
     with pytest.raises(TransportError, match=r"this workspace has llama_msgs 4\.4, not 6\.0"):
         rclpy_join().action_server(NAME, llama.GENERATE_RESPONSE, version="6.0")
+
+
+def test_an_executor_still_tells_of_a_qos_that_does_not_fit(rclpy_join: Join) -> None:
+    rclpy_join().subscription("/x", "std_msgs/msg/String", QoS())
+    (node,) = GRAPH
+    (handler,) = node.handlers
+    assert handler.callback_group is node.default_callback_group
 
 
 def test_closing_waits_for_a_consumer_that_waits(rclpy_join: Join) -> None:
