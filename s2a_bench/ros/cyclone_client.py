@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections import deque
 from typing import Any
 
@@ -16,8 +15,8 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import CANCEL_GOAL, STATUS_ARRAY, CancelCode
 from s2a_bench.ros.dds import AT_ONCE, RawReader, RawWriter, Waiter, dds_qos
 from s2a_bench.ros.dds_service import BODY_AT, READER_QOS, ServiceClient
+from s2a_bench.ros.waiting import appeared
 
-MATCH_POLL_S = 0.01
 FEEDBACK_ID = slice(4, 20)
 
 
@@ -51,13 +50,8 @@ class CycloneActionClient:
         return (*self._goals.ends(), *self._results.ends(), *self._cancels.ends(), self._feedback, self._status)
 
     def wait_for_server(self, timeout_s: float) -> bool:
-        """Look every 10 ms."""
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
-        while not self.server_present():
-            if now_ns() > deadline_ns or self._waiter.interrupted:
-                return False
-            time.sleep(MATCH_POLL_S)
-        return True
+        """Look whether it is matched."""
+        return appeared(self.server_present, timeout_s, lambda: self._waiter.interrupted)
 
     def server_present(self) -> bool:
         """Look for both ends of the three services, and the writers of feedback and status."""

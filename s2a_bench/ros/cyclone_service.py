@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from threading import Lock, Thread
 from typing import Any
@@ -16,9 +15,8 @@ from s2a_bench.ros import REQUEST_BYTES, QoS
 from s2a_bench.ros.dds import Waiter
 from s2a_bench.ros.dds_service import BODY_AT, HEADER, HEADER_AT, ServiceClient, ServiceServer
 from s2a_bench.ros.messages import DEFAULT_VERSION
+from s2a_bench.ros.waiting import WAIT_SLICE_NS, appeared
 
-SLICE_NS = 500_000_000
-MATCH_POLL_S = 0.01
 _log = logging.getLogger(__name__)
 
 
@@ -52,7 +50,7 @@ class CycloneServices:
             for offered in self._offered:
                 for packed in offered.server.reader.arrived():
                     offered.handle(packed)
-            self._waiter.wait_until(now_ns() + SLICE_NS)
+            self._waiter.wait_until(now_ns() + WAIT_SLICE_NS)
 
 
 class _Offered:
@@ -93,10 +91,8 @@ class CycloneServiceClient:
     def call(self, request: Any, timeout_s: float) -> Any:
         """Wait for the server, send, wait for the reply that is ours."""
         deadline_ns = now_ns() + int(timeout_s * 1e9)
-        while not self._client.matched():
-            if now_ns() > deadline_ns:
-                raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
-            time.sleep(MATCH_POLL_S)
+        if not appeared(self._client.matched, timeout_s):
+            raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
         self._asked += 1
         key = self._asked.to_bytes(8, "big")
         self._client.call(self._client.pack(request), key)

@@ -37,11 +37,10 @@ from cyclonedds.topic import Topic
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS
+from s2a_bench.ros.waiting import WAIT_SLICE_NS
 
 FOREVER_NS = 2**63 - 1
 ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
-WAIT_SLICE_NS = 500_000_000
-"""A blocked wait returns to Python this often, so that Ctrl-C acts."""
 AT_ONCE = 1000
 """More than that is not taken before what has come is looked at."""
 

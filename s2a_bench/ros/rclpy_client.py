@@ -12,7 +12,6 @@ drops it (ros2/rclpy issue 1123, in Humble and in Jazzy up to autumn 2025).
 from __future__ import annotations
 
 import os
-import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,8 +28,8 @@ from s2a_bench.ros.messages import serialised_bytes
 from s2a_bench.ros.rclpy_node import SpinningNode, qos_profile
 from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
 from s2a_bench.ros.rclpy_waiter import Unserved, for_waitable, run_now
+from s2a_bench.ros.waiting import appeared
 
-MATCH_POLL_S = 0.01
 AT_ONCE = 10_000
 """A server may send feedback faster than we take it; an answer has fewer pieces."""
 
@@ -119,13 +118,8 @@ class RclpyActionClient:
                 run_now(self._client.execute(self._client.take_data()))
 
     def wait_for_server(self, timeout_s: float) -> bool:
-        """Look every 10 ms; rclpy's own waiting looks four times a second."""
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
-        while not self.server_present():
-            if now_ns() > deadline_ns or self._waiter.interrupted:
-                return False
-            time.sleep(MATCH_POLL_S)
-        return True
+        """Look whether it is matched."""
+        return appeared(self.server_present, timeout_s, lambda: self._waiter.interrupted)
 
     def server_present(self) -> bool:
         """Ask rclpy, for its client and for ours."""

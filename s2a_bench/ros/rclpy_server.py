@@ -25,7 +25,8 @@ from s2a_bench.ros import QoS
 from s2a_bench.ros.action import NEXT, Status
 from s2a_bench.ros.rclpy_node import SpinningNode, qos_profile
 from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
-from s2a_bench.ros.rclpy_waiter import SLICE_NS, Unserved, for_waitable, run_now
+from s2a_bench.ros.rclpy_waiter import Unserved, for_waitable, run_now
+from s2a_bench.ros.waiting import WAIT_SLICE_NS
 
 FEEDBACK_QOS = QoS(depth=1000)
 """As with Cyclone: deeper than ROS's 10."""
@@ -214,7 +215,7 @@ class RclpyActionServer:
         """Take what comes until closed; a request that fails is reported and the next is served."""
         while not self._waiter.interrupted:
             try:
-                if self._waiter.wait_until(now_ns() + SLICE_NS):
+                if self._waiter.wait_until(now_ns() + WAIT_SLICE_NS):
                     with self._server:
                         if self._server.is_ready(self._waiter.wait_set):
                             run_now(self._server.execute(self._server.take_data()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswer
@@ -14,8 +13,7 @@ from s2a_bench.ros import QoS
 from s2a_bench.ros.messages import DEFAULT_VERSION
 from s2a_bench.ros.rclpy_node import SpinningNode, qos_profile
 from s2a_bench.ros.rclpy_types import from_ros, interface_class, to_ros
-
-MATCH_POLL_S = 0.01
+from s2a_bench.ros.waiting import appeared
 
 
 def offer(node: SpinningNode, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS) -> None:
@@ -41,11 +39,9 @@ class RclpyServiceClient:
     def call(self, request: Any, timeout_s: float) -> Any:
         """Wait for the server, send, wait for the executor to bring the answer."""
         deadline_ns = now_ns() + int(timeout_s * 1e9)
-        while not self._client.service_is_ready():
+        if not appeared(self._client.service_is_ready, timeout_s, lambda: self._node.closed):
             self._node.check_open()
-            if now_ns() > deadline_ns:
-                raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
-            time.sleep(MATCH_POLL_S)
+            raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
         outcome: Future[Any] = Future()
         asked = self._client.call_async(
             to_ros(request, self._class.Request, self._type_name + "_Request", DEFAULT_VERSION)

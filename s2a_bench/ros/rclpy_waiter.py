@@ -17,9 +17,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
+from s2a_bench.ros.waiting import WAIT_SLICE_NS
 
-SLICE_NS = 500_000_000
-"""A blocked wait returns to Python this often, so that Ctrl-C acts."""
 ONE_SUBSCRIPTION = (1, 0, 0, 0, 0, 0)
 """Subscriptions, guard conditions, timers, clients, services and events of a wait set."""
 
@@ -62,7 +61,7 @@ class Waiter:
             self.wait_set.clear_entities()
             self._add(self.wait_set)
             self.wait_set.add_guard_condition(self._guard.handle)
-            self.wait_set.wait(min(left_ns, SLICE_NS))
+            self.wait_set.wait(min(left_ns, WAIT_SLICE_NS))
         return left_ns > 0 and not self.interrupted
 
     def wake(self) -> None:

@@ -5,19 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
-from s2a_bench.clock import SystemClock
 from s2a_bench.errors import MissingInterface, ServerDied, TransportError
 from s2a_bench.ros import Middleware, QoS, Tuning, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE
 from s2a_bench.ros.remap import Remapped, table
+from s2a_bench.ros.waiting import appeared
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA
 from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
 MATCH_TIMEOUT_S = 15.0
-MATCH_POLL_NS = 10_000_000
 SETTLE_S = 0.3
 """Time to discover a server that is there already."""
 
@@ -58,12 +57,8 @@ def remapped(wiring: Wiring[RosOptions]) -> dict[str, str]:
 
 def wait_until(arrived: Callable[[], bool], alive: Callable[[], bool], what: str) -> None:
     """Wait for a peer to be matched; raises ServerDied, saying ``what`` did not appear."""
-    clock = SystemClock()
-    deadline = clock.now_ns() + int(MATCH_TIMEOUT_S * 1e9)
-    while not arrived():
-        if clock.now_ns() > deadline or not alive():
-            raise ServerDied(f"{what}; is ROS_DOMAIN_ID the same on both sides?")
-        clock.sleep_until_ns(clock.now_ns() + MATCH_POLL_NS)
+    if not appeared(arrived, MATCH_TIMEOUT_S, lambda: not alive()):
+        raise ServerDied(f"{what}; is ROS_DOMAIN_ID the same on both sides?")
 
 
 def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
