@@ -38,11 +38,9 @@ class Finding:
 
 def diagnostic_array(node_name: str, findings: Iterable[Finding], stamp_ns: int) -> Any:
     """Build the message; ``stamp_ns`` is ROS time, parts are named ``node: part`` as ROS's diagnostic_updater does."""
-    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    stamp = ros.default("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
     return ros.default(
         ARRAY,
-        header=ros.default("std_msgs/msg/Header", stamp=stamp),
+        header=ros.header(stamp_ns),
         status=[
             ros.default(
                 "diagnostic_msgs/msg/DiagnosticStatus",

@@ -175,18 +175,22 @@ def float64_array(values: Iterable[float]) -> NDArray[Any]:
     return np.fromiter(values, np.float64)
 
 
-def _header(stamp_ns: int, frame_id: str) -> Any:
-    """Build a std_msgs/Header."""
+def stamp(stamp_ns: int) -> Any:
+    """Build a builtin_interfaces/Time of ROS time."""
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    stamp = message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-    return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+    return message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+
+
+def header(stamp_ns: int, frame_id: str = "") -> Any:
+    """Build a std_msgs/Header."""
+    return message("std_msgs/msg/Header", stamp=stamp(stamp_ns), frame_id=frame_id)
 
 
 def image_message(frame: Frame, stamp_ns: int, frame_id: str) -> Any:
     """Wrap a raw frame as sensor_msgs/Image, without copying pixels; ``stamp_ns`` is ROS time."""
     return message(
         IMAGE,
-        header=_header(stamp_ns, frame_id),
+        header=header(stamp_ns, frame_id),
         height=frame.height,
         width=frame.width,
         encoding=frame.encoding,
@@ -199,7 +203,7 @@ def image_message(frame: Frame, stamp_ns: int, frame_id: str) -> Any:
 def compressed_image_message(data: Pixels, stamp_ns: int, frame_id: str, coding: str = "jpeg") -> Any:
     """Wrap a JPEG or PNG as sensor_msgs/CompressedImage, its format in the words of compressed_image_transport."""
     format_ = f"bgr8; {coding} compressed bgr8"
-    return message(COMPRESSED_IMAGE, header=_header(stamp_ns, frame_id), format=format_, data=data)
+    return message(COMPRESSED_IMAGE, header=header(stamp_ns, frame_id), format=format_, data=data)
 
 
 def frame_of_image(image: Any, index: int = -1) -> Frame:

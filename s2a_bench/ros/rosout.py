@@ -37,10 +37,9 @@ class Rosout(logging.Handler):
 
 def log_message(record: logging.LogRecord, name: str) -> Any:
     """Turn a record into a message; ROS's levels are Python's, and its stamp is ROS time."""
-    seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
     return ros.default(
         LOG,
-        stamp=ros.default("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds),
+        stamp=ros.stamp(time.time_ns()),
         level=min(max(record.levelno // 10 * 10, logging.DEBUG), logging.CRITICAL),
         name=name,
         msg=_text(record.getMessage()),

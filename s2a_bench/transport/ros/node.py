@@ -157,9 +157,8 @@ class NodeApi:
 
     def _tell(self, **lists: Sequence[Any]) -> None:
         """Publish a ParameterEvent."""
-        seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
-        stamp = ros.default("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-        self._events.send(self._events.pack(ros.default(EVENT, stamp=stamp, node=self._name, **lists)))
+        event = ros.default(EVENT, stamp=ros.stamp(time.time_ns()), node=self._name, **lists)
+        self._events.send(self._events.pack(event))
 
 
 def declared(wiring: Wiring[RosOptions], settings: Options | None) -> list[Parameter]:
