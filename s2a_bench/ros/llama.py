@@ -43,10 +43,16 @@ def generate_goal(
     return default(GENERATE_RESPONSE + "_Goal", version, **fields, sampling_config=sampling_config(version, **sampling))
 
 
+def images_of(message: Any) -> list[Any]:
+    """Return the images of a goal of either version, an empty one included; other messages have none."""
+    if hasattr(message, "images"):
+        return list(message.images)
+    return [message.image] if hasattr(message, "image") else []
+
+
 def goal_images(goal: Any) -> list[Any]:
     """Return the images of a goal of either version, empty ones left out."""
-    images = goal.images if hasattr(goal, "images") else [goal.image]
-    return [image for image in images if image.data.size]
+    return [image for image in images_of(goal) if image.data.size]
 
 
 def token_feedback(text: str, token: int, version: str = DEFAULT_VERSION) -> Any:

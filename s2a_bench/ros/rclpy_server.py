@@ -23,6 +23,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import MissingInterface, TransportError
 from s2a_bench.ros import QoS
 from s2a_bench.ros.action import NEXT, Status
+from s2a_bench.ros.llama import images_of
 from s2a_bench.ros.rclpy_node import SpinningNode, qos_profile
 from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
 from s2a_bench.ros.rclpy_waiter import Unserved, for_waitable, run_now
@@ -51,8 +52,7 @@ class RclpyServerGoal:
     def size_bytes(self) -> int:
         """Return the letters of its prompt and the bytes of its pictures."""
         goal = self._request[1].goal
-        images = goal.images if hasattr(goal, "images") else [goal.image]
-        return len(goal.prompt) + sum(len(image.data) for image in images)
+        return len(goal.prompt) + sum(len(image.data) for image in images_of(goal))
 
     @property
     def cancel_requested(self) -> bool:

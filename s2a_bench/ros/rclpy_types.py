@@ -8,7 +8,7 @@ generated classes take as it is, by one copy, and out of it by none.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -19,6 +19,7 @@ from rosbags.interfaces import Nodetype
 
 from s2a_bench.errors import MissingInterface
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.llama import images_of
 
 NO_PIXELS = np.empty(0, np.uint8)
 
@@ -39,7 +40,7 @@ def to_ros(message: Any, cls: Any, type_name: str, version: str) -> Any:
     """Turn a rosbags message into one of the generated class."""
     with _without_pixels(message, NO_PIXELS) as pixels:
         made = deserialize_message(bytes(ros.serialise(message, type_name, version)), cls)
-    for image, its in zip(_images(made), pixels, strict=True):
+    for image, its in zip(images_of(made), pixels, strict=True):
         data = array("B")
         data.frombytes(np.ascontiguousarray(its).data.cast("B"))
         image.data = data
@@ -50,20 +51,15 @@ def from_ros(message: Any, type_name: str, version: str) -> Any:
     """Turn a message of a generated class into a rosbags message, whose arrays are views of its CDR or pixels."""
     with _without_pixels(message, array("B")) as pixels:
         made = ros.deserialise(memoryview(serialize_message(message)), type_name, version)
-    for image, its in zip(_images(made), pixels, strict=True):
+    for image, its in zip(images_of(made), pixels, strict=True):
         image.data = np.frombuffer(its, np.uint8)
     return made
-
-
-def _images(message: Any) -> Sequence[Any]:
-    """Return the images of a goal of either version; other messages of actions have none."""
-    return getattr(message, "images", None) or [image for image in (getattr(message, "image", None),) if image]
 
 
 @contextmanager
 def _without_pixels(message: Any, none: Any) -> Iterator[list[Any]]:
     """Give out the pixels of a message's images, which has ``none`` meanwhile."""
-    images = _images(message)
+    images = images_of(message)
     pixels = [image.data for image in images]
     try:
         for image in images:
