@@ -69,9 +69,10 @@ class CycloneActionClient:
         announced = self._goals.peer_type_hash()
         if not announced:
             return None
-        for version in (self._version, *ros.VERSIONS):
-            if announced == ros.type_hash(self._goals.request_type, version):
-                return version
+        if announced == ros.type_hash(self._goals.request_type, self._version):
+            return self._version
+        if version := ros.version_of(self._goals.request_type, announced):
+            return version
         raise TransportError(
             f"the server's {self._type} has type hash {announced}: its llama_msgs is none of {', '.join(ros.VERSIONS)}"
         )

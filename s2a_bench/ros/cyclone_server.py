@@ -46,10 +46,10 @@ class CycloneServerGoal:
     def other_version(self) -> str:
         """Compare the type hash that the client's goal writer announces."""
         service = self._server.send_goal
-        announced = (service.reader.peer(self._sender) or {}).get("typehash", "")
-        known = {ros.type_hash(service.request_type, version): version for version in ros.VERSIONS}
-        spoken = known.get(announced, f"of type hash {announced}") if announced else ""
-        return spoken if spoken != self._server.version else ""
+        announced = service.client(self._sender).type_hash
+        if announced in {"", ros.type_hash(service.request_type, self._server.version)}:
+            return ""
+        return ros.version_of(service.request_type, announced) or f"of type hash {announced}"
 
     def unpack(self) -> Any:
         """Deserialise; arrays are views of the lent sample."""
@@ -131,7 +131,7 @@ class CycloneActionServer:
             if packed is None:
                 if not self._goal_waiter.wait_until(deadline_ns):
                     return None
-            elif other := self.send_goal.other_dds_of(self.send_goal.reader.sender()):
+            elif other := self.send_goal.client(self.send_goal.reader.sender()).other_dds:
                 self._tell_once(other)
             elif len(packed) < BODY_AT + 16:
                 _log.warning("%s: dropped a goal request of %d bytes, too short for an id", self._name, len(packed))

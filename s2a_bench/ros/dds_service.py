@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import count
 from threading import Lock
 from typing import Any
@@ -17,7 +18,7 @@ from cyclonedds.domain import DomainParticipant
 
 from s2a_bench.clock import now_ns
 from s2a_bench.ros import QoS
-from s2a_bench.ros.dds import RawReader, RawWriter, dds_qos, other_dds
+from s2a_bench.ros.dds import RawReader, RawWriter, dds_qos, other_dds, user_data
 from s2a_bench.ros.messages import deserialise, serialise, type_hash
 
 HEADER = struct.Struct("<Qq")
@@ -45,6 +46,15 @@ def endpoint_id(prefix: bytes, number: int) -> str:
     return f"{data[0]:2x}" + "".join(f".{byte:x}" for byte in data[1:])
 
 
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """What a client's writer announces; "" is not known."""
+
+    other_dds: str = ""
+    """Of which DDS it is, where its services have another form than ours."""
+    type_hash: str = ""
+
+
 class _End:
     """What client and server have in common."""
 
@@ -65,12 +75,12 @@ class _End:
         request, reply = ("rq" + name + "Request", self.request_type), ("rr" + name + "Reply", self.reply_type)
         sent, received = (request, reply) if own == "clientid" else (reply, request)
 
-        def user_data(type_name: str) -> str:
+        def told(type_name: str) -> str:
             return f"{own}={identity};typehash={type_hash(type_name, version)};"
 
         writer_qos = qos or (REQUEST_QOS if sent is request else REPLY_QOS)
-        self.writer = RawWriter(participant, *sent, dds_qos(writer_qos, user_data(sent[1])))
-        self.reader = RawReader(participant, *received, dds_qos(qos or READER_QOS, user_data(received[1])))
+        self.writer = RawWriter(participant, *sent, dds_qos(writer_qos, told(sent[1])))
+        self.reader = RawReader(participant, *received, dds_qos(qos or READER_QOS, told(received[1])))
 
     def matched(self) -> bool:
         """Return whether both endpoints of one peer are matched."""
@@ -137,6 +147,7 @@ class ServiceServer(_End):
         """Create both endpoints of the service ``/name``; ``qos`` as for `_End`."""
         super().__init__(participant, name, type_name, version, ("serviceid", "clientid"), qos)
         self._reachable: set[int] = set()
+        self._clients: dict[int, Peer] = {}
 
     def pack(self, body: Any) -> bytearray:
         """Serialise a reply; `reply` fills its header in."""
@@ -151,10 +162,17 @@ class ServiceServer(_End):
         """Deserialise a request's body; raises TransportError."""
         return deserialise(packed, self.request_type + "__wire", self._version).body
 
-    def other_dds_of(self, sender: int) -> str:
-        """Return the DDS of the writer ``sender`` where its services have another form than ours, else ""."""
-        endpoint = None if sender in self._reachable else self.reader.endpoint(sender)
-        return "" if endpoint is None else other_dds(endpoint)
+    def client(self, sender: int) -> Peer:
+        """Return what the writer ``sender`` announced, asked once: it stays as it is; nothing if it has left."""
+        found = self._clients.get(sender)
+        if found is None:
+            endpoint = self.reader.endpoint(sender)
+            if endpoint is None:
+                return Peer()
+            if len(self._clients) >= REMEMBERED_CLIENTS:
+                self._clients.clear()
+            found = self._clients[sender] = Peer(other_dds(endpoint), user_data(endpoint).get("typehash", ""))
+        return found
 
     def await_client(self, sender: int) -> bool:
         """Wait, 100 ms at most, until replies reach the client whose request came from writer ``sender``.

@@ -126,6 +126,11 @@ def _sequence(description: Any, values: Iterable[Any]) -> Any:
     return np.asarray(values, {"byte": "uint8"}.get(inner[1][0], inner[1][0]))
 
 
+def version_of(type_name: str, announced: str) -> str | None:
+    """Return the version of llama_msgs in which a type has the hash that a peer announces; None for no such one."""
+    return next((version for version in VERSIONS if announced == type_hash(type_name, version)), None)
+
+
 @cache
 def type_hash(type_name: str, version: str = DEFAULT_VERSION) -> str:
     """Return the type's REP-2016 hash, ``RIHS01_`` and 64 hex digits."""
