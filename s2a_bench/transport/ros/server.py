@@ -23,7 +23,7 @@ from s2a_bench.ros.diagnostics import Finding
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros import ACTION
-from s2a_bench.transport.ros.action import ActionFront
+from s2a_bench.transport.ros.action_front import ActionFront
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company
 from s2a_bench.transport.ros.node import Activity, NodeApi
