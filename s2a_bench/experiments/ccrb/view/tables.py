@@ -137,7 +137,7 @@ def ccrb_json(run: Run) -> dict[str, Any]:
 
 def _counts(run: Run, table: Table[Any]) -> list[dict[str, Any]]:
     """Return the rows of a study that counts; what one lacks is no key."""
-    rows = run.table(table).drop(columns=["cell", PROVENANCE], errors="ignore")
+    rows = run.table(table).drop(columns=["cell", PROVENANCE])
     return [{str(name): value for name, value in row.dropna().items()} for _, row in rows.astype(object).iterrows()]
 
 
