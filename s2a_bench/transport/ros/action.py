@@ -1,4 +1,4 @@
-"""The client of the ROS variant `action`: ``llama_msgs/action/GenerateResponse``, as llama_ros speaks it, tokens as feedback.
+"""The client of the ROS variant `action`: ``llama_msgs/action/GenerateResponse`` as in llama_ros, tokens as feedback.
 
 Our own server also publishes its marks on ``<namespace>/marks``, keyed by the goal's id; a plain llama_ros node does
 not, and then everything between packing and the first token is the stage `server`. A goal has no token limit, so the
