@@ -6,8 +6,6 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,7 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.ros import Accepted, Feedback, Middleware, Rejected, Result, llama, open_middleware
+from s2a_bench.ros import Accepted, Feedback, Rejected, Result, llama, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.testing.action import NAME, WAIT_S, Action, ActionSuite, event, offer, receive, send, start, text_of
 from s2a_bench.testing.middleware import Join
@@ -31,18 +29,6 @@ OURS = {
     ("writer", r"rt/generate/_action/feedback|rr/generate/.*Reply"): "Policy.History.KeepLast(depth=1000)",
 }
 """Where our history, which is local and matches any other, is deeper than ROS's."""
-
-
-@pytest.fixture
-def join(dds_domain: int) -> Iterator[Join]:
-    with ExitStack() as stack:
-
-        def join() -> Middleware:
-            middleware = open_middleware("cyclonedds", domain_id=dds_domain)
-            stack.callback(middleware.close)
-            return middleware
-
-        yield join
 
 
 @pytest.fixture

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.ros import REQUEST_BYTES, Middleware, QoS, open_middleware
+from s2a_bench.ros import REQUEST_BYTES, QoS
 from s2a_bench.ros import messages as ros
 from s2a_bench.testing.middleware import GET_TYPES, WAIT_S, Join
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
 NAME = "/robot/node/get_parameter_types"
-
-
-@pytest.fixture
-def join(dds_domain: int) -> Iterator[Join]:
-    with ExitStack() as stack:
-
-        def join() -> Middleware:
-            middleware = open_middleware("cyclonedds", domain_id=dds_domain)
-            stack.callback(middleware.close)
-            return middleware
-
-        yield join
 
 
 def lengths(request: Any) -> Any:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack
-
 import pytest
 
 from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.ros import MIDDLEWARES, Middleware, QoS, open_middleware
+from s2a_bench.ros import MIDDLEWARES, QoS, open_middleware
 from s2a_bench.ros.messages import type_hash
 from s2a_bench.testing.middleware import Join, MiddlewareSuite
 
@@ -17,15 +14,8 @@ cyclonedds = pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for
 
 class TestCyclone(MiddlewareSuite):
     @pytest.fixture
-    def join(self, dds_domain: int) -> Iterator[Join]:
-        with ExitStack() as stack:
-
-            def join() -> Middleware:
-                middleware = open_middleware("cyclonedds", domain_id=dds_domain)
-                stack.callback(middleware.close)
-                return middleware
-
-            yield join
+    def join(self, join: Join) -> Join:
+        return join
 
 
 def test_endpoints_look_like_those_of_ros(dds_domain: int) -> None:

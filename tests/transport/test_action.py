@@ -303,19 +303,12 @@ def test_a_handler_that_breaks_fails_its_goal_only(dds_domain: int) -> None:
             yield from super().__call__(request, trace)
 
     told = wiring("ros/action", "/test_broken", domain_id=dds_domain)
-    server = open_server(told, Broken(["fine"]))
-    thread = Thread(target=server.serve)
-    thread.start()
-    client = open_client(told)
-    try:
+    with closing(connector(told)) as connecting:
+        client = next(connecting)(Broken(["fine"]))
         for _ in range(6):
             with pytest.raises(RequestFailed, match="a bug"):
                 ask(client, Request("a", "break"))
         assert len(ask(client, Request("a", "plan"))[0]) == 1
-    finally:
-        client.close()
-        server.stop()
-        thread.join()
 
 
 def test_a_goal_that_cannot_start_ends_and_says_why(dds_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -329,18 +322,11 @@ def test_a_goal_that_cannot_start_ends_and_says_why(dds_domain: int, monkeypatch
 
     monkeypatch.setattr(CycloneServerGoal, "executing", executing)
     told = wiring("ros/action", "/test_start", domain_id=dds_domain)
-    server = open_server(told, Recorder(["fine"]))
-    thread = Thread(target=server.serve)
-    thread.start()
-    client = open_client(told)
-    try:
+    with closing(connector(told)) as connecting:
+        client = next(connecting)(Recorder(["fine"]))
         with pytest.raises(RequestFailed, match="no status can be sent"):
             ask(client, Request("a", "plan"))
         assert len(ask(client, Request("a", "plan"))[0]) == 1
-    finally:
-        client.close()
-        server.stop()
-        thread.join()
 
 
 def test_a_server_that_stops_ends_the_answer_under_way(dds_domain: int) -> None:
