@@ -65,6 +65,7 @@ def test_the_animation_has_frames_of_the_right_size(tmp_path: Path) -> None:
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) > 100
 
 
+@pytest.mark.slow
 def test_a_live_run_prints_one_object_and_leaves_a_whole_folder(tmp_path: Path) -> None:
     flags = ("--live", "--transport", "loopback", "--pace", "40", "--threads", "1", "--skills", "3", "--ttc")
     done = run(*flags, "--json", "--output", str(tmp_path))

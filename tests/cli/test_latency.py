@@ -266,6 +266,7 @@ def test_a_killed_harness_takes_its_servers_along_and_leaves_a_readable_run(tmp_
         Event().wait(0.02)
 
 
+@pytest.mark.slow
 def test_a_run_beside_another_has_a_namespace_of_its_own_unless_it_is_told_that_of_the_other(tmp_path: Path) -> None:
     process, first = start_long(tmp_path / "first", "--transport", "ros/topic,ros/action,http/as-deployed")
     try:

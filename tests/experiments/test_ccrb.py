@@ -292,6 +292,7 @@ def test_who_never_stalls_is_not_hit_where_the_follower_survives(made: Callable[
     assert (idm["survived"] == idm["points"]).all()
 
 
+@pytest.mark.slow
 def test_six_numbers_are_varied_over_the_same_points(made: Callable[..., Run]) -> None:
     run = made(sensitivity=True, seeds=2, seed_points=64)
     rows = run.table(SENSITIVITY)
