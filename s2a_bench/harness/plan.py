@@ -13,13 +13,13 @@ from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
 from s2a_bench.frames import SOURCES
-from s2a_bench.inference import EngineConfig, default_engine, told_by
+from s2a_bench.inference import ACTING, EngineConfig, acts, default_engine, told_by
 from s2a_bench.machine.resources.rows import SPENT
 from s2a_bench.options import Grammar, Names, Options, Size, TextOrFile, group, option
 from s2a_bench.trace import path_of
-from s2a_bench.transport import TRANSPORTS, Transport
+from s2a_bench.transport import ACTIONS, TRANSPORTS, Transport
 from s2a_bench.transport.options import PAYLOADS, SERVING, Payload, sides
-from s2a_bench.transport.pipeline import Pipeline, pipelines, require_payload
+from s2a_bench.transport.pipeline import Pipeline, answer_over, pipelines, require_payload
 
 LARGEST = 16_384
 
@@ -72,6 +72,8 @@ class RequestsConfig(Options):
 
     QUICK: ClassVar[dict[str, int]] = {"runs": 10, "warmup": 2, "max_tokens": 8}
     """What ``quick`` sets, unless told."""
+    COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
+    """Why answers of actions are no use here; empty: they are."""
 
     transports: Names = option(
         ("http", "ros"),
@@ -143,6 +145,21 @@ class RequestsConfig(Options):
         told = {name: {each: getattr(given, each) for each in given.model_fields_set} for name, given in self.options}
         return pipelines(self.names, {**told, "": {"payload": self.payload}}, dict(self.variants), self.engine.name)
 
+    @cached_property
+    def answer(self) -> str:
+        """Return what the answers of all cells are made of; raises UsageError."""
+        return answer_over(self.engine.answer, self.pipelines)
+
+    @property
+    def served_engine(self) -> EngineConfig:
+        """Return the engine as servers are told."""
+        return self.engine.but(answer=self.answer)
+
+    @property
+    def most_pieces(self) -> int:
+        """Return the most tokens, or actions, of an answer."""
+        return self.engine.horizon if self.answer == ACTIONS else self.max_tokens
+
     @property
     def used(self) -> list[Transport[Any]]:
         """Return the transports, each once."""
@@ -191,6 +208,9 @@ class RequestsConfig(Options):
         """Return it with the engine that can answer where none is named, and ``say`` which if that is not llama."""
         if "name" in self.engine.model_fields_set or not self.own_engine:
             return self
+        if self.answer == ACTIONS:
+            say("the echo engine answers with actions; a model's are those of its own server, see `url`")
+            return self.but(engine=self.engine.but(name="echo"))
         if self.starts_program and not extras.installed("llama_cpp"):
             only = [each.name for each in self.pipelines if each.transport.program(each.options)]
             say(f"only {', '.join(only)}: our own servers have no engine here; {extras.how_to_install('llama')}")
@@ -211,6 +231,7 @@ class RequestsConfig(Options):
                 f"`size`: {self.width}x{self.height} should be 16x16 to {LARGEST}x{LARGEST}, of even width"
             )
         check_replay(self.engine)
+        self._check_answer()
         if self.record is not None and self.record.exists():
             raise UsageError(f"`record`: {self.record} exists already and is not overwritten; name another")
         for pipeline in self.pipelines:
@@ -230,6 +251,19 @@ class RequestsConfig(Options):
         if self.mode == "stream" and pipeline.payload == "jpeg-preencoded":
             raise UsageError("`payload` jpeg-preencoded has no meaning in `mode` stream; use jpeg")
 
+    def _check_answer(self) -> None:
+        """Check that what the answers are made of can be said, and is of use."""
+        if self.answer != ACTIONS:
+            return
+        if self.COUNTS_TOKENS:
+            carrier = next((each.name for each in self.pipelines if each.answers == (ACTIONS,)), "`answer` actions")
+            raise UsageError(f"{self.COUNTS_TOKENS}, and {carrier} brings actions; 's2a-bench latency' measures them")
+        if self.own_engine and "name" in self.engine.model_fields_set and not acts(self.engine.name):
+            alone = next(each.name for each in self.pipelines if each.answers == (ACTIONS,))
+            raise UsageError(
+                f"`engine` {self.engine.name} answers with tokens, and {alone} carries actions; use `engine` {ACTING}"
+            )
+
     def _check_unused(self) -> None:
         """Refuse a server of somebody else's that nobody would ask."""
         used = {transport.name for transport in self.used}
@@ -242,4 +276,4 @@ class RequestsConfig(Options):
         told = {each.name: each.options.model_dump(mode="json", exclude_defaults=True) for each in self.pipelines}
         own = self.model_dump(exclude={"quick", "nonce"})  # the nonce stands with the seeds
         size = {"width": self.width, "height": self.height, "size": f"{self.width}x{self.height}"}
-        return {**own, **size, "tuned": self.tuned, "engine": self.engine.to_manifest(), "pipelines": told}
+        return {**own, **size, "tuned": self.tuned, "engine": self.served_engine.to_manifest(), "pipelines": told}

@@ -29,7 +29,7 @@ from s2a_bench.trace import STAGES, Mark, Trace
 from s2a_bench.transport import Client
 from s2a_bench.transport.options import LOSSLESS
 from s2a_bench.transport.pipeline import Pipeline
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.types import Frame, Piece, Request, Token
 
 FATAL = (ServerDied, SourceError, UsageError, EngineError)
 """Errors after which the next request cannot succeed either."""
@@ -102,7 +102,7 @@ class Session:
         """Make one request; a failure becomes a row with its error, and says whether it is the run's end."""
         self.feed.get_ready()
         request_id = f"{self.cell.name}-{place.block}"
-        seen: list[tuple[Token, int]] = []
+        seen: list[tuple[Piece, int]] = []
         trace = Trace()
         error, retry_after_s = "", 0.0
         fatal: S2AError | KeyboardInterrupt | None = None
@@ -111,9 +111,9 @@ class Session:
         frame = self.feed.capture(trace)
         images = () if frame is None else (frame,)
         config = self._config
-        request = Request(request_id, config.prompt, images, config.max_tokens, config.grammar, config.seed)
+        request = Request(request_id, config.prompt, images, config.most_pieces, config.grammar, config.seed)
         try:
-            seen.extend((token, now_ns()) for token in self.client.request(request, trace))
+            seen.extend((piece, now_ns()) for piece in self.client.request(request, trace))
         except S2AError as failure:
             error = f"{type(failure).__name__}: {failure}"
             fatal = failure if isinstance(failure, FATAL) else None
@@ -122,8 +122,11 @@ class Session:
         except KeyboardInterrupt as interrupt:
             error, fatal = INTERRUPTED, interrupt
         self._sampler.edge()
-        texts = struck_pieces([token.text for token, _ in seen])
-        seen = [(replace(token, text=text), at_ns) for (token, at_ns), text in zip(seen, texts, strict=True)]
+        texts = struck_pieces([piece.text for piece, _ in seen])
+        seen = [
+            (replace(piece, text=text) if isinstance(piece, Token) else piece, at_ns)
+            for (piece, at_ns), text in zip(seen, texts, strict=True)
+        ]
         trace.facts.update(self._sampler.window(started_ns, now_ns()))
         if not error and not seen:
             error = "RequestFailed: the answer was empty"
@@ -141,7 +144,7 @@ class Session:
         request_id: str,
         frame: Frame | None,
         trace: Trace,
-        seen: list[tuple[Token, int]],
+        seen: list[tuple[Piece, int]],
         error: str,
     ) -> Measured:
         """Turn what was seen into rows."""

@@ -14,7 +14,7 @@ A package that offers a transport tests it like this, once for each of its varia
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from threading import Thread
@@ -29,20 +29,20 @@ from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import GROUPS, RESIDUAL, STAGES, Trace, budget, path_of
 from s2a_bench.transport import TRANSPORTS, Client, Handler, Transport, Wiring, open_client, open_server
 from s2a_bench.transport.pipeline import one_pipeline, pipelines
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.types import Action, Frame, Piece, Request, Token
 
 Connect = Callable[[Handler], Client]
 
 
 class Recorder:
-    """A handler that remembers what it got and answers what it is told."""
+    """A handler that remembers what it got and answers what it is told: texts, or the actions of an array (H, D)."""
 
-    def __init__(self, answer: list[str]) -> None:
+    def __init__(self, answer: Sequence[Any]) -> None:
         self.answer = answer
         self.requests: list[Request] = []
         self.fail_at: int | None = None
 
-    def __call__(self, request: Request, trace: Trace) -> Generator[Token, None, None]:
+    def __call__(self, request: Request, trace: Trace) -> Generator[Piece, None, None]:
         self.requests.append(request)
         for index, text in enumerate(self.answer):
             if index == self.fail_at:
@@ -51,7 +51,9 @@ class Recorder:
             if not index:
                 trace.marks.append(("inference", now))
             trace.token_ns.append(now)
-            yield Token(index, text, 7 + index)
+            yield (
+                Token(index, text, 7 + index) if isinstance(text, str) else Action(index, np.asarray(text, np.float32))
+            )
         if self.fail_at == len(self.answer):
             raise EngineError("the engine has had enough")
         trace.facts[PROMPT_N] = 12.0
@@ -63,7 +65,7 @@ def yuyv_frame(width: int = 64, height: int = 48, seed: int = 0) -> Frame:
     return Frame(seed, now_ns(), width, height, "yuv422_yuy2", data)
 
 
-def ask(client: Client, request: Request) -> tuple[list[Token], Trace]:
+def ask(client: Client, request: Request) -> tuple[list[Piece], Trace]:
     """Make one request the way a session does."""
     trace = Trace()
     trace.mark(RESIDUAL)

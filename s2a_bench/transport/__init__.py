@@ -1,4 +1,4 @@
-"""How pictures and tokens travel: a Client sends one request and yields tokens, a Server feeds a Handler.
+"""How pictures and answers travel: a Client sends a request and yields tokens or actions, a Server feeds a Handler.
 
 To add a transport, write a package with a module like this, and offer its instance as an entry point of the group
 ``s2a_bench.transports``; nothing in this repository changes::
@@ -45,18 +45,21 @@ if TYPE_CHECKING:
     from s2a_bench.facts import Fact
     from s2a_bench.trace import Trace
     from s2a_bench.transport.options import Options
-    from s2a_bench.types import Frame, Request, Token
+    from s2a_bench.types import Frame, Piece, Request
 
 O = TypeVar("O", bound="Options")  # noqa: E741 - the one type variable here
+
+TOKENS: Final = "tokens"
+ACTIONS: Final = "actions"
 
 TOKEN_S: Final = 5.0
 """Of a deadline that nobody set, for each token; far slower than any model that a robot could wait for."""
 
-Handler: TypeAlias = "Callable[[Request, Trace], Generator[Token, None, None]]"
-"""What a server does with a request whose pictures are ``rgb8``: it yields tokens and marks the trace.
+Handler: TypeAlias = "Callable[[Request, Trace], Generator[Piece, None, None]]"
+"""What a server does with a request whose pictures are ``rgb8``: it yields tokens, or actions, and marks the trace.
 
-A handler marks `queue` if it waited for a free engine, `inference` at the first token, and appends the time of
-every token to ``trace.token_ns``. Transports know handlers, never engines.
+A handler marks `queue` if it waited for a free engine, `inference` at the first piece, and appends the time of
+every piece to ``trace.token_ns``. Transports know handlers, never engines.
 """
 
 
@@ -80,10 +83,10 @@ class Client(Protocol):
         """None where the newest frame goes with the prompt instead."""
         ...
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
-        """Send a request with its frames as captured, yield tokens as they arrive, mark every stage.
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
+        """Send a request with its frames as captured, yield pieces as they arrive, mark every stage.
 
-        After the last token ``trace.remote`` holds the server's marks. Raises RequestFailed when the server
+        After the last piece ``trace.remote`` holds the server's marks. Raises RequestFailed when the server
         refuses or breaks off, or goes beyond what `transport.bounds` allows, ServerDied when it is gone.
         """
         ...
@@ -217,6 +220,14 @@ class Transport(Generic[O]):
     def travels(self, variant: str, options: O) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
         """Return how pictures can travel over a variant, the default first."""
         return self.payloads
+
+    def answers(self, variant: str, options: O) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
+        """Return what answers over a variant can be made of: tokens, actions."""
+        return (TOKENS,) if self.foreign_by(options) else (TOKENS, ACTIONS)
+
+    def takes_state(self, variant: str, options: O) -> bool:  # noqa: ARG002 - for subclasses
+        """Whether a request over a variant can carry the robot's state."""
+        return not self.foreign_by(options)
 
     def told(self, options: O) -> Sequence[Fact]:  # noqa: ARG002 - for subclasses
         """Return the facts that may be told with these options, by somebody else's server too."""

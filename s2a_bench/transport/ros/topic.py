@@ -23,6 +23,7 @@ from s2a_bench.transport.ros.wire import (
     REQUEST_QOS,
     TOKEN_QOS,
     marks_message,
+    pieces_of,
     plain,
     readable,
     remote_of,
@@ -30,7 +31,7 @@ from s2a_bench.transport.ros.wire import (
     token_message,
     unguessable,
 )
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request, Token
 
 
 class TopicClient:
@@ -54,7 +55,7 @@ class TopicClient:
             self.close()
             raise
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Publish the request, with its frames if it has any, and yield its tokens."""
         images: dict[str, list[Any]] = {ros.IMAGE: [], ros.COMPRESSED_IMAGE: []}
         for frame in request.images:
@@ -72,15 +73,16 @@ class TopicClient:
             token = self._next(name, trace, bounds)
             if token.index != expected:
                 raise MessagesLost(
-                    f"token {token.index} came instead of {expected}: messages were lost, or two servers answer"
+                    f"piece {token.index} came instead of {expected}: messages were lost, or two servers answer"
                 )
             if token.last:
                 break
             bounds.piece()
+            pieces = pieces_of(token)
             if not expected:
                 trace.mark("return")
-            yield Token(token.index, token.text, token.token)
-            expected += 1
+            yield from pieces
+            expected += len(pieces)
         if token.marks:
             trace.receive(remote_of(token.marks[0]))
         if token.error:
@@ -137,7 +139,7 @@ class TopicFront:
         request_id = self._requests.unpack(packed).id
         self.send(request_id, Token(0, "", -1), [marks_message(request_id, Trace().to_remote())], why)
 
-    def send(self, request_id: str, token: Token, marks: list[Any], error: str = "") -> None:
+    def send(self, request_id: str, token: Piece, marks: list[Any], error: str = "") -> None:
         """Publish one token, or with marks the end of the answer."""
         self._tokens.send(
             self._tokens.pack(token_message(request_id, token, last=bool(marks), error=error, marks=marks))
@@ -173,14 +175,15 @@ class TopicJob:
         except S2AError as error:
             self._error = str(error)
             return None
-        return Request(plain(message.id), message.prompt, images, message.max_tokens, message.grammar, message.seed)
+        said = message.max_tokens, message.grammar, message.seed
+        return Request(plain(message.id), message.prompt, images, *said, state=tuple(message.state.tolist()))
 
     def start(self) -> bool:
         """Begin, as the answer is always wanted."""
         return True
 
-    def token(self, token: Token) -> bool:
-        """Publish a token; return whether more are wanted, which this variant cannot tell."""
+    def token(self, token: Piece) -> bool:
+        """Publish a piece; return whether more are wanted, which this variant cannot tell."""
         self._front.send(self._id, token, [])
         self._sent += 1
         return True
