@@ -171,19 +171,26 @@ class HttpClient:
             fields = merged(self._dialect.body(request, pictures, self._model), self._extra)
             body, headers = self._codec.dumps(fields), self._headers
         trace.mark("json_pack")
-        trace.facts[PAYLOAD_BYTES] = len(body)
+        trace.facts[PAYLOAD_BYTES] = sum(map(len, body)) if isinstance(body, list) else len(body)
         return body, headers
 
     def _pack_binary(self, request: Request, trace: Trace) -> tuple[Any, dict[str, str]]:
-        """Build our own binary variant: the picture is the body, all else a header."""
-        media_type, data = "application/octet-stream", None
-        for frame in request.images[:1]:
+        """Build our own binary variant: the pictures are the body, one after the other, all else a header."""
+        types, bodies = [], []
+        for frame in request.images:
             media_type, data = encoded(frame, self._options.payload, trace)
+            types.append(media_type)
+            bodies.append(data.reshape(-1).data)
         fields = own.parameters(request, self._model)
         fields |= {**own.own_parameters(request), "prompt": request.prompt}
+        if len(bodies) > 1:
+            fields["pictures"] = [[kind, len(body)] for kind, body in zip(types, bodies, strict=True)]
         header = json.dumps(fields)  # headers are ASCII, which the standard library's JSON is
+        media_type = types[0] if len(types) == 1 else "application/octet-stream"
         headers = {**self._headers, "content-type": media_type, own.PARAMETERS_HEADER: header}
-        return (data.reshape(-1).data if data is not None else b""), headers
+        if len(bodies) > 1:
+            return bodies, {**headers, "content-length": str(sum(map(len, bodies)))}
+        return (bodies[0] if bodies else b""), headers
 
     def _tokens(
         self, response: httpx.Response | LeanResponse, trace: Trace, headers_ns: int, packed_ns: int

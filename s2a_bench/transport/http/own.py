@@ -108,7 +108,8 @@ def parameters(request: Request, model: str) -> dict[str, Any]:
 
 def own_parameters(request: Request) -> dict[str, Any]:
     """Return the fields that only our own server knows."""
-    return {"request_id": request.id, **({"grammar": request.grammar} if request.grammar else {})}
+    more = {"grammar": request.grammar, "state": request.state}
+    return {"request_id": request.id, **{name: value for name, value in more.items() if value}}
 
 
 def messages(prompt: str, uris: list[str]) -> list[dict[str, Any]]:

@@ -14,6 +14,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.bounds import Bounds
+from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.limits import Limits, whole_number
 from s2a_bench.transport.ros.camera import POLL_S, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
@@ -172,11 +173,12 @@ class TopicJob:
             whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
             pictures = (*message.images, *message.compressed_images)
             images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
+            state = state_of(message.state)
         except S2AError as error:
             self._error = str(error)
             return None
         said = message.max_tokens, message.grammar, message.seed
-        return Request(plain(message.id), message.prompt, images, *said, state=tuple(message.state.tolist()))
+        return Request(plain(message.id), message.prompt, images, *said, state=state)
 
     def start(self) -> bool:
         """Begin, as the answer is always wanted."""
