@@ -280,6 +280,7 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "http": "s2a_bench.transport.http:HTTP",
         "ros": "s2a_bench.transport.ros:ROS",
         "loopback": "s2a_bench.transport.loopback:LOOPBACK",
+        "websocket": "s2a_bench.transport.websocket:WEBSOCKET",
     },
 )
 """Name -> what is said about it."""

@@ -59,3 +59,20 @@ class TestRosAction(TransportSuite):
     @pytest.fixture
     def told(self, dds_domain: int) -> Wiring[Any]:
         return wiring("ros/action", domain_id=dds_domain, max_tokens=2000)
+
+
+@pytest.mark.parametrize("payload", ["raw", "png"])
+class TestWebsocket(TransportSuite):
+    whole = True
+
+    @pytest.fixture
+    def told(self, payload: str) -> Wiring[Any]:
+        return wiring("websocket/openpi", payload=payload)
+
+
+class TestWebsocketStreamed(TransportSuite):
+    name = "websocket/openpi-stream"
+
+
+class TestWebsocketJpeg(TransportSuite):
+    name, lossless, whole = "websocket/openpi?payload=jpeg", False, True
