@@ -633,3 +633,13 @@ def test_policy_websocket_killed_in_mid_request_is_one_line(policy_server: tuple
         process.wait()
         with pytest.raises(ServerDied, match="nothing answers"):
             ask(client, Request("a", "go", (yuyv_frame(),), state=(0.5,)))
+
+
+def test_an_answer_that_no_socket_takes_at_once_comes_whole() -> None:
+    chunk = np.random.default_rng(1).normal(size=(4096, 200)).astype(np.float32)
+    handler = Recorder(list(chunk))
+    with serving(handler) as server, robot(server.address) as (socket, _):
+        for _ in "ab":
+            socket.send(packb({"prompt": "go"}))
+        for _ in "ab":
+            np.testing.assert_array_equal(unpackb(socket.recv(timeout=20))["actions"], chunk)

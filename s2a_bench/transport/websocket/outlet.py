@@ -13,7 +13,7 @@ from threading import Lock
 from typing import Final
 
 POLL_S: Final = 0.005
-"""How often it is looked whether the client has read what was spilled."""
+"""How often it is looked whether the client has read what it was sent."""
 
 
 class Outlet:
@@ -23,12 +23,14 @@ class Outlet:
         """Write to the socket of ``transport``, and close it with `close`."""
         self._transport, self._loop = transport, loop
         self._socket = socket.socket(fileno=os.dup(transport.get_extra_info("socket").fileno()))
-        self._lock, self._spilling = Lock(), 0
+        self._lock = Lock()
+        self._rest = bytearray()
+        self._behind = self._scheduled = False
 
     def send(self, data: bytes) -> None:
         """Write on this thread, without waiting."""
         with self._lock:
-            if not self._spilling:
+            if not self._behind:
                 try:
                     sent = self._socket.send(data, socket.MSG_DONTWAIT)
                 except BlockingIOError:
@@ -36,21 +38,30 @@ class Outlet:
                 except OSError:
                     return  # it has gone, and the loop hears of it
                 data = data[sent:]
-            if data:
-                self._spilling += 1
+            if not data:
+                return
+            self._behind = True
+            self._rest += data
+            if not self._scheduled:
+                self._scheduled = True
                 with suppress(RuntimeError):  # the loop has ended
-                    self._loop.call_soon_threadsafe(self._spill, data)
+                    self._loop.call_soon_threadsafe(self._drain)
 
     def close(self) -> None:
         """Send nothing any more."""
         self._socket.close()
 
-    def _spill(self, data: bytes) -> None:
-        closing = self._transport.is_closing()
-        if data and not closing:
+    def _drain(self) -> None:
+        """Hand over what is left; once the client has read all of it, threads write themselves again."""
+        with self._lock:
+            data, self._rest = bytes(self._rest), bytearray()
+            self._scheduled = False
+        if self._transport.is_closing():
+            return
+        if data:
             self._transport.write(data)
         with self._lock:
-            if not closing and self._transport.get_write_buffer_size():
-                self._loop.call_later(POLL_S, self._spill, b"")
-            else:
-                self._spilling -= 1
+            self._behind = bool(self._rest) or self._transport.get_write_buffer_size() > 0
+            if self._behind and not self._scheduled:
+                self._scheduled = True
+                self._loop.call_later(POLL_S, self._drain)
