@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
@@ -17,7 +17,7 @@ from s2a_bench.inference import ACTING, EngineConfig, acts, default_engine, told
 from s2a_bench.machine.resources.rows import SPENT
 from s2a_bench.options import Grammar, Names, Options, Size, TextOrFile, group, option
 from s2a_bench.trace import path_of
-from s2a_bench.transport import ACTIONS, TRANSPORTS, Transport
+from s2a_bench.transport import ACTIONS, TRANSPORTS, Transport, named_by
 from s2a_bench.transport.options import PAYLOADS, SERVING, Payload, sides
 from s2a_bench.transport.pipeline import Pipeline, answer_over, pipelines, require_payload
 
@@ -50,6 +50,22 @@ def _variants(*, first: bool) -> type[Options]:
             default = measured if first else ()
             fields[name] = (Names, option(default, f"{about} [default: {','.join(measured)}]"))
     return _made(fields)
+
+
+def _schemes() -> list[str]:
+    """Return what URLs of servers begin with."""
+    return [f"{scheme}://" for _, each in TRANSPORTS.loaded() for scheme in each.schemes]
+
+
+def _with_url(url: str, options: Options | Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of transports, the one that a URL's scheme names told the URL."""
+    told = {name: own if isinstance(own, Mapping) else _said(own) for name, own in dict(options).items()}
+    name = named_by(url)
+    return {**told, name: {**told.get(name, {}), "url": url}}
+
+
+def _said(options: Options) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in options.model_fields_set}
 
 
 def _made(fields: dict[str, Any]) -> type[Options]:
@@ -87,6 +103,9 @@ class RequestsConfig(Options):
     """The variants to measure where a pipeline's name has none; those that a transport measures by default if empty."""
     options: TransportOptions = group(TransportOptions)
     """The options of every transport, for names that do not say them themselves."""
+    url: str = option(
+        "", f"a server that runs already (a black box), of the transport that its scheme names: {', '.join(_schemes())}"
+    )
     engine: EngineConfig = group(EngineConfig)
     runs: int = option(50, "samples a pipeline [default: 50, quick: 10]", ge=1, le=10**9)
     warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
@@ -122,7 +141,10 @@ class RequestsConfig(Options):
 
     def __init__(self, **given: Any) -> None:
         """Keep what is given, few samples where a quick look is asked for; raises UsageError naming the field."""
-        super().__init__(**({**self.QUICK, **given} if given.get("quick") else given))
+        given = {**self.QUICK, **given} if given.get("quick") else given
+        if given.get("url"):
+            given["options"] = _with_url(given["url"], given.get("options") or {})
+        super().__init__(**given)
 
     @property
     def width(self) -> int:
@@ -142,7 +164,7 @@ class RequestsConfig(Options):
     @cached_property
     def pipelines(self) -> list[Pipeline]:
         """Return what is compared, a cell each; raises UsageError."""
-        told = {name: {each: getattr(given, each) for each in given.model_fields_set} for name, given in self.options}
+        told = {name: _said(given) for name, given in self.options}
         return pipelines(self.names, {**told, "": {"payload": self.payload}}, dict(self.variants), self.engine.name)
 
     @cached_property
