@@ -192,6 +192,11 @@ def _size(value: Any) -> Any:
     return int(width), int(height)
 
 
+def _square(value: Any) -> Any:
+    """Read WIDTHxHEIGHT, or one number for both."""
+    return (int(value),) * 2 if isinstance(value, str) and value.isdecimal() else _size(value)
+
+
 def _text(value: Any) -> Any:
     return _sound(_content(value[1:]) if isinstance(value, str) and value.startswith("@") else value)
 
@@ -228,6 +233,9 @@ WholeNumbers = Annotated[tuple[int, ...], SEVERAL]
 
 Size = Annotated[tuple[int, int], BeforeValidator(_size)]
 """Width and height; as text 640x480."""
+
+Square = Annotated[tuple[int, int], BeforeValidator(_square)]
+"""Width and height; as text 224x224, or 224 for both."""
 
 TextOrFile = Annotated[str, BeforeValidator(_text)]
 """A text, or the content of the file that @FILE names."""
