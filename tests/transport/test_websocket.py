@@ -19,6 +19,7 @@ import msgpack
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Frame, Opcode
 from websockets.sync.client import connect as plain_connect
 from websockets.sync.server import serve as plain_serve
 
@@ -28,6 +29,7 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.testing.transport import Connect, Recorder, ask, connector, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client, open_server
+from s2a_bench.transport.dangers import examine
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.turns import Queued
 from s2a_bench.transport.websocket.codec import packb, unpackb
@@ -391,6 +393,27 @@ def test_a_port_in_use_is_named() -> None:
             open_server(wiring("websocket", f"127.0.0.1:{port}"), Recorder([]))
 
 
+def test_the_doctor_tells_of_a_server_without_a_key_that_refuses_pages() -> None:
+    with serving(Recorder(list(CHUNK))) as server:
+        found = {finding.code: finding for finding in examine(server.address)}
+    assert "it greets everybody (server, provenance)" in found["no-key"].message
+    assert "any-page" not in found
+
+
+def test_the_doctor_tells_of_a_server_that_any_page_may_ask() -> None:
+    with told_by(lambda _: b"") as address:
+        found = {finding.code: finding for finding in examine(address)}
+    assert {"plain-text", "no-key", "any-page"} == set(found)
+
+
+def test_the_doctor_tells_of_a_server_with_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOT_KEY", "open sesame")
+    with serving(Recorder(list(CHUNK)), api_key_env="ROBOT_KEY") as server:
+        found = {finding.code: finding for finding in examine(server.address)}
+    assert "greets nobody without a key" in found["server"].message
+    assert {finding.level for finding in examine("ws://127.0.0.1:9")} == {"state", "error"}
+
+
 # our client
 
 
@@ -534,6 +557,26 @@ def test_answers_that_are_none_are_one_line_and_the_next_request_may_succeed(ans
             ask(client, Request("a", "go"))
         assert str(failed.value).isprintable()
         assert len(ask(client, Request("b", "go"))[0]) == 4
+
+
+def test_what_comes_unasked_is_no_answer_to_the_next_request() -> None:
+    def twice(socket: Any) -> None:
+        socket.send(packb({}))
+        for message in socket:
+            number = unpackb(message)["state"][0]
+            answer = Frame(Opcode.BINARY, packb({"actions": np.array([[number]])})).serialize(mask=False)
+            socket.socket.sendall(answer * 2)
+
+    with plain_serve(twice, "127.0.0.1", 0, compression=None) as server:
+        thread = Thread(target=server.serve_forever)
+        thread.start()
+        address = "ws://{}:{}".format(*server.socket.getsockname()[:2])
+        with foreign(address, template="aloha") as client:
+            for number in (1.0, 2.0, 3.0):
+                (action,), _ = ask(client, Request("a", "go", (yuyv_frame(),), state=(number,) * 14))
+                assert action.values.tolist() == [number]
+        server.shutdown()
+        thread.join()
 
 
 def test_a_foreign_stream_is_read_whether_or_not_its_last_frame_repeats_it() -> None:
