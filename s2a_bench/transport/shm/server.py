@@ -1,40 +1,29 @@
-"""The server: a thread for each link, which waits for its turn, and writes each token where its client reads it."""
+"""The server: a thread for each link, which reads a request where it lies, waits for its turn, and writes the pieces."""
 
 from __future__ import annotations
 
 import logging
-import os
 import socket
-import struct
-from contextlib import closing, suppress
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Lock, Thread
-from typing import Any
+from typing import Final
 
-import orjson
-
-from s2a_bench.errors import RequestFailed, S2AError, TransportError
-from s2a_bench.trace import RESIDUAL, Trace
+from s2a_bench.errors import EngineError, S2AError, TransportError
+from s2a_bench.trace import RESIDUAL, Remote, Trace
 from s2a_bench.transport import Handler, Wiring
-from s2a_bench.transport.limits import SEEDS, Limits, check_pixels, text, whole_number
-from s2a_bench.transport.pictures import decoded, rgb_of
 from s2a_bench.transport.shm import ShmOptions
-from s2a_bench.transport.shm.memory import (
-    ANSWER_BYTES,
-    HELLO,
-    PICTURES_AT,
-    REQUEST,
-    Memory,
-    listen,
-    offered,
-    receive,
-)
-from s2a_bench.transport.shm.ring import Writer
+from s2a_bench.transport.shm.door import listen, may_ask, wait_at_most
+from s2a_bench.transport.shm.memory import ANSWER_BYTES, PICTURES_AT, PLACE, Memory, accept, offer, refuse
+from s2a_bench.transport.shm.pieces import packed
+from s2a_bench.transport.shm.reading import Header, Held
+from s2a_bench.transport.shm.ring import PIECE_BYTES, Writer, is_there
 from s2a_bench.transport.turns import Queued, Turn
-from s2a_bench.types import Frame, Request, Token
 
-CREDENTIALS = struct.Struct("3i")
-BYTES_A_PIXEL = {"bgr8": 3, "yuv422_yuy2": 2}
+PAUSE_S: Final = 0.1
+"""Before the next link is taken, where one could not be: the limit of open files, or of threads, is met."""
 
 _log = logging.getLogger(__name__)
 
@@ -43,9 +32,10 @@ class ShmServer:
     """Answers the clients of one user on one machine."""
 
     def __init__(self, wiring: Wiring[ShmOptions], handler: Handler) -> None:
-        """Bind; raises PortInUse."""
+        """Bind; raises PortInUse, TransportError."""
         self._limits = wiring.limits
         self._queued = Queued.around(handler, wiring.limits)
+        self._held = Held(wiring.limits)
         self._listener = listen(wiring.address)
         self.address = self._listener.getsockname()
         self._lock, self._links, self._stopped = Lock(), set[socket.socket](), False
@@ -59,140 +49,111 @@ class ShmServer:
         while not self._stopped:
             try:
                 link, _ = self._listener.accept()
-            except OSError:
-                break
-            if self._welcome(link):
+            except OSError as error:
+                if not self._stopped:
+                    _log.warning("no link can be taken: %s", error)
+                    time.sleep(PAUSE_S)
+                continue
+            try:
                 Thread(target=self._answer_all, args=(link,), name="shm link", daemon=True).start()
-            else:
+            except RuntimeError as error:
+                _log.warning("no link can be taken: %s", error)
                 link.close()
+                time.sleep(PAUSE_S)
 
     def stop(self) -> None:
         """Stop listening, and end every link."""
+        if not self._stopped:
+            with suppress(OSError):
+                Path(self.address).unlink()  # while it is ours
         self._stopped = True
         with suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
-        with suppress(OSError):
-            Path(self.address).unlink()
         with self._lock:
             links = list(self._links)
         for link in links:
             with suppress(OSError):
                 link.shutdown(socket.SHUT_RDWR)
 
-    def _welcome(self, link: socket.socket) -> bool:
-        """Whether a client is one of this user's, and there is room."""
-        _, user, _ = CREDENTIALS.unpack(link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
-        with self._lock:
-            if user not in {0, os.getuid()} or len(self._links) >= self._limits.connections:
-                return False
-            self._links.add(link)
-        return True
-
     def _answer_all(self, link: socket.socket) -> None:
-        """Answer one request after the other."""
-        requests: Memory | None = None
-        writer: Writer | None = None
+        """Welcome a client, and answer one request after the other."""
         try:
-            while True:
-                what, first, second, files = receive(link)
-                trace = Trace()
-                trace.mark("network")
-                if what == HELLO:
-                    requests = Memory.received(files, first, PICTURES_AT + self._limits.body_bytes)
-                    writer = writer or Writer(offered(link, ANSWER_BYTES))
-                elif what == REQUEST and requests is not None and writer is not None:
-                    self._answer(link, requests, writer, (first, second), trace)
-                else:
-                    raise ValueError(f"a packet that is none of a request: {what!r}")
+            with link, self._counted(link):
+                try:
+                    requests, writer = self._welcome(link)
+                except TransportError as error:
+                    refuse(link, str(error))
+                    raise
+                while packet := link.recv(PLACE.size + 1):
+                    trace = Trace()
+                    trace.mark("network")
+                    if len(packet) != PLACE.size:
+                        raise TransportError(f"a packet of {len(packet)} bytes is none of a request")
+                    self._answer(link, requests, writer, PLACE.unpack(packet), trace)
         except (OSError, EOFError):
             pass  # the client has gone
-        except (ValueError, TransportError) as error:
+        except TransportError as error:
             _log.warning("a link was closed: %s", error)
+
+    @contextmanager
+    def _counted(self, link: socket.socket) -> Iterator[None]:
+        """Know a link for as long as it lasts."""
+        with self._lock:
+            self._links.add(link)
+        try:
+            yield
         finally:
             with self._lock:
                 self._links.discard(link)
-            link.close()
+
+    def _welcome(self, link: socket.socket) -> tuple[Memory, Writer]:
+        """Exchange memory; raises TransportError for who is none of ours."""
+        wait_at_most(link, self._limits.head_s)
+        if not may_ask(link):
+            raise TransportError("this server answers its own user only")
+        if self._stopped or len(self._links) > self._limits.connections:
+            raise TransportError(f"{self._limits.connections} links are open already")
+        requests = accept(link, PICTURES_AT + self._limits.body_bytes)
+        writer = Writer(link, offer(link, ANSWER_BYTES), requests)
+        wait_at_most(link, 0)
+        return requests, writer
 
     def _answer(
-        self, link: socket.socket, requests: Memory, writer: Writer, header: tuple[int, int], trace: Trace
+        self, link: socket.socket, requests: Memory, writer: Writer, place: tuple[int, int], trace: Trace
     ) -> None:
-        """Read a request, wait for its turn, write the answer."""
+        """Read a request, wait for its turn, write the answer; raises OSError where the client has gone."""
         turn: Turn | None = None
-
-        def left_s() -> float:
-            return turn.left_s() if turn else self._limits.answer_s
-
+        said: Remote | str
+        writer.begin()
         try:
-            request = self._read(requests, *header, trace)
-            turn = self._queued.turns.join()
-            if turn.come is not None:
-                trace.mark(RESIDUAL)
-                if not turn.wait(lambda: _gone(link)):
-                    return
-                trace.mark("queue")
-            with closing(self._queued.answer(request, trace, turn)) as tokens:
-                for token in tokens:
-                    writer.send(link, _event(token), requests, left_s)
-            last: dict[str, Any] = {"remote": trace.to_remote()}
+            with self._held.request(requests, *place):
+                header = Header.read(requests, *place, self._limits)
+                trace.mark("header_parse")
+                turn = self._queued.turns.join()
+                request = header.request(requests, trace)
+                if turn.come is not None:
+                    trace.mark(RESIDUAL)
+                    if not turn.wait(lambda: not is_there(link)):
+                        raise ConnectionAbortedError
+                    trace.mark("queue")
+                tokens = self._queued.answer(request, trace, turn)
+                try:
+                    for token in tokens:
+                        writer.send(packed(token))
+                finally:
+                    tokens.close()
+            said = trace.to_remote()
         except S2AError as error:
-            last = {"error": str(error)}
+            said = str(error)
+        except OSError:
+            raise
+        except Exception as error:  # who asked must hear of it, whatever broke
+            _log.error("a request failed", exc_info=error)
+            said = str(EngineError("Internal Server Error"))
         finally:
             if turn is not None:
                 turn.leave()
-        writer.send(link, orjson.dumps(last), requests, left_s)
-
-    def _read(self, memory: Memory, at: int, length: int, trace: Trace) -> Request:
-        """Read header and pictures; raises RequestFailed."""
-        if not (0 < length <= self._limits.body_bytes and at >= PICTURES_AT and at + length <= memory.size):
-            raise RequestFailed(f"a header of {length} bytes at {at} is none")
-        try:
-            fields = orjson.loads(memory.bytes[at : at + length].tobytes())
-        except ValueError as error:
-            raise RequestFailed(f"the header is no JSON: {error}") from error
-        trace.mark("header_parse")
-        if not isinstance(fields, dict) or not isinstance(told := fields.get("images", []), list):
-            raise RequestFailed("the header should be an object whose images are a list")
-        images, begin = [], PICTURES_AT
-        for about in told:
-            size = about.get("bytes") if isinstance(about, dict) else None
-            if type(size) is not int or size <= 0 or begin + size > at:
-                raise RequestFailed("a picture should lie before the header")
-            images.append(_picture(about, memory, begin, trace, self._limits))
-            begin += size
-        return Request(
-            id=text("id", fields.get("id")),
-            prompt=text("prompt", fields.get("prompt")),
-            images=tuple(images),
-            max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, self._limits.answer_tokens, 32),
-            grammar=text("grammar", fields.get("grammar")),
-            seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
-        )
-
-
-def _picture(about: dict[str, Any], memory: Memory, begin: int, trace: Trace, limits: Limits) -> Frame:
-    """Make what the engine takes of a picture; its pixels are read where they lie."""
-    data = memory.bytes[begin : begin + about["bytes"]]
-    encoding = text("encoding", about.get("encoding"))
-    if encoding not in BYTES_A_PIXEL:
-        return decoded(encoding, data.data, trace, limits)
-    width, height = (whole_number(side, about.get(side), 1, limits.pixels, 0) for side in ("width", "height"))
-    check_pixels(width, height, limits)
-    if data.size != width * height * BYTES_A_PIXEL[encoding]:
-        raise RequestFailed(f"{data.size} bytes are no {encoding} picture of {width}x{height}")
-    pixels = data.reshape(height, width, BYTES_A_PIXEL[encoding])
-    return rgb_of(Frame(-1, 0, width, height, encoding, pixels), trace)  # type: ignore[arg-type]
-
-
-def _event(token: Token) -> bytes:
-    return orjson.dumps({"index": token.index, "text": token.text, "id": token.id})
-
-
-def _gone(link: socket.socket) -> bool:
-    """Whether the client has closed its end; it has nothing to say while it waits."""
-    try:
-        return not link.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True
+        end = packed(said)
+        writer.send(end if len(end) <= PIECE_BYTES else packed(f"{len(end)} bytes of marks: too long an answer"))
+        writer.finish(turn.left_s if turn is not None else lambda: self._limits.answer_s)
