@@ -7,18 +7,25 @@ import json
 import os
 import socket
 import tempfile
+import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any, TypeAlias
 
 from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
+from s2a_bench.trace import Remote
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.shm.memory import ANSWER_BYTES, EVENT, HELLO, PACKET, PICTURES_AT, REQUEST, SEALS
+from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PICTURES_AT, PLACE, REFUSED
+from s2a_bench.transport.shm.pieces import packed, unpacked
+from s2a_bench.transport.shm.reading import HEADER_BYTES
+from s2a_bench.types import Token
 
+ODD: tuple[Any, ...] = (-1, 1.5, [], 1 << 40)
 Does: TypeAlias = "Callable[[socket.socket], None]"
 MIB = 1 << 20
+SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
 
 
 def file_of(size: int, content: bytes = b"", *, sealed: bool = True, at: int = PICTURES_AT) -> int:
@@ -33,7 +40,7 @@ def file_of(size: int, content: bytes = b"", *, sealed: bool = True, at: int = P
 
 def hello(link: socket.socket, file: int, size: int) -> None:
     """Hand memory over, and forget it."""
-    socket.send_fds(link, [PACKET.pack(HELLO, size, 0)], [file] if file >= 0 else [])
+    socket.send_fds(link, [HELLO.pack(MAGIC, size)], [file] if file >= 0 else [])
     if file >= 0:
         os.close(file)
 
@@ -42,22 +49,26 @@ def attack(does: Does, seconds: float = 2.0) -> Attack:
     """Return a client that does something and then listens until the server closes, or for ``seconds``."""
 
     def run(told: Wiring[Any]) -> str:
-        said = b""
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+        said = ""
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link, ExitStack() as stack:
             link.settimeout(seconds)
             link.connect(told.address)
-            memory: int | None = None
+            memory = -1
             with suppress(OSError):
                 does(link)
                 while len(said) < MIB:
                     data, files, _, _ = socket.recv_fds(link, 1 << 16, 8)
+                    for file in files:
+                        stack.callback(os.close, memory := file)
                     if not data:
                         break
-                    memory = files[0] if files else memory
-                    what, at, length = PACKET.unpack(data)
-                    if what == EVENT and memory is not None:
-                        said += os.pread(memory, length, at % ANSWER_BYTES)
-        return said.decode(errors="replace")
+                    if len(data) == PLACE.size and not files and memory >= 0:
+                        begin, length = PLACE.unpack(data)
+                        piece = unpacked(os.pread(memory, length, begin % ANSWER_BYTES))
+                        said += piece.text if isinstance(piece, Token) else str(piece)
+                    elif not files:
+                        said += data.decode(errors="replace")
+        return said
 
     return run
 
@@ -70,7 +81,7 @@ def asks(header: bytes, pictures: bytes = b"", at: int | None = None, length: in
         size = PICTURES_AT + max(len(body), 1)
         hello(link, file_of(size, body), size)
         where = PICTURES_AT + len(pictures) if at is None else at
-        link.send(PACKET.pack(REQUEST, where, len(header) if length is None else length))
+        link.send(PLACE.pack(where, len(header) if length is None else length))
 
     return attack(does)
 
@@ -85,6 +96,28 @@ def fields(**more: Any) -> bytes:
 def picture(**more: Any) -> bytes:
     """Return a header with one picture of 4x2."""
     return fields(images=[{"encoding": "bgr8", "width": 4, "height": 2, "bytes": 24, **more}])
+
+
+def encoded(*files: bytes) -> tuple[bytes, bytes]:
+    """Return a header with such files as pictures, and these."""
+    return fields(images=[{"encoding": "image/png", "bytes": len(file)} for file in files]), b"".join(files)
+
+
+def jpeg_header(width: int, height: int) -> bytes:
+    """Return the beginning of a JPEG of such a size."""
+    sides = height.to_bytes(2, "big") + width.to_bytes(2, "big")
+    return b"\xff\xd8\xff\xc0\x00\x11\x08" + sides + bytes(64)
+
+
+def png(width: int, height: int) -> bytes:
+    """Return a black picture."""
+    row = zlib.compressobj(9)
+    data = b"".join(row.compress(bytes(1 + 3 * width)) for _ in range(height)) + row.flush()
+    sides = width.to_bytes(4, "big") + height.to_bytes(4, "big")
+    chunks = ((b"IHDR", sides + b"\x08\x02\0\0\0"), (b"IDAT", data), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big") for kind, body in chunks
+    )
 
 
 def goes(link: socket.socket) -> None:
@@ -105,19 +138,42 @@ def sends(*packets: bytes) -> Does:
 def truncates(link: socket.socket) -> None:
     """Offer memory and cut it off afterwards, which reading it would not outlive."""
     file = file_of(MIB, fields(), sealed=False)
-    socket.send_fds(link, [PACKET.pack(HELLO, MIB, 0)], [file])
+    socket.send_fds(link, [HELLO.pack(MAGIC, MIB)], [file])
     with suppress(OSError):
         os.ftruncate(file, 0)
-    link.send(PACKET.pack(REQUEST, PICTURES_AT, len(fields())))
+    link.send(PLACE.pack(PICTURES_AT, len(fields())))
     os.close(file)
 
 
-def many_files(link: socket.socket) -> None:
-    """Send more files than belong to a packet."""
-    files = [file_of(4096) for _ in range(4)]
-    socket.send_fds(link, [PACKET.pack(REQUEST, 0, 0)], files)
-    for file in files:
-        os.close(file)
+def on_a_disk(link: socket.socket) -> None:
+    """Offer a file that has a name."""
+    with tempfile.TemporaryFile() as file:
+        file.truncate(4096)
+        hello(link, os.dup(file.fileno()), 4096)
+
+
+def later(packet: bytes) -> Does:
+    """Return what greets properly, and then sends a packet."""
+
+    def does(link: socket.socket) -> None:
+        hello(link, file_of(4096), 4096)
+        link.send(packet)
+
+    return does
+
+
+def many_files(number: int, *, later: bool = False) -> Does:
+    """Return what sends more files than belong to a packet: with the first one, or ``later``, where none belongs."""
+
+    def does(link: socket.socket) -> None:
+        if later:
+            hello(link, file_of(4096), 4096)
+        files = [file_of(4096) for _ in range(number)]
+        socket.send_fds(link, [PLACE.pack(0, 0) if later else HELLO.pack(MAGIC, 4096)], files)
+        for file in files:
+            os.close(file)
+
+    return does
 
 
 def does_not_read(link: socket.socket) -> None:
@@ -125,7 +181,7 @@ def does_not_read(link: socket.socket) -> None:
     header = fields(max_tokens=60_000)
     size = PICTURES_AT + len(header)
     hello(link, file_of(size, header), size)
-    link.send(PACKET.pack(REQUEST, PICTURES_AT, len(header)))
+    link.send(PLACE.pack(PICTURES_AT, len(header)))
     Event().wait(1.0)
     link.shutdown(socket.SHUT_RDWR)
 
@@ -133,21 +189,28 @@ def does_not_read(link: socket.socket) -> None:
 CLIENTS: tuple[Case[Attack], ...] = (
     Case("silence", attack(sends(), seconds=1)),
     Case("gone at once", attack(goes)),
-    Case("packet of 3 bytes", attack(sends(b"abc"))),
-    Case("packet of 64 KiB", attack(sends(bytes(1 << 16)))),
-    Case("packet that is none", attack(sends(PACKET.pack(b"whatever", 1, 2)))),
-    Case("request without memory", attack(sends(PACKET.pack(REQUEST, 64, 10)))),
-    Case("memory without a file", attack(lambda link: hello(link, -1, 4096))),
-    Case("1 TiB of memory", attack(lambda link: hello(link, file_of(4096), 1 << 40))),
-    Case("more memory than the file has", attack(lambda link: hello(link, file_of(4096), MIB))),
-    Case("no memory", attack(lambda link: hello(link, file_of(4096), 0))),
-    Case("a pipe as memory", attack(lambda link: hello(link, os.pipe()[0], 4096))),
-    Case("memory that may shrink", attack(lambda link: hello(link, file_of(MIB, fields(), sealed=False), MIB))),
+    Case("packet of 3 bytes", attack(sends(b"abc")), "no offer"),
+    Case("packet of 64 KiB", attack(sends(bytes(1 << 16))), "no offer"),
+    Case("request without memory", attack(sends(PLACE.pack(64, 10))), "no offer"),
+    Case("memory of another version", attack(sends(HELLO.pack(b"S2A-SHM9", 4096))), "no offer"),
+    Case("memory without a file", attack(lambda link: hello(link, -1, 4096)), "should be one file"),
+    Case("memory of three files", attack(many_files(3)), "should be one file"),
+    Case("memory of 200 files", attack(many_files(200)), "should be one file"),
+    Case("1 TiB of memory", attack(lambda link: hello(link, file_of(4096), 1 << 40)), "at most"),
+    Case("more memory than the file has", attack(lambda link: hello(link, file_of(4096), MIB)), "its size may change"),
+    Case("no memory", attack(lambda link: hello(link, file_of(4096), 0)), "of 0 bytes"),
+    Case("4 bytes of memory", attack(lambda link: hello(link, file_of(4096), 4)), "of 4 bytes"),
+    Case("a pipe as memory", attack(lambda link: hello(link, os.pipe()[0], 4096)), "is no memory"),
+    Case("a file on a disk as memory", attack(on_a_disk), "is no memory"),
+    Case("memory that may shrink", attack(lambda link: hello(link, file_of(MIB, fields(), sealed=False), MIB)), "may"),
     Case("memory that shrinks", attack(truncates)),
-    Case("files with a request", attack(many_files)),
-    Case("header beyond the memory", asks(fields(), at=1 << 40), "is none"),
-    Case("header of 2^63 bytes", asks(fields(), length=1 << 63), "is none"),
-    Case("header before its place", asks(fields(), at=0), "is none"),
+    Case("files with a request", attack(many_files(4, later=True))),
+    Case("packet of 64 KiB as a request", attack(later(bytes(1 << 16)))),
+    Case("header beyond the memory", asks(fields(), at=1 << 40), "cannot be"),
+    Case("header of 2^63 bytes", asks(fields(), length=1 << 63), "cannot be"),
+    Case("header before its place", asks(fields(), at=0), "cannot be"),
+    Case("header of 5 MiB", asks(b"[" + b"{}," * (5 * MIB // 3) + b"{}]"), "cannot be"),
+    Case("a million pictures", asks(fields(images=[{}] * (HEADER_BYTES // 5))), "should lie before the header"),
     Case("no JSON", asks(b"{]" * 50), "no JSON"),
     Case("100,000 brackets", asks(b"[" * 100_000), "no JSON"),
     Case("a list", asks(b"[1, 2]"), "should be an object"),
@@ -156,9 +219,11 @@ CLIENTS: tuple[Case[Attack], ...] = (
     Case("picture after the header", asks(picture(bytes=1 << 30), bytes(24)), "should lie before the header"),
     Case("picture of other sides", asks(picture(width=5), bytes(24)), "are no bgr8 picture of 5x2"),
     Case("picture of 2^62 pixels", asks(picture(width=1 << 31, height=1 << 31), bytes(24)), "should be a whole number"),
-    Case("unknown encoding", asks(picture(encoding="tiff"), bytes(24)), "neither a JPEG nor a PNG|no such picture"),
+    Case("unknown encoding", asks(picture(encoding="tiff"), bytes(24)), "neither a JPEG nor a PNG"),
+    Case("JPEG of 4 gigapixels", asks(*encoded(jpeg_header(65_000, 65_000))), "pixels are taken"),
+    Case("ten pictures of 36 megapixels", asks(*encoded(*[png(6000, 6000)] * 10)), "at most .* pixels are taken"),
     Case("half a surrogate", asks(fields().replace(b'"go"', b'"\\ud800"')), "no JSON|surrogate"),
-    *(Case(f"max_tokens {value}", asks(fields(max_tokens=value)), "max_tokens") for value in (-1, 1.5, [], 1 << 40)),
+    *(Case(f"max_tokens {value}", asks(fields(max_tokens=value)), "max_tokens") for value in ODD),
     Case("reads nothing", attack(does_not_read)),
 )
 
@@ -176,7 +241,7 @@ def serves(does: Does, *, asked: bool = True) -> Trap:
                     data, files, _, _ = socket.recv_fds(link, 1 << 16, 8)
                     for file in files:
                         os.close(file)
-                    if not data or data.startswith(REQUEST):
+                    if not data or (len(data) == PLACE.size and not files):
                         break
                 does(link)
                 over.wait(30)
@@ -202,58 +267,66 @@ def serves(does: Does, *, asked: bool = True) -> Trap:
     return trap
 
 
-def tells(*events: bytes, again: bool = False) -> Does:
-    """Return what offers memory and tells of events in it, of the last for ever if ``again``."""
+def tells(*pieces: bytes, again: bool = False, leaves: bool = False) -> Does:
+    """Return what offers memory and tells of pieces in it, of the last for ever if ``again``; it may leave then."""
 
     def does(link: socket.socket) -> None:
-        file = file_of(ANSWER_BYTES, b"".join(events), at=0)
+        file = file_of(ANSWER_BYTES, b"".join(pieces), at=0)
         hello(link, file, ANSWER_BYTES)
         begin = 0
-        for event in events:
-            link.send(PACKET.pack(EVENT, begin, len(event)))
-            begin += len(event)
+        for piece in pieces:
+            link.send(PLACE.pack(begin, len(piece)))
+            begin += len(piece)
         while again:
-            link.send(PACKET.pack(EVENT, begin - len(events[-1]), len(events[-1])))
+            link.send(PLACE.pack(begin - len(pieces[-1]), len(pieces[-1])))
+        if leaves:
+            goes(link)
 
     return does
 
 
 def points(at: int, length: int) -> Does:
-    """Return what tells of an event at a place of the server's choice."""
+    """Return what tells of a piece at a place of the server's choice."""
+    return greets(PLACE.pack(at, length))
+
+
+def greets(packet: bytes) -> Does:
+    """Return what greets properly, and then sends a packet."""
 
     def does(link: socket.socket) -> None:
         hello(link, file_of(ANSWER_BYTES), ANSWER_BYTES)
-        link.send(PACKET.pack(EVENT, at, length))
+        link.send(packet)
 
     return does
 
 
-def token(index: int = 0) -> bytes:
-    """Return the event of a token."""
-    return json.dumps({"index": index, "text": "x", "id": 1}).encode()
-
+TOKEN = packed(Token(0, "x", 1))
 
 SERVERS: tuple[Case[Trap], ...] = (
     Case("silence", serves(sends()), FAILED),
+    Case("silence after a greeting", serves(lambda link: hello(link, file_of(MIB), MIB)), FAILED),
     Case("gone at once", serves(goes, asked=False), FAILED),
     Case("gone when asked", serves(goes), FAILED),
     Case("packet of 3 bytes", serves(sends(b"abc")), FAILED),
-    Case("packet that is none", serves(sends(PACKET.pack(b"whatever", 1, 2))), FAILED),
-    Case("event without memory", serves(sends(PACKET.pack(EVENT, 0, 10))), FAILED),
+    Case("packet of 3 bytes, later", serves(greets(b"abc")), FAILED),
+    Case("piece without memory", serves(sends(PLACE.pack(0, 10))), FAILED),
+    Case("refusal with letters that move a cursor", serves(sends(REFUSED + b"\x1b[2J\r\n!\xff")), FAILED),
     Case("memory without a file", serves(lambda link: hello(link, -1, 4096)), FAILED),
     Case("1 TiB of memory", serves(lambda link: hello(link, file_of(4096), 1 << 40)), FAILED),
     Case("memory that may shrink", serves(lambda link: hello(link, file_of(MIB, sealed=False), MIB)), FAILED),
-    Case("event of 2^63 bytes", serves(points(0, 1 << 63)), FAILED),
-    Case("event at 2^63", serves(points((1 << 63) + 5, ANSWER_BYTES)), FAILED),
-    Case("event across the end", serves(points(ANSWER_BYTES - 1, 2)), FAILED),
-    Case("empty event", serves(points(0, 0)), FAILED),
-    Case("no JSON", serves(tells(b"{]")), FAILED),
-    Case("a number", serves(tells(b"7")), FAILED),
-    Case("token without text", serves(tells(b'{"index": 0}')), FAILED),
-    Case("token then silence", serves(tells(token())), FAILED),
-    Case("endless tokens", serves(tells(token(1), again=True)), FAILED),
-    Case("marks that are none", serves(tells(b'{"remote": {"clock": 1}}')), FAILED),
-    Case(
-        "error with letters that move a cursor", serves(tells(json.dumps({"error": "\x1b[2J\r\n!"}).encode())), FAILED
-    ),
+    Case("piece of 2^63 bytes", serves(points(0, 1 << 63)), FAILED),
+    Case("piece at 2^64 - 8", serves(points((1 << 64) - 8, 8)), FAILED),
+    Case("piece across the end", serves(points(ANSWER_BYTES - 1, 2)), FAILED),
+    Case("empty piece", serves(points(0, 0)), FAILED),
+    Case("piece of 3 bytes", serves(points(0, 3)), FAILED),
+    Case("piece of zeros", serves(points(0, 100)), FAILED),
+    Case("token that is no UTF-8", serves(tells(TOKEN + b"\xff")), FAILED),
+    Case("token then silence", serves(tells(TOKEN)), FAILED),
+    Case("token then gone", serves(tells(TOKEN, leaves=True)), FAILED),
+    Case("endless tokens", serves(tells(TOKEN, again=True)), FAILED),
+    Case("tokens of a MiB for ever", serves(tells(TOKEN + b"x" * MIB, again=True)), FAILED),
+    Case("end that is no JSON", serves(tells(packed(Remote("a"))[:16] + b"{]")), FAILED),
+    Case("end that is a number", serves(tells(packed(Remote("a"))[:16] + b"7")), FAILED),
+    Case("marks that are none", serves(tells(packed(Remote("a", [("x", -1)])))), FAILED),
+    Case("error with letters that move a cursor", serves(tells(packed("\x1b[2J\r\n!"))), FAILED),
 )

@@ -1,7 +1,7 @@
 """The Unix socket at which memory is handed over: a file that its user alone may open, cleaned up by the next start.
 
-An abstract socket would leave no file behind, but has no permissions either: any program in the machine's network namespace
-could connect, or take the name first. Both ends ask the kernel who the other one is (SO_PEERCRED) all the same.
+An abstract socket would leave no file behind, but has no permissions either: any program in the machine's network
+namespace could connect, or take the name first. Both ends ask the kernel who the other is (SO_PEERCRED) all the same.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def connect(path: str, patience_s: float) -> socket.socket:
 
 
 def wait_at_most(link: socket.socket, seconds: float) -> None:
-    """Let a blocking call end with BlockingIOError after so long, 0: never, without the system call for it each time."""
+    """Let blocking calls end with BlockingIOError after so long, 0: never; `settimeout` would cost each a poll."""
     whole = int(seconds)
     value = _TIMEVAL.pack(whole, max(int((seconds - whole) * 1e6), int(seconds > 0 and not whole)))
     link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)

@@ -1,7 +1,8 @@
-"""A client's link: the socket, the memory that it writes and, when the server has answered, the memory that it reads."""
+"""A client's link: the socket, the memory that it writes, and the memory that it reads once the server has answered."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Final
 
 from s2a_bench.transport.shm.door import connect, wait_at_most
@@ -22,18 +23,23 @@ class Link:
         self._reader: Reader | None = None
         try:
             self.requests = offer(self._socket, size)
-        except BaseException:
-            self._socket.close()
+        except BaseException as error:
+            with self._socket:
+                self._reason(error)
             raise
 
     def ask(self, at: int, length: int) -> None:
-        """Tell of a request whose header lies there; raises OSError."""
+        """Tell of a request whose header lies there; raises OSError, TransportError."""
         if self._reader is not None:
             self._reader.begin()
-        self._socket.send(PLACE.pack(at, length))
+        try:
+            self._socket.send(PLACE.pack(at, length))
+        except OSError as error:
+            self._reason(error)
+            raise
 
     def next(self, wait_s: float) -> bytes:
-        """Return the next piece; raises BlockingIOError after ``wait_s``, EOFError, OSError, ValueError, TransportError."""
+        """Return the next piece; raises BlockingIOError after ``wait_s``, and what `accept` and `Reader` raise."""
         if not self._waits_s - NEARER_S <= wait_s <= self._waits_s + NEARER_S:
             wait_at_most(self._socket, wait_s)
             self._waits_s = wait_s
@@ -43,6 +49,12 @@ class Link:
         if not packet:
             raise EOFError
         return self._reader.read(packet)
+
+    def _reason(self, error: BaseException) -> None:
+        """Raise what a server said that has closed a new link."""
+        if isinstance(error, BrokenPipeError | ConnectionResetError) and self._reader is None:
+            with suppress(OSError, EOFError):
+                accept(self._socket, ANSWER_BYTES)
 
     def close(self) -> None:
         """Hang up."""

@@ -1,14 +1,14 @@
 """Memory that two processes share without a name, and the packets that say where in it to look.
 
-A client connects to a Unix socket (SEQPACKET) and hands over a file of memory (memfd) that it writes its requests into; the
-server hands over another, for its answers. From then on packets of 16 bytes say where something lies. They wake the
-other side about as fast as an eventfd or a futex would, and unlike these they end when the other side does.
+A client connects to a Unix socket (SEQPACKET) and hands over a file of memory (memfd) that it writes its requests into;
+the server hands over another, for its answers. From then on packets of 16 bytes say where something lies. They wake the
+other side about as fast as an eventfd or a futex would (docs/latency.md), and unlike these they end when it does.
 
 - Nothing has a name in /dev/shm: the memory goes when its last process does, whoever is killed and how.
 - Each side maps the other's memory for reading only, and only if its size is sealed: to read beyond the end of what the
   other side has cut off would be a SIGBUS.
-- Whoever reads copies what it checks before it checks: the other side may write meanwhile. Raw pixels are used where they
-  lie, for any bytes are a picture.
+- Whoever reads copies what it checks before it checks: the other side may write meanwhile. Raw pixels are used where
+  they lie, for any bytes are a picture.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ REFUSED: Final = b"refused:"
 PLACE: Final = struct.Struct("<QQ")
 """All others, a client's: where a request's header lies, and its length. A server's: see `ring`."""
 PICTURES_AT: Final = 64
-"""Where a request's pictures begin, one after the other, the header behind them; before it is how far answers were read."""
+"""Where a request's pictures begin, one after the other, its header behind them; first is how far answers were read."""
 ANSWER_BYTES: Final = 4 << 20
 """What a server may be ahead of its client."""
 
@@ -48,30 +48,34 @@ class Memory:
     __slots__ = ("map", "pixels", "size")
 
     def __init__(self, file: int, size: int, *, writes: bool) -> None:
-        """Map the file, which is closed then."""
-        try:
-            self.map = mmap(file, size, access=ACCESS_WRITE if writes else ACCESS_READ)
-        finally:
-            os.close(file)
+        """Map the file, which need not stay open."""
+        self.map = mmap(file, size, access=ACCESS_WRITE if writes else ACCESS_READ)
         self.pixels: Pixels = np.frombuffer(self.map, np.uint8)
         self.size = size
 
 
 def offer(link: socket.socket, size: int) -> Memory:
-    """Make memory of so many bytes and hand it over; raises OSError."""
-    file = os.memfd_create("s2a_bench", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    """Make memory of so many bytes and hand it over; raises TransportError where there is none, OSError."""
     try:
-        os.ftruncate(file, size)
-        fcntl.fcntl(file, fcntl.F_ADD_SEALS, _SEALS | fcntl.F_SEAL_SEAL)
+        file = os.memfd_create("s2a_bench", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        try:
+            os.ftruncate(file, size)
+            fcntl.fcntl(file, fcntl.F_ADD_SEALS, _SEALS | fcntl.F_SEAL_SEAL)
+            memory = Memory(file, size, writes=True)
+        except OSError:
+            os.close(file)
+            raise
+    except OSError as error:
+        raise TransportError(f"shared memory of {size} bytes cannot be had: {error.strerror}") from error
+    try:
         socket.send_fds(link, [HELLO.pack(MAGIC, size)], [file])
-    except OSError:
+    finally:
         os.close(file)
-        raise
-    return Memory(file, size, writes=True)
+    return memory
 
 
 def accept(link: socket.socket, most: int) -> Memory:
-    """Map what the other side hands over; raises EOFError, OSError, and TransportError for what is not to be trusted."""
+    """Map what the other side hands over; raises EOFError, OSError, and TransportError for what is not trusted."""
     data, files = _receive(link)
     try:
         if not data:
@@ -82,12 +86,12 @@ def accept(link: socket.socket, most: int) -> Memory:
             raise TransportError("what came first was no offer of shared memory")
         _, size = HELLO.unpack(data)
         if len(files) != 1:
-            raise TransportError(f"shared memory should be one file; {len(files)} came (is the limit of open files met?)")
+            raise TransportError(f"memory should be one file; {len(files)} came (is the limit of open files met?)")
         if not PICTURES_AT <= size <= most:
             raise TransportError(f"shared memory of {size} bytes was offered; at most {most} are taken")
         if not _is_sealed(files[0], size):
             raise TransportError("what was offered is no memory, or its size may change")
-        return Memory(files.pop(), size, writes=False)
+        return Memory(files[0], size, writes=False)
     finally:
         for file in files:
             os.close(file)
@@ -101,7 +105,10 @@ def refuse(link: socket.socket, why: str) -> None:
 def _receive(link: socket.socket) -> tuple[bytes, list[int]]:
     """Return the next packet, and the files that came with it."""
     room = socket.CMSG_SPACE(4 * _FILES)
-    data, controls, _, _ = link.recvmsg(_PACKET_BYTES, room, socket.MSG_CMSG_CLOEXEC)
+    try:
+        data, controls, _, _ = link.recvmsg(_PACKET_BYTES, room, socket.MSG_CMSG_CLOEXEC)
+    except ConnectionResetError:  # it left without reading all; what it said before is there still
+        data, controls, _, _ = link.recvmsg(_PACKET_BYTES, room, socket.MSG_CMSG_CLOEXEC)
     files = [
         file
         for level, kind, content in controls

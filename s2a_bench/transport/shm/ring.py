@@ -1,7 +1,7 @@
 """An answer in memory that goes round: written from its beginning at every request, where the reader has been already.
 
-A server's packet says how many bytes were written before a piece, counting those that were skipped so that no piece lies
-across the end, and the piece's length. The client counts what it has read at the beginning of its own memory.
+A server's packet says how many bytes were written before a piece, counting those that were skipped so that no piece
+lies across the end, and the piece's length. The client counts what it has read at the beginning of its own memory.
 """
 
 from __future__ import annotations
@@ -41,20 +41,21 @@ class Writer:
         if len(piece) > PIECE_BYTES:
             raise RequestFailed(f"a piece of {len(piece)} bytes is larger than this wire carries")
         if self._late:
-            self._catch_up()
+            self.catch_up()
         if self._late or not self._put(piece):
             self._late.append(piece)
 
     def finish(self, left_s: Callable[[], float]) -> None:
         """Wait for a slow client to take the rest, until no time is left; raises OSError where it has gone."""
         while self._late:
-            self._catch_up()
+            self.catch_up()
             if self._late:
                 if left_s() <= 0 or not is_there(self._link):
                     raise ConnectionAbortedError("the client does not read its answer")
                 time.sleep(POLL_S)
 
-    def _catch_up(self) -> None:
+    def catch_up(self) -> None:
+        """Write what is late, as far as there is room."""
         while self._late and self._put(self._late[0]):
             self._late.popleft()
 

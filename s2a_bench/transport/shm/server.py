@@ -1,4 +1,4 @@
-"""The server: a thread for each link, which reads a request where it lies, waits for its turn, and writes the pieces."""
+"""The server: a thread for each link reads a request where it lies, waits for its turn, and writes the pieces."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ class ShmServer:
             said = str(error)
         except OSError:
             raise
-        except Exception as error:  # who asked must hear of it, whatever broke
+        except Exception as error:  # noqa: BLE001 - who asked must hear of it, whatever broke
             _log.error("a request failed", exc_info=error)
             said = str(EngineError("Internal Server Error"))
         finally:
