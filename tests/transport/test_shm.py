@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import socket
 import stat
 import struct
@@ -83,8 +82,8 @@ def memory_of(pid: int) -> list[str]:
 
 def named_memory(*pids: int) -> list[str]:
     """Return what processes would leave in /dev/shm if they were killed now."""
-    named = re.compile(r"/dev/shm/(?!.*\(deleted\)$)")
-    return [name for pid in pids for name in memory_of(pid) if named.match(name)]
+    named = (Path(name) for pid in pids for name in memory_of(pid) if not name.endswith("(deleted)"))
+    return [path.name for path in named if path.parts[1:3] == ("dev", "shm")]
 
 
 @pytest.mark.parametrize("payload", ["raw", "png"])

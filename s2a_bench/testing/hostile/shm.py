@@ -66,6 +66,8 @@ def attack(does: Does, seconds: float = 2.0) -> Attack:
                         begin, length = PLACE.unpack(data)
                         piece = unpacked(os.pread(memory, length, begin % ANSWER_BYTES))
                         said += piece.text if isinstance(piece, Token) else str(piece)
+                        if not isinstance(piece, Token):
+                            break
                     elif not files:
                         said += data.decode(errors="replace")
         return said
