@@ -8,14 +8,12 @@ from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.transport.shm import unavailable
 
 
-def shared_memory(machine: Machine) -> Finding:  # noqa: ARG001 - the system of this process
-    """Return whether memory without a name can be had here: a sandbox may forbid it."""
+def shared_memory(machine: Machine) -> Finding | None:  # noqa: ARG001 - the system of this process
+    """Return that memory without a name cannot be had here, if so: a sandbox may forbid it."""
     why = unavailable()
     if not why:
         try:
             os.close(os.memfd_create("s2a_bench", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING))
         except OSError as error:
             why = f"memfd_create: {error.strerror}"
-    if why:
-        return Finding("shared-memory", "advice", f"--transport shm cannot run: {why}", "leave it out")
-    return Finding("shared-memory", "state", "memfd")
+    return Finding("shared-memory", "advice", f"--transport shm cannot run: {why}", "leave it out") if why else None
