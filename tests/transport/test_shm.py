@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import socket
 import stat
@@ -10,7 +11,7 @@ from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from threading import Barrier, Thread
+from threading import Barrier, Event, Thread
 from typing import Any
 
 import numpy as np
@@ -155,6 +156,41 @@ def test_a_server_that_is_killed_in_mid_answer_leaves_nothing_and_the_next_start
         assert [*own_folder.iterdir()] == [Path(second.address)]
         with closing(open_client(wiring("shm", second.address))) as client:
             assert len(ask(client, Request("a", "go on", max_tokens=2))[0]) == 2
+
+
+def test_a_folder_that_somebody_keeps_locked_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(door, "_LOCK_PAUSE_S", 0)
+    handle = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        with pytest.raises(PortInUse, match=r"cannot be had: somebody keeps .* locked"):
+            open_server(wiring("shm", str(tmp_path / "robot.sock")), Recorder([]))
+    finally:
+        os.close(handle)
+
+
+def test_an_answer_stops_when_a_client_that_did_not_read_has_gone(connect: Connect) -> None:
+    begun, over = Event(), Event()
+
+    def handler(_: Request, trace: Trace) -> Generator[Token, None, None]:
+        trace.mark("inference")
+        try:
+            for index in range(10**6):
+                yield Token(index, "long " * 1000)
+                if index == 2000:  # more than its memory holds
+                    begun.set()
+                    over.wait(20)
+        finally:
+            ended.append(True)
+
+    ended: list[bool] = []
+    client = connect(handler)
+    answer = client.request(Request("a", "plan", max_tokens=60_000), Trace())
+    assert next(answer).index == 0
+    assert begun.wait(20)
+    client.close()
+    over.set()
+    assert eventually(lambda: ended)
 
 
 def test_a_client_that_is_killed_in_mid_answer_leaves_nothing() -> None:

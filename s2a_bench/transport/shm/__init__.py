@@ -32,7 +32,7 @@ class Shm(Transport[ShmOptions]):
     stages: ClassVar[Mapping[str, str]] = {"header_pack": "pack", "header_parse": "parse"}
     tells = (PAYLOAD_BYTES,)
     order = 90
-    looks: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#6A3D9A", "-.")}
+    looks: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#6A3D9A", "--")}
     checks: ClassVar[Mapping[str, str]] = {"shared-memory": "s2a_bench.transport.shm.checks:shared_memory"}
 
     def client(self, wiring: Wiring[ShmOptions], alive: Callable[[], bool]) -> Client:

@@ -12,8 +12,10 @@ import socket
 import stat
 import struct
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
+from errno import EAGAIN
 from pathlib import Path
 from typing import Final
 
@@ -23,6 +25,7 @@ ROOT: Final = 0
 _CREDENTIALS = struct.Struct("3i")
 _TIMEVAL = struct.Struct("@ll")
 _BACKLOG = 128
+_LOCK_TRIES, _LOCK_PAUSE_S = 100, 0.05
 
 
 def listen(path: str) -> socket.socket:
@@ -95,7 +98,13 @@ def _alone_in(folder: Path) -> Iterator[None]:
     """Keep others from cleaning up between our `bind` and `listen`, when nobody seems to listen there."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+        for _ in range(_LOCK_TRIES):
+            with suppress(BlockingIOError):
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            time.sleep(_LOCK_PAUSE_S)
+        else:
+            raise BlockingIOError(EAGAIN, f"somebody keeps {folder} locked")
         yield
     finally:
         os.close(handle)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from threading import Lock
 from typing import Any, Final
@@ -29,8 +27,7 @@ class Held:
         """Hold nothing."""
         self._limits, self._lock, self._bytes = limits, Lock(), 0
 
-    @contextmanager
-    def request(self, memory: Memory, at: int, length: int) -> Iterator[None]:
+    def take(self, memory: Memory, at: int, length: int) -> int:
         """Count a request whose header lies there; raises RequestFailed where it cannot, Busy where it is too much."""
         if not (0 < length <= HEADER_BYTES and at >= PICTURES_AT and at + length <= memory.size):
             raise RequestFailed(f"a header of {length} bytes at {at} cannot be; at most {HEADER_BYTES} are taken")
@@ -39,11 +36,12 @@ class Held:
             if self._bytes + size > self._limits.in_flight_bytes:
                 raise Busy(f"requests of {self._limits.in_flight_bytes} bytes are under way already")
             self._bytes += size
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._bytes -= size
+        return size
+
+    def give_back(self, size: int) -> None:
+        """Count it no more."""
+        with self._lock:
+            self._bytes -= size
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,6 +42,8 @@ class Writer:
             raise RequestFailed(f"a piece of {len(piece)} bytes is larger than this wire carries")
         if self._late:
             self.catch_up()
+            if self._late and not is_there(self._link):
+                raise ConnectionAbortedError("the client has gone")
         if self._late or not self._put(piece):
             self._late.append(piece)
 

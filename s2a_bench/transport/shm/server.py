@@ -124,25 +124,26 @@ class ShmServer:
     ) -> None:
         """Read a request, wait for its turn, write the answer; raises OSError where the client has gone."""
         turn: Turn | None = None
+        held = 0
         said: Remote | str
         writer.begin()
         try:
-            with self._held.request(requests, *place):
-                header = Header.read(requests, *place, self._limits)
-                trace.mark("header_parse")
-                turn = self._queued.turns.join()
-                request = header.request(requests, trace)
-                if turn.come is not None:
-                    trace.mark(RESIDUAL)
-                    if not turn.wait(lambda: not is_there(link)):
-                        raise ConnectionAbortedError
-                    trace.mark("queue")
-                tokens = self._queued.answer(request, trace, turn)
-                try:
-                    for token in tokens:
-                        writer.send(packed(token))
-                finally:
-                    tokens.close()
+            held = self._held.take(requests, *place)
+            header = Header.read(requests, *place, self._limits)
+            trace.mark("header_parse")
+            turn = self._queued.turns.join()
+            request = header.request(requests, trace)
+            if turn.come is not None:
+                trace.mark(RESIDUAL)
+                if not turn.wait(lambda: not is_there(link)):
+                    raise ConnectionAbortedError
+                trace.mark("queue")
+            tokens = self._queued.answer(request, trace, turn)
+            try:
+                for token in tokens:
+                    writer.send(packed(token))
+            finally:
+                tokens.close()
             said = trace.to_remote()
         except S2AError as error:
             said = str(error)
@@ -152,6 +153,7 @@ class ShmServer:
             _log.error("a request failed", exc_info=error)
             said = str(EngineError("Internal Server Error"))
         finally:
+            self._held.give_back(held)
             if turn is not None:
                 turn.leave()
         end = packed(said)
