@@ -14,13 +14,16 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
 from s2a_bench.trace import Remote
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PICTURES_AT, PLACE, REFUSED
 from s2a_bench.transport.shm.pieces import packed, unpacked
 from s2a_bench.transport.shm.reading import HEADER_BYTES
-from s2a_bench.types import Token
+from s2a_bench.transport.shm.ring import PIECE_BYTES
+from s2a_bench.types import Action, Token
 
 ODD: tuple[Any, ...] = (-1, 1.5, [], 1 << 40)
 Does: TypeAlias = "Callable[[socket.socket], None]"
@@ -65,8 +68,8 @@ def attack(does: Does, seconds: float = 2.0) -> Attack:
                     if len(data) == PLACE.size and not files and memory >= 0:
                         begin, length = PLACE.unpack(data)
                         piece = unpacked(os.pread(memory, length, begin % ANSWER_BYTES))
-                        said += piece.text if isinstance(piece, Token) else str(piece)
-                        if not isinstance(piece, Token):
+                        said += piece.text if isinstance(piece, (Token, Action)) else str(piece)
+                        if not isinstance(piece, (Token, Action)):
                             break
                     elif not files:
                         said += data.decode(errors="replace")
@@ -226,6 +229,7 @@ CLIENTS: tuple[Case[Attack], ...] = (
     Case("ten pictures of 36 megapixels", asks(*encoded(*[png(6000, 6000)] * 10)), "at most .* pixels are taken"),
     Case("half a surrogate", asks(fields().replace(b'"go"', b'"\\ud800"')), "no JSON|surrogate"),
     *(Case(f"max_tokens {value}", asks(fields(max_tokens=value)), "max_tokens") for value in ODD),
+    *(Case(f"state {value}", asks(fields(state=value)), "the state") for value in (7, ["x"], [[1]], {"a": 1}, [1e999])),
     Case("reads nothing", attack(does_not_read)),
 )
 
@@ -303,6 +307,7 @@ def greets(packet: bytes) -> Does:
 
 
 TOKEN = packed(Token(0, "x", 1))
+ACTION = packed(Action(0, np.zeros(7, np.float32)))
 
 SERVERS: tuple[Case[Trap], ...] = (
     Case("silence", serves(sends()), FAILED),
@@ -327,6 +332,14 @@ SERVERS: tuple[Case[Trap], ...] = (
     Case("token then gone", serves(tells(TOKEN, leaves=True)), FAILED),
     Case("endless tokens", serves(tells(TOKEN, again=True)), FAILED),
     Case("tokens of a MiB for ever", serves(tells(TOKEN + b"x" * MIB, again=True)), FAILED),
+    Case("action of three bytes", serves(tells(ACTION[:-1])), FAILED),
+    Case("action without numbers", serves(tells(ACTION[:16])), FAILED),
+    Case("action that is no number", serves(tells(packed(Action(0, np.full(7, np.nan, np.float32))))), FAILED),
+    Case(
+        "action of 2 MiB for ever",
+        serves(tells(packed(Action(0, np.zeros(PIECE_BYTES // 4 - 4, np.float32))), again=True)),
+        FAILED,
+    ),
     Case("end that is no JSON", serves(tells(packed(Remote("a"))[:16] + b"{]")), FAILED),
     Case("end that is a number", serves(tells(packed(Remote("a"))[:16] + b"7")), FAILED),
     Case("marks that are none", serves(tells(packed(Remote("a", [("x", -1)])))), FAILED),

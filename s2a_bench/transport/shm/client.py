@@ -18,7 +18,7 @@ from s2a_bench.transport.shm import ShmOptions
 from s2a_bench.transport.shm.link import Link
 from s2a_bench.transport.shm.memory import PICTURES_AT
 from s2a_bench.transport.shm.pieces import Said, unpacked
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.types import Action, Frame, Piece, Request, Token
 
 STEP_BYTES: Final = 1 << 20
 """Memory for requests comes in steps; one holds a raw picture of 640x480."""
@@ -36,14 +36,14 @@ class ShmClient:
         self._link: Link | None = None
         self._connect(STEP_BYTES)
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
-        """Write the request, tell of it, yield the tokens."""
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
+        """Write the request, tell of it, yield the pieces."""
         bounds = Bounds(self._path, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
         link, at, length = self._lay_out(request, trace)
         done = False
         try:
             self._ask(link, at, length)
-            while isinstance(said := self._next(link, bounds), Token):
+            while isinstance(said := self._next(link, bounds), (Token, Action)):
                 if not said.index:
                     trace.mark("return")
                 bounds.piece()
@@ -147,6 +147,7 @@ def _header(request: Request, pictures: list[dict[str, Any]]) -> bytes:
             "max_tokens": request.max_tokens,
             "grammar": request.grammar,
             "seed": request.seed,
+            "state": request.state,
             "images": pictures,
         }
     )

@@ -10,6 +10,7 @@ import orjson
 
 from s2a_bench.errors import Busy, RequestFailed
 from s2a_bench.trace import Trace
+from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.limits import SEEDS, Limits, check_pixels, text, whole_number
 from s2a_bench.transport.pictures import decoded, rgb_of
 from s2a_bench.transport.shm.memory import PICTURES_AT, Memory
@@ -85,6 +86,7 @@ class Header:
             max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, self.limits.answer_tokens, 32),
             grammar=text("grammar", fields.get("grammar")),
             seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
+            state=state_of(fields.get("state") or ()),
         )
 
 
