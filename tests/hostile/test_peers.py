@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, websocket
+from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm, websocket
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
 
@@ -39,6 +39,12 @@ class TestRosTopic(HostileSuite):
 class TestRosAction(HostileSuite):
     name = "ros/action"
     servers = ros_servers.GOALS
+
+
+class TestShm(HostileSuite):
+    name = "shm"
+    clients = shm.CLIENTS
+    servers = shm.SERVERS
 
 
 class TestWebsocket(HostileSuite):
