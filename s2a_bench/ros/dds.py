@@ -37,12 +37,11 @@ from cyclonedds.topic import Topic
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS
+from s2a_bench.ros.action_client import AT_ONCE
 from s2a_bench.ros.waiting import WAIT_SLICE_NS
 
 FOREVER_NS = 2**63 - 1
 ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
-AT_ONCE = 1000
-"""More than that is not taken before what has come is looked at."""
 
 
 class _Outgoing(ct.Structure):

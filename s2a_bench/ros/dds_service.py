@@ -55,6 +55,14 @@ class Peer:
     type_hash: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Who asked: the writer of a request, and the request's header, under which its reply goes."""
+
+    sender: int
+    header: tuple[int, int]
+
+
 class _End:
     """What client and server have in common."""
 
@@ -157,6 +165,19 @@ class ServiceServer(_End):
         """Send a reply under the header of its request."""
         HEADER.pack_into(packed, HEADER_AT, *header)
         self.writer.send(packed)
+
+    def caller(self, packed: memoryview) -> Caller:
+        """Return who sent the request that was taken last; of one that is too short for a header, nobody's."""
+        header = HEADER.unpack_from(packed, HEADER_AT) if len(packed) >= BODY_AT else (0, 0)
+        return Caller(self.reader.sender(), header)
+
+    def respond(self, packed: bytearray, caller: Caller) -> None:
+        """Send a reply to who asked."""
+        self.reply(packed, caller.header)
+
+    def reaches(self, caller: Caller) -> bool:
+        """Wait until replies reach who asked."""
+        return self.await_client(caller.sender)
 
     def unpack(self, packed: memoryview) -> Any:
         """Deserialise a request's body; raises TransportError."""

@@ -96,7 +96,10 @@ def test_interface_files_become_the_types_ros_derives(tmp_path: Path) -> None:
     (tmp_path / "msg" / "README").write_text("not an interface")
     definitions, defaults = read_package(tmp_path, "pkg")
     fields = {name: [field for field, _ in of] for name, (_, of) in definitions.items()}
-    of_service = {"": ["request_message", "response_message", "event_message"], "_Event": ["info", "request", "response"]}
+    of_service = {
+        "": ["request_message", "response_message", "event_message"],
+        "_Event": ["info", "request", "response"],
+    }
     services = ("pkg/srv/Thing", "pkg/action/Thing_SendGoal", "pkg/action/Thing_GetResult")
     assert fields == {
         **{service + part: names for service in services for part, names in of_service.items()},
