@@ -9,12 +9,13 @@ import logging
 import time
 from collections.abc import Callable
 from threading import RLock
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, Protocol
 
 from s2a_bench.clock import now_ns
 from s2a_bench.ros import QoS
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Goals, Status, status_array
+from s2a_bench.ros.service import Caller, Service
 
 FEEDBACK_QOS: Final = QoS(depth=1000)
 """Deeper than ROS's 10: what was lost of a burst can be sent again."""
@@ -24,9 +25,6 @@ WAITING_AT_MOST: Final = 1000
 """So many requests for one goal's result are remembered; more are not answered."""
 
 _log = logging.getLogger(__name__)
-Caller = TypeVar("Caller")
-"""What a middleware keeps of a request so that its reply finds who asked."""
-Caller_contra = TypeVar("Caller_contra", contravariant=True)
 
 
 class Sender(Protocol):
@@ -34,29 +32,6 @@ class Sender(Protocol):
 
     def send(self, packed: bytearray, /) -> None:
         """Send; raises TransportError."""
-        ...
-
-
-class Service(Protocol[Caller_contra]):
-    """The server's side of one service."""
-
-    request_type: str
-    reply_type: str
-
-    def pack(self, body: Any, /) -> bytearray:
-        """Serialise a reply."""
-        ...
-
-    def unpack(self, packed: memoryview, /) -> Any:
-        """Deserialise a request; raises TransportError."""
-        ...
-
-    def respond(self, packed: bytearray, caller: Caller_contra, /) -> None:
-        """Send a reply to who asked."""
-        ...
-
-    def reaches(self, caller: Caller_contra, /) -> bool:
-        """Wait, a moment at most, until replies reach who asked; False if it has left."""
         ...
 
 
