@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pkgutil import resolve_name
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Any, Final, Literal, Protocol, TypeAlias
 
 from s2a_bench.errors import TransportError, UsageError
 
@@ -302,23 +302,48 @@ class Middleware(Protocol):
 MIDDLEWARES: dict[str, str] = {
     "cyclonedds": "s2a_bench.ros.cyclone:CycloneMiddleware",
     "rclpy": "s2a_bench.ros.rclpy_middleware:RclpyMiddleware",
+    "zenoh": "s2a_bench.ros.zenoh_middleware:ZenohMiddleware",
 }
-"""Name -> class, built as ``Class(domain_id, tuning, node_name)``."""
+"""Name -> class, built as ``Class(domain_id, tuning, node_name)``; of what is `ROUTED` with a `Router` behind that."""
+ROUTED = frozenset({"zenoh"})
+"""Middlewares whose nodes meet at a router."""
 WAYS_OUT = {
-    "cyclonedds": "it has wheels for x86-64 only: elsewhere source a ROS 2 installation, whose rclpy is taken then "
+    "cyclonedds": "it has wheels for x86-64 only: elsewhere use --middleware zenoh (pip install 's2a-bench[zenoh]'), "
+    "or source a ROS 2 installation, whose rclpy is taken then "
     "(source /opt/ros/<distribution>/setup.bash), or leave ros out of --transport",
     "rclpy": "it comes with ROS 2: source /opt/ros/<distribution>/setup.bash, or use --middleware cyclonedds",
+    "zenoh": "pip install 's2a-bench[zenoh]', or use --middleware cyclonedds",
 }
+ROUTER: Final = "tcp/127.0.0.1:7447"
+"""Where rmw_zenoh's nodes look for their router."""
+
+
+@dataclass(frozen=True, slots=True)
+class Router:
+    """Where the nodes of a `ROUTED` middleware meet; ``host``: our session is the router itself."""
+
+    endpoint: str = ROUTER
+    host: bool = False
 
 
 def default_middleware(environ: Mapping[str, str]) -> str:
-    """Choose rclpy inside a sourced ROS 2 environment whose rclpy this Python finds, else cyclonedds."""
+    """Choose rclpy inside a sourced ROS 2 environment whose rclpy this Python finds, else what PyPI has for this CPU.
+
+    That is cyclonedds, and zenoh where only that is installed.
+    """
     sourced = environ.get("ROS_DISTRO") and environ.get("AMENT_PREFIX_PATH")
-    return "rclpy" if sourced and find_spec("rclpy") else "cyclonedds"
+    if sourced and find_spec("rclpy"):
+        return "rclpy"
+    return "zenoh" if find_spec("zenoh") and not find_spec("cyclonedds") else "cyclonedds"
 
 
 def open_middleware(
-    name: str = "", *, domain_id: int = 0, tuning: Tuning = "tuned", node_name: str = "/s2a_bench"
+    name: str = "",
+    *,
+    domain_id: int = 0,
+    tuning: Tuning = "tuned",
+    node_name: str = "/s2a_bench",
+    router: Router | None = None,
 ) -> Middleware:
     """Join a ROS 2 domain as the node ``node_name``, its namespace included; `default_middleware` without a name.
 
@@ -331,5 +356,6 @@ def open_middleware(
         implementation = resolve_name(MIDDLEWARES[name])
     except ModuleNotFoundError as error:
         raise TransportError(f"middleware {name} is not installed ({error}); {WAYS_OUT[name]}") from error
-    middleware: Middleware = implementation(domain_id, tuning, node_name)
+    more = (router or Router(),) if name in ROUTED else ()
+    middleware: Middleware = implementation(domain_id, tuning, node_name, *more)
     return middleware

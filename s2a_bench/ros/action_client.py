@@ -26,6 +26,8 @@ class Asker(Protocol):
     """The client's side of one service."""
 
     request_type: str
+    hashed_type: str
+    """The type whose hash a server announces."""
 
     def pack(self, body: Any, /) -> bytearray:
         """Serialise a request."""
@@ -109,9 +111,9 @@ class AskingAction:
         announced = self._goals.peer_type_hash()
         if not announced:
             return None
-        if announced == ros.type_hash(self._goals.request_type, self._version):
+        if announced == ros.type_hash(self._goals.hashed_type, self._version):
             return self._version
-        if version := ros.version_of(self._goals.request_type, announced):
+        if version := ros.version_of(self._goals.hashed_type, announced):
             return version
         raise TransportError(
             f"the server's {self._type} has type hash {announced}: its llama_msgs is none of {', '.join(ros.VERSIONS)}"

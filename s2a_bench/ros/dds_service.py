@@ -114,6 +114,7 @@ class ServiceClient(_End):
     def __init__(self, participant: DomainParticipant, name: str, type_name: str, version: str) -> None:
         """Create both endpoints of the service ``/name``."""
         super().__init__(participant, name, type_name, version, ("clientid", "serviceid"))
+        self.hashed_type = self.request_type
         self._guid = self.writer.entity.get_instance_handle() % 2**64
         self._numbers = count(1)
         self._pending: dict[int, bytes] = {}
