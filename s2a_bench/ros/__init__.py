@@ -11,9 +11,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pkgutil import resolve_name
-from typing import Any, Final, Literal, Protocol, TypeAlias
+from typing import Any, Literal, Protocol, TypeAlias
 
 from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.ros.router import Router
 
 Tuning: TypeAlias = Literal["tuned", "default"]
 
@@ -314,16 +315,6 @@ WAYS_OUT = {
     "rclpy": "it comes with ROS 2: source /opt/ros/<distribution>/setup.bash, or use --middleware cyclonedds",
     "zenoh": "pip install 's2a-bench[zenoh]', or use --middleware cyclonedds",
 }
-ROUTER: Final = "tcp/127.0.0.1:7447"
-"""Where rmw_zenoh's nodes look for their router."""
-
-
-@dataclass(frozen=True, slots=True)
-class Router:
-    """Where the nodes of a `ROUTED` middleware meet; ``host``: our session is the router itself."""
-
-    endpoint: str = ROUTER
-    host: bool = False
 
 
 def default_middleware(environ: Mapping[str, str]) -> str:

@@ -10,8 +10,9 @@ from typing import Any
 import zenoh
 
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import SERVICE_QOS, QoS, Router, Tuning
+from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
 from s2a_bench.ros.messages import DEFAULT_VERSION
+from s2a_bench.ros.router import Router
 from s2a_bench.ros.zenoh_action import ZenohActionClient, ZenohActionServer
 from s2a_bench.ros.zenoh_node import Node
 from s2a_bench.ros.zenoh_service import ZenohServiceClient, ZenohServices

@@ -6,19 +6,15 @@ nothing but the link is between it and its clients. Scouting by multicast is off
 
 from __future__ import annotations
 
-import ipaddress
 import json
 import re
-import socket
-from contextlib import closing
 from typing import Any, Final
 
 import zenoh
 
-from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.ros import ROUTER
+from s2a_bench.errors import TransportError
+from s2a_bench.ros.router import endpoint_of
 
-ENDPOINT: Final = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):([0-9]{1,5})")
 PLACE: Final = re.compile(r"!?\s+at /\S+")
 MESSAGE_BYTES: Final = 128 << 20
 """A larger message is dropped as it comes in."""
@@ -26,43 +22,6 @@ OPEN_MS: Final = 5000
 """So long a router may take to say what it is."""
 SEND_US: Final = 5_000_000
 """A peer that reads nothing for so long is hung up on."""
-LOOK_S: Final = 1.0
-
-
-def endpoint_of(text: str) -> tuple[str, str, int]:
-    """Return protocol, host and port of an endpoint as ``tcp/127.0.0.1:7447``; raises UsageError."""
-    found = ENDPOINT.fullmatch(text)
-    if not found or not 0 < int(found[3]) < 2**16:
-        raise UsageError(f"router: '{text}' should look like {ROUTER}")
-    return found[1], found[2].strip("[]"), int(found[3])
-
-
-def listens(endpoint: str) -> bool:
-    """Return whether somebody listens there; of what is not TCP, as if so."""
-    protocol, host, port = endpoint_of(endpoint)
-    if protocol != "tcp":
-        return True
-    try:
-        socket.create_connection((host, port), LOOK_S).close()
-    except OSError:
-        return False
-    return True
-
-
-def may_host(endpoint: str) -> bool:
-    """Return whether a server of ours may be the router there: on loopback, without being asked who comes."""
-    protocol, host, _ = endpoint_of(endpoint)
-    try:
-        return protocol == "tcp" and (host == "localhost" or ipaddress.ip_address(host).is_loopback)
-    except ValueError:
-        return False
-
-
-def free_endpoint() -> str:
-    """Return an endpoint on loopback where nobody listens."""
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def open_session(endpoint: str, *, host: bool) -> zenoh.Session:

@@ -7,7 +7,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from s2a_bench.ros import Middleware, Router, open_middleware
+from s2a_bench.ros import Middleware, open_middleware
+from s2a_bench.ros.router import Router, free_endpoint
 from s2a_bench.testing.action import ActionSuite
 from s2a_bench.testing.middleware import Join, MiddlewareSuite
 
@@ -16,8 +17,6 @@ zenoh = pytest.importorskip("zenoh", reason="the extra zenoh is not installed")
 
 @pytest.fixture
 def endpoint() -> str:
-    from s2a_bench.ros.zenoh_session import free_endpoint
-
     return free_endpoint()
 
 
