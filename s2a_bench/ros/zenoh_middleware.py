@@ -26,7 +26,7 @@ class ZenohMiddleware:
     def __init__(self, domain_id: int, tuning: Tuning, node_name: str, router: Router) -> None:
         """Join ``domain_id`` as the node ``/namespace/name``; raises TransportError where no router answers."""
         self._domain_id, self._tuning, self._router = domain_id, tuning, router
-        self._session: zenoh.Session | None = open_session(router.endpoint, host=router.host)
+        self._session: zenoh.Session | None = open_session(router.endpoint, host=router.host, tuning=tuning)
         atexit.register(self.close)
         self._servers: list[ZenohActionServer] = []
         self._services: ZenohServices | None = None
@@ -71,6 +71,7 @@ class ZenohMiddleware:
             "middleware": "zenoh",
             "version": package_version("eclipse-zenoh"),
             "domain_id": self._domain_id,
+            "tuning": self._tuning,
             "router": self._router.endpoint,
             "router_is": "this process" if self._router.host else "another process",
         }
