@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -122,3 +123,11 @@ class refusals:  # noqa: N801 - as contextlib's
 def direct(callback: Any) -> Any:
     """Return a handler that is called on the very thread that receives, with no thread of Python's between."""
     return zenoh.handlers.Callback(callback, indirect=False)
+
+
+def give_way() -> None:
+    """Let Zenoh's thread send what was just handed to it, where it waits for this very core.
+
+    Linux wakes it beside its waker. Without this the first of 32 tokens left after the last: .75 ms instead of .25.
+    """
+    os.sched_yield()

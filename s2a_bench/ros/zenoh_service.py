@@ -20,7 +20,7 @@ from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, ser
 from s2a_bench.ros.service import Offered
 from s2a_bench.ros.waiting import WAIT_SLICE_NS, appeared
 from s2a_bench.ros.zenoh_inbox import Bell, Inbox
-from s2a_bench.ros.zenoh_node import Node, direct, refusals
+from s2a_bench.ros.zenoh_node import Node, direct, give_way, refusals
 from s2a_bench.ros.zenoh_topic import Stamps, plain_cdr
 
 BODY_AT: Final = CDR_HEADER
@@ -104,6 +104,7 @@ class ServiceServer:
                 caller.query.reply(self._key, packed, attachment=stamp, express=True)
             finally:
                 caller.query.drop()
+        give_way()
 
 
 class ServiceClient:
@@ -155,6 +156,7 @@ class ServiceClient:
         with refusals(self._name):
             handler = zenoh.handlers.Callback(put, end, indirect=False)
             self._querier.get(handler, payload=packed, attachment=self._stamps.next())
+        give_way()
 
     def ended(self) -> Iterator[tuple[bytes, memoryview | None]]:
         """Take what has arrived, a bounded number: (goal id, CDR), without CDR where nobody replied."""

@@ -17,7 +17,7 @@ from s2a_bench.ros import QoS
 from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
 from s2a_bench.ros.zenoh_inbox import Bell, Inbox
-from s2a_bench.ros.zenoh_node import Node, direct, refusals
+from s2a_bench.ros.zenoh_node import Node, direct, give_way, refusals
 
 CACHED_AT_MOST: Final = 1000
 """What a latched topic that keeps all keeps."""
@@ -80,6 +80,7 @@ class ZenohPublisher:
         """Put, without holding the GIL while a link is busy."""
         with refusals(self._topic):
             self._publisher.put(packed, attachment=self._stamps.next())
+        give_way()
 
     def matched(self) -> int:
         """Count the subscriptions that are announced, once the router has told that there are any."""
