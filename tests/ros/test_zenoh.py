@@ -113,6 +113,7 @@ def test_peers_see_our_node_and_its_endpoints_until_it_leaves(stranger: Any, end
     )
     named.service("/ask", GET_TYPES, lambda _: None)
     named.action_server(NAME, llama.GENERATE_RESPONSE)
+    until(lambda: sum("/brain/" in token for token in tokens_of(stranger, dds_domain)) == 14)
     seen = [token.split("/")[5:] for token in tokens_of(stranger, dds_domain) if "/brain" in token]
     assert ["NN", "%", "%robot", "brain"] in seen
     image = ("sensor_msgs::msg::dds_::Image_", ros.type_hash(ros.IMAGE))
@@ -135,7 +136,7 @@ def test_peers_see_our_node_and_its_endpoints_until_it_leaves(stranger: Any, end
 def test_an_endpoint_that_is_no_longer_used_is_gone(stranger: Any, routed: Join, dds_domain: int) -> None:
     middleware = routed()
     publisher = middleware.publisher("/brief", STRING, QoS())
-    assert any("%brief" in token for token in tokens_of(stranger, dds_domain))
+    until(lambda: any("%brief" in token for token in tokens_of(stranger, dds_domain)))
     del publisher
     until(lambda: not any("%brief" in token for token in tokens_of(stranger, dds_domain)))
 
@@ -187,6 +188,7 @@ def test_a_message_without_its_attachment_is_dropped_and_told_once(
         stranger.put(key, bytes(publisher.pack(text("x"))), attachment=attachment)
     publisher.send(publisher.pack(text("whole")))
     assert subscription.unpack(subscription.take(WAIT_S)).data == "whole"
+    until(lambda: subscription.take(0.05) is None and caplog.records)
     assert [record.getMessage()[:26] for record in caplog.records] == ["/topic: dropped a message:"]
 
 
