@@ -64,7 +64,9 @@ class ZenohActionServer(ServedAction[Asked]):
         status = ZenohPublisher(node, prefix + "status", STATUS_ARRAY, STATUS_QOS)
         results = ServiceServer(node, prefix + "get_result", type_name + "_GetResult", version, self._service_bell)
         cancels = ServiceServer(node, prefix + "cancel_goal", CANCEL_GOAL, version, self._service_bell)
-        goals = ServiceServer(node, prefix + "send_goal", type_name + "_SendGoal", version, self._goal_bell)
+        goals = ServiceServer(
+            node, prefix + "send_goal", type_name + "_SendGoal", version, self._goal_bell, most_bytes=0
+        )
         super().__init__(name, type_name, result_timeout_s, version, (goals, results, cancels), (feedback, status))
         self._told: set[str] = set()
         self.interrupt = self._goal_bell.interrupt

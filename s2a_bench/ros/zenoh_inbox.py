@@ -57,9 +57,10 @@ class Bell:
 class Inbox(Generic[Item]):
     """What has come in for one endpoint: the last ``depth`` items, all for 0."""
 
-    def __init__(self, name: str, bell: Bell, depth: int = 0) -> None:
-        """Start empty."""
+    def __init__(self, name: str, bell: Bell, depth: int = 0, most_bytes: int = 0) -> None:
+        """Start empty; it has room for `HELD_BYTES`, or as many as told."""
         self._name, self._bell, self._depth = name, bell, depth
+        self._most = most_bytes or HELD_BYTES
         self._items: deque[tuple[Item, int]] = deque()
         self._bytes, self._told = 0, False
 
@@ -69,14 +70,14 @@ class Inbox(Generic[Item]):
         with self._bell.condition:
             if self._depth and len(self._items) >= self._depth:
                 self._pop()
-            if full := self._bytes + size > HELD_BYTES:
+            if full := self._bytes + size > self._most:
                 told, self._told = self._told, True
             else:
                 self._items.append((item, size))
                 self._bytes += size
             self._bell.ring()
         if full and not told:
-            _log.warning("%s: messages are dropped: %d MiB wait to be taken", self._name, HELD_BYTES >> 20)
+            _log.warning("%s: messages are dropped: %d MiB wait to be taken", self._name, self._most >> 20)
         return not full
 
     def take(self) -> Item | None:

@@ -14,7 +14,7 @@ import zenoh
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import SERVICE_QOS, QoS
+from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, QoS
 from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
 from s2a_bench.ros.service import Offered
@@ -24,6 +24,8 @@ from s2a_bench.ros.zenoh_node import Node, direct, give_way, refusals
 from s2a_bench.ros.zenoh_topic import Stamps, plain_cdr
 
 BODY_AT: Final = CDR_HEADER
+SMALL_BYTES: Final = 16 * REQUEST_BYTES
+"""So much of a service's requests may wait, where they hold no pictures."""
 ANSWER_S: Final = 86_400.0
 """A query may wait so long for its reply, as that for a goal's result does; whoever calls waits less."""
 
@@ -42,13 +44,25 @@ class Asked:
 class ServiceServer:
     """The server's side of one service."""
 
-    def __init__(self, node: Node, name: str, type_name: str, version: str, bell: Bell, qos: QoS = SERVICE_QOS) -> None:
-        """Declare the queryable of ``/name``, then announce it; ``bell`` is rung by what arrives."""
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        type_name: str,
+        version: str,
+        bell: Bell,
+        qos: QoS = SERVICE_QOS,
+        most_bytes: int = SMALL_BYTES,
+    ) -> None:
+        """Declare the queryable of ``/name``, then announce it; ``bell`` is rung by what arrives.
+
+        Requests of ``most_bytes`` together may wait, with 0 as many as an inbox holds.
+        """
         self.type_name = type_name
         self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
         self._name, self._version = name, version
         self._key = names.key(node.domain_id, name, type_name, names.wire_hash(type_name, version))
-        self._inbox: Inbox[zenoh.Query] = Inbox(name, bell)
+        self._inbox: Inbox[zenoh.Query] = Inbox(name, bell, most_bytes=most_bytes)
         self._said = False
         held = ref(self._inbox)
 
@@ -173,7 +187,8 @@ class ServiceClient:
         """Return whether a server is there: one of our version that is reached, or only others."""
         hashes = [*self._node.peers(names.SERVICE, self._seen.entity)]
         if self._seen.entity.type_hash in hashes:
-            return bool(self._querier.matching_status.matching)
+            with refusals(self._name):
+                return bool(self._querier.matching_status.matching)
         return bool(hashes)
 
     def peer_type_hash(self) -> str:

@@ -84,8 +84,9 @@ class ZenohPublisher:
 
     def matched(self) -> int:
         """Count the subscriptions that are announced, once the router has told that there are any."""
-        if not (self._latched or self._publisher.matching_status.matching):
-            return 0
+        with refusals(self._topic):
+            if not (self._latched or self._publisher.matching_status.matching):
+                return 0
         return self._node.matching(names.SUBSCRIPTION, self._seen.entity)
 
 

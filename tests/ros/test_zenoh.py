@@ -321,6 +321,35 @@ def test_an_inbox_is_bounded_and_says_once_that_it_is_full(
     assert [*inbox.arrived()] == [0, 1, 2, 3]
     assert inbox.put(9, 1000)
     assert caplog.messages == ["/x: messages are dropped: 0 MiB wait to be taken"]
+    small: Any = zenoh_inbox.Inbox("/y", zenoh_inbox.Bell(), most_bytes=5000)
+    assert [small.put(number, 1000) for number in range(3)] == [True, True, False]
     last: Any = zenoh_inbox.Inbox("/x", zenoh_inbox.Bell(), depth=2)
     assert all(last.put(number, 1000) for number in range(9))
     assert [*last.arrived()] == [7, 8]
+
+
+def test_a_closed_middleware_is_told_of(join: Join) -> None:
+    middleware = join()
+    publisher, client = middleware.publisher("/topic", STRING, QoS()), middleware.service_client("/ask", GET_TYPES)
+    middleware.close()
+    with pytest.raises(TransportError, match=r"Zenoh: /topic: .*closed"):
+        publisher.send(publisher.pack(text("x")))
+    with pytest.raises(TransportError, match="no server of the service /ask appeared"):
+        client.call(ros.default(GET_TYPES + "_Request"), 0.05)
+    with pytest.raises(TransportError, match="the middleware is closed"):
+        middleware.subscription("/topic", STRING, QoS())
+
+
+def test_a_message_that_is_too_large_is_dropped_and_the_next_arrives(
+    endpoint: str, dds_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("s2a_bench.ros.zenoh_session.MESSAGE_BYTES", 1 << 20)
+    with ExitStack() as stack:
+        ends = [open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint, host)) for host in (True, False)]
+        for each in ends:
+            stack.callback(each.close)
+        publisher, subscription = ends[1].publisher("/x", STRING, QoS()), ends[0].subscription("/x", STRING, QoS(0))
+        wait_matched(publisher, subscription)
+        for value in ("a" * (3 << 20), "whole"):
+            publisher.send(publisher.pack(text(value)))
+        assert subscription.unpack(subscription.take(WAIT_S)).data == "whole"
