@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
@@ -13,10 +15,23 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import REQUEST_BYTES, Middleware, QoS, Rejected, Result, llama, open_middleware
+from s2a_bench.ros import (
+    MIDDLEWARES,
+    REQUEST_BYTES,
+    Accepted,
+    ActionClient,
+    Feedback,
+    Middleware,
+    QoS,
+    Rejected,
+    Result,
+    default_middleware,
+    llama,
+    open_middleware,
+)
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.router import Router, endpoint_of, free_endpoint
-from s2a_bench.testing.action import NAME, ActionSuite, event, offer, receive, start
+from s2a_bench.ros.router import Router, endpoint_of, free_endpoint, listens
+from s2a_bench.testing.action import NAME, ActionSuite, event, offer, receive, send, start, text_of
 from s2a_bench.testing.middleware import GET_TYPES, STRING, WAIT_S, Join, MiddlewareSuite, text, wait_matched
 
 zenoh = pytest.importorskip("zenoh", reason="the extra zenoh is not installed")
@@ -353,3 +368,64 @@ def test_a_message_that_is_too_large_is_dropped_and_the_next_arrives(
         for value in ("a" * (3 << 20), "whole"):
             publisher.send(publisher.pack(text(value)))
         assert subscription.unpack(subscription.take(WAIT_S)).data == "whole"
+
+
+SERVER_PROCESS = """
+import sys
+from s2a_bench.ros import llama, open_middleware
+from s2a_bench.ros.router import Router
+middleware = open_middleware("zenoh", domain_id=int(sys.argv[1]), router=Router(sys.argv[2], host=True))
+server = middleware.action_server(sys.argv[3], llama.GENERATE_RESPONSE)
+goal = server.next_goal(60)
+goal.accept()
+words = goal.unpack().prompt.split()
+goal.executing()
+for number, word in enumerate(words):
+    goal.feedback(llama.token_feedback(word, number))
+goal.succeed(llama.text_result(" ".join(words)))
+sys.stdin.read()
+"""
+
+
+def test_a_server_that_was_the_router_may_die_and_come_back(endpoint: str, dds_domain: int) -> None:
+    words = [f"word{number}" for number in range(200)]
+
+    def served() -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-c", SERVER_PROCESS, str(dds_domain), endpoint, NAME]
+        return subprocess.Popen(command, stdin=subprocess.PIPE)
+
+    def answers(client: ActionClient) -> None:
+        assert client.wait_for_server(WAIT_S)
+        sent = send(client, " ".join(words))
+        assert event(client, Accepted).goal_id == sent
+        assert [text_of(client, event(client, Feedback)) for _ in words] == words
+        assert client.unpack_result(event(client, Result).packed).response.text == " ".join(words)
+
+    with served() as server:
+        until(lambda: listens(endpoint))
+        middleware = open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint))
+        client = middleware.action_client(NAME, llama.GENERATE_RESPONSE)
+        answers(client)
+        server.kill()
+    until(lambda: not client.server_present())
+    with served() as server:
+        answers(client)
+        server.kill()
+    middleware.close()
+
+
+def test_a_missing_package_is_named_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(MIDDLEWARES, "zenoh", "s2a_bench.ros.no_such_module:X")
+    with pytest.raises(TransportError, match=r"zenoh is not installed.*pip install 's2a-bench\[zenoh\]'"):
+        open_middleware("zenoh")
+
+
+@pytest.mark.parametrize(
+    ("there", "expected"),
+    [({"cyclonedds", "zenoh"}, "cyclonedds"), ({"zenoh"}, "zenoh"), ({"cyclonedds"}, "cyclonedds"), ((), "cyclonedds")],
+)
+def test_zenoh_is_the_default_where_it_alone_is_there(
+    there: set[str], expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("s2a_bench.ros.find_spec", lambda name: name in there or None)
+    assert default_middleware({}) == expected
