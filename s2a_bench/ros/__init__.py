@@ -310,18 +310,14 @@ ROUTED = frozenset({"zenoh"})
 """Middlewares whose nodes meet at a router."""
 WAYS_OUT = {
     "cyclonedds": "it has wheels for x86-64 only: elsewhere use --middleware zenoh (pip install 's2a-bench[zenoh]'), "
-    "or source a ROS 2 installation, whose rclpy is taken then "
-    "(source /opt/ros/<distribution>/setup.bash), or leave ros out of --transport",
+    "or the rclpy of a ROS 2 (source /opt/ros/<distribution>/setup.bash), or leave ros out of --transport",
     "rclpy": "it comes with ROS 2: source /opt/ros/<distribution>/setup.bash, or use --middleware cyclonedds",
     "zenoh": "pip install 's2a-bench[zenoh]', or use --middleware cyclonedds",
 }
 
 
 def default_middleware(environ: Mapping[str, str]) -> str:
-    """Choose rclpy inside a sourced ROS 2 environment whose rclpy this Python finds, else what PyPI has for this CPU.
-
-    That is cyclonedds, and zenoh where only that is installed.
-    """
+    """Choose rclpy inside a sourced ROS 2 environment that has it for this Python, else cyclonedds, else zenoh."""
     sourced = environ.get("ROS_DISTRO") and environ.get("AMENT_PREFIX_PATH")
     if sourced and find_spec("rclpy"):
         return "rclpy"
