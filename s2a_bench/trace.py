@@ -10,7 +10,7 @@ first token seen by the client is the mark `return`. Everything is in integer na
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
@@ -33,6 +33,7 @@ GROUPS: tuple[str, ...] = (
 STAGES: dict[str, str] = {
     "capture": "capture",
     "convert": "encode",
+    "resize": "encode",
     "image_encode": "encode",
     "connect": "network",
     "network": "network",
@@ -93,6 +94,19 @@ class Remote:
     provenance: dict[str, str] = field(default_factory=dict)
     """Who answered, as `provenance.Provenance` has it; empty where the server does not tell."""
 
+    @staticmethod
+    def of_json(value: Mapping[str, Any]) -> Remote:
+        """Read what a server sent as JSON; raises ValueError, KeyError or TypeError for what can be none."""
+        return Remote(
+            clock=value["clock"],
+            marks=[(stage, stamp) for stage, stamp in value["marks"]],
+            token_ns=value["token_ns"],
+            frame_stamp_ns=value["frame_stamp_ns"],
+            frame_marks=[(stage, stamp) for stage, stamp in value["frame_marks"]],
+            facts=value["facts"],
+            provenance=value.get("provenance", {}),
+        ).check()
+
     def check(self) -> Remote:
         """Return it; raises ValueError for what came from outside and can be no server's marks."""
         marks = [*self.marks, *self.frame_marks]
@@ -113,10 +127,11 @@ class Trace:
 
     ``token_ns`` holds the times at which tokens left the engine; ``facts`` what the engine or a black-box server
     says about itself (llama.cpp's ``timings`` and the like); a client's ``remote`` what the server sent back.
-    ``odd`` holds the names of what it said that can be no fact.
+    ``odd`` holds the names of what it said that can be no fact. ``later`` holds facts that take time to find: they are
+    computed once the answer is on its way.
     """
 
-    __slots__ = ("facts", "frame_marks", "frame_stamp_ns", "marks", "odd", "provenance", "remote", "token_ns")
+    __slots__ = ("facts", "frame_marks", "frame_stamp_ns", "later", "marks", "odd", "provenance", "remote", "token_ns")
 
     def __init__(self) -> None:
         """Start empty."""
@@ -124,6 +139,7 @@ class Trace:
         self.token_ns: list[int] = []
         self.facts: dict[str, float] = {}
         self.odd: set[str] = set()
+        self.later: dict[str, Callable[[], float]] = {}
         self.remote: Remote | None = None
         self.frame_stamp_ns = -1
         self.frame_marks: list[Mark] = []
@@ -149,7 +165,9 @@ class Trace:
                 self.odd.add(name)
 
     def to_remote(self) -> Remote:
-        """Return what a server sends back about this request."""
+        """Return what a server sends back about this request, last of all."""
+        self.facts |= {name: find() for name, find in self.later.items()}
+        self.later = {}
         frame = self.frame_stamp_ns, self.frame_marks
         facts = {str(name): value for name, value in self.facts.items()}  # not every serialiser takes a subclass of str
         return Remote(clock_id(), self.marks, self.token_ns, *frame, facts, self.provenance)

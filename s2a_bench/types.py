@@ -1,15 +1,17 @@
-"""The nouns every package shares: a frame, a request about frames, a token of the answer."""
+"""The nouns every package shares: a frame, a request about frames, a piece of the answer: a token or an action."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
 Pixels: TypeAlias = "NDArray[np.uint8]"
+Vector: TypeAlias = "NDArray[np.float32]"
 
 Bayer: TypeAlias = Literal["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"]
 Yuv: TypeAlias = Literal["yuv422_yuy2", "yuv422", "nv12", "nv21"]
@@ -42,10 +44,12 @@ Sampling: TypeAlias = "tuple[tuple[str, float], ...]"
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One question to a model: a prompt about zero or more pictures.
+    """One question to a model: a prompt about zero or more pictures and the robot's state.
 
     A client receives it with frames as captured; a handler and an engine receive it with ``rgb8`` frames.
-    ``grammar`` is GBNF text (llama.cpp ``grammars/README.md``); an empty string means none.
+    ``max_tokens`` is the most pieces of the answer, tokens or actions. ``grammar`` is GBNF text (llama.cpp
+    ``grammars/README.md``); an empty string means none. ``state`` is what a policy is told of the robot (joint angles,
+    gripper) in the robot's own units, each a float32; empty: nothing.
     """
 
     id: str
@@ -55,6 +59,7 @@ class Request:
     grammar: str = ""
     seed: int = 0
     sampling: Sampling = ()
+    state: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,3 +69,24 @@ class Token:
     index: int
     text: str
     id: int = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Action:
+    """One piece of a policy's answer: what the robot does in one control tick, as part of a chunk of such.
+
+    ``index`` counts ticks of the chunk from 0; ``values`` is float32 (D,), in the robot's own units.
+    """
+
+    index: int
+    values: Vector
+    id: ClassVar[int] = -1
+
+    @property
+    def text(self) -> str:
+        """Return the values as a JSON list, each as short as reads back to the same float32."""
+        return json.dumps([float(str(value)) for value in self.values])
+
+
+Piece: TypeAlias = Token | Action
+"""What an answer is made of; all pieces of one answer are of one kind."""

@@ -13,18 +13,18 @@ from pydantic import create_model
 from s2a_bench.cli.adapter import command, flags_of
 from s2a_bench.cli.ros_args import read as read_ros_args
 from s2a_bench.errors import UsageError
-from s2a_bench.inference import EngineConfig
+from s2a_bench.inference import ACTING, ANSWERS, EngineConfig, acts
 from s2a_bench.options import Options, group, option, placed, places
 from s2a_bench.toml_file import loads
-from s2a_bench.transport import TRANSPORTS, Transport, Wiring
+from s2a_bench.transport import ACTIONS, TRANSPORTS, Transport, Wiring
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.options import sides
-from s2a_bench.transport.pipeline import one_pipeline
+from s2a_bench.transport.pipeline import Pipeline, answer_over, one_pipeline
 
 if TYPE_CHECKING:
     from s2a_bench.harness.processes import ServerProcess
 
-ENGINE = ("name", "model", "mmproj", "threads", "gpu_layers", "context", "profile", "gaps")
+ENGINE = ("name", "model", "mmproj", "threads", "gpu_layers", "context", "profile", "gaps", *ANSWERS)
 """The engine's options that a server has flags for."""
 Sorted: TypeAlias = "tuple[dict[str, Any], dict[str, Any], dict[str, Any]]"
 _NUMBER = EngineConfig.model_fields["threads"]
@@ -77,8 +77,8 @@ def _serve(config: Any) -> None:
     chosen = TRANSPORTS[config.pipeline.partition("?")[0].partition("/")[0]]
     own = getattr(config, chosen.name, None)
     for other, _ in TRANSPORTS.loaded():
-        if other != chosen.name and (given := [*getattr(config, other, Options()).given()]):
-            raise UsageError(f"`{given[0]}` is no option of {chosen.name}; it has {', '.join(_told(chosen))}")
+        if stray := [each for each in getattr(config, other, Options()).given() if each not in _told(chosen)]:
+            raise UsageError(f"`{stray[0]}` is no option of {chosen.name}; it has {', '.join(_told(chosen))}")
     flags = {name: getattr(own, name) for name in own.given()} if own else {}
     values = _toml(config.config) if config.config else {}
     of_engine, of_transport, of_limits = _sorted(values, f"`config` {config.config}", chosen)
@@ -91,7 +91,18 @@ def _serve(config: Any) -> None:
     engine = {name: getattr(config.engine, name) for name in config.engine.given()}
     limits = Limits(**{**of_limits, **{name: getattr(config.limits, name) for name in config.limits.given()}})
     pipeline = one_pipeline(config.pipeline, **{**chosen.serving, **of_transport, **flags})
-    _run(pipeline.wiring(chosen.bind(pipeline.options, ()), limits=limits), EngineConfig(**{**of_engine, **engine}))
+    told = EngineConfig(**{**of_engine, **engine})
+    _run(pipeline.wiring(chosen.bind(pipeline.options, ()), limits=limits), _answering(told, pipeline))
+
+
+def _answering(engine: EngineConfig, pipeline: Pipeline) -> EngineConfig:
+    """Return the engine, told what to answer with; raises UsageError for one that cannot."""
+    answer = answer_over(engine.answer, [pipeline])
+    if answer == ACTIONS and not acts(engine.name):
+        raise UsageError(
+            f"`engine` {engine.name} answers with tokens, and {pipeline.name} carries actions; use `engine` {ACTING}"
+        )
+    return engine.but(answer=answer)
 
 
 def _toml(path: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from s2a_bench.transport.ros import ROS
 from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA, FRAME_ID
 from s2a_bench.transport.ros.options import NAMESPACE
 from s2a_bench.transport.ros.wire import request_message, token_message
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.types import Frame, Piece, Request
 
 
 class RunRecorder:
@@ -40,7 +40,7 @@ class RunRecorder:
             message = ros.compressed_image_message(frame.data, stamp_ns, FRAME_ID, frame.encoding)
             self._recorder.write(self._namespace + COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE, message, stamp_ns)
 
-    def answer(self, cell: str, request: Request, asked_ns: int, tokens: list[tuple[Token, int]], error: str) -> None:
+    def answer(self, cell: str, request: Request, asked_ns: int, tokens: list[tuple[Piece, int]], error: str) -> None:
         """Note a request and its tokens with the times at which the client saw them (CLOCK_MONOTONIC)."""
         topic = f"{self._namespace}/{re.sub('[^A-Za-z0-9/]', '_', cell)}"
         self._recorder.write(topic + "/request", ros.REQUEST, request_message(request), asked_ns + self._offset_ns)

@@ -85,7 +85,7 @@ class ServerSet:
             process = self._start_program(program, log)
         else:
             wiring = self._wiring(pipeline, address)
-            process = OwnServer(name, ServerJob(wiring, config.engine, tuned=config.tuned), log)
+            process = OwnServer(name, ServerJob(wiring, config.served_engine, tuned=config.tuned), log)
         return _Running(name, address, self._stack.enter_context(process))
 
     def _start_program(self, program: Program, log: Path) -> ServerProcess:
@@ -94,7 +94,7 @@ class ServerSet:
 
     def _serve_here(self, wiring: Wiring[Any]) -> str:
         """Serve on a thread of this process, and return the address."""
-        engine = open_engine(self._config.engine)
+        engine = open_engine(self._config.served_engine)
         self._stack.callback(engine.close)
         self._local_engine = engine.describe()
         server = open_server(wiring, engine_handler(engine, limits=wiring.limits))
@@ -104,7 +104,7 @@ class ServerSet:
 
     def _wiring(self, pipeline: Pipeline, address: str) -> Wiring[Any]:
         config = self._config
-        told = {"timeout_s": config.timeout_s, "deadline_s": config.deadline_s, "max_tokens": config.max_tokens}
+        told = {"timeout_s": config.timeout_s, "deadline_s": config.deadline_s, "max_tokens": config.most_pieces}
         return pipeline.wiring(address, limits=RUN_LIMITS, **told)
 
     def wiring(self, pipeline: Pipeline) -> Wiring[Any]:

@@ -1,10 +1,10 @@
-"""What answers: an Engine turns a request with RGB pictures into a stream of tokens."""
+"""What answers: an Engine turns a request with RGB pictures into a stream of tokens, or of actions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Final, Protocol
+from typing import Annotated, Final, Literal, Protocol
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
@@ -12,7 +12,7 @@ from s2a_bench.facts import Fact
 from s2a_bench.inference.llama_settings import FLASH_ATTENTION, KV_TYPES, LARGEST, LEAST_BATCH, LEAST_CONTEXT, SAMPLINGS
 from s2a_bench.options import Options, one_of, option
 from s2a_bench.registry import Registry
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request
 
 
 class Engine(Protocol):
@@ -23,8 +23,8 @@ class Engine(Protocol):
         """Return what it tells of the last request, as llama.cpp's ``timings``: those that its class declares."""
         ...
 
-    def generate(self, request: Request) -> Iterator[Token]:
-        """Yield the answer's tokens, at most ``request.max_tokens``; closing the iterator cancels the rest.
+    def generate(self, request: Request) -> Iterator[Piece]:
+        """Yield the answer's pieces, at most ``request.max_tokens``; closing the iterator cancels the rest.
 
         Pictures are ``rgb8``. Raises EngineError for a request that cannot be answered (a bad grammar,
         a prompt longer than the context).
@@ -55,6 +55,13 @@ CHECKS: dict[str, str] = {"llama-build": "s2a_bench.inference.checks:llama_build
 """Code -> ``module:function`` of the doctor's checks that are about engines."""
 
 
+ANSWERS: Final = ("answer", "horizon", "action_dim")
+"""The options that say what an answer is made of."""
+
+ACTING: Final = "echo or replay"
+"""The engines that answer with actions, for errors."""
+
+
 class EngineConfig(Options):
     """Which engine, on which files, with which settings; plain data, so that a server process can be told."""
 
@@ -78,6 +85,11 @@ class EngineConfig(Options):
     sampling: Annotated[str, one_of(lambda: SAMPLINGS)] = option(
         "model", "model (as its authors recommend), greedy (the likeliest token)"
     )
+    answer: Literal["auto", "tokens", "actions"] = option(
+        "auto", "tokens, actions (chunks, as policies answer), auto (actions where a transport carries nothing else)"
+    )
+    horizon: int = option(16, "actions of a chunk", ge=1, le=4096)
+    action_dim: int = option(7, "numbers of an action", ge=1, le=1024)
     pace: float | None = option(
         None, "hold the answer back to so many tokens/s [default: the model's own]", gt=0, le=10_000
     )
@@ -89,6 +101,23 @@ class EngineConfig(Options):
                 f"`kv_type` {self.kv_type} needs flash attention, which alone reads a quantised V cache; "
                 "leave out `flash_attention` off"
             )
+        if self.chunks and "name" in self.model_fields_set and not acts(self.name):
+            raise UsageError(f"`answer`: `engine` {self.name} answers with tokens alone; use `engine` {ACTING}")
+
+    @property
+    def chunks(self) -> bool:
+        """Whether it answers with actions."""
+        return self.answer == "actions"
+
+    @property
+    def pieces(self) -> str:
+        """Return what an answer of actions is, in words."""
+        return f"{self.horizon} actions of {self.action_dim}"
+
+
+def acts(name: str) -> bool:
+    """Whether an engine can answer with actions."""
+    return bool(getattr(ENGINES[name], "acts", False))
 
 
 def told_by(name: str) -> Sequence[Fact]:

@@ -7,11 +7,14 @@ from itertools import cycle, islice
 
 from s2a_bench.errors import EngineError
 from s2a_bench.inference import EngineConfig
-from s2a_bench.types import Request, Token
+from s2a_bench.inference.chunk import chunk
+from s2a_bench.types import Piece, Request, Token
 
 
 class EchoEngine:
-    """Says the prompt's words again and again until ``max_tokens``; pictures and grammar are ignored."""
+    """Says the prompt's words again and again until ``max_tokens``, or a chunk of actions; the rest is ignored."""
+
+    acts = True
 
     def __init__(self, config: EngineConfig) -> None:
         """Take the settings for their name only."""
@@ -19,17 +22,21 @@ class EchoEngine:
         self._config = config
         self._closed = False
 
-    def generate(self, request: Request) -> Iterator[Token]:
-        """Yield the prompt's words as tokens; an empty prompt is answered with "echo"."""
+    def generate(self, request: Request) -> Iterator[Piece]:
+        """Yield the prompt's words as tokens, where there are none "echo"; or the actions of a chunk."""
         if self._closed:
             raise EngineError("echo: the engine is closed; open a new one")
+        if self._config.chunks:
+            yield from chunk(self._config, request)
+            return
         words = request.prompt.split() or ["echo"]
         for index, word in enumerate(islice(cycle(words), max(0, request.max_tokens))):
             yield Token(index, word if index == 0 else f" {word}")
 
     def describe(self) -> dict[str, str | int | float | bool]:
         """Say that nothing but an echo answers."""
-        return {"engine": self._config.name, "model": "none", "dummy": True}
+        chunks = {"answer": self._config.pieces} if self._config.chunks else {}
+        return {"engine": self._config.name, "model": "none", "dummy": True, **chunks}
 
     def close(self) -> None:
         """Refuse further requests."""

@@ -19,7 +19,7 @@ from s2a_bench.errors import EngineError
 from s2a_bench.facts import LLAMA
 from s2a_bench.inference import Engine, EngineConfig
 from s2a_bench.inference.llama_settings import PENALTY_LAST_N, SAMPLER_ARGUMENTS
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request
 
 AHEAD = 8
 """Tokens that may wait for who reads, before the engine waits too."""
@@ -30,12 +30,12 @@ class _Answer:
 
     def __init__(self) -> None:
         self.wanted = True
-        self._tokens: SimpleQueue[Token | None] = SimpleQueue()
+        self._tokens: SimpleQueue[Piece | None] = SimpleQueue()
         self._places: SimpleQueue[None] = SimpleQueue()  # a semaphore, but one in C
         for _ in range(AHEAD):
             self._places.put(None)
 
-    def write(self, tokens: Iterator[Token]) -> None:
+    def write(self, tokens: Iterator[Piece]) -> None:
         """Compute tokens while they are wanted; raises what the engine raises."""
         try:
             while self._room() and (token := next(tokens, None)) is not None:
@@ -49,7 +49,7 @@ class _Answer:
         self._places.get()
         return self.wanted
 
-    def read(self) -> Iterator[Token]:
+    def read(self) -> Iterator[Piece]:
         """Yield the tokens until the engine has no more."""
         while (token := self._tokens.get()) is not None:
             self._places.put(None)
@@ -80,7 +80,7 @@ class OneThreadEngine:
         """Return the engine's own facts about the last request."""
         return self._engine.facts
 
-    def generate(self, request: Request) -> Generator[Token, None, None]:
+    def generate(self, request: Request) -> Generator[Piece, None, None]:
         """Yield the engine's tokens, which it computes ahead; a later request ends this one, as does leaving early."""
         self._answer.cancel()
         answer = self._answer = _Answer()

@@ -6,7 +6,7 @@ from collections.abc import Generator, Iterator
 
 from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.inference import Engine
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request
 
 
 class PacedEngine:
@@ -26,7 +26,7 @@ class PacedEngine:
         """Return the engine's own facts about the last request."""
         return self._engine.facts
 
-    def generate(self, request: Request) -> Iterator[Token]:
+    def generate(self, request: Request) -> Iterator[Piece]:
         """Yield the engine's tokens, each at its time or later."""
         first_ns = 0
         tokens = self._engine.generate(request)

@@ -17,7 +17,8 @@ from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import EngineError, UsageError
 from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_MS
 from s2a_bench.inference import EngineConfig
-from s2a_bench.types import Request, Token
+from s2a_bench.inference.chunk import chunk
+from s2a_bench.types import Piece, Request, Token
 
 if TYPE_CHECKING:
     import numpy as np
@@ -77,25 +78,27 @@ def _settings(config: EngineConfig) -> tuple[Profile, str, Draw]:
 
 
 class ReplayEngine:
-    """Says numbered skill calls of six tokens each, at a profile's speed; pictures and grammar are ignored.
+    """Says numbered skill calls of six tokens each, or actions, at a profile's speed; the rest is ignored.
 
     Text depends on ``request.seed`` alone. Times are drawn from the seed and the number of requests before, as equal
     times for all requests of a run would hide the spread; a recording goes on where the request before ended.
     """
 
     tells = (PROMPT_MS, PREDICTED_N, PREDICTED_MS)
+    acts = True
 
     def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
         """Load the profile; raises UsageError for what `check_replay` refuses."""
         self.facts: dict[str, float] = {}
         self._profile, self._gaps, self._draw = _settings(config)
+        self._config = config
         self._clock = clock or SystemClock()
         self._requests = 0
         self._played = 0
         self._closed = False
 
-    def generate(self, request: Request) -> Iterator[Token]:
-        """Yield tokens at their time until ``max_tokens``."""
+    def generate(self, request: Request) -> Iterator[Piece]:
+        """Yield pieces, each at the time of a token, until ``max_tokens``."""
         if self._closed:
             raise EngineError("replay: the engine is closed; open a new one")
         if request.max_tokens <= 0:
@@ -106,15 +109,22 @@ class ReplayEngine:
         rng = np.random.default_rng((request.seed % 2**32, self._requests))
         self._requests += 1
         prompt_s = self._prompt_s(rng)
-        gaps_s = [prompt_s + self._profile.gaps.mean_s, *self._draw(rng, request.max_tokens - 1, self._played)]
+        pieces = list(self._pieces(request))
+        gaps_s = [prompt_s + self._profile.gaps.mean_s, *self._draw(rng, len(pieces) - 1, self._played)]
         due_ns = accumulate(round(gap * 1e9) for gap in gaps_s)
         self.facts = {PROMPT_MS: prompt_s * 1e3, PREDICTED_N: 0.0, PREDICTED_MS: 0.0}
-        for index, (text, due) in enumerate(zip(islice(_plan(request.seed), request.max_tokens), due_ns, strict=True)):
+        for index, (piece, due) in enumerate(zip(pieces, due_ns, strict=True)):
             self._clock.sleep_until_ns(started_ns + due)
             self._played += index > 0
             self.facts[PREDICTED_N] = float(index + 1)
             self.facts[PREDICTED_MS] = (self._clock.now_ns() - started_ns) / 1e6 - self.facts[PROMPT_MS]
-            yield Token(index, text)
+            yield piece
+
+    def _pieces(self, request: Request) -> Iterator[Piece]:
+        """Yield the answer, without its times."""
+        if self._config.chunks:
+            return chunk(self._config, request)
+        return (Token(index, text) for index, text in enumerate(islice(_plan(request.seed), request.max_tokens)))
 
     def _prompt_s(self, rng: np.random.Generator) -> float:
         profile = self._profile
@@ -138,6 +148,7 @@ class ReplayEngine:
             "tokens_per_s": profile.tokens_per_s,
             "prompt_s": profile.prompt_s,
             "grammar": "ignored",
+            **({"answer": self._config.pieces} if self._config.chunks else {}),
         }
 
     def close(self) -> None:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 CDR_HEADER = 4
 REQUEST = "s2a_msgs/msg/Request"
 TOKEN = "s2a_msgs/msg/Token"  # noqa: S105 - a type name
+ACTIONS = "s2a_msgs/msg/Actions"
 MARKS = "s2a_msgs/msg/Marks"
 PROVENANCE = "s2a_msgs/msg/Provenance"
 IMAGE = "sensor_msgs/msg/Image"
@@ -184,6 +185,11 @@ def int64_array(values: Iterable[int]) -> NDArray[Any]:
 def float64_array(values: Iterable[float]) -> NDArray[Any]:
     """Make what rosbags wants for a ``float64[]`` field."""
     return np.fromiter(values, np.float64)
+
+
+def float32_array(values: Iterable[float]) -> NDArray[Any]:
+    """Make what rosbags wants for a ``float32[]`` field."""
+    return np.fromiter(values, np.float32)
 
 
 def stamp(stamp_ns: int) -> Any:

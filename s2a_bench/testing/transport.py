@@ -14,7 +14,7 @@ A package that offers a transport tests it like this, once for each of its varia
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from threading import Thread
@@ -27,22 +27,32 @@ from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import GROUPS, RESIDUAL, STAGES, Trace, budget, path_of
-from s2a_bench.transport import TRANSPORTS, Client, Handler, Transport, Wiring, open_client, open_server
+from s2a_bench.transport import (
+    ACTIONS,
+    TOKENS,
+    TRANSPORTS,
+    Client,
+    Handler,
+    Transport,
+    Wiring,
+    open_client,
+    open_server,
+)
 from s2a_bench.transport.pipeline import one_pipeline, pipelines
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.types import Action, Frame, Piece, Request, Token
 
 Connect = Callable[[Handler], Client]
 
 
 class Recorder:
-    """A handler that remembers what it got and answers what it is told."""
+    """A handler that remembers what it got and answers what it is told: texts, or the actions of an array (H, D)."""
 
-    def __init__(self, answer: list[str]) -> None:
+    def __init__(self, answer: Sequence[Any]) -> None:
         self.answer = answer
         self.requests: list[Request] = []
         self.fail_at: int | None = None
 
-    def __call__(self, request: Request, trace: Trace) -> Generator[Token, None, None]:
+    def __call__(self, request: Request, trace: Trace) -> Generator[Piece, None, None]:
         self.requests.append(request)
         for index, text in enumerate(self.answer):
             if index == self.fail_at:
@@ -51,7 +61,9 @@ class Recorder:
             if not index:
                 trace.marks.append(("inference", now))
             trace.token_ns.append(now)
-            yield Token(index, text, 7 + index)
+            yield (
+                Token(index, text, 7 + index) if isinstance(text, str) else Action(index, np.asarray(text, np.float32))
+            )
         if self.fail_at == len(self.answer):
             raise EngineError("the engine has had enough")
         trace.facts[PROMPT_N] = 12.0
@@ -63,7 +75,7 @@ def yuyv_frame(width: int = 64, height: int = 48, seed: int = 0) -> Frame:
     return Frame(seed, now_ns(), width, height, "yuv422_yuy2", data)
 
 
-def ask(client: Client, request: Request) -> tuple[list[Token], Trace]:
+def ask(client: Client, request: Request) -> tuple[list[Piece], Trace]:
     """Make one request the way a session does."""
     trace = Trace()
     trace.mark(RESIDUAL)
@@ -110,6 +122,10 @@ class TransportSuite:
     lossless = True
     """Whether the engine should see the camera's very pixels."""
     carries_id_and_limit = True
+    carries: ClassVar[frozenset[str]] = frozenset({"grammar", "seed"})
+    """The further fields of a request that reach the handler."""
+    whole = False
+    """Whether an answer is sent as one piece: then none of it comes before a break."""
 
     @pytest.fixture
     def told(self) -> Wiring[Any]:
@@ -123,6 +139,12 @@ class TransportSuite:
     @pytest.fixture
     def transport(self, told: Wiring[Any]) -> Transport[Any]:
         return TRANSPORTS[told.transport]
+
+    def handler(self, told: Wiring[Any], words: Sequence[str]) -> Recorder:
+        """A handler that answers with words, or where those cannot travel with as many actions."""
+        if TOKENS in TRANSPORTS[told.transport].answers(told.variant, told.options):
+            return Recorder(words)
+        return Recorder([[place / 8, -place] for place in range(len(words))])
 
     def test_it_is_found_by_the_name_that_it_declares(self, transport: Transport[Any], told: Wiring[Any]) -> None:
         assert transport.name == told.transport
@@ -149,7 +171,8 @@ class TransportSuite:
         for cell in pipelines([transport.name], said):
             assert pipelines([cell.name], said) == [cell]
 
-    def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect) -> None:
+    def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect, told: Wiring[Any]) -> None:
+        self._needs(TOKENS, told)
         client = connect(Recorder(["go", "_to(", "キッチン", ")\n", ""]))
         tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),)))
         assert [(token.index, token.text, token.id) for token in tokens] == [
@@ -160,17 +183,46 @@ class TransportSuite:
             (4, "", 11),
         ]
 
-    def test_every_field_of_a_request_reaches_the_handler(self, connect: Connect) -> None:
-        handler = Recorder(["x"])
+    def test_actions_arrive_in_order_with_every_bit(self, connect: Connect, told: Wiring[Any]) -> None:
+        self._needs(ACTIONS, told)
+        chunk = np.random.default_rng(5).normal(size=(16, 7)).astype(np.float32)
+        chunk[0, :3] = 1e-42, 3.4e38, -0.0
+        actions, trace = ask(connect(Recorder(list(chunk))), Request("a", "plan", (yuyv_frame(),), max_tokens=16))
+        assert [action.index for action in actions] == list(range(16))
+        got = np.stack([action.values for action in actions if isinstance(action, Action)])
+        assert got.dtype == np.float32
+        assert got.tobytes() == chunk.tobytes()
+        assert trace.remote is not None
+        assert len(trace.remote.token_ns) == 16
+        assert trace.chain()[-1][0] == "return"
+
+    def test_several_pictures_and_the_state_reach_the_handler(self, connect: Connect, told: Wiring[Any]) -> None:
+        handler = self.handler(told, ["x"])
+        state = (0.5, -1.25, 3.0) if TRANSPORTS[told.transport].takes_state(told.variant, told.options) else ()
+        frames = tuple(yuyv_frame(width, height, seed=width) for width, height in ((64, 48), (32, 32), (48, 64)))
+        ask(connect(handler), Request("a", "plan", frames, state=state))
+        (got,) = handler.requests
+        assert got.state == state
+        assert [image.data.shape for image in got.images] == [(48, 64, 3), (32, 32, 3), (64, 48, 3)]
+
+    @staticmethod
+    def _needs(kind: str, told: Wiring[Any]) -> None:
+        if kind not in TRANSPORTS[told.transport].answers(told.variant, told.options):
+            pytest.skip(f"{told.transport}/{told.variant} does not carry {kind}")
+
+    def test_every_field_of_a_request_reaches_the_handler(self, connect: Connect, told: Wiring[Any]) -> None:
+        handler = self.handler(told, ["x"])
         sent = Request("id-7", 'Grüße,\n"robot"\t机器人', (), max_tokens=9, grammar='root ::= "x"\n', seed=42)
         ask(connect(handler), sent)
         (got,) = handler.requests
-        assert got == (sent if self.carries_id_and_limit else replace(sent, id=got.id, max_tokens=got.max_tokens))
+        expected = sent if self.carries_id_and_limit else replace(sent, id=got.id, max_tokens=got.max_tokens)
+        lost = {"grammar": "", "seed": 0}
+        assert got == replace(expected, **{name: lost[name] for name in lost.keys() - self.carries})  # type: ignore[arg-type]
 
-    def test_the_picture_arrives_as_rgb(self, connect: Connect) -> None:
+    def test_the_picture_arrives_as_rgb(self, connect: Connect, told: Wiring[Any]) -> None:
         import cv2
 
-        handler = Recorder(["x"])
+        handler = self.handler(told, ["x"])
         frame = yuyv_frame(seed=3)
         ask(connect(handler), Request("a", "", (frame,)))
         (image,) = handler.requests[0].images
@@ -180,8 +232,10 @@ class TransportSuite:
         if self.lossless:
             np.testing.assert_array_equal(image.data, expected)
 
-    def test_stages_and_residual_sum_to_the_whole(self, connect: Connect, transport: Transport[Any]) -> None:
-        client = connect(Recorder(["x", "y"]))
+    def test_stages_and_residual_sum_to_the_whole(
+        self, connect: Connect, transport: Transport[Any], told: Wiring[Any]
+    ) -> None:
+        client = connect(self.handler(told, ["x", "y"]))
         begin = now_ns()
         _, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
         end = now_ns()
@@ -194,8 +248,8 @@ class TransportSuite:
         assert all(duration >= 0 for duration in spent.stages_ns.values())
         assert {"inference", "return"} <= set(spent.stages_ns)
 
-    def test_the_servers_marks_come_back(self, connect: Connect) -> None:
-        _, trace = ask(connect(Recorder(["x", "y", "z"])), Request("a", "plan"))
+    def test_the_servers_marks_come_back(self, connect: Connect, told: Wiring[Any]) -> None:
+        _, trace = ask(connect(self.handler(told, ["x", "y", "z"])), Request("a", "plan"))
         assert trace.remote is not None
         assert trace.remote.clock == clock_id()
         assert len(trace.remote.token_ns) == 3
@@ -205,48 +259,51 @@ class TransportSuite:
     def test_every_fact_that_it_tells_is_declared(
         self, connect: Connect, transport: Transport[Any], told: Wiring[Any]
     ) -> None:
-        _, trace = ask(connect(Recorder(["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
+        _, trace = ask(connect(self.handler(told, ["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
         assert set(trace.facts) <= {*transport.told(told.options), PROMPT_N}  # which the handler tells
         assert all(fact.about for fact in transport.told(told.options))
 
-    def test_an_engine_that_refuses_fails_this_request_only(self, connect: Connect) -> None:
-        handler = Recorder(["x"])
+    def test_an_engine_that_refuses_fails_this_request_only(self, connect: Connect, told: Wiring[Any]) -> None:
+        handler = self.handler(told, ["x"])
         client = connect(handler)
         handler.fail_at = 0
         with pytest.raises(RequestFailed, match="the engine has had enough"):
             ask(client, Request("a", "plan"))
         handler.fail_at = None
         tokens, _ = ask(client, Request("b", "plan"))
-        assert [token.text for token in tokens] == ["x"]
+        assert len(tokens) == 1
 
     @pytest.mark.parametrize("fail_at", [1, 2, 3])
-    def test_tokens_before_a_break_are_seen(self, connect: Connect, fail_at: int) -> None:
-        handler = Recorder(["a", "b", "c"])
+    def test_tokens_before_a_break_are_seen(self, connect: Connect, told: Wiring[Any], fail_at: int) -> None:
+        handler = self.handler(told, ["a", "b", "c"])
         handler.fail_at = fail_at
-        seen: list[str] = []
+        seen: list[int] = []
         with pytest.raises(RequestFailed, match="the engine has had enough"):
-            seen.extend(token.text for token in connect(handler).request(Request("a", "plan"), Trace()))
+            seen.extend(token.index for token in connect(handler).request(Request("a", "plan"), Trace()))
         # what a generator hands to extend before it raises is kept
-        assert seen == ["a", "b", "c"][:fail_at]
+        assert seen == ([] if self.whole else [0, 1, 2][:fail_at])
 
-    def test_an_empty_answer_is_no_error(self, connect: Connect) -> None:
+    def test_an_empty_answer_is_no_error(self, connect: Connect, told: Wiring[Any]) -> None:
+        self._needs(TOKENS, told)
         tokens, _ = ask(connect(Recorder([])), Request("a", "plan"))
         assert tokens == []
 
-    def test_a_burst_of_a_thousand_tokens_is_complete(self, connect: Connect) -> None:
-        words = [f"t{number} " for number in range(1000)]
-        tokens, _ = ask(connect(Recorder(words)), Request("a", "plan", max_tokens=1000))
-        assert [token.text for token in tokens] == words
+    def test_a_burst_of_a_thousand_tokens_is_complete(self, connect: Connect, told: Wiring[Any]) -> None:
+        handler = self.handler(told, [f"t{number} " for number in range(1000)])
+        tokens, _ = ask(connect(handler), Request("a", "plan", max_tokens=1000))
+        acts = not isinstance(handler.answer[0], str)
+        expected = [Action(0, np.float32(each)).text for each in handler.answer] if acts else handler.answer  # type: ignore[arg-type]
+        assert [token.text for token in tokens] == expected
 
-    def test_a_request_can_be_left_early(self, connect: Connect) -> None:
-        client = connect(Recorder([f"t{number}" for number in range(50)]))
+    def test_a_request_can_be_left_early(self, connect: Connect, told: Wiring[Any]) -> None:
+        client = connect(self.handler(told, [f"t{number}" for number in range(50)]))
         tokens = client.request(Request("a", "plan"), Trace())
-        assert next(tokens).text == "t0"
+        assert next(tokens).index == 0
         tokens.close()  # type: ignore[attr-defined]  # both are generators
         again, _ = ask(client, Request("b", "plan", max_tokens=50))
         assert len(again) == 50
 
-    def test_closing_twice_does_no_harm(self, connect: Connect) -> None:
-        client = connect(Recorder(["x"]))
+    def test_closing_twice_does_no_harm(self, connect: Connect, told: Wiring[Any]) -> None:
+        client = connect(self.handler(told, ["x"]))
         client.close()
         client.close()

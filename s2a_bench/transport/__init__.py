@@ -1,4 +1,4 @@
-"""How pictures and tokens travel: a Client sends one request and yields tokens, a Server feeds a Handler.
+"""How pictures and answers travel: a Client sends a request and yields tokens or actions, a Server feeds a Handler.
 
 To add a transport, write a package with a module like this, and offer its instance as an entry point of the group
 ``s2a_bench.transports``; nothing in this repository changes::
@@ -45,18 +45,21 @@ if TYPE_CHECKING:
     from s2a_bench.facts import Fact
     from s2a_bench.trace import Trace
     from s2a_bench.transport.options import Options
-    from s2a_bench.types import Frame, Request, Token
+    from s2a_bench.types import Frame, Piece, Request
 
 O = TypeVar("O", bound="Options")  # noqa: E741 - the one type variable here
+
+TOKENS: Final = "tokens"
+ACTIONS: Final = "actions"
 
 TOKEN_S: Final = 5.0
 """Of a deadline that nobody set, for each token; far slower than any model that a robot could wait for."""
 
-Handler: TypeAlias = "Callable[[Request, Trace], Generator[Token, None, None]]"
-"""What a server does with a request whose pictures are ``rgb8``: it yields tokens and marks the trace.
+Handler: TypeAlias = "Callable[[Request, Trace], Generator[Piece, None, None]]"
+"""What a server does with a request whose pictures are ``rgb8``: it yields tokens, or actions, and marks the trace.
 
-A handler marks `queue` if it waited for a free engine, `inference` at the first token, and appends the time of
-every token to ``trace.token_ns``. Transports know handlers, never engines.
+A handler marks `queue` if it waited for a free engine, `inference` at the first piece, and appends the time of
+every piece to ``trace.token_ns``. Transports know handlers, never engines.
 """
 
 
@@ -80,10 +83,10 @@ class Client(Protocol):
         """None where the newest frame goes with the prompt instead."""
         ...
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
-        """Send a request with its frames as captured, yield tokens as they arrive, mark every stage.
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
+        """Send a request with its frames as captured, yield pieces as they arrive, mark every stage.
 
-        After the last token ``trace.remote`` holds the server's marks. Raises RequestFailed when the server
+        After the last piece ``trace.remote`` holds the server's marks. Raises RequestFailed when the server
         refuses or breaks off, or goes beyond what `transport.bounds` allows, ServerDied when it is gone.
         """
         ...
@@ -193,6 +196,10 @@ class Transport(Generic[O]):
     """Whether UDP packets that the machine drops during a run are a reason for doubt."""
     in_process: ClassVar[bool] = False
     """Whether its server is a thread of the client's process."""
+    schemes: ClassVar[tuple[str, ...]] = ()
+    """Of the URLs, ``scheme://...``, that name a server of its kind which is not ours; its option `url` takes them."""
+    examines: ClassVar[str] = ""
+    """``module:function`` of what `doctor --url` looks at, see `transport.dangers`."""
     elsewhere: ClassVar[tuple[str, ...]] = ()
     """Options that, when set, name a server that is not ours."""
     serving: ClassVar[Mapping[str, Any]] = {}
@@ -217,6 +224,14 @@ class Transport(Generic[O]):
     def travels(self, variant: str, options: O) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
         """Return how pictures can travel over a variant, the default first."""
         return self.payloads
+
+    def answers(self, variant: str, options: O) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
+        """Return what answers over a variant can be made of: tokens, actions."""
+        return (TOKENS,) if self.foreign_by(options) else (TOKENS, ACTIONS)
+
+    def takes_state(self, variant: str, options: O) -> bool:  # noqa: ARG002 - for subclasses
+        """Whether a request over a variant can carry the robot's state."""
+        return not self.foreign_by(options)
 
     def told(self, options: O) -> Sequence[Fact]:  # noqa: ARG002 - for subclasses
         """Return the facts that may be told with these options, by somebody else's server too."""
@@ -269,6 +284,7 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "http": "s2a_bench.transport.http:HTTP",
         "ros": "s2a_bench.transport.ros:ROS",
         "loopback": "s2a_bench.transport.loopback:LOOPBACK",
+        "shm": "s2a_bench.transport.shm:SHM",
     },
 )
 """Name -> what is said about it."""
@@ -287,6 +303,12 @@ def declared(name: str) -> Transport[Any]:
         return TRANSPORTS[name]
     except UsageError:
         return _Undeclared()
+
+
+def named_by(url: str) -> str:
+    """Return the transport that a URL's scheme names; ``http`` where none does, whose options say what is wrong."""
+    scheme = url.partition("://")[0].lower()
+    return next((name for name, each in TRANSPORTS.loaded() if scheme in each.schemes), "http")
 
 
 def open_client(wiring: Wiring[Any], alive: Callable[[], bool] = lambda: True) -> Client:

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import parse_qsl, quote
 
 from s2a_bench.errors import UsageError
-from s2a_bench.transport import TRANSPORTS, Transport, Wiring
+from s2a_bench.transport import ACTIONS, TOKENS, TRANSPORTS, Transport, Wiring
 from s2a_bench.transport.options import Options, checked, server_side, text_of
 
 
@@ -41,6 +41,11 @@ class Pipeline:
     def server(self) -> tuple[object, ...]:
         """Return what cells must have in common to share a server."""
         return (self.transport.name, *server_side(self.options))
+
+    @property
+    def answers(self) -> tuple[str, ...]:
+        """Return what its answers can be made of."""
+        return self.transport.answers(self.variant, self.options)
 
     def wiring(self, address: str = "", **told: Any) -> Wiring[Any]:
         """Return what its client, or its server, is told."""
@@ -85,6 +90,19 @@ def pipelines(
         for pipeline in _standing_for(_parse(text), given, variants or {}, engine):
             found.setdefault(pipeline.name, pipeline)
     return list(found.values())
+
+
+def answer_over(asked: str, compared: Sequence[Pipeline]) -> str:
+    """Return what all answers are made of, so that all pipelines do the same work; raises UsageError.
+
+    Where that is left open (``auto``) it is tokens, actions if one of the pipelines carries nothing else.
+    """
+    alone = {kind: next((each.name for each in compared if each.answers == (kind,)), "") for kind in (TOKENS, ACTIONS)}
+    answer = (ACTIONS if alone[ACTIONS] else TOKENS) if asked == "auto" else asked
+    if stuck := alone[TOKENS if answer == ACTIONS else ACTIONS]:
+        other = f", and {alone[ACTIONS]} nothing else" if answer == ACTIONS and alone[ACTIONS] else ""
+        raise UsageError(f"`answer`: {stuck} does not carry {answer}{other}; measure it in a run of its own")
+    return answer
 
 
 def first_variants() -> dict[str, tuple[str, ...]]:

@@ -20,7 +20,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, Overdue
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request
 
 if TYPE_CHECKING:
     from s2a_bench.options import Options
@@ -140,8 +140,17 @@ class Turns:
         return (now_ns() - running.alive_ns) / 1e9 if running is not None else 0.0
 
 
-Answering: TypeAlias = "Callable[[Request, Trace, Turn], Generator[Token, None, None]]"
+Answering: TypeAlias = "Callable[[Request, Trace, Turn], Generator[Piece, None, None]]"
 """What answers in its turn, and leaves as soon as the engine is free: what it does then, nobody waits for."""
+
+
+def whole(pieces: Generator[Piece, None, None], trace: Trace) -> list[Piece]:
+    """Take an answer that is sent as one: what its later pieces took is `inference` too."""
+    with closing(pieces):
+        taken = list(pieces)
+    if len(trace.token_ns) > 1:
+        trace.marks.append(("inference", trace.token_ns[-1]))
+    return taken
 
 
 class Queued:
@@ -165,7 +174,7 @@ class Queued:
         if isinstance(handler, Queued):
             return handler
 
-        def answering(request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
+        def answering(request: Request, trace: Trace, turn: Turn) -> Generator[Piece, None, None]:
             with closing(handler(request, trace)) as tokens:
                 for token in tokens:
                     turn.alive(now_ns())
@@ -173,7 +182,7 @@ class Queued:
 
         return Queued(answering, limits)
 
-    def __call__(self, request: Request, trace: Trace) -> Generator[Token, None, None]:
+    def __call__(self, request: Request, trace: Trace) -> Generator[Piece, None, None]:
         """Wait for a turn and answer; raises Busy or Overdue.
 
         What taking a free turn costs, some 2 us, is the engine's time.
@@ -189,7 +198,7 @@ class Queued:
         finally:
             turn.leave()
 
-    def answer(self, request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
+    def answer(self, request: Request, trace: Trace, turn: Turn) -> Generator[Piece, None, None]:
         """Answer in a turn that has come, and leave it."""
         trace.provenance = self.provenance
         trace.mark(RESIDUAL)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers
+from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
 
@@ -58,3 +58,9 @@ class TestRosTopicOverZenoh(HostileSuite):
 class TestRosActionOverZenoh(HostileSuite):
     name = "ros/action?middleware=zenoh"
     servers = ros_servers.GOALS
+
+
+class TestShm(HostileSuite):
+    name = "shm"
+    clients = shm.CLIENTS
+    servers = shm.SERVERS

@@ -204,7 +204,7 @@ def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, told: Wir
     assert budget(traces["2"].chain()).stages_ns["queue"] > 0
 
 
-@pytest.mark.parametrize(("came", "told_of"), [([0, 2], "token 2 came instead of 1"), ([0, 0], "token 0 .* of 1")])
+@pytest.mark.parametrize(("came", "told_of"), [([0, 2], "piece 2 came instead of 1"), ([0, 0], "piece 0 .* of 1")])
 def test_tokens_out_of_order_are_messages_lost(
     stack: ExitStack, told: Wiring[Any], came: list[int], told_of: str
 ) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.paper import AgainstPaper
 from s2a_bench.harness.plan import RequestsConfig
@@ -15,9 +17,14 @@ WIRES = {"bgr": "raw", "compressed": "jpeg"}
 class LatencyConfig(RequestsConfig):
     """The settings of a latency run: all of a run of requests, and of the engine what matters to transports."""
 
+    COUNTS_TOKENS: ClassVar[str] = ""
+
     engine: EngineConfig = group(
         EngineConfig,
-        only=("name", "profile", "gaps", "model", "mmproj", "threads", "gpu_layers", "context", "flash_attention"),
+        only=(
+            *("name", "profile", "gaps", "model", "mmproj", "threads", "gpu_layers", "context", "flash_attention"),
+            *("answer", "horizon", "action_dim"),
+        ),
     )
     wire: str = option("", "gone: see --payload", hidden=True)
 

@@ -34,7 +34,7 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.testing.hostile.asker import TOKENS
 from s2a_bench.testing.hostile.usage import forget_peak, usage
 from s2a_bench.testing.transport import ask, wiring
-from s2a_bench.transport import Client, Wiring, open_client
+from s2a_bench.transport import TRANSPORTS, Client, Wiring, open_client
 from s2a_bench.transport.bounds import PIECES, PIECES_A_TOKEN
 from s2a_bench.types import Request
 
@@ -104,6 +104,8 @@ class HostileSuite:
     """As in ``--transport``."""
     clients: ClassVar[Sequence[Case[Attack]]] = ()
     servers: ClassVar[Sequence[Case[Trap]]] = ()
+    expected: ClassVar[list[str]]
+    """What an honest client is answered."""
 
     @classmethod
     def told(cls) -> Wiring[Any]:
@@ -128,7 +130,8 @@ class HostileSuite:
     def honest(cls, server: OwnServer) -> Iterator[Client]:
         """A client that means well."""
         with closing(open_client(replace(cls.told(), address=server.address, timeout_s=60.0))) as client:
-            ask(client, Request("first", "go on", max_tokens=1))  # its connection is there from now on
+            cls.expected = _answer(client)  # its connection is there from now on
+            assert cls.expected
             yield client
 
     @pytest.fixture(scope="class")
@@ -150,10 +153,10 @@ class HostileSuite:
         began = now_ns()
         said = hostile_client.does(replace(self.told(), address=server.address))
         seconds = (now_ns() - began) / 1e9
-        tokens, _ = ask(honest, Request("honest", "go on", max_tokens=3))
+        answer = _answer(honest)
         peak = usage(server.pid).peak_mib
         record_property("cost", f"{self.name}, server: {seconds:.2f} s, {peak:.0f} MiB")
-        assert [token.text for token in tokens] == ["go", " on", " go"]
+        assert answer == self.expected
         assert server.alive()
         assert re.search(hostile_client.says, said, re.DOTALL), said[:1000]
         assert seconds < hostile_client.seconds
@@ -177,10 +180,17 @@ class HostileSuite:
 @contextmanager
 def own_server(told: Wiring[Any], log: Path, **engine: Any) -> Iterator[OwnServer]:
     """Run a server in a process of its own, with the echo engine, which may be told more."""
-    server = OwnServer("hostile", ServerJob(told, EngineConfig(name="echo", **engine)), log)
+    can = TRANSPORTS[told.transport].answers(told.variant, told.options)
+    config = EngineConfig(**{"name": "echo", "answer": can[0], **engine})
+    server = OwnServer("hostile", ServerJob(told, config), log)
     with server:
         server.wait_ready()
         yield server
+
+
+def _answer(client: Client) -> list[str]:
+    """Return what one short question is answered."""
+    return [piece.text for piece in ask(client, Request("honest", "go on", max_tokens=3))[0]]
 
 
 def _settled(met: Callable[[], bool]) -> bool:

@@ -22,7 +22,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.credentials import read_key
-from s2a_bench.transport.http import HEADERS_MS, RECONNECTS, THINKING_MS, THINKING_PIECES, own
+from s2a_bench.transport.http import HEADERS_MS, RECONNECTS, THINKING_MS, THINKING_PIECES, blocks, own
 from s2a_bench.transport.http.bounded import BoundedClient
 from s2a_bench.transport.http.detect import body_of, detected, getter
 from s2a_bench.transport.http.dialects import OWN, Dialect, Event, Picture, open_dialect
@@ -33,7 +33,7 @@ from s2a_bench.transport.http.merge import merged, read_patch
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.http.refusals import advice_for, refusal
 from s2a_bench.transport.pictures import encoded
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request, Token
 
 ERROR_LIMIT = 1 << 16
 """Bytes that are read of a refusal."""
@@ -111,7 +111,7 @@ class HttpClient:
         """Start the bounds of an answer."""
         return Bounds(self._wiring.address, self._wiring.deadline_of(max_tokens), max_tokens)
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Encode and send the request and yield the streamed tokens."""
         body, headers = self._pack(request, trace)
         client = self._client
@@ -125,7 +125,8 @@ class HttpClient:
                 response = self._send(client, body, headers, stack, trace)
                 headers_ns = now_ns()
                 kind = response.headers.get("content-type", "")
-                if response.status_code != httpx.codes.OK or not kind.startswith(self._dialect.media_type):
+                expected = self._dialect.media_type, *((blocks.MEDIA_TYPE,) if self._dialect.name == OWN else ())
+                if response.status_code != httpx.codes.OK or not kind.startswith(expected):
                     text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
                     raise refusal(self._url, response, text, self._options, self._dialect.media_type)
                 if (coding := response.headers.get("content-encoding", "identity")) != "identity":
@@ -170,23 +171,30 @@ class HttpClient:
             fields = merged(self._dialect.body(request, pictures, self._model), self._extra)
             body, headers = self._codec.dumps(fields), self._headers
         trace.mark("json_pack")
-        trace.facts[PAYLOAD_BYTES] = len(body)
+        trace.facts[PAYLOAD_BYTES] = sum(map(len, body)) if isinstance(body, list) else len(body)
         return body, headers
 
     def _pack_binary(self, request: Request, trace: Trace) -> tuple[Any, dict[str, str]]:
-        """Build our own binary variant: the picture is the body, all else a header."""
-        media_type, data = "application/octet-stream", None
-        for frame in request.images[:1]:
+        """Build our own binary variant: the pictures are the body, one after the other, all else a header."""
+        types, bodies = [], []
+        for frame in request.images:
             media_type, data = encoded(frame, self._options.payload, trace)
+            types.append(media_type)
+            bodies.append(data.reshape(-1).data)
         fields = own.parameters(request, self._model)
         fields |= {**own.own_parameters(request), "prompt": request.prompt}
+        if len(bodies) > 1:
+            fields["pictures"] = [[kind, len(body)] for kind, body in zip(types, bodies, strict=True)]
         header = json.dumps(fields)  # headers are ASCII, which the standard library's JSON is
+        media_type = types[0] if len(types) == 1 else "application/octet-stream"
         headers = {**self._headers, "content-type": media_type, own.PARAMETERS_HEADER: header}
-        return (data.reshape(-1).data if data is not None else b""), headers
+        if len(bodies) > 1:
+            return bodies, {**headers, "content-length": str(sum(map(len, bodies)))}
+        return (bodies[0] if bodies else b""), headers
 
     def _tokens(
         self, response: httpx.Response | LeanResponse, trace: Trace, headers_ns: int, packed_ns: int
-    ) -> Iterator[Token]:
+    ) -> Iterator[Piece]:
         """Yield the tokens of an answer; after the last, complete the trace."""
         first_ns, thinking_ns, thoughts, index, finished = 0, 0, 0, 0, False
         for event in self._events(response):
@@ -196,10 +204,11 @@ class HttpClient:
             if event.thinking:
                 thinking_ns = thinking_ns or now_ns()
                 thoughts += 1
-            if event.text is not None:
+            pieces = event.actions if event.text is None else (Token(index, event.text, event.token_id),)
+            if pieces:
                 first_ns = first_ns or now_ns()
-                yield Token(index, event.text, event.token_id)
-                index += 1
+                yield from pieces
+                index += len(pieces)
             finished = finished or bool(event.finish)
             trace.learn(event.facts)
             if event.remote is not None:
@@ -229,7 +238,10 @@ class HttpClient:
 
     def _events(self, response: httpx.Response | LeanResponse) -> Iterator[Event]:
         """Yield the events of an answer; comments and drops of an event do not count as a sign of life for ever."""
-        decoder = Decoder(self._dialect, self._codec.loads)
+        if response.headers.get("content-type") == blocks.MEDIA_TYPE:
+            decoder = Decoder(self._dialect, blocks.read, blocks.Blocks)
+        else:
+            decoder = Decoder(self._dialect, self._codec.loads)
         heard_ns, patience_ns = now_ns(), int(self._wiring.timeout_s * 1e9)
         for data in response.iter_raw():
             for event in decoder.feed(data):

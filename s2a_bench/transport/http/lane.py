@@ -22,7 +22,7 @@ from typing import Final
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, EngineError, Overdue, S2AError
 from s2a_bench.trace import RESIDUAL, Trace
-from s2a_bench.transport.http import own
+from s2a_bench.transport.http import blocks, own
 from s2a_bench.transport.http.access import allowed
 from s2a_bench.transport.http.reading import Buffer, Headers, of_json, of_picture
 from s2a_bench.transport.http.reply import Reply
@@ -75,7 +75,7 @@ class Call:
         self._reply: Reply | None = None
         self._resumes = Lock()  # held by who has let go on, or given up, a request that waits for the engine
         self._late: TimerHandle | None = None
-        self._gone = self._spilled = self._started = self._chunks = self._keep = False
+        self._gone = self._spilled = self._started = self._chunks = self._keep = self._binary = False
         lane.calls.add(self)
 
     def start(self, reads: Reads, headers: Headers, body: Buffer, *, chunks: bool, keep: bool) -> None:
@@ -83,6 +83,7 @@ class Call:
         trace = Trace()
         trace.mark("network")
         self._chunks, self._keep = chunks, keep and chunks
+        self._binary = reads is of_picture
         self._lane.threads.submit(self._read, reads, headers, body, trace)
 
     def leave(self) -> None:
@@ -170,9 +171,11 @@ class Call:
 
     def _stream(self, reply: Reply) -> None:
         """Write each event, the first with the headers."""
-        head = ["HTTP/1.1 200 OK", "content-type: text/event-stream; charset=utf-8", *self._connection()]
+        as_bytes = self._binary and reply.acts
+        kind = blocks.MEDIA_TYPE if as_bytes else "text/event-stream; charset=utf-8"
+        head = ["HTTP/1.1 200 OK", f"content-type: {kind}", *self._connection()]
         data = "\r\n".join([*head, *["transfer-encoding: chunked"] * self._chunks, "", ""]).encode()
-        for event in reply.events():
+        for event in reply.blocks() if as_bytes else reply.events():
             self._write(data + (b"%x\r\n%b\r\n" % (len(event), event) if self._chunks else event))
             data = b""
         if self._chunks:

@@ -108,7 +108,8 @@ def parameters(request: Request, model: str) -> dict[str, Any]:
 
 def own_parameters(request: Request) -> dict[str, Any]:
     """Return the fields that only our own server knows."""
-    return {"request_id": request.id, **({"grammar": request.grammar} if request.grammar else {})}
+    more = {"grammar": request.grammar, "state": request.state}
+    return {"request_id": request.id, **{name: value for name, value in more.items() if value}}
 
 
 def messages(prompt: str, uris: list[str]) -> list[dict[str, Any]]:
@@ -130,12 +131,4 @@ def remote_json(remote: Remote) -> dict[str, Any]:
 
 def remote_of_json(value: dict[str, Any]) -> Remote:
     """Read a server's marks from the last event; raises ValueError for what can be none."""
-    return Remote(
-        clock=value["clock"],
-        marks=[(stage, stamp) for stage, stamp in value["marks"]],
-        token_ns=value["token_ns"],
-        frame_stamp_ns=value["frame_stamp_ns"],
-        frame_marks=[(stage, stamp) for stage, stamp in value["frame_marks"]],
-        facts=value["facts"],
-        provenance=value.get("provenance", {}),
-    ).check()
+    return Remote.of_json(value)

@@ -6,6 +6,7 @@ from typing import Any
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.trace import Trace
+from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.http import own
 from s2a_bench.transport.limits import SEEDS, Limits, text, whole_number
 from s2a_bench.transport.pictures import decoded
@@ -37,8 +38,28 @@ def of_picture(headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> 
     if not (isinstance(fields, dict) and isinstance(prompt := fields.get("prompt", ""), str)):
         raise RequestFailed(f"header {own.PARAMETERS_HEADER} should be an object whose prompt is text")
     trace.mark("json_parse")
-    images = (decoded(said.get("content-type", ""), body, trace, limits),) if body else ()
+    pictures = _cut(fields.get("pictures"), said.get("content-type", ""), body)
+    images = tuple(decoded(kind, data, trace, limits) for kind, data in pictures)
     return _request(fields, prompt, images, limits)
+
+
+def _cut(pictures: Any, media_type: str, body: Buffer) -> list[tuple[str, Buffer]]:
+    """Return the pictures of a body with their media types; raises RequestFailed where they are not the whole."""
+    if pictures is None:
+        return [(media_type, body)] if body else []
+    view, at = memoryview(body), 0
+    found: list[tuple[str, Buffer]] = []
+    try:
+        for kind, size in pictures:
+            if not (isinstance(kind, str) and type(size) is int and 0 < size <= len(view) - at):
+                raise ValueError(f"{size!r} bytes of {kind!r} where {len(view) - at} are left")
+            found.append((kind, view[at : at + size]))
+            at += size
+        if at != len(view):
+            raise ValueError(f"{len(view) - at} bytes are nobody's")
+    except (TypeError, ValueError) as error:
+        raise RequestFailed(f"pictures should be pairs of media type and bytes: {error}") from error
+    return found
 
 
 def of_fields(fields: Any, trace: Trace, limits: Limits, codec: own.Codec) -> tuple[Request, bool]:
@@ -72,5 +93,6 @@ def _request(fields: dict[str, Any], prompt: str, images: tuple[Frame, ...], lim
         max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, limits.answer_tokens, 32),
         grammar=text("grammar", fields.get("grammar")),
         seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
+        state=state_of(fields.get("state") or ()),
     )
     return request, bool(fields.get("stream"))

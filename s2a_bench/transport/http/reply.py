@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from itertools import chain, islice
 from typing import Any
 
 from s2a_bench.errors import S2AError
 from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import Trace
-from s2a_bench.transport.http import own
+from s2a_bench.transport.http import blocks, own
 from s2a_bench.transport.turns import Queued
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Action, Piece, Request
+
+
+def content(pieces: Sequence[Piece]) -> str:
+    """Return an answer as one text; actions as a JSON list of theirs."""
+    acts = any(isinstance(piece, Action) for piece in pieces)
+    return f"[{', '.join(piece.text for piece in pieces)}]" if acts else "".join(piece.text for piece in pieces)
 
 
 class Reply:
@@ -26,7 +32,7 @@ class Reply:
         self.turn = queued.turns.join()
         self._request, self._codec = request, codec
         self._tokens = queued.answer(request, trace, self.turn)
-        self._first: list[Token] = []
+        self._first: list[Piece] = []
 
     def begin(self) -> None:
         """Take the first token on this thread; raises what the engine raises."""
@@ -43,7 +49,7 @@ class Reply:
             tokens = list(self._wanted())
         finally:
             self.close()
-        message = {"role": "assistant", "content": "".join(token.text for token in tokens)}
+        message = {"role": "assistant", "content": content(tokens)}
         return {
             "id": self._request.id,
             "object": "chat.completion",
@@ -57,9 +63,13 @@ class Reply:
         """Yield the server-sent events; an engine that fails on the way ends them with an error event."""
         count, dumps, request_id = 0, self._codec.dumps, self._request.id
         try:
-            for token in self._wanted():
-                event = own.chunk(request_id, {"content": token.text})
-                event["choices"][0]["token"] = token.id
+            for piece in self._wanted():
+                if isinstance(piece, Action):
+                    event = own.chunk(request_id, {})
+                    event["choices"][0] |= {"tick": piece.index, "action": piece.values.tolist()}
+                else:
+                    event = own.chunk(request_id, {"content": piece.text})
+                    event["choices"][0]["token"] = piece.id
                 yield b"data: " + dumps(event) + b"\n\n"
                 count += 1
         except S2AError as error:
@@ -69,8 +79,27 @@ class Reply:
         last = own.chunk(request_id, {}, usage=self._usage(count), s2a=own.remote_json(self.trace.to_remote()))
         yield b"data: " + dumps(last) + b"\n\ndata: [DONE]\n\n"
 
-    def _wanted(self) -> Iterator[Token]:
-        """Yield the tokens for as long as somebody wants them."""
+    @property
+    def acts(self) -> bool:
+        """Whether the answer that has begun is one of actions."""
+        return any(isinstance(piece, Action) for piece in self._first)
+
+    def blocks(self) -> Generator[bytes, None, None]:
+        """Yield an answer of actions as `blocks`."""
+        count = 0
+        try:
+            for piece in self._wanted():
+                if isinstance(piece, Action):
+                    yield blocks.of_action(piece)
+                    count += 1
+        except S2AError as error:
+            yield blocks.of_json({"error": {"message": str(error), "type": type(error).__name__}})
+            return
+        last = own.chunk(self._request.id, {}, self._finish_reason(count), s2a=own.remote_json(self.trace.to_remote()))
+        yield blocks.of_json(last)
+
+    def _wanted(self) -> Iterator[Piece]:
+        """Yield the pieces for as long as somebody wants them."""
         for token in chain(self._first, self._tokens):
             if self.gone:
                 return

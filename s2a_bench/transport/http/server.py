@@ -73,6 +73,7 @@ class ChatRequest(BaseModel):
     grammar: str = ""
     seed: StrictInt | None = None
     request_id: str = "chatcmpl-0"
+    state: list[float] | None = None
 
 
 def _received(app: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[None]]:

@@ -15,7 +15,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.options import Options
 from s2a_bench.transport.pictures import bgr_of, rgb_of
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request
 
 _servers: dict[str, LoopbackServer] = {}
 _numbers = count()
@@ -54,7 +54,7 @@ class LoopbackClient:
         self.camera = None
         self._address = wiring.address
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Convert, swap channels and hand over, all on the calling thread."""
         server = _servers.get(self._address)
         if server is None:

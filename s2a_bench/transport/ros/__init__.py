@@ -11,7 +11,7 @@ from secrets import token_hex
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_STAMP_AGE_MS, PAYLOAD_BYTES, STALE_FRAMES, Fact
 from s2a_bench.ros.router import ROUTER
-from s2a_bench.transport import Client, Handler, Server, Transport, Wiring
+from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, Server, Transport, Wiring
 from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
 TOPIC, ACTION = VARIANTS = ("topic", "action")
@@ -75,6 +75,14 @@ class Ros(Transport[RosOptions]):
     def measured(self, options: RosOptions, chosen: Sequence[str], engine: str) -> Sequence[str]:  # noqa: ARG002
         """Return topics unless told, and of somebody else's node its action."""
         return (ACTION,) if options.action else chosen or (TOPIC,)
+
+    def answers(self, variant: str, options: RosOptions) -> tuple[str, ...]:  # noqa: ARG002 - of all transports
+        """Return tokens alone for the action: llama_msgs has no field for a robot's."""
+        return (TOKENS,) if variant == ACTION else (TOKENS, ACTIONS)
+
+    def takes_state(self, variant: str, options: RosOptions) -> bool:  # noqa: ARG002 - of all transports
+        """Whether it is the topic: a goal of llama_msgs has no field for it."""
+        return variant == TOPIC
 
     def check(self, variant: str, options: RosOptions, *, mode: str, engine: str) -> None:  # noqa: ARG002
         """Refuse what a goal cannot carry, and a stream that nobody keeps."""

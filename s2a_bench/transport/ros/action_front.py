@@ -19,7 +19,7 @@ from s2a_bench.transport.ros.joining import namespace_of
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.sampling import Wishes
 from s2a_bench.transport.ros.wire import TOKEN_QOS, marks_message, token_message
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request
 
 NO_SEED = 2**32 - 1
 """SamplingConfig.seed of a client that does not care."""
@@ -74,7 +74,7 @@ class ActionFront:
         _log.warning("goal %s rejected: %s", packed.id.hex(), why)
         packed.reject()
 
-    def plot(self, goal_id: str, token: Token) -> None:
+    def plot(self, goal_id: str, token: Piece) -> None:
         """Publish a token for whoever plots, where that is wanted."""
         if self._plot is not None:
             self._plot.send(self._plot.pack(token_message(goal_id, token, last=False)))
@@ -99,7 +99,7 @@ class GenerateJob:
         self._message = message
         self._id = goal.id.hex()
         self._stop = [text for text in message.stop if text]
-        self._tokens: list[Token] = []
+        self._tokens: list[Piece] = []
         self._held: list[str] = []
         self._fed_ns = 0
         self._error = ""
@@ -137,7 +137,7 @@ class GenerateJob:
         self.trace.mark("accept")
         return self._started
 
-    def token(self, token: Token) -> bool:
+    def token(self, token: Piece) -> bool:
         """Send a token as feedback; return False after a cancel or a stop word."""
         if self._goal.cancel_requested:
             return False

@@ -31,7 +31,7 @@ from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.topic import TopicFront
 from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, provenance_message
 from s2a_bench.transport.turns import Queued, Turn
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request
 
 _log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class Job(Protocol):
         """Note that the request's turn has come; return whether the answer is still wanted."""
         ...
 
-    def token(self, token: Token) -> bool:
+    def token(self, token: Piece) -> bool:
         """Send a token; return whether more are wanted."""
         ...
 

@@ -14,6 +14,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.bounds import Bounds
+from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.limits import Limits, whole_number
 from s2a_bench.transport.ros.camera import POLL_S, CameraPublisher, picture_message, picture_of
 from s2a_bench.transport.ros.joining import join, namespace_of, place_of, wait_until
@@ -23,6 +24,7 @@ from s2a_bench.transport.ros.wire import (
     REQUEST_QOS,
     TOKEN_QOS,
     marks_message,
+    pieces_of,
     plain,
     readable,
     remote_of,
@@ -30,7 +32,7 @@ from s2a_bench.transport.ros.wire import (
     token_message,
     unguessable,
 )
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request, Token
 
 
 class TopicClient:
@@ -54,7 +56,7 @@ class TopicClient:
             self.close()
             raise
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Publish the request, with its frames if it has any, and yield its tokens."""
         images: dict[str, list[Any]] = {ros.IMAGE: [], ros.COMPRESSED_IMAGE: []}
         for frame in request.images:
@@ -72,15 +74,16 @@ class TopicClient:
             token = self._next(name, trace, bounds)
             if token.index != expected:
                 raise MessagesLost(
-                    f"token {token.index} came instead of {expected}: messages were lost, or two servers answer"
+                    f"piece {token.index} came instead of {expected}: messages were lost, or two servers answer"
                 )
             if token.last:
                 break
             bounds.piece()
+            pieces = pieces_of(token)
             if not expected:
                 trace.mark("return")
-            yield Token(token.index, token.text, token.token)
-            expected += 1
+            yield from pieces
+            expected += len(pieces)
         if token.marks:
             trace.receive(remote_of(token.marks[0]))
         if token.error:
@@ -137,7 +140,7 @@ class TopicFront:
         request_id = self._requests.unpack(packed).id
         self.send(request_id, Token(0, "", -1), [marks_message(request_id, Trace().to_remote())], why)
 
-    def send(self, request_id: str, token: Token, marks: list[Any], error: str = "") -> None:
+    def send(self, request_id: str, token: Piece, marks: list[Any], error: str = "") -> None:
         """Publish one token, or with marks the end of the answer."""
         self._tokens.send(
             self._tokens.pack(token_message(request_id, token, last=bool(marks), error=error, marks=marks))
@@ -170,17 +173,19 @@ class TopicJob:
             whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
             pictures = (*message.images, *message.compressed_images)
             images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
+            state = state_of(message.state)
         except S2AError as error:
             self._error = str(error)
             return None
-        return Request(plain(message.id), message.prompt, images, message.max_tokens, message.grammar, message.seed)
+        said = message.max_tokens, message.grammar, message.seed
+        return Request(plain(message.id), message.prompt, images, *said, state=state)
 
     def start(self) -> bool:
         """Begin, as the answer is always wanted."""
         return True
 
-    def token(self, token: Token) -> bool:
-        """Publish a token; return whether more are wanted, which this variant cannot tell."""
+    def token(self, token: Piece) -> bool:
+        """Publish a piece; return whether more are wanted, which this variant cannot tell."""
         self._front.send(self._id, token, [])
         self._sent += 1
         return True

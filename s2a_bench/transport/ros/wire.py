@@ -11,8 +11,9 @@ from s2a_bench.provenance import Provenance
 from s2a_bench.ros import QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Remote, Trace
+from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.ros import UNREADABLE_N
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Action, Piece, Request, Token
 
 REQUEST_QOS = QoS(depth=10)
 
@@ -57,23 +58,41 @@ def request_message(request: Request, images: Sequence[Any] = (), compressed_ima
         grammar=request.grammar,
         max_tokens=request.max_tokens,
         seed=request.seed,
+        state=ros.float32_array(request.state),
         images=images,
         compressed_images=compressed_images,
     )
 
 
-def token_message(request_id: str, token: Token, *, last: bool, error: str = "", marks: Sequence[Any] = ()) -> Any:
-    """Turn a token into s2a_msgs/Token; ``last`` ends the answer, with marks or an error."""
+def token_message(request_id: str, piece: Piece, *, last: bool, error: str = "", marks: Sequence[Any] = ()) -> Any:
+    """Turn a piece of an answer into s2a_msgs/Token; ``last`` ends the answer, with marks or an error."""
     return ros.message(
         ros.TOKEN,
         id=request_id,
-        index=token.index,
-        text=token.text,
-        token=token.id,
+        index=piece.index,
+        text="" if isinstance(piece, Action) else piece.text,
+        token=piece.id,
+        actions=[_actions_message(piece)] if isinstance(piece, Action) else [],
         last=last,
         error=error,
         marks=marks,
     )
+
+
+def _actions_message(action: Action) -> Any:
+    return ros.message(ros.ACTIONS, index=action.index, dims=len(action.values), values=action.values)
+
+
+def pieces_of(message: Any) -> list[Piece]:
+    """Read s2a_msgs/Token: a token, or the actions that it brings; raises RequestFailed for what can be none."""
+    if not message.actions:
+        return [Token(message.index, message.text, message.token)]
+    pieces: list[Piece] = []
+    for actions in message.actions:
+        if not actions.dims or len(actions.values) % actions.dims:
+            raise RequestFailed(f"{len(actions.values)} numbers are no actions of {actions.dims}")
+        pieces += actions_of(actions.values.reshape(-1, actions.dims), message.index + len(pieces))
+    return pieces
 
 
 def marks_message(request_id: str, remote: Remote) -> Any:

@@ -32,7 +32,7 @@ from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, open_client
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request
 
 MODE = "live"
 LATE = 1.05
@@ -49,7 +49,7 @@ class Tee:
         self.plan: PlanFeed | None = None
         """Who is told; nobody during warm-up."""
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Token]:
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Pass tokens on, and tell of each before that; time counts from the start of the capture."""
         plan = self.plan
         if plan is None:

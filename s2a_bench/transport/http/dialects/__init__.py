@@ -13,7 +13,7 @@ from typing import Any, Final, Protocol
 from s2a_bench.facts import Fact
 from s2a_bench.registry import Registry
 from s2a_bench.trace import Remote, Trace
-from s2a_bench.types import Frame, Pixels, Request
+from s2a_bench.types import Action, Frame, Pixels, Request
 
 OWN = "s2a"
 """The dialect of our own server, in all its variants."""
@@ -43,6 +43,8 @@ class Event:
     facts: dict[str, float] = field(default_factory=dict)
     remote: Remote | None = None
     error: str = ""
+    actions: Sequence[Action] = ()
+    """Pieces of a policy's answer, which has no text."""
     status: int = 0
     """The HTTP status that the error would have had before the stream began, 0 if unknown."""
 
@@ -50,11 +52,11 @@ class Event:
 class Framing(Protocol):
     """How messages are cut out of a body."""
 
-    def feed(self, data: bytes) -> Iterator[str]:
+    def feed(self, data: bytes) -> Iterator[str | bytes]:
         """Yield the messages that these bytes complete; raises ValueError for one that is too large."""
         ...
 
-    def end(self) -> Iterator[str]:
+    def end(self) -> Iterator[str | bytes]:
         """Yield what is left when the body has ended."""
         ...
 

@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
+from s2a_bench.errors import RequestFailed
 from s2a_bench.secrets import struck
-from s2a_bench.transport.http.dialects import Dialect, Event
+from s2a_bench.transport.http.dialects import Dialect, Event, Framing
 
 DONE = "[DONE]"
 """OpenAI's last message, which is no JSON."""
@@ -27,11 +28,13 @@ ODD = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowErro
 class Decoder:
     """One answer's decoder."""
 
-    def __init__(self, dialect: Dialect, loads: Callable[[str], Any] = json.loads) -> None:
-        """Start at the beginning of a body."""
+    def __init__(
+        self, dialect: Dialect, loads: Callable[[Any], Any] = json.loads, framing: Callable[[], Framing] | None = None
+    ) -> None:
+        """Start at the beginning of a body, cut as the dialect has it unless told."""
         self._dialect = dialect
         self._loads = loads
-        self._framing = dialect.framing()
+        self._framing = (framing or dialect.framing)()
         self._failed = False
 
     def feed(self, data: bytes) -> Iterator[Event]:
@@ -42,7 +45,7 @@ class Decoder:
         """Yield what the end of the body completes."""
         yield from self._events(self._framing.end())
 
-    def _events(self, messages: Iterator[str]) -> Iterator[Event]:
+    def _events(self, messages: Iterator[str | bytes]) -> Iterator[Event]:
         """Read each message until one is an error."""
         if self._failed:
             return
@@ -57,7 +60,7 @@ class Decoder:
             self._failed = True
             yield Event(error=f"the server sent {error}")
 
-    def _event(self, message: str) -> Event:
+    def _event(self, message: str | bytes) -> Event:
         """Return what one message means."""
         if message == DONE:
             return Event(finish="done")
@@ -67,8 +70,11 @@ class Decoder:
             if error:
                 return Event(error=f"the server broke off: {error}", status=status_in(value))
             event = self._dialect.event(value)
+        except RequestFailed as problem:
+            return Event(error=f"the server sent {problem}")
         except ODD as problem:
-            start = struck(message)[:QUOTED].strip()  # before the cut, which could leave half a key
+            text = message if isinstance(message, str) else message.decode("utf-8", "replace")
+            start = struck(text)[:QUOTED].strip()  # before the cut, which could leave half a key
             return Event(error=f"this is not the dialect '{self._dialect.name}' ({problem!r}): {start}")
         return _storable(event)
 

@@ -6,6 +6,7 @@ prompt cache off, and their names for a GBNF grammar.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import isfinite
 from typing import Any
@@ -24,6 +25,8 @@ from s2a_bench.facts import (
     USAGE_ZERO,
     Fact,
 )
+from s2a_bench.transport.chunks import NUMBERS as TICKS
+from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http import own as dialect
 from s2a_bench.transport.http.dialects import OWN, Event, Picture
 from s2a_bench.transport.http.dialects.common import (
@@ -36,7 +39,8 @@ from s2a_bench.transport.http.dialects.common import (
     token_id,
     usage_of,
 )
-from s2a_bench.types import Request
+from s2a_bench.transport.limits import whole_number
+from s2a_bench.types import Action, Request
 
 TIMINGS = {str(fact): fact for fact in (CACHE_N, PROMPT_N, PROMPT_MS, PREDICTED_N, PREDICTED_MS)}
 """What of llama-server's ``timings`` is kept."""
@@ -161,10 +165,15 @@ class Own(OpenAI):
     def event(self, message: Any) -> Event:
         """Read one chunk, the last of which carries the marks."""
         text, token, finish = None, -1, ""
+        actions: Sequence[Action] = ()
         for choice in message.get("choices") or ():
+            if "action" in choice:
+                actions = actions_of(choice["action"], whole_number("index", choice.get("tick"), 0, TICKS, 0))
+            elif "actions" in choice:  # as `blocks` reads them
+                actions = choice["actions"]
             delta = choice.get("delta") or {}
             text = text_of(delta["content"]) if "content" in delta else None
             token = token_id(choice.get("token"))
             finish = text_of(choice.get("finish_reason") or "")
         remote = dialect.remote_of_json(message["s2a"]) if "s2a" in message else None
-        return Event(text, token, finish=finish, remote=remote)
+        return Event(text, token, finish=finish, remote=remote, actions=actions)
