@@ -22,6 +22,7 @@ EXTRAS: Final = {
     "openvla": "the openvla dialect",
     "ray": "sweeps on a Ray cluster",
     "carla": "the carla simulator",
+    "zenoh": "ROS 2 over Zenoh, as rmw_zenoh speaks it",
 }
 """Extra -> what it is for."""
 BY_HAND: Final = ("ray", "carla")
