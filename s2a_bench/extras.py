@@ -23,6 +23,7 @@ EXTRAS: Final = {
     "ray": "sweeps on a Ray cluster",
     "websocket": "policies over WebSocket, as openpi serves them",
     "carla": "the carla simulator",
+    "zenoh": "ROS 2 over Zenoh, as rmw_zenoh speaks it",
 }
 """Extra -> what it is for."""
 BY_HAND: Final = ("ray", "carla")
