@@ -21,6 +21,7 @@ EXTRAS: Final = {
     "nvidia": "load, memory and power of NVIDIA GPUs",
     "openvla": "the openvla dialect",
     "ray": "sweeps on a Ray cluster",
+    "websocket": "policies over WebSocket, as openpi serves them",
     "carla": "the carla simulator",
     "zenoh": "ROS 2 over Zenoh, as rmw_zenoh speaks it",
 }

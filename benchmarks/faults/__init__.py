@@ -24,7 +24,10 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import open_client
 from s2a_bench.types import Request
 
-TRANSPORTS = ("http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action", "shm")
+TRANSPORTS = (
+    *("http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action", "shm"),
+    "websocket/openpi-stream",
+)
 WHATS = ("server killed", "server told to end", "server stopped", "client killed", "client stopped", "connection cut")
 WHENS = ("before the first request", "in the queue", "in the middle of an answer", "between requests", "while closing")
 ENDS_THE_SERVER = ("server killed", "server told to end")
@@ -45,7 +48,7 @@ class Fault:
     @property
     def applies(self) -> bool:
         """Whether there is such a thing: DDS has no connection, and who waits for its turn asked for something."""
-        return self.what != "connection cut" or self.transport.startswith("http")
+        return self.what != "connection cut" or self.transport.startswith(("http", "websocket"))
 
     @property
     def promised(self) -> tuple[str, ...]:

@@ -285,6 +285,7 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "ros": "s2a_bench.transport.ros:ROS",
         "loopback": "s2a_bench.transport.loopback:LOOPBACK",
         "shm": "s2a_bench.transport.shm:SHM",
+        "websocket": "s2a_bench.transport.websocket:WEBSOCKET",
     },
 )
 """Name -> what is said about it."""

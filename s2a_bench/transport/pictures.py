@@ -63,6 +63,17 @@ def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
     return f"image/{payload}", data
 
 
+def told(frame: Frame, payload: str, trace: Trace) -> Pixels:
+    """Return a picture as policies are told it: (H, W, 3) RGB, or a file's (n,) bytes; marks as `encoded` does."""
+    if payload != "raw":
+        return encoded(frame, payload, trace)[1].reshape(-1)
+    if frame.encoding == "rgb8":
+        return frame.data
+    data = to_rgb(frame)
+    trace.mark("convert")
+    return data
+
+
 def decoded(media_type: str, data: bytes | memoryview, trace: Trace, limits: Limits = LIMITS) -> Frame:
     """Turn received bytes into an ``rgb8`` frame; marks `image_decode` or `channel_swap`. Raises RequestFailed."""
     try:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm
+from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm, websocket
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
 
@@ -64,3 +64,18 @@ class TestShm(HostileSuite):
     name = "shm"
     clients = shm.CLIENTS
     servers = shm.SERVERS
+
+
+class TestWebsocket(HostileSuite):
+    name = "websocket/openpi"
+    clients = websocket.CLIENTS
+    servers = websocket.SERVERS
+
+    @classmethod
+    def told(cls) -> Wiring[Any]:
+        return replace(super().told(), limits=Limits(head_s=2, body_s=3))  # three cases wait for them
+
+
+class TestWebsocketStreamed(HostileSuite):
+    name = "websocket/openpi-stream"
+    servers = websocket.SERVERS

@@ -62,6 +62,23 @@ class TestRosAction(TransportSuite):
         return wiring("ros/action", domain_id=dds_domain, max_tokens=2000)
 
 
+@pytest.mark.parametrize("payload", ["raw", "png"])
+class TestWebsocket(TransportSuite):
+    whole = True
+
+    @pytest.fixture
+    def told(self, payload: str) -> Wiring[Any]:
+        return wiring("websocket/openpi", payload=payload)
+
+
+class TestWebsocketStreamed(TransportSuite):
+    name = "websocket/openpi-stream"
+
+
+class TestWebsocketJpeg(TransportSuite):
+    name, lossless, whole = "websocket/openpi?payload=jpeg", False, True
+
+
 needs_zenoh = pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")
 
 

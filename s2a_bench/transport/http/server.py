@@ -25,8 +25,9 @@ from starlette.requests import ClientDisconnect
 from s2a_bench.errors import Busy, PortInUse, S2AError, UsageError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
+from s2a_bench.transport.credentials import key_for
 from s2a_bench.transport.http import own
-from s2a_bench.transport.http.access import key_for, keyed
+from s2a_bench.transport.http.access import keyed
 from s2a_bench.transport.http.answer import Answer
 from s2a_bench.transport.http.door import door
 from s2a_bench.transport.http.lane import Lane
@@ -174,7 +175,8 @@ class HttpServer:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind((host or "127.0.0.1", int(port)))
-            key = key_for(self._socket.getsockname()[0], wiring.options)
+            options = wiring.options
+            key = key_for(self._socket.getsockname()[0], options.api_key_env, everybody=options.no_auth)
             self._socket.listen()  # only now is the port ours
         except UsageError:
             self._socket.close()

@@ -1,0 +1,90 @@
+"""What a server makes of an observation whose keys it does not know: pictures, the robot's state, the prompt.
+
+Policies name their keys as they like. So every array of uint8 is a picture, (H, W, 3) or (3, H, W) pixels in RGB with
+any axes of batch and time in front, or (n,) the bytes of a JPEG or PNG, as bytes are; every number with a fraction, or
+array of such, is part of the state; the prompt is the text under ``prompt``, else the first text there is. All in the
+order of the keys. Whole numbers and truths are ignored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from s2a_bench.errors import RequestFailed
+from s2a_bench.trace import Trace
+from s2a_bench.transport.chunks import state_of
+from s2a_bench.transport.limits import Limits, check_pixels, text
+from s2a_bench.transport.pictures import decoded
+from s2a_bench.types import Frame
+
+PICTURES: Final = 64
+NUMBERS: Final = 4096
+"""The most of one request: pictures, and numbers of the state."""
+PROMPT: Final = "prompt"
+DEPTH: Final = 32
+COLOURS: Final = 3
+
+
+def observed(observation: Any, trace: Trace, limits: Limits) -> tuple[tuple[Frame, ...], tuple[float, ...], str]:
+    """Return pictures as ``rgb8``, state and prompt; marks `image_decode`. Raises RequestFailed naming the key."""
+    if not isinstance(observation, Mapping):
+        raise RequestFailed(f"an observation is a dictionary, not {type(observation).__name__}")
+    frames: list[Frame] = []
+    numbers: list[Any] = []
+    count, first, prompt = 0, None, None
+    for key, value in _leaves(observation, "", 0):
+        if isinstance(value, str):
+            first = value if first is None else first
+            prompt = value if prompt is None and key.rpartition(".")[2] == PROMPT else prompt
+        elif isinstance(value, bytes) or (isinstance(value, np.ndarray) and value.dtype == np.uint8):
+            frames += _pictures(key, value, trace, limits)
+        elif isinstance(value, (float, np.floating)) or (isinstance(value, np.ndarray) and value.dtype.kind == "f"):
+            row = np.asarray(value).reshape(-1)
+            count += row.size
+            if count > NUMBERS:
+                raise RequestFailed(f"{key}: a state of more than {NUMBERS} numbers; pictures are uint8")
+            numbers.append(row)
+        if len(frames) > PICTURES:
+            raise RequestFailed(f"more than {PICTURES} pictures")
+    state = state_of(np.concatenate(numbers)) if count else ()
+    return tuple(frames), state, text(PROMPT, prompt if prompt is not None else first)
+
+
+def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
+    """Yield every value that is no dictionary and no list, with the path to it."""
+    if depth > DEPTH:
+        raise RequestFailed(f"{path[:80]}: more than {DEPTH} dictionaries and lists in each other")
+    if isinstance(value, Mapping):
+        for key, each in value.items():
+            name = key.decode(errors="replace") if isinstance(key, bytes) else str(key)
+            yield from _leaves(each, f"{path}.{name}" if path else name, depth + 1)
+    elif isinstance(value, (list, tuple)):
+        for each in value:
+            yield from _leaves(each, path, depth + 1)
+    else:
+        yield path, value
+
+
+def _pictures(key: str, value: Any, trace: Trace, limits: Limits) -> Sequence[Frame]:
+    """Return the pictures of one array."""
+    if isinstance(value, bytes) or value.ndim == 1:
+        if not len(value):
+            raise RequestFailed(f"{key}: an empty picture")
+        try:
+            return [decoded("image", memoryview(value), trace, limits)]
+        except RequestFailed as error:
+            raise RequestFailed(f"{key}: {error}") from error
+    shape = value.shape
+    last = value.ndim >= COLOURS and shape[-1] == COLOURS
+    if not last and not (value.ndim >= COLOURS and shape[-3] == COLOURS):
+        raise RequestFailed(f"{key}: a picture of shape {shape}; they are (H, W, 3), (3, H, W) or a JPEG's bytes")
+    height, width = shape[-3:-1] if last else shape[-2:]
+    check_pixels(width, height, limits)
+    several = value.reshape(-1, *shape[-3:])
+    if len(several) > PICTURES:
+        raise RequestFailed(f"{key}: {len(several)} pictures; at most {PICTURES} are taken")
+    planes = several if last else np.ascontiguousarray(np.moveaxis(several, 1, -1))
+    return [Frame(-1, 0, width, height, "rgb8", picture) for picture in planes]

@@ -1,0 +1,187 @@
+"""The WebSocket client: fill the template, pack, mask, send, read the actions, and mark each step.
+
+Our own server sends its marks in one more frame after an answer. A foreign one sends none: all from the last byte that
+was packed to the answer is the stage `server`, and where it tells ``infer_ms`` that much of it is `inference`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from s2a_bench.clock import clock_id, now_ns
+from s2a_bench.errors import RequestFailed, ServerDied
+from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS
+from s2a_bench.secrets import struck
+from s2a_bench.trace import Trace
+from s2a_bench.transport import Wiring
+from s2a_bench.transport.bounds import Bounds
+from s2a_bench.transport.chunks import actions_of
+from s2a_bench.transport.credentials import read_key
+from s2a_bench.transport.observation import template_of
+from s2a_bench.transport.pictures import told
+from s2a_bench.transport.websocket import STREAM, STREAM_PATH, TIMING, own
+from s2a_bench.transport.websocket.codec import packb, unpackb
+from s2a_bench.transport.websocket.link import Broken, Link
+from s2a_bench.transport.websocket.options import WebsocketOptions
+from s2a_bench.types import Action, Piece, Request
+
+QUOTED = 500
+"""Letters that are shown of what a server says went wrong: the end of it, as a traceback's reason comes last."""
+
+
+class WebsocketClient:
+    """One variant of openpi's protocol."""
+
+    def __init__(self, wiring: Wiring[WebsocketOptions], alive: Callable[[], bool]) -> None:
+        """Prepare to ask the server at ``wiring.address``; the first request connects."""
+        self.camera = None
+        self._wiring, self._alive = wiring, alive
+        self._ours = not wiring.black_box
+        self._streams = wiring.variant == STREAM
+        self._url = wiring.address + (STREAM_PATH if self._ours and self._streams else "")
+        self._template = template_of(wiring.options.template)
+        key = read_key(wiring.options.api_key_env)
+        self._headers = {"Authorization": f"{own.SCHEME} {key}"} if key else {}
+        if self._ours:
+            self._headers[own.MARKS_HEADER] = "1"
+        self._link: Link | None = None
+        self._metadata: dict[str, str] = {}
+
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
+        """Send the observation and yield the actions of its answer."""
+        body = self._pack(request, trace)
+        bounds = Bounds(self._url, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
+        whole = False
+        try:
+            message, packed_ns = self._asked(body, bounds, trace)
+            for piece in self._answer(message, packed_ns, trace):
+                bounds.piece()
+                yield piece
+            whole = True
+        except Broken as error:
+            if not self._alive():
+                raise ServerDied(f"the server is gone: {error}") from error
+            raise RequestFailed(str(error)) from error
+        finally:
+            if not whole:
+                self.close()
+
+    def _pack(self, request: Request, trace: Trace) -> bytes:
+        """Fill the template and write it as MessagePack, marking each stage."""
+        pictures = [told(frame, self._wiring.options.payload, trace) for frame in request.images]
+        observation = self._template.fill(pictures, request.state, request.prompt)
+        if self._ours:
+            observation[own.OWN] = own.parameters(request)
+        body = packb(observation)
+        trace.mark("msgpack_pack")
+        trace.facts[PAYLOAD_BYTES] = len(body)
+        return body
+
+    def _asked(self, body: bytes, bounds: Bounds, trace: Trace) -> tuple[bytes, int]:
+        """Send, once more if the server had just closed the kept connection; return the answer's first message."""
+        if self._link is not None:
+            self._link.bounds = bounds
+            if self._link.alive():
+                try:
+                    return self._exchanged(self._link, body, trace)
+                except Broken:
+                    trace.facts[RECONNECTS] = 1.0
+            else:
+                trace.facts[RECONNECTS] = 1.0
+            self.close()
+        self._link = Link(self._url, self._headers, bounds, self._wiring.timeout_s)
+        self._greeted(self._link)
+        trace.mark("connect")
+        return self._exchanged(self._link, body, trace)
+
+    def _exchanged(self, link: Link, body: bytes, trace: Trace) -> tuple[bytes, int]:
+        pieces = link.pack(body)
+        trace.mark("frame_pack")
+        packed_ns = trace.marks[-1][1]
+        link.send(pieces)
+        return self._message(link), packed_ns
+
+    def _greeted(self, link: Link) -> None:
+        """Read what a server says of itself when it is connected to."""
+        metadata = unpackb(self._message(link))
+        if not isinstance(metadata, dict):
+            raise RequestFailed(f"{self._url}: its metadata is {type(metadata).__name__}, not a dictionary")
+        plain = {name: value for name, value in metadata.items() if isinstance(value, (str, int, float, bool))}
+        self._metadata = {str(name)[:64]: struck(str(value))[:64] for name, value in list(plain.items())[:32]}
+
+    def _message(self, link: Link) -> bytes:
+        """Return the next binary message; a text is an error."""
+        message = link.receive()
+        if isinstance(message, str):
+            said = " ".join(struck(message).split())
+            raise RequestFailed(f"{self._url}: {said[-QUOTED:] or 'an error without words'}")
+        return message
+
+    def _answer(self, message: bytes, packed_ns: int, trace: Trace) -> Generator[Action, None, None]:
+        """Yield the actions of an answer; after the last, complete the trace."""
+        assert self._link  # noqa: S101 - for mypy
+        count, first_ns = 0, 0
+        while True:
+            answer = unpackb(message)
+            if not isinstance(answer, dict) or own.ACTIONS not in answer:
+                raise RequestFailed(f"{self._url}: an answer without {own.ACTIONS}: {_shown(answer)}")
+            last = not self._streams or answer.get(own.TYPE) != own.PARTIAL
+            actions = actions_of(answer[own.ACTIONS])
+            if not last:
+                actions = [Action(count + index, action.values) for index, action in enumerate(actions)]
+            elif count > len(actions):
+                raise RequestFailed(f"{self._url}: {count} actions came, and {len(actions)} of them are the whole")
+            else:
+                actions = actions[count:]
+            first_ns = first_ns or now_ns()
+            yield from actions
+            count += len(actions)
+            if last:
+                break
+            message = self._message(self._link)
+        self._learn(answer.get(own.TIMING), trace)
+        if self._ours:
+            trace.receive(own.remote_of(unpackb(self._message(self._link))))
+        self._mark(trace, packed_ns, first_ns)
+
+    def _learn(self, timing: Any, trace: Trace) -> None:
+        """Keep what a server says of its times."""
+        if isinstance(timing, dict):
+            trace.learn({TIMING[name]: _plain(value) for name, value in timing.items() if name in TIMING})
+
+    def _mark(self, trace: Trace, packed_ns: int, first_ns: int) -> None:
+        """Name the stretch from the last byte packed to the first action."""
+        if trace.remote is not None and trace.remote.clock == clock_id():
+            trace.marks.append(("return", first_ns))
+            return
+        infer_ns = round(trace.facts.get(INFER_MS, 0) * 1e6)
+        if 0 < infer_ns < first_ns - packed_ns and not self._streams:
+            trace.marks += [("server", first_ns - infer_ns), ("inference", first_ns)]
+        else:
+            trace.marks.append(("server", first_ns))
+
+    def describe(self) -> dict[str, str]:
+        """Return who is asked and what it said of itself, for the manifest."""
+        return {"url": self._url, "template": self._template.name, **self._metadata}
+
+    def close(self) -> None:
+        """Close the kept connection."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+
+def _plain(value: Any) -> Any:
+    """Return a number as Python's."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    return float(value) if type(value) in {int, float} and isfinite(value) else value
+
+
+def _shown(answer: Any) -> str:
+    keys = ", ".join(str(key)[:40] for key in list(answer)[:8]) if isinstance(answer, dict) else type(answer).__name__
+    return keys or "nothing"

@@ -1,0 +1,129 @@
+"""MessagePack with NumPy's arrays as openpi writes them, byte for byte, and bounds on what is read.
+
+An array is the map ``{b"__ndarray__": True, b"data": bytes, b"dtype": text, b"shape": [...]}``, one of NumPy's numbers
+``{b"__npgeneric__": True, b"data": its value, b"dtype": text}``. No other hook is called, so bytes become nothing but
+numbers, texts, bytes, lists, dictionaries and arrays of numbers and texts: no objects (dtype kind O), no records (V),
+no complex numbers (c), which openpi refuses too.
+"""
+
+from __future__ import annotations
+
+import re
+from math import prod
+from typing import Any, Final
+
+import msgpack
+import numpy as np
+
+from s2a_bench.errors import RequestFailed
+
+ARRAY, GENERIC = b"__ndarray__", b"__npgeneric__"
+LIST, MAP, VALUES = 4096, 1024, 1 << 16
+"""The most elements of a list, keys of a map, and elements and keys of a whole message; arrays are one each."""
+DIMENSIONS: Final = 8
+UNSAFE: Final = "VOc"
+"""Kinds of dtypes that do not travel."""
+
+_DTYPE = re.compile(r"[<>|=]?(?:[?b]1?|[biuf]\d{1,2}|[SU][1-9]\d{0,4}|[mM]8(?:\[\d{0,4}[a-z]{1,2}\])?)", re.IGNORECASE)
+_PLAIN: Final = {"b": (bool,), "i": (int,), "u": (int,), "f": (float, int), "S": (bytes,), "U": (str,)}
+"""Kind of a dtype -> the types of one value of it."""
+
+
+def packb(value: Any) -> bytes:
+    """Write a message; raises RequestFailed for an array that no policy server takes, or a value that is none."""
+    try:
+        packed: bytes = msgpack.packb(value, default=_packable)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise RequestFailed(f"a message that MessagePack cannot carry: {error}") from error
+    return packed
+
+
+def _packable(value: Any) -> Any:
+    """Return what stands for an array or one of NumPy's numbers."""
+    if not isinstance(value, (np.ndarray, np.generic)):
+        raise TypeError(f"{type(value).__name__} is none of its types")
+    if value.dtype.kind in UNSAFE:
+        raise ValueError(f"arrays of type {value.dtype} do not travel")
+    if isinstance(value, np.generic):
+        return {GENERIC: True, b"data": value.item(), b"dtype": value.dtype.str}
+    if value.flags.c_contiguous and value.size:
+        data: Any = value.reshape(-1).view(np.uint8).data  # without the copy of tobytes
+    else:
+        data = value.tobytes()
+    return {ARRAY: True, b"data": data, b"dtype": value.dtype.str, b"shape": value.shape}
+
+
+def unpackb(data: bytes | bytearray | memoryview) -> Any:
+    """Read a message, whose arrays are read-only views of their bytes; raises RequestFailed for any other bytes."""
+    reader = _Reader()
+    try:
+        return msgpack.unpackb(
+            data,
+            object_hook=reader.map,
+            list_hook=reader.list,
+            ext_hook=_no_extension,
+            max_array_len=LIST,
+            max_map_len=MAP,
+        )
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:  # msgpack's own are ValueErrors
+        raise RequestFailed(f"{len(data)} bytes that are no message: {_why(error)}") from error
+
+
+class _Reader:
+    """The hooks of one message, which count what it has."""
+
+    def __init__(self) -> None:
+        self._left = VALUES
+
+    def list(self, value: list[Any]) -> list[Any]:
+        self._count(len(value))
+        return value
+
+    def map(self, value: dict[Any, Any]) -> Any:
+        self._count(len(value))
+        if ARRAY in value:
+            return _array(value)
+        return _generic(value) if GENERIC in value else value
+
+    def _count(self, number: int) -> None:
+        self._left -= number + 1
+        if self._left < 0:
+            raise ValueError(f"it has more than {VALUES} values")
+
+
+def _array(told: dict[Any, Any]) -> Any:
+    data, shape, dtype = told.get(b"data"), told.get(b"shape"), _dtype(told)
+    if not (isinstance(data, bytes) and isinstance(shape, list) and len(shape) <= DIMENSIONS):
+        raise ValueError("an array without bytes, or without a shape")
+    if not all(type(size) is int and size >= 0 for size in shape):
+        raise ValueError(f"an array of shape {str(shape)[:80]}")
+    if prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"an array of shape {tuple(shape)} and type {dtype} in {len(data)} bytes")
+    return np.ndarray(shape, dtype, data)
+
+
+def _generic(told: dict[Any, Any]) -> Any:
+    dtype, data = _dtype(told), told.get(b"data")
+    if type(data) not in _PLAIN.get(dtype.kind, ()):
+        raise ValueError(f"a number of type {dtype} that is {type(data).__name__}")
+    with np.errstate(over="ignore"):  # it is infinite, and whoever takes numbers says so
+        return dtype.type(data)
+
+
+def _dtype(told: dict[Any, Any]) -> np.dtype[Any]:
+    """Read a dtype, without NumPy's whole language for them."""
+    text = told.get(b"dtype")
+    if not (isinstance(text, str) and _DTYPE.fullmatch(text)):
+        raise ValueError(f"an array of type {str(text)[:40]!r}, which does not travel")
+    dtype = np.dtype(text)
+    if dtype.kind in UNSAFE or not dtype.itemsize:
+        raise ValueError(f"an array of type {dtype}, which does not travel")
+    return dtype
+
+
+def _no_extension(code: int, _: bytes) -> Any:
+    raise ValueError(f"an extension of type {code}, which nobody knows")
+
+
+def _why(error: Exception) -> str:
+    return f"{error}" or type(error).__name__

@@ -1,0 +1,177 @@
+"""What a foreign policy is told, by a template."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from s2a_bench.errors import RequestFailed, UsageError
+from s2a_bench.transport.observation import DEFAULT, Template, names, template_of
+
+FIRST, SECOND = (np.full((4, 6, 3), number, np.uint8) for number in (1, 2))
+STATE = tuple(float(number) for number in range(8))
+
+
+def filled(content: Any, pictures: Any = (FIRST, SECOND), state: Any = (), prompt: str = "go") -> Any:
+    return Template(content, "mine").fill(pictures, state, prompt)
+
+
+def test_places_become_pictures_state_and_prompt() -> None:
+    got = filled({"a": "{image}", "b": {"c": "{image:1}"}, "s": "{state}", "p": "{prompt}"}, state=STATE)
+    assert got["a"] is FIRST
+    assert got["b"]["c"] is SECOND
+    assert (got["s"].dtype, got["s"].tolist()) == (np.float32, list(STATE))
+    assert got["p"] == "go"
+
+
+def test_a_slice_of_the_state() -> None:
+    got = filled(
+        {"joints": "{state:0:7}", "gripper": "{state:7:8}", "rest": "{state:6:}", "head": "{state::2}"}, (), STATE
+    )
+    assert {key: value.tolist() for key, value in got.items()} == {
+        "joints": [0, 1, 2, 3, 4, 5, 6],
+        "gripper": [7],
+        "rest": [6, 7],
+        "head": [0, 1],
+    }
+
+
+def test_a_list_of_arrays_is_an_array_with_one_more_axis() -> None:
+    got = filled({"video": [["{image}"]], "both": ["{image:0}", "{image:1}"], "state": [["{state}"]]}, state=STATE)
+    assert got["video"].shape == (1, 1, 4, 6, 3)
+    assert np.shares_memory(got["video"], FIRST)  # no copy
+    np.testing.assert_array_equal(got["both"], np.stack([FIRST, SECOND]))
+    assert got["state"].shape == (1, 1, 8)
+
+
+def test_other_lists_and_values_stay_what_they_are() -> None:
+    content = {"language": [["{prompt}"]], "numbers": [1, 2.5], "flag": True, "none": None, "empty": []}
+    assert filled(content, ()) == {**content, "language": [["go"]]}
+
+
+def test_a_prompt_stands_within_a_text_and_is_not_read_again() -> None:
+    assert filled({"p": "Task: {prompt}; {{json}}"}, (), prompt="{image}")["p"] == "Task: {image}; {json}"
+
+
+def test_colours_first_and_files() -> None:
+    got = filled({"a": "{image:0|CHW}", "b": "{image:1|bytes}"})
+    np.testing.assert_array_equal(got["a"], FIRST.transpose(2, 0, 1))
+    assert got["a"].flags.c_contiguous
+    assert got["b"] == SECOND.tobytes()
+    assert Template({"b": "{image|bytes}"}, "mine").encoded
+
+
+def test_a_key_with_a_question_mark_is_left_out_where_the_request_lacks_it() -> None:
+    content = {"a": "{image}", "b?": "{image:1}", "c?": {"d": ["{state}"]}, "p?": "{prompt}"}
+    assert filled(content, [FIRST], ()) == {"a": FIRST, "p": "go"}
+    assert set(filled(content, state=STATE)) == {"a", "b", "c", "p"}
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ({"a": {"b": "{image:2}"}}, "a.b wants picture 2, and the request has 2"),
+        ({"a": ["{image:1}"], "s": "{state:7:9}"}, r"s wants the state's numbers \(7:9\), and the request has 8"),
+        ({"a": "{image}", "t": "{prompt}"}, "places for 1 pictures, not 2"),
+        ({"a": "{image:1}"}, "no place for the robot's state"),
+    ],
+)
+def test_a_request_that_does_not_fit_is_refused_with_the_key(content: Any, says: str) -> None:
+    with pytest.raises(RequestFailed, match=says):
+        filled(content, state=STATE if "state" in says else ())
+
+
+def test_pictures_of_unlike_sizes_cannot_be_one_array() -> None:
+    with pytest.raises(RequestFailed, match="both: all input arrays must have the same shape"):
+        filled({"both": ["{image:0}", "{image:1}"]}, (FIRST, SECOND[1:]))
+
+
+def deep() -> Any:
+    content: Any = "{prompt}"
+    for _ in range(20):
+        content = [content]
+    return {"a": content}
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ([], "should be a table"),
+        ({"a": "{picture}"}, "a has a brace that is no place"),
+        ({"a": {"b": ["x", "{image:a}"]}}, r"a.b\[1\] has a brace that is no place"),
+        ({"a": "{image:0|BGR}"}, "a wants picture 0 as BGR"),
+        ({"a": "{image:99}"}, "a wants picture 99"),
+        ({"a": "{state:7:7}"}, "a wants the numbers 7:7 of the state, which are none"),
+        ({"a": 1 << 70}, "which no policy can be told"),
+        ({"a": object()}, "which no policy can be told"),
+        ({"a": 1, "a?": 2}, "a is twice there"),
+        ({"?": 1}, "empty"),
+        ({"a": "\ud800"}, "a is no Unicode text"),
+        ({"a": [0] * 2000}, "beyond what is read"),
+        (deep(), "beyond what is read"),
+    ],
+)
+def test_a_template_that_makes_no_sense_is_refused_with_the_key(content: Any, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        Template(content, "mine")
+
+
+def test_it_is_known_what_a_template_takes() -> None:
+    droid = template_of("droid")
+    assert (droid.pictures, droid.takes_state, droid.encoded) == (2, True, False)
+
+
+@pytest.mark.parametrize("name", names())
+def test_those_with_names_can_be_filled(name: str) -> None:
+    template = template_of(name)
+    got = template.fill([FIRST] * template.pictures, range(14), "go")
+    assert got
+
+
+def test_the_default_takes_what_there_is() -> None:
+    template = template_of(DEFAULT)
+    assert template.fill([], (), "go") == {"prompt": "go"}
+    assert list(template.fill([FIRST, SECOND], STATE, "go")) == [
+        "observation/image",
+        "observation/wrist_image",
+        "observation/state",
+        "prompt",
+    ]
+
+
+def test_toml_and_json_say_the_same(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text('"observation/image" = "{image}"\n[x]\ny = [["{prompt}"]]\n')
+    (tmp_path / "a.json").write_text(json.dumps({"observation/image": "{image}", "x": {"y": [["{prompt}"]]}}))
+    for name in ("a.toml", "a.json"):
+        assert template_of(str(tmp_path / name)).fill([FIRST], (), "go") == {
+            "observation/image": FIRST,
+            "x": {"y": [["go"]]},
+        }
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("a.json", "{", "no JSON"),
+        ("a.json", '{"a": 1, "a": 2}', "a key is twice there"),
+        ("a.json", "[" * 100_000, "too deep|no JSON|has more than"),
+        ("a.json", "[" * 50_000, "too deep"),
+        ("a.toml", "a = ", "no TOML"),
+        ("a.toml", "a = 2020-01-01", "which no policy can be told"),
+        ("a.toml", "#" * 70_000, "more than 65536 bytes"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_refused_in_a_line(tmp_path: Path, name: str, text: str, says: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(UsageError, match=says):
+        template_of(str(tmp_path / name))
+
+
+@pytest.mark.parametrize(("told", "says"), [("drold", "is none of aloha, droid"), ("no/such.toml", "cannot read")])
+def test_an_unknown_name_is_refused(told: str, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        template_of(told)
