@@ -74,7 +74,7 @@ def test_without_inference_there_is_no_e2e_without_it() -> None:
 def test_own_stages_come_last_on_the_way_out_and_first_on_the_way_in() -> None:
     own = [{"wrap": "encode", "json": "pack"}, {"accept": "network", "unwrap": "decode", "teleport": "network"}]
     assert [*path_of(own)] == [
-        *("capture", "convert", "image_encode", "wrap", "json", "connect", "network", "accept", "teleport"),
+        *("capture", "convert", "resize", "image_encode", "wrap", "json", "connect", "network", "accept", "teleport"),
         *("unwrap", "image_decode", "yuv_decode", "channel_swap", "queue"),
         *("preprocess", "inference", "server", "return"),
     ]
