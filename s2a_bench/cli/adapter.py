@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from s2a_bench.options import Options
 
 FIELD = re.compile(r"`([a-z][a-z0-9_]*)`")
+DEFAULT = re.compile(r" ?\[default: ([^\]]*)\]$")
 PLAIN: tuple[type, ...] = (bool, int, float, Path)
 """What typer reads by itself; every other type is read from text by its field."""
 
@@ -116,11 +117,8 @@ def distinct(flags: Sequence[Flag], taken: Iterable[str] = ()) -> list[Flag]:
     """
     names = {name.strip("_").replace("_", "-") for name in taken}
     chosen = _owners(flags)
-    return [
-        replace(flag, whose=_joined([each.whose for each in flags if chosen[each.name] is flag and _same(each, flag)]))
-        for flag in flags
-        if flag.name not in names and chosen[flag.name] is flag
-    ]
+    typed = [flag for flag in flags if flag.name not in names and chosen[flag.name] is flag]
+    return [_shared([each for each in flags if each.name == flag.name and _same(each, flag)]) for flag in typed]
 
 
 def _owners(flags: Iterable[Flag]) -> dict[str, Flag]:
@@ -137,9 +135,20 @@ def _same(flag: Flag, other: Flag) -> bool:
     return flag.path == other.path or beside(flag.path, other.path)
 
 
-def _joined(owners: Sequence[str]) -> str:
-    """Join what stands before the help of one flag: ``http: `` and ``ros: `` are ``http, ros: ``."""
-    return f"{', '.join(each.removesuffix(': ') for each in owners)}: " if len(set(owners)) > 1 else owners[0]
+def _shared(flags: Sequence[Flag]) -> Flag:
+    """Return the flag that stands for several: all owners before its help, and behind it the defaults that differ."""
+    first = flags[0]
+    owners = [flag.whose.removesuffix(": ") for flag in flags]
+    if len(set(owners)) == 1:
+        return first
+    defaults = {
+        owner: found[1] for owner, flag in zip(owners, flags, strict=True) if (found := DEFAULT.search(flag.about))
+    }
+    about = first.about
+    if len(set(defaults.values())) > 1:
+        told = ", ".join(f"{owner} {default}" for owner, default in defaults.items())
+        about = DEFAULT.sub(f" [default: {told}]", about)
+    return replace(first, whose=f"{', '.join(owners)}: ", about=about)
 
 
 def build(options: type[Options], given: Mapping[str, Any]) -> Options:

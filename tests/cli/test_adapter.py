@@ -47,7 +47,7 @@ class Here(Options):
 
 
 class There(Options):
-    port: int = option(0, "port of the server", ge=0)
+    port: int = option(8, "port of the server", ge=0)
 
 
 class Both(Options):
@@ -106,7 +106,7 @@ def test_groups_beside_each_other_share_a_flag() -> None:
     )
     about = {flag.name: flag.whose + flag.about for flag in distinct([*flags_of(Both)])}
     assert about == {
-        "port": "here, there: port of the server [default: 0]",
+        "port": "here, there: port of the server [default: here 0, there 8]",
         "own": "here: what nobody else has",
     }
 
