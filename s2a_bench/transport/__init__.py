@@ -281,6 +281,7 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "ros": "s2a_bench.transport.ros:ROS",
         "loopback": "s2a_bench.transport.loopback:LOOPBACK",
         "websocket": "s2a_bench.transport.websocket:WEBSOCKET",
+        "zmq": "s2a_bench.transport.zmq:ZMQ",
     },
 )
 """Name -> what is said about it."""
