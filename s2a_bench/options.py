@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
@@ -96,18 +96,31 @@ def extra_of(field: FieldInfo) -> Mapping[str, Any]:
     return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
 
 
-def places(options: type[Options]) -> dict[str, tuple[str, ...]]:
-    """Return every name under which one option can be given, its field's and its flag's, and the path to its field.
+Place: TypeAlias = tuple[str, ...]
+"""The field of an option, behind the fields of the groups that it is in."""
 
-    The options of a group are there by their own names.
+
+def beside(path: Place, other: Place) -> bool:
+    """Whether two options are in groups beside each other, so that by one name they are one: the port of any server."""
+    return len(path) == len(other) and path[:-2] == other[:-2]
+
+
+def places(options: type[Options]) -> dict[str, list[Place]]:
+    """Return every name under which one option can be given, its field's and its flag's, and the paths to its fields.
+
+    The options of a group are there by their own names; groups beside each other share those that they all have.
     """
-    found: dict[str, tuple[str, ...]] = {}
+    found: dict[str, list[Place]] = {}
     for name, field in options.model_fields.items():
         if inner := group_of(field):
-            found = {each: (name, *path) for each, path in places(inner).items()} | found
+            for each, paths in places(inner).items():
+                mine = [(name, *path) for path in paths]
+                known = found.setdefault(each, mine)
+                if known is not mine and beside(known[0], mine[0]):
+                    known += mine
     for name, field in options.model_fields.items():
         if group_of(field) is None:
-            found |= {name: (name,), str(extra_of(field).get("flag") or name).replace("-", "_"): (name,)}
+            found |= {name: [(name,)], str(extra_of(field).get("flag") or name).replace("-", "_"): [(name,)]}
     return found
 
 
@@ -115,11 +128,11 @@ def placed(options: type[Options], given: Mapping[str, Any]) -> dict[str, Any]:
     """Return options, each given by one of its names, as the class takes them; unknown ones stay as they are."""
     known = places(options)
 
-    def place(name: str, value: Any) -> tuple[str, ...]:
+    def at(name: str, value: Any) -> list[Place]:
         whole = name in options.model_fields and isinstance(value, (Options, dict))
-        return (name,) if whole else known.get(name, (name,))
+        return [(name,)] if whole else known.get(name, [(name,)])
 
-    return nested((place(name, value), value) for name, value in given.items())
+    return nested((path, value) for name, value in given.items() for path in at(name, value))
 
 
 def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
@@ -179,6 +192,11 @@ def _size(value: Any) -> Any:
     return int(width), int(height)
 
 
+def _square(value: Any) -> Any:
+    """Read WIDTHxHEIGHT, or one number for both."""
+    return (int(value),) * 2 if isinstance(value, str) and value.isdecimal() else _size(value)
+
+
 def _text(value: Any) -> Any:
     return _sound(_content(value[1:]) if isinstance(value, str) and value.startswith("@") else value)
 
@@ -215,6 +233,9 @@ WholeNumbers = Annotated[tuple[int, ...], SEVERAL]
 
 Size = Annotated[tuple[int, int], BeforeValidator(_size)]
 """Width and height; as text 640x480."""
+
+Square = Annotated[tuple[int, int], BeforeValidator(_square)]
+"""Width and height; as text 224x224, or 224 for both."""
 
 TextOrFile = Annotated[str, BeforeValidator(_text)]
 """A text, or the content of the file that @FILE names."""

@@ -33,6 +33,7 @@ GROUPS: tuple[str, ...] = (
 STAGES: dict[str, str] = {
     "capture": "capture",
     "convert": "encode",
+    "resize": "encode",
     "image_encode": "encode",
     "connect": "network",
     "network": "network",

@@ -39,6 +39,8 @@ class Flag:
     argument: bool = False
     """Whether it is given by its place."""
     hidden: bool = False
+    whose: str = ""
+    """What stands before the help, as its group says."""
 
     @property
     def spelled(self) -> str:
@@ -55,9 +57,11 @@ class Flag:
         """Return it as a parameter of the function that typer reads; None says that it was not given."""
         default = inspect.Parameter.empty if self.needed else None
         declared: Any = (
-            typer.Argument(metavar=self.spelled + "..." * self.several, help=self.about, show_default=False)
+            typer.Argument(
+                metavar=self.spelled + "..." * self.several, help=self.whose + self.about, show_default=False
+            )
             if self.argument
-            else typer.Option(self.spelled, help=self.about, show_default=False, hidden=self.hidden)
+            else typer.Option(self.spelled, help=self.whose + self.about, show_default=False, hidden=self.hidden)
         )
         kind: Any = self.kind if self.needed else Union[self.kind, None]  # noqa: UP007 - made at run time
         annotation: Any = Annotated[kind, declared]
@@ -80,7 +84,7 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
             only, about = extra.get("only"), extra.get("about", "")
             for flag in flags_of(group):
                 if not only or flag.path[0] in only:
-                    yield replace(flag, path=(name, *flag.path), about=f"{about}{flag.about}")
+                    yield replace(flag, path=(name, *flag.path), whose=f"{about}{flag.whose}")
         else:
             flag_name = str(extra.get("flag") or name.replace("_", "-"))
             kind, argument, hidden = _kind(field.annotation), bool(extra.get("argument")), bool(extra.get("hidden"))
@@ -106,12 +110,36 @@ def command(function: Callable[..., None], *options: type[Options], about: str =
 
 
 def distinct(flags: Sequence[Flag], taken: Iterable[str] = ()) -> list[Flag]:
-    """Return the flags whose names are not ``taken``; of several with one name that in the fewest groups, the first."""
+    """Return the flags whose names are not ``taken``; of several with one name that in the fewest groups, the first.
+
+    It stands for all that are in groups beside its own.
+    """
     names = {name.strip("_").replace("_", "-") for name in taken}
+    chosen = _owners(flags)
+    return [
+        replace(flag, whose=_joined([each.whose for each in flags if chosen[each.name] is flag and _same(each, flag)]))
+        for flag in flags
+        if flag.name not in names and chosen[flag.name] is flag
+    ]
+
+
+def _owners(flags: Iterable[Flag]) -> dict[str, Flag]:
+    """Return of all flags with one name the one that is typed."""
     owners: dict[str, Flag] = {}
     for flag in sorted(flags, key=lambda flag: len(flag.path)):
         owners.setdefault(flag.name, flag)
-    return [flag for flag in flags if flag.name not in names and owners[flag.name] is flag]
+    return owners
+
+
+def _same(flag: Flag, other: Flag) -> bool:
+    from s2a_bench.options import beside
+
+    return flag.path == other.path or beside(flag.path, other.path)
+
+
+def _joined(owners: Sequence[str]) -> str:
+    """Join what stands before the help of one flag: ``http: `` and ``ros: `` are ``http, ros: ``."""
+    return f"{', '.join(each.removesuffix(': ') for each in owners)}: " if len(set(owners)) > 1 else owners[0]
 
 
 def build(options: type[Options], given: Mapping[str, Any]) -> Options:
@@ -121,8 +149,16 @@ def build(options: type[Options], given: Mapping[str, Any]) -> Options:
     """
     from s2a_bench.options import nested
 
-    flags = flags_of(options)
-    return options(**nested((flag.path, given[flag.key]) for flag in flags if given.get(flag.key) is not None))
+    flags = [*flags_of(options)]
+    typed = _owners(flags)
+    said = ((flag, typed[flag.name]) for flag in flags)
+    return options(
+        **nested(
+            (flag.path, given[owner.key])
+            for flag, owner in said
+            if _same(flag, owner) and given.get(owner.key) is not None
+        )
+    )
 
 
 @contextmanager

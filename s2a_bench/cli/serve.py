@@ -77,8 +77,8 @@ def _serve(config: Any) -> None:
     chosen = TRANSPORTS[config.pipeline.partition("?")[0].partition("/")[0]]
     own = getattr(config, chosen.name, None)
     for other, _ in TRANSPORTS.loaded():
-        if other != chosen.name and (given := [*getattr(config, other, Options()).given()]):
-            raise UsageError(f"`{given[0]}` is no option of {chosen.name}; it has {', '.join(_told(chosen))}")
+        if stray := [each for each in getattr(config, other, Options()).given() if each not in _told(chosen)]:
+            raise UsageError(f"`{stray[0]}` is no option of {chosen.name}; it has {', '.join(_told(chosen))}")
     flags = {name: getattr(own, name) for name in own.given()} if own else {}
     values = _toml(config.config) if config.config else {}
     of_engine, of_transport, of_limits = _sorted(values, f"`config` {config.config}", chosen)

@@ -11,7 +11,7 @@ from typing import Protocol
 from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import S2AError, SourceError
 from s2a_bench.frames import FrameSource
-from s2a_bench.frames.convert import encode_jpeg, to_bgr
+from s2a_bench.frames.convert import encode_jpeg, resize, to_bgr
 from s2a_bench.trace import RESIDUAL, Mark, Trace
 from s2a_bench.transport import CameraSink
 from s2a_bench.transport.pictures import JPEG_QUALITY, bgr_of
@@ -25,32 +25,47 @@ class Feed(Protocol):
         """Do what need not be timed."""
         ...
 
-    def capture(self, trace: Trace) -> Frame | None:
-        """Return the frame that goes with the prompt, or None when the server has it; marks the trace."""
+    def capture(self, trace: Trace) -> tuple[Frame, ...]:
+        """Return the frames that go with the prompt, none when the server has it; marks the trace."""
         ...
 
 
 class RequestFeed:
-    """Captures a frame for each request; with ``preencoded`` the camera is one that delivers JPEG."""
+    """Captures frames for each request; with ``preencoded`` the camera is one that delivers JPEG."""
 
-    def __init__(self, source: FrameSource, *, preencoded: bool) -> None:
-        """Take frames from ``source``."""
+    def __init__(
+        self, source: FrameSource, *, preencoded: bool, cameras: int = 1, size: tuple[int, int] | None = None
+    ) -> None:
+        """Take ``cameras`` frames a request from ``source``, and scale them to ``size`` (width, height) if given."""
         self._source = source
         self._preencoded = preencoded
-        self._ready: Frame | None = None
+        self._cameras = cameras
+        self._size = size
+        self._ready: tuple[Frame, ...] = ()
 
     def get_ready(self) -> None:
-        """Encode ahead, where a JPEG is to be at hand."""
+        """Encode ahead, where JPEGs are to be at hand."""
         if self._preencoded:
-            frame = self._source.read()
-            self._ready = replace(frame, encoding="jpeg", data=encode_jpeg(to_bgr(frame), JPEG_QUALITY))
+            self._ready = tuple(
+                replace(frame, encoding="jpeg", data=encode_jpeg(to_bgr(frame), JPEG_QUALITY)) for frame in self._read()
+            )
 
-    def capture(self, trace: Trace) -> Frame:
-        """Read a frame, or hand over the one that is ready."""
+    def capture(self, trace: Trace) -> tuple[Frame, ...]:
+        """Read the frames, or hand over those that are ready."""
         trace.mark(RESIDUAL)
-        frame = self._ready or self._source.read()
+        frames = self._ready or self._read()
         trace.mark("capture")
-        return frame
+        return tuple(self._scaled(frame, trace) for frame in frames) if self._size else frames
+
+    def _read(self) -> tuple[Frame, ...]:
+        return tuple(self._source.read() for _ in range(self._cameras))
+
+    def _scaled(self, frame: Frame, trace: Trace) -> Frame:
+        """Scale one frame, as ``bgr8``."""
+        width, height = self._size or (frame.width, frame.height)
+        pixels = resize(bgr_of(frame, trace).data, width, height)
+        trace.mark("resize")
+        return replace(frame, width=width, height=height, encoding="bgr8", data=pixels)
 
 
 @dataclass(slots=True)
@@ -204,11 +219,11 @@ class StreamFeed:
         """Return the camera's frames since the last call."""
         return self._camera.drain()
 
-    def capture(self, trace: Trace) -> Frame | None:
-        """Start the prompt's clock and take the newest frame; None where the server has it."""
+    def capture(self, trace: Trace) -> tuple[Frame, ...]:
+        """Start the prompt's clock and take the newest frame; none where the server has it."""
         newest = self._camera.newest()
         trace.mark(RESIDUAL)
         if newest is None:
-            return None
+            return ()
         self.last = newest[0]
-        return newest[1] if self.sink is None else None
+        return () if self.sink else (newest[1],)

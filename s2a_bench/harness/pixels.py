@@ -6,6 +6,7 @@ does then competes with the sending of the tokens, and a pause before it would l
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,14 @@ RGB_ENGINE = Fact("rgb_engine", "", "checksum of the engine's pixels")
 def fingerprint(frame: Frame) -> int:
     """Return a checksum, of 52 bits, of a picture as it lies in memory."""
     return _checksum(frame.data)
+
+
+def together(checksums: Iterable[int]) -> int:
+    """Return one checksum, of 52 bits, of several in order; that of a single one is itself."""
+    first, *others = checksums
+    for each in others:
+        first = ((first * _ODD + each) * _ODD) % 2**64 >> 12
+    return first
 
 
 def rgb_fingerprint(frame: Frame) -> int:

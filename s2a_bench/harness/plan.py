@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
@@ -15,9 +15,9 @@ from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
 from s2a_bench.frames import SOURCES
 from s2a_bench.inference import ACTING, EngineConfig, acts, default_engine, told_by
 from s2a_bench.machine.resources.rows import SPENT
-from s2a_bench.options import Grammar, Names, Options, Size, TextOrFile, group, option
+from s2a_bench.options import Grammar, Names, Options, Size, Square, TextOrFile, group, option
 from s2a_bench.trace import path_of
-from s2a_bench.transport import ACTIONS, TRANSPORTS, Transport
+from s2a_bench.transport import ACTIONS, TRANSPORTS, Transport, named_by
 from s2a_bench.transport.options import PAYLOADS, SERVING, Payload, sides
 from s2a_bench.transport.pipeline import Pipeline, answer_over, pipelines, require_payload
 
@@ -52,6 +52,22 @@ def _variants(*, first: bool) -> type[Options]:
     return _made(fields)
 
 
+def _schemes() -> list[str]:
+    """Return what URLs of servers begin with."""
+    return [f"{scheme}://" for _, each in TRANSPORTS.loaded() for scheme in each.schemes]
+
+
+def _with_url(url: str, options: Options | Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of transports, the one that a URL's scheme names told the URL."""
+    told = {name: own if isinstance(own, Mapping) else _said(own) for name, own in dict(options).items()}
+    name = named_by(url)
+    return {**told, name: {**told.get(name, {}), "url": url}}
+
+
+def _said(options: Options) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in options.model_fields_set}
+
+
 def _made(fields: dict[str, Any]) -> type[Options]:
     made: type[Options] = create_model("PerTransport", __base__=Options, **fields)
     return made
@@ -82,11 +98,19 @@ class RequestsConfig(Options):
     )
     source: str = option("synthetic", f"{', '.join(SOURCES)}, as video:FILE")
     size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]")
+    cameras: int = option(1, "pictures a request, read one after the other from the source", ge=1, le=16)
+    resize: Square | None = option(
+        None, "WIDTHxHEIGHT, or 224 for 224x224: pictures are scaled to it before they travel [default: as captured]"
+    )
+    state: int = option(0, "numbers (float32) of the robot's state that go with a request", ge=0, le=4096)
     payload: Payload = option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: http jpeg, ros raw]")
     variants: Variants = group(Variants)
     """The variants to measure where a pipeline's name has none; those that a transport measures by default if empty."""
     options: TransportOptions = group(TransportOptions)
     """The options of every transport, for names that do not say them themselves."""
+    url: str = option(
+        "", f"a server that runs already (a black box), of the transport that its scheme names: {', '.join(_schemes())}"
+    )
     engine: EngineConfig = group(EngineConfig)
     runs: int = option(50, "samples a pipeline [default: 50, quick: 10]", ge=1, le=10**9)
     warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
@@ -122,7 +146,10 @@ class RequestsConfig(Options):
 
     def __init__(self, **given: Any) -> None:
         """Keep what is given, few samples where a quick look is asked for; raises UsageError naming the field."""
-        super().__init__(**({**self.QUICK, **given} if given.get("quick") else given))
+        given = {**self.QUICK, **given} if given.get("quick") else given
+        if given.get("url"):
+            given["options"] = _with_url(given["url"], given.get("options") or {})
+        super().__init__(**given)
 
     @property
     def width(self) -> int:
@@ -142,7 +169,7 @@ class RequestsConfig(Options):
     @cached_property
     def pipelines(self) -> list[Pipeline]:
         """Return what is compared, a cell each; raises UsageError."""
-        told = {name: {each: getattr(given, each) for each in given.model_fields_set} for name, given in self.options}
+        told = {name: _said(given) for name, given in self.options}
         return pipelines(self.names, {**told, "": {"payload": self.payload}}, dict(self.variants), self.engine.name)
 
     @cached_property
@@ -232,6 +259,7 @@ class RequestsConfig(Options):
             )
         check_replay(self.engine)
         self._check_answer()
+        self._check_observation()
         if self.record is not None and self.record.exists():
             raise UsageError(f"`record`: {self.record} exists already and is not overwritten; name another")
         for pipeline in self.pipelines:
@@ -264,6 +292,29 @@ class RequestsConfig(Options):
                 f"`engine` {self.engine.name} answers with tokens, and {alone} carries actions; use `engine` {ACTING}"
             )
 
+    def _check_observation(self) -> None:
+        """Check that what a request brings can be made, and carried."""
+        if self.resize is not None and not all(1 <= side <= LARGEST for side in self.resize):
+            raise UsageError(f"`resize`: {self.resize[0]}x{self.resize[1]} should be 1x1 to {LARGEST}x{LARGEST}")
+        if self.mode == "stream" and (self.cameras > 1 or self.resize):
+            name = "cameras" if self.cameras > 1 else "resize"
+            raise UsageError(f"`{name}`: in `mode` stream one camera runs, whose frames travel as they are")
+        for pipeline in self.pipelines:
+            if self.resize and pipeline.payload in {"yuyv", "jpeg-preencoded"}:
+                raise UsageError(
+                    f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png"
+                )
+            if self.state and not pipeline.transport.takes_state(pipeline.variant, pipeline.options):
+                raise UsageError(f"`state`: a request of {pipeline.name} has no place for it; leave one of them out")
+
+    @property
+    def observation(self) -> str:
+        """Return what a request brings besides the prompt, in words: 3 x 640x480 as 224x224, state of 14."""
+        size = f"{self.width}x{self.height}"
+        said = f"{self.cameras} x {size}" if self.cameras > 1 else size
+        said += f" as {self.resize[0]}x{self.resize[1]}" if self.resize else ""
+        return f"{said}, state of {self.state}" if self.state else said
+
     def _check_unused(self) -> None:
         """Refuse a server of somebody else's that nobody would ask."""
         used = {transport.name for transport in self.used}
@@ -276,4 +327,5 @@ class RequestsConfig(Options):
         told = {each.name: each.options.model_dump(mode="json", exclude_defaults=True) for each in self.pipelines}
         own = self.model_dump(exclude={"quick", "nonce"})  # the nonce stands with the seeds
         size = {"width": self.width, "height": self.height, "size": f"{self.width}x{self.height}"}
+        size |= {"observation": self.observation}
         return {**own, **size, "tuned": self.tuned, "engine": self.served_engine.to_manifest(), "pipelines": told}

@@ -227,7 +227,8 @@ def _sessions(
             feed = StreamFeed(camera, client.camera, int(1e9 / config.fps), random)
         else:
             source = sources.of(cell.name, cell.name if cell.black_box else "")
-            feed = RequestFeed(source, preencoded=cell.payload == "jpeg-preencoded")
+            preencoded = cell.payload == "jpeg-preencoded"
+            feed = RequestFeed(source, preencoded=preencoded, cameras=config.cameras, size=config.resize)
         name = task.in_process if cell.transport.in_process and task.in_process else cell.name
         yield Session(replace(cell, name=name), client, feed, config, recorder, sampler, servers.origin(cell))
 

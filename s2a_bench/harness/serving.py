@@ -19,7 +19,7 @@ from typing import Any
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.facts import PREPROCESS_MS
-from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint
+from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, together
 from s2a_bench.inference import Engine, EngineConfig, honoured_by, open_engine
 from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
 from s2a_bench.provenance import Provenance
@@ -37,7 +37,7 @@ def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMI
     """Make the handler that lets one request at a time into the engine and marks `queue`, `preprocess`, `inference`.
 
     `preprocess` is there where the engine tells ``preprocess_ms`` by its first token. ``limits`` bound the queue and
-    the time of an answer. With ``pixels`` it also tells the checksum of the picture, which is found once the answer is
+    the time of an answer. With ``pixels`` it also tells the checksum of the pictures, which is found once the answer is
     on its way and the engine is free.
     """
 
@@ -59,8 +59,8 @@ def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMI
             if isinstance(tokens, Generator):
                 tokens.close()
             turn.leave()
-        if pixels and len(request.images) == 1:
-            trace.later[RGB_ENGINE] = lambda: float(fingerprint(request.images[0]))
+        if pixels and request.images:
+            trace.later[RGB_ENGINE] = lambda: float(together(fingerprint(image) for image in request.images))
 
     return Queued(answer, limits, Provenance.of_engine(engine.describe()).to_dict())
 

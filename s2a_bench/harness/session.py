@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -18,9 +19,10 @@ from s2a_bench.facts import (
     PROMPT_N,
 )
 from s2a_bench.harness.feed import Feed, StreamedFrame, StreamFeed
-from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint
+from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint, together
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.recording import RunRecorder
+from s2a_bench.inference.chunk import swing
 from s2a_bench.machine.resources.sampler import Sampler
 from s2a_bench.provenance import UNKNOWN, Provenance
 from s2a_bench.secrets import struck_pieces
@@ -106,12 +108,13 @@ class Session:
         trace = Trace()
         error, retry_after_s = "", 0.0
         fatal: S2AError | KeyboardInterrupt | None = None
+        state = state_at(place.block, self._config.state)
         started_ns = now_ns()
         self._sampler.edge()
-        frame = self.feed.capture(trace)
-        images = () if frame is None else (frame,)
+        frames = self.feed.capture(trace)
         config = self._config
-        request = Request(request_id, config.prompt, images, config.most_pieces, config.grammar, config.seed)
+        said = config.prompt, frames, config.most_pieces, config.grammar, config.seed
+        request = Request(request_id, *said, state=state)
         try:
             seen.extend((piece, now_ns()) for piece in self.client.request(request, trace))
         except S2AError as failure:
@@ -131,18 +134,19 @@ class Session:
         if not error and not seen:
             error = "RequestFailed: the answer was empty"
         if self._recorder is not None:
-            if frame is not None and config.mode == "request":  # in stream mode the camera records its frames
-                self._recorder.frame(frame)
+            if config.mode == "request":  # in stream mode the camera records its frames
+                for frame in frames:
+                    self._recorder.frame(frame)
             self._recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
             self._recorder.flush()
-        rows = self._rows(place, request_id, frame, trace, seen, error)
+        rows = self._rows(place, request_id, frames, trace, seen, error)
         return replace(rows, fatal=fatal, retry_after_s=retry_after_s)
 
     def _rows(
         self,
         place: Place,
         request_id: str,
-        frame: Frame | None,
+        frames: Sequence[Frame],
         trace: Trace,
         seen: list[tuple[Piece, int]],
         error: str,
@@ -155,13 +159,14 @@ class Session:
         streamed = self._streamed(trace, request_id)
         if streamed:
             index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index
-        elif frame:
-            index, captured_ns, picture = frame.index, frame.stamp_ns, fingerprint(frame)
+        elif frames:
+            index, captured_ns = frames[0].index, frames[0].stamp_ns
+            picture = together(fingerprint(frame) for frame in frames)
         else:
             index, captured_ns, picture = -1, -1, place.block
         if isinstance(self.feed, StreamFeed) and streamed is None:
             error = error or "RequestFailed: the server knew no frame of this camera"
-        rgb_source = None if frame is None else rgb_fingerprint(frame)
+        rgb_source = together(rgb_fingerprint(frame) for frame in frames) if frames else None
         rgb_engine = _whole(facts.pop(RGB_ENGINE, None))
         error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)
@@ -241,6 +246,11 @@ class Session:
             frame = self._frames.pop(next(iter(self._frames)))
             rows.append(FrameRow(self.cell.name, frame.index, frame.intended_ns, frame.marks, frame.used_by))
         return rows
+
+
+def state_at(block: int, numbers: int) -> tuple[float, ...]:
+    """Return the state of a robot that nobody has: so many joints, another in each block, float32."""
+    return tuple(swing(1, numbers, block)[0].tolist()) if numbers else ()
 
 
 def inference_start_ns(trace: Trace) -> int | None:

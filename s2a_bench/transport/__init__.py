@@ -196,6 +196,8 @@ class Transport(Generic[O]):
     """Whether UDP packets that the machine drops during a run are a reason for doubt."""
     in_process: ClassVar[bool] = False
     """Whether its server is a thread of the client's process."""
+    schemes: ClassVar[tuple[str, ...]] = ()
+    """Of the URLs, ``scheme://...``, that name a server of its kind which is not ours; its option `url` takes them."""
     elsewhere: ClassVar[tuple[str, ...]] = ()
     """Options that, when set, name a server that is not ours."""
     serving: ClassVar[Mapping[str, Any]] = {}
@@ -300,6 +302,12 @@ def declared(name: str) -> Transport[Any]:
         return TRANSPORTS[name]
     except UsageError:
         return _Undeclared()
+
+
+def named_by(url: str) -> str:
+    """Return the transport that a URL's scheme names; ``http`` where none does, whose options say what is wrong."""
+    scheme = url.partition("://")[0].lower()
+    return next((name for name, each in TRANSPORTS.loaded() if scheme in each.schemes), "http")
 
 
 def open_client(wiring: Wiring[Any], alive: Callable[[], bool] = lambda: True) -> Client:

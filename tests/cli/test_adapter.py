@@ -10,9 +10,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from s2a_bench.cli.adapter import command, flags_of
+from s2a_bench.cli.adapter import command, distinct, flags_of
 from s2a_bench.errors import UsageError
-from s2a_bench.options import Names, Options, Size, TextOrFile, WholeNumbers, group, option
+from s2a_bench.options import Names, Options, Size, TextOrFile, WholeNumbers, group, option, placed
 
 
 class Engine(Options):
@@ -39,6 +39,20 @@ class Named(Options):
     task: TextOrFile = option("", "text, or @FILE")
     size: Size = option((640, 480), "WIDTHxHEIGHT [default: 640x480]")
     engine: Engine = group(Engine, only=("threads",), about="the model's ")
+
+
+class Here(Options):
+    port: int = option(0, "port of the server", ge=0)
+    own: bool = option(False, "what nobody else has")
+
+
+class There(Options):
+    port: int = option(0, "port of the server", ge=0)
+
+
+class Both(Options):
+    here: Here = group(Here, about="here: ")
+    there: There = group(There, about="there: ")
 
 
 def run(*arguments: str, options: type[Options] = Asked) -> Any:
@@ -78,9 +92,23 @@ def test_a_size_is_width_and_height() -> None:
 
 def test_of_a_group_only_some_fields_may_be_flags() -> None:
     assert run("go", "--threads", "2", options=Named).engine == Engine(threads=2)
-    about = {flag.name: flag.about for flag in flags_of(Named)}
+    about = {flag.name: flag.whose + flag.about for flag in flags_of(Named)}
     assert about["threads"].startswith("the model's CPU threads; 0: all")
     assert "model" not in about
+
+
+def test_groups_beside_each_other_share_a_flag() -> None:
+    asked = run("--port", "7", "--own", options=Both)
+    assert (
+        asked
+        == Both(here=Here(port=7, own=True), there=There(port=7))
+        == Both(**placed(Both, {"port": 7, "own": True}))
+    )
+    about = {flag.name: flag.whose + flag.about for flag in distinct([*flags_of(Both)])}
+    assert about == {
+        "port": "here, there: port of the server [default: 0]",
+        "own": "here: what nobody else has",
+    }
 
 
 def test_a_text_may_come_from_a_file(tmp_path: Path) -> None:

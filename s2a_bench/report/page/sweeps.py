@@ -6,10 +6,12 @@ Only what is computed is put together: measured cells stay runs of their own, si
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from s2a_bench.experiments.latency.view import against_bytes
 from s2a_bench.experiments.latency.view.cells import cells_of, engine_note
 from s2a_bench.experiments.latency.view.tables import TITLES
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
@@ -19,9 +21,12 @@ from s2a_bench.stats import summary_of
 from s2a_bench.store.requests import TOKENS
 from s2a_bench.store.run import Run
 from s2a_bench.writers.csv_text import CsvTable
+from s2a_bench.writers.figures import marked
 from s2a_bench.writers.tables import ABSENT, TextTable, mean_sd, number
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from s2a_bench.experiments.latency.view.cells import Cell, Floats
     from s2a_bench.store.sweep import Sweep
 
@@ -42,10 +47,16 @@ def overview(sweep: Sweep, runs: Runs) -> Content:
     tables = {"cells": cell_table(sweep)}
     if measured := measured_table(runs):
         tables = {"overview": measured, **tables}
+    lines, figures = against_bytes.shown([run for _, run in runs])
     line = sweep.origins.line
-    tables = {name: replace(table, provenance=line) for name, table in tables.items()}
+    tables = {name: replace(table, provenance=line) for name, table in (lines | tables).items()}
     csvs = {"cells.csv": CsvTable.of_frame(sweep.cells)}
-    return Content(said, tables, ["overview"] if measured else [], csvs)
+    drawn = {name: partial(_marked, build, line) for name, build in figures.items()}
+    return Content(said, tables, [*lines, *(["overview"] if measured else [])], csvs, drawn)
+
+
+def _marked(build: Callable[[], Figure], line: str) -> Figure:
+    return marked(build(), line)
 
 
 def cell_table(sweep: Sweep) -> TextTable:

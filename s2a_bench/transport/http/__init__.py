@@ -55,6 +55,7 @@ class Http(Transport[HttpOptions]):
     packages = (
         *("fastapi", "httptools", "httpx", "json-numpy", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"),
     )
+    schemes = ("http", "https")
     elsewhere = ("url", "llama_server")
     serving = {"port": 8080}
 

@@ -185,6 +185,23 @@ def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | Non
     return ratio_of_launches(cell.by_launch(metric), base.by_launch(metric), seed)
 
 
+def asked(run: Run, cells: list[Cell]) -> str:
+    """Return what each request brings, in words: the pictures' sizes, how many, and the robot's state."""
+    sizes = sorted({cell.about["size"] for cell in cells})
+    return str(run.manifest["configuration"].get("observation") or ", ".join(sizes))
+
+
+def pieces_of(run: Run) -> str:
+    """Return what answers are made of: tokens or actions; a folder from before there were actions has tokens."""
+    engine: dict[str, Any] = run.manifest["configuration"].get("engine") or {}
+    return "actions" if engine.get("answer") == "actions" else "tokens"
+
+
+def chunks(run: Run) -> str:
+    """Return the shape of each answer, in words, where answers are chunks of actions that an engine of ours makes."""
+    return str((run.manifest.get("model") or {}).get("answer") or "")
+
+
 def engine_note(run: Run, cells: list[Cell]) -> Note:
     """Return what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
     engines = {cell.about["engine"] for cell in cells}

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note, groups_present
+from s2a_bench.experiments.latency.view.cells import Cell, asked, cells_of, chunks, engine_note, groups_present
 from s2a_bench.experiments.paper import CAVEAT, LABEL, paper_latency
 from s2a_bench.stats import summary_of
 from s2a_bench.writers.figures import LINE_CHARS, WIDE_SPREAD, logarithmic, name_rows, new_figure, write_beside
@@ -145,7 +145,8 @@ def _title(run: Run, cells: list[Cell], what: str, metric: str) -> str:
     """Return what is drawn, from how many samples, of what size, and what did not really answer."""
     counts = sorted({cell.n for cell in cells})
     facts = [f"n = {' to '.join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))} a cell"]
-    facts += sorted({cell.about["size"] for cell in cells}) + sorted({f"{cell.about['mode']} mode" for cell in cells})
+    facts += [asked(run, cells), *sorted({f"{cell.about['mode']} mode" for cell in cells})]
+    facts += [f"chunks of {shape}"] if (shape := chunks(run)) else []
     facts += [note] if (note := engine_note(run, cells)) else []
     left_out = [cell.name for cell in cells_of(run) if cell.name not in {shown.name for shown in cells}]
     facts += [f"{name} not shown (inference unknown)" for name in left_out]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from s2a_bench.experiments.latency.view.cells import cells_of, ratios
+from s2a_bench.experiments.latency.view.cells import asked, cells_of, ratios
 from s2a_bench.experiments.latency.view.tables import TITLES
 from s2a_bench.stats import summary_of
 from s2a_bench.transport import declared
@@ -27,7 +27,7 @@ def latency_sentences(run: Run) -> list[str]:
     about = cells[0].about
     names = ", ".join(cell.name for cell in cells)
     requests = counts([cell.n for cell in cells], "request")
-    said = [f"{requests} a cell over {names}; frames of {about['size']}, {about['mode']} mode."]
+    said = [f"{requests} a cell over {names}; frames of {asked(run, cells)}, {about['mode']} mode."]
     comparable = any(cell.values_ms("e2e_without_inference").size for cell in cells)
     metric = "e2e_without_inference" if comparable else "e2e"
     medians = [

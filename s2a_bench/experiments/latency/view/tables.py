@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.latency.view.cells import (
     Cell,
+    asked,
     cells_of,
+    chunks,
     engine_note,
     groups_present,
+    pieces_of,
     ratio_between,
     stages_present,
 )
@@ -126,7 +129,7 @@ def token_table(run: Run) -> TextTable | None:
         row += [number(value) for value in (gap.median, gap.p99)] if gap else [ABSENT] * 2
         rows.append((cell.name, *row))
     header = ("cell", "delay median", "p90", "p99", "gap median", "gap p99")
-    title = "Tokens in ms: engine to client (delay), and from one to the next (gap)"
+    title = f"{pieces_of(run).capitalize()} in ms: engine to client (delay), and from one to the next (gap)"
     return TextTable(title, header, rows, 1, notes=_engine_notes(run, cells))
 
 
@@ -182,11 +185,13 @@ def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
     counts = sorted({cell.n for cell in cells})
     span = " to ".join(str(count) for count in dict.fromkeys((*counts[:1], *counts[-1:])))
     notes = [f"n = {span} samples a cell, warm-ups left out." if counts else "No samples."]
-    if sizes := sorted({cell.about["size"] for cell in cells}):
+    if cells:
         payloads = dict.fromkeys(
             f"{cell.pipeline} {cell.about['payload']}" for cell in cells if cell.about["payload"] not in {"none", ""}
         )
-        notes.append(f"{', '.join(sizes)}; payload: {', '.join(payloads) or 'none'}.")
+        notes.append(f"{asked(run, cells)}; payload: {', '.join(payloads) or 'none'}.")
+    if shape := chunks(run):
+        notes.append(f"Each answer is a chunk of {shape} numbers, not tokens.")
     notes += _engine_notes(run, cells)
     if any(cell.has_ingest for cell in cells):
         notes.append(

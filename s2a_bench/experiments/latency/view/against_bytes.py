@@ -1,0 +1,207 @@
+"""Time against bytes, over the latency runs of a sweep: a fixed cost and a cost a megabyte for every pipeline.
+
+The bytes are those of the pictures as pixels (width x height x 3 x cameras), the same for every pipeline and payload,
+so that lines can cross; what of them travels is a column beside them. Loopback's line is the work on the pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note
+from s2a_bench.stats.line import Estimate, Line, crossing, fit_line
+from s2a_bench.transport import declared
+from s2a_bench.writers.figures import new_figure
+from s2a_bench.writers.style import WIDTH_IN, cell_looks
+from s2a_bench.writers.tables import ABSENT, TextTable, number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from s2a_bench.experiments.latency.view.cells import Floats
+    from s2a_bench.store.run import Run
+
+METRIC = "e2e_without_inference"
+MB = 1e6
+FITTED = (
+    "e2e without inference = fixed + ms a MB x MB of the pictures as pixels (width x height x 3 x cameras), fitted to "
+    "the medians by relative distance; 95 % intervals of a bootstrap within each run."
+)
+FIT = (
+    "Travels: bytes on the wire for each of the pixels. Farthest: the median that lies farthest from the line; above "
+    "10 % what was measured is not a line."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Pipeline:
+    """One pipeline with one payload, over all runs."""
+
+    name: str
+    payload: str
+    path: tuple[str, str]
+    groups: tuple[tuple[float, Floats], ...]
+    """MB of pixels a request, ms of each request; an entry a run."""
+    line: Line | None
+    travels: float | None
+    """Bytes on the wire for each of the pixels; None where nothing travels, or nobody tells."""
+
+
+def against_bytes(runs: Sequence[Run]) -> list[Pipeline]:
+    """Return the pipelines of latency runs that differ in how many bytes their pictures have; nothing of others."""
+    found: dict[tuple[str, str], list[tuple[float, Cell]]] = {}
+    for run in runs:
+        if run.manifest["command"] != "latency" or run.samples.empty or not (pixels := _pixels(run)):
+            continue
+        payloads = {cell.about["payload"] for cell in cells_of(run)} - {"", "none"}
+        for cell in cells_of(run):
+            payload = cell.about["payload"] if cell.about["payload"] in payloads else "/".join(sorted(payloads))
+            if cell.values_ms(METRIC).size:
+                found.setdefault((cell.name, payload), []).append((pixels, cell))
+    lines = [_pipeline(name, payload, cells) for (name, payload), cells in found.items()]
+    order = sorted(
+        lines, key=lambda each: (each.payload != "raw", each.payload, declared(each.path[0]).order, each.name)
+    )
+    return order if any(each.line for each in order) else []
+
+
+def _pipeline(name: str, payload: str, cells: Sequence[tuple[float, Cell]]) -> Pipeline:
+    groups = tuple((pixels / MB, cell.values_ms(METRIC)) for pixels, cell in cells)
+    told = [
+        float(sent.median()) / pixels for pixels, cell in cells if (sent := cell.good["payload_bytes"].dropna()).size
+    ]
+    travels = float(np.median(told)) if told else None
+    return Pipeline(name, payload, cells[0][1].path, groups, fit_line(groups), travels)
+
+
+def _pixels(run: Run) -> int:
+    """Return the bytes of a request's pictures as pixels, scaled if they are before they travel."""
+    asked: Mapping[str, Any] = run.manifest["configuration"]
+    width, height = asked.get("resize") or (asked.get("width", 0), asked.get("height", 0))
+    return int(width) * int(height) * 3 * int(asked.get("cameras") or 1)
+
+
+def crossings(pipelines: Sequence[Pipeline]) -> list[tuple[Pipeline, Pipeline, Estimate]]:
+    """Return the pairs whose lines cross between the smallest and the largest picture: the cheaper below first."""
+    found = []
+    for one, other in combinations([each for each in pipelines if each.line], 2):
+        if not (one.line and other.line) or (one.name, one.payload) == (other.name, other.payload):
+            continue
+        sizes = [size for each in (one, other) for size, _ in each.groups]
+        met = crossing(one.line, other.line)
+        if met and min(sizes) <= met.value <= max(sizes):
+            below = (one, other) if one.line.fixed.value < other.line.fixed.value else (other, one)
+            found.append((*below, met))
+    return found
+
+
+def line_table(runs: Sequence[Run], pipelines: Sequence[Pipeline]) -> TextTable:
+    """Lay out each line: the fixed cost, the cost a megabyte, what of the pixels travels, how well a line fits."""
+    rows: list[tuple[str, ...]] = [
+        (
+            each.name,
+            each.payload,
+            _estimate(each.line.fixed),
+            _estimate(each.line.slope),
+            ABSENT if each.travels is None else f"{each.travels:.2f}",
+            f"{each.line.worst:.0%}",
+        )
+        for each in pipelines
+        if each.line
+    ]
+    header = ("pipeline", "payload", "fixed ms", "ms a MB", "travels", "farthest")
+    notes: list[str] = [
+        FITTED,
+        FIT,
+        *_answered(runs),
+    ]
+    return TextTable("Time against bytes: a line for each pipeline", header, rows, 2, notes=tuple(notes))
+
+
+def crossing_table(runs: Sequence[Run], pipelines: Sequence[Pipeline]) -> TextTable | None:
+    """Lay out where lines cross, with loopback, which no picture travels over, left out; None where none do."""
+    wired = [each for each in pipelines if not declared(each.path[0]).in_process]
+    rows: list[tuple[str, ...]] = [
+        (_said(below), _said(above), _estimate(met))
+        for below, above, met in sorted(crossings(wired), key=lambda found: found[2].value)
+    ]
+    if not rows:
+        return None
+    notes = (
+        "Where 95 % of the bootstrap's lines cross, between the smallest and the largest picture.",
+        *_answered(runs),
+    )
+    header = ("faster below", "faster above", "at MB of pixels")
+    return TextTable("Where one becomes faster than another", header, rows, 2, notes=notes)
+
+
+def _said(each: Pipeline) -> str:
+    return f"{each.name}, {each.payload}"
+
+
+def _estimate(found: Estimate) -> str:
+    return f"{number(found.value)} [{number(found.low)}, {number(found.high)}]"
+
+
+def _answered(runs: Sequence[Run]) -> list[str]:
+    notes = {note.sentence(): note for run in runs if (note := engine_note(run, cells_of(run)))}
+    return [notes[said].sentence() for said in sorted(notes)]
+
+
+def build_lines(runs: Sequence[Run], pipelines: Sequence[Pipeline]) -> Figure:
+    """Draw medians and lines, a panel a payload, both axes logarithmic."""
+    drawn = [each for each in pipelines if each.line]
+    payloads = list(dict.fromkeys(each.payload for each in drawn))
+    names = {each.name: each.path for each in drawn}
+    looks = cell_looks(names)
+    title = "Time against bytes: medians and fitted lines"
+    if answered := _answered(runs):
+        title += f"\n{' '.join(answered)}"
+    height = 0.6 + 2.3 * len(payloads) + 0.14 * -(-len(names) // 2)
+    figure = new_figure(height, title, WIDTH_IN)
+    panels = figure.subplots(len(payloads), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, payload in zip(panels, payloads, strict=True):
+        _draw(axes, [each for each in drawn if each.payload == payload], looks)
+        axes.set_title(f"payload {payload}", loc="left")
+        axes.set_ylabel("e2e without inference (ms)")
+    panels[-1].set_xlabel("pictures of a request, as pixels (MB)")
+    handles = {name: handle for axes in panels for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2, columnspacing=1.2)
+    return figure
+
+
+def _draw(axes: Axes, pipelines: Sequence[Pipeline], looks: Mapping[str, tuple[str, str]]) -> None:
+    """Draw one payload's lines, each with its medians."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    for each in pipelines:
+        colour, style = looks[each.name]
+        sizes = np.array([size for size, _ in each.groups])
+        medians = [float(np.median(values)) for _, values in each.groups]
+        axes.scatter(sizes, medians, s=7, color=colour, linewidths=0)
+        if each.line:
+            along = np.geomspace(sizes.min(), sizes.max(), 60)
+            axes.plot(along, [each.line.at(x) for x in along], color=colour, linestyle=style, label=each.name)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    axes.grid(visible=True, linewidth=0.3, color="#DDDDDD")
+
+
+def shown(runs: Sequence[Run]) -> tuple[dict[str, TextTable], dict[str, Callable[[], Figure]]]:
+    """Return the tables and the figure of runs that differ in bytes, by their files' names."""
+    pipelines = against_bytes(runs)
+    if not pipelines:
+        return {}, {}
+    tables = {"bytes": line_table(runs, pipelines)}
+    if crossed := crossing_table(runs, pipelines):
+        tables["crossings"] = crossed
+    return tables, {"time_against_bytes": lambda: build_lines(runs, pipelines)}

@@ -1,0 +1,105 @@
+"""Straight lines through groups of measurements, a fixed cost and a cost a unit, with intervals, and where two cross.
+
+A line minimises the *relative* distances of the groups' medians from it: times of small and of large pictures count
+alike. Intervals are percentiles of a bootstrap within each group (Efron and Tibshirani, An Introduction to the
+Bootstrap, 13.3): they hold for the moments that were measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+DRAWS: Final = 1000
+SURE: Final = 0.95
+LIMITS: Final = (2.5, 97.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A number with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """``y = fixed + slope x``.
+
+    ``worst`` is the largest distance of a group's median from the line, as a share of it: above a tenth or so, what was
+    measured is no line. ``draws`` are (fixed, slope) of the bootstrap: float64 (draws, 2).
+    """
+
+    fixed: Estimate
+    slope: Estimate
+    worst: float
+    draws: Floats
+
+    def at(self, x: float) -> float:
+        """Return y."""
+        return self.fixed.value + self.slope.value * x
+
+
+def fit_line(groups: Sequence[tuple[float, Floats]], seed: int = 0) -> Line | None:
+    """Fit a line through groups of (x, values of y above 0); None where they have fewer than two different x."""
+    import numpy as np
+
+    groups = [(x, values) for x, values in groups if values.size]
+    x = np.array([x for x, _ in groups])
+    if len(set(x.tolist())) < 2:  # noqa: PLR2004 - a line needs two
+        return None
+    rng = np.random.default_rng(seed)
+    y = np.array([np.median(values) for _, values in groups])
+    drawn = np.stack(
+        [np.median(values[rng.integers(values.size, size=(DRAWS, values.size))], 1) for _, values in groups]
+    )
+    fixed, slope = _fit(x, y[:, None])
+    draws = np.stack(_fit(x, drawn), 1)
+    worst = float(np.max(np.abs(y / (fixed[0] + slope[0] * x) - 1)))
+    (low, low_slope), (high, high_slope) = np.percentile(draws, LIMITS, 0)
+    return Line(
+        Estimate(float(fixed[0]), float(low), float(high)),
+        Estimate(float(slope[0]), float(low_slope), float(high_slope)),
+        worst,
+        draws,
+    )
+
+
+def crossing(one: Line, other: Line) -> Estimate | None:
+    """Return the x above 0 at which two lines cross; None where they do not, or fewer than 95 % of the draws do."""
+    import numpy as np
+
+    def meet(fixed: Floats, slope: Floats) -> Floats:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(slope == 0, -1.0, -fixed / slope)
+
+    apart = one.draws - other.draws
+    met = meet(apart[:, 0], apart[:, 1])
+    point = meet(
+        np.array([one.fixed.value - other.fixed.value]), np.array([one.slope.value - other.slope.value])
+    ).item()
+    same_way = np.sign(apart[:, 1]) == np.sign(one.slope.value - other.slope.value)
+    if point <= 0 or np.mean((met > 0) & same_way) < SURE:
+        return None
+    low, high = np.percentile(met[(met > 0) & same_way], LIMITS)
+    return Estimate(point, float(low), float(high))
+
+
+def _fit(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Fit y (groups, fits) with weights 1 / y^2; return fixed and slope, each (fits,)."""
+    import numpy as np
+
+    x, weights = x[:, None], 1 / np.square(y)
+    total, first, second = (np.sum(weights * x**power, 0) for power in range(3))
+    sum_y, sum_xy = np.sum(weights * y, 0), np.sum(weights * x * y, 0)
+    scale = total * second - first**2
+    return (second * sum_y - first * sum_xy) / scale, (total * sum_xy - first * sum_y) / scale

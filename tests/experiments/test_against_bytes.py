@@ -1,0 +1,77 @@
+"""Time against bytes: lines over the runs of a sweep, and the pictures of the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from s2a_bench.experiments.latency.view.against_bytes import against_bytes, build_lines, crossings, shown
+from s2a_bench.store.run import Run
+
+MakeRun = Callable[..., Run]
+FIXED = {"http/binary": 1.0, "ros/topic": 0.2, "loopback": 0.1}
+A_MB = {"http/binary": 0.3, "ros/topic": 0.9, "loopback": 0.2}
+
+
+def asked(width: int, height: int, cameras: int, **more: Any) -> dict[str, Any]:
+    return {"configuration": {"width": width, "height": height, "cameras": cameras, **more}}
+
+
+@pytest.fixture
+def runs(make_run: MakeRun) -> list[Run]:
+    made = []
+    for width, height, cameras in ((224, 224, 1), (640, 480, 1), (640, 480, 3), (1920, 1080, 3)):
+        pixels = width * height * 3 * cameras
+        cells = {
+            name: {"capture": FIXED[name] + A_MB[name] * pixels / 1e6, "inference": 5.0, "return": 0.0}
+            for name in FIXED
+        }
+        payloads = {"http": "raw", "ros": "raw", "loopback": "none"}
+        manifest = asked(width, height, cameras)
+        made.append(make_run(cells, n=8, spread=0, manifest=manifest, payloads=payloads, payload_bytes=2 * pixels))
+    return made
+
+
+def test_lines_are_what_made_the_times(runs: list[Run]) -> None:
+    found = {each.name: each for each in against_bytes(runs)}
+    assert list(found) == ["http/binary", "ros/topic", "loopback"]
+    for name, each in found.items():
+        assert each.line is not None
+        assert (each.line.fixed.value, each.line.slope.value) == pytest.approx((FIXED[name], A_MB[name]), rel=1e-3)
+        assert (each.payload, each.travels) == ("raw", 2.0)
+    ((below, above, met),) = crossings([found["http/binary"], found["ros/topic"]])
+    assert (below.name, above.name) == ("ros/topic", "http/binary")
+    assert met.value == pytest.approx(0.8 / 0.6, rel=1e-2)
+
+
+def test_scaled_pictures_count_as_scaled(make_run: MakeRun) -> None:
+    cells = {"ros/topic": {"capture": 1.0, "inference": 1.0, "return": 0.0}}
+    sizes = [asked(640, 480, 1, resize=[224, 224]), asked(640, 480, 1)]
+    made = [make_run(cells, n=5, spread=0, manifest=each, payloads={"ros": "raw"}) for each in sizes]
+    ((pipeline),) = against_bytes(made)
+    assert [size for size, _ in pipeline.groups] == [224 * 224 * 3 / 1e6, 640 * 480 * 3 / 1e6]
+
+
+def test_runs_of_one_size_show_nothing(make_run: MakeRun) -> None:
+    same = [make_run(n=5, manifest=asked(640, 480, 1)) for _ in range(2)]
+    assert against_bytes(same) == []
+    assert shown(same) == ({}, {})
+    assert against_bytes([make_run(n=5)]) == []  # a folder that says no size
+
+
+def test_tables_and_figure_say_what_answered(runs: list[Run]) -> None:
+    tables, figures = shown(runs)
+    assert set(tables) == {"bytes", "crossings"}
+    assert tables["bytes"].rows[0] == (
+        *("http/binary", "raw", "1.00 [1.00, 1.00]", "0.300 [0.300, 0.300]", "2.00", "0%"),
+    )
+    assert tables["crossings"].rows == [("ros/topic, raw", "http/binary, raw", "1.33 [1.33, 1.33]")]
+    assert all("Echo engine." in table.notes for table in tables.values())
+    figure = figures["time_against_bytes"]()
+    assert "Echo engine." in figure.get_suptitle()
+    (axes,) = figure.axes
+    assert [line.get_label() for line in axes.lines] == ["http/binary", "ros/topic", "loopback"]
+    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+    assert build_lines(runs, against_bytes(runs)).axes
