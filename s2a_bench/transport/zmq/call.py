@@ -41,14 +41,14 @@ class _Gone(Exception):
 class Office:
     """What all calls of a server share."""
 
-    def __init__(self, queued: Queued, limits: Limits, key: str, layout: str, send: Callable[[list[bytes]], None]):
+    def __init__(self, queued: Queued, limits: Limits, key: str, layout: str, send: Callable[[list[Any]], None]):
         """Answer with ``queued`` who has the ``key``; ``send`` takes the frames of an answer from any thread."""
         self.queued, self.limits, self.send = queued, limits, send
         self.threads = ThreadPoolExecutor(THREADS, "zmq")
         self.calls: set[Call] = set()
         self._key, self._layout = key.encode(), layout
         self._lock = Lock()
-        self._marks: OrderedDict[tuple[bytes, str], bytes | Call | None] = OrderedDict()
+        self._marks: OrderedDict[tuple[bytes, str], memoryview | Call | None] = OrderedDict()
 
     @property
     def in_flight(self) -> int:
@@ -94,7 +94,7 @@ class Office:
             if isinstance(asked, Call):
                 asked.refuse(UNKNOWN)
 
-    def keep(self, who: bytes, request_id: str, marks: bytes) -> None:
+    def keep(self, who: bytes, request_id: str, marks: memoryview) -> None:
         """Hand marks to who has asked for them, or keep them."""
         with self._lock:
             asked = self._marks.pop((who, request_id), None)
@@ -110,7 +110,7 @@ class Office:
             if marks is None:
                 self._marks[who, request_id] = call
                 return
-            if not isinstance(marks, bytes):
+            if not isinstance(marks, memoryview):
                 raise UNKNOWN
             del self._marks[who, request_id]
         call.say(marks)
@@ -144,7 +144,7 @@ class Call:
         elif at_ns > turn.deadline_ns:
             goes_on()
 
-    def say(self, message: bytes) -> None:
+    def say(self, message: memoryview) -> None:
         """Answer, and be over."""
         self._office.calls.discard(self)
         self._office.send([*self._envelope, message])

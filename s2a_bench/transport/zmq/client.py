@@ -92,7 +92,7 @@ class ZmqClient:
             trace.mark("connect")
         return self._link
 
-    def _pack(self, request: Request, trace: Trace) -> bytes:
+    def _pack(self, request: Request, trace: Trace) -> memoryview:
         """Fill the template and write it as MessagePack, marking each stage."""
         rooms: dict[int, Room] = {}
         pictures = [self._told(frame, rooms, trace) for frame in request.images]
@@ -181,7 +181,7 @@ class _Link:
             self._check(ends_ns, bounds)
         self._poller.register(self._socket, zmq.POLLIN)
 
-    def asked(self, body: bytes, bounds: Bounds) -> bytes:
+    def asked(self, body: memoryview, bounds: Bounds) -> bytes:
         """Send a request; return its answer."""
         try:
             self._socket.send(body, copy=False)

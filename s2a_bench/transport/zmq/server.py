@@ -1,14 +1,17 @@
 """Our policy server: GR00T's protocol on a ROUTER socket, so that one request does not block all other clients.
 
-One thread has the socket, as libzmq wants it; threads of a pool read and answer (`call`), and hand answers back to it.
+One thread waits for messages; threads of a pool read and answer (`call`). libzmq allows a socket to one thread at a time,
+which a lock sees to: whoever answers sends by itself, so that no answer waits for the interpreter to change threads. So
+the waiting thread must not ask the socket, and waits for its descriptor instead, which tells of changes (ZMQ_FD).
 """
 
 from __future__ import annotations
 
 import errno
+import select
 import socket
-from collections import deque
 from contextlib import suppress
+from threading import Lock
 from typing import Any, Final
 
 import zmq
@@ -46,6 +49,7 @@ class ZmqServer:
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
         self._woken.setblocking(False)
+        self._lock = Lock()
         self._context = zmq.Context()
         self._router = self._context.socket(zmq.ROUTER)
         self._router.linger = 0
@@ -61,7 +65,6 @@ class ZmqServer:
                 raise PortInUse(f"`port`: {port} is in use on {host}; choose another, or 0 for any free one") from error
             raise PortInUse(f"`port`: cannot bind {host}:{port}: {error.strerror}") from error
         self.address: str = self._router.get_string(zmq.LAST_ENDPOINT)
-        self._answers: deque[list[bytes]] = deque()
         self._office = Office(Queued.around(handler, wiring.limits), wiring.limits, key, options.layout, self._send)
         self._stopped = False
 
@@ -71,39 +74,39 @@ class ZmqServer:
 
     def serve(self) -> None:
         """Serve until stopped."""
-        poller = zmq.Poller()
-        for readable in (self._router, self._woken, self._watch.monitor):
-            poller.register(readable, zmq.POLLIN)
-        looked_ns = 0
+        poller = select.poll()
+        for readable in (self._router.FD, self._woken, self._watch.monitor.FD):
+            poller.register(readable, select.POLLIN)
+        looked_ns, more = 0, True
         try:
             while not self._stopped:
                 busy = self._watch.connections or self._office.calls
-                ready = dict(poller.poll(LOOKS_MS if busy else None))
-                if self._woken.fileno() in ready:
-                    with suppress(BlockingIOError):
-                        self._woken.recv(4096)
-                self._say()
-                if self._router in ready:
-                    self._hear()
-                if self._watch.monitor in ready:
-                    self._watch.hear()
+                poller.poll(0 if more else LOOKS_MS if busy else None)
+                with suppress(BlockingIOError):
+                    self._woken.recv(4096)
+                more = self._hear()
+                self._watch.hear()
                 if (at_ns := now_ns()) - looked_ns > LOOKS_MS * 1e6:
                     looked_ns = at_ns
-                    self._look(at_ns)
+                    self._watch.keep(self._limits, self._office.in_flight, at_ns)
+                    for call in list(self._office.calls):
+                        call.look(at_ns)
         finally:
             self._office.threads.shutdown(wait=False, cancel_futures=True)
             self._close()
 
-    def _hear(self) -> None:
-        """Take the messages that are there."""
+    def _hear(self) -> bool:
+        """Take the messages that are there; return whether there may be more."""
         for _ in range(QUEUED):
-            try:
-                frames = self._router.recv_multipart(zmq.NOBLOCK, copy=False)
-            except zmq.Again:
-                return
+            with self._lock:
+                try:
+                    frames = self._router.recv_multipart(zmq.NOBLOCK, copy=False)
+                except zmq.Again:
+                    return False
             trace = Trace()
             trace.mark("network")
             self._take(frames, trace)
+        return True
 
     def _take(self, frames: list[Any], trace: Trace) -> None:
         """Have a message answered: one frame, after an envelope that ends with an empty one."""
@@ -121,34 +124,32 @@ class ZmqServer:
             return
         Call(self._office, envelope, connection, size).start(frames[-1].buffer, trace)
 
-    def _send(self, frames: list[bytes]) -> None:
-        """Have the socket's thread send an answer."""
-        self._answers.append(frames)
+    def _send(self, frames: list[Any]) -> None:
+        """Send an answer, from any thread."""
+        with self._lock:
+            if self._router.closed:
+                return
+            with suppress(zmq.ZMQError):  # who asked has gone, or does not read
+                self._router.send_multipart(frames, zmq.NOBLOCK)
+            came = self._router.EVENTS & zmq.POLLIN
+        if came:  # sending has taken note of it, so that the descriptor no longer tells
+            self._rouse()
+
+    def _rouse(self) -> None:
         with suppress(OSError):  # it is awake already, or has ended
             self._wake.send(b"\0")
 
-    def _say(self) -> None:
-        while self._answers:
-            with suppress(zmq.ZMQError):  # who asked has gone
-                self._router.send_multipart(self._answers.popleft(), zmq.NOBLOCK)
-
-    def _look(self, at_ns: int) -> None:
-        """Keep the limits."""
-        self._watch.keep(self._limits, self._office.in_flight, at_ns)
-        for call in list(self._office.calls):
-            call.look(at_ns)
-
     def _close(self) -> None:
-        self._watch.close()
-        self._wake.close()
-        self._woken.close()
-        self._context.destroy(0)
+        with self._lock:
+            self._watch.close()
+            self._wake.close()
+            self._woken.close()
+            self._context.destroy(0)
 
     def stop(self) -> None:
         """Break off what is under way."""
         self._stopped = True
-        with suppress(OSError):
-            self._wake.send(b"\0")
+        self._rouse()
 
 
 def _resolved(host: str) -> str:

@@ -17,11 +17,13 @@ from s2a_bench.transport.zmq.npy import Room, array_of, file_of
 ARRAY, FILE = "__ndarray_class__", "as_npy"
 LIST, MAP, VALUES = 4096, 1024, 1 << 16
 """The most elements of a list, keys of a map, and elements and keys of a whole message; arrays are one each."""
+SMALL: Final = 1 << 16
+"""Bytes that a message without large pictures takes, or fewer."""
 NO_ROOMS: Final[Mapping[int, Room]] = {}
 
 
-def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS) -> bytes:
-    """Return a message as bytes; raises RequestFailed for values that cannot travel.
+def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS) -> memoryview:
+    """Return a message; raises RequestFailed for values that cannot travel.
 
     An array whose pixels are in one of ``rooms``, by their address, is sent from there.
     """
@@ -32,11 +34,13 @@ def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS) -> bytes:
         room = rooms.get(value.__array_interface__["data"][0])
         return {ARRAY: True, FILE: (room.file(value) if room else None) or file_of(value)}
 
+    size = SMALL + sum(room.pixels.size for room in rooms.values())
     try:
-        packed: bytes = msgpack.packb(message, default=plain)
+        packer = msgpack.Packer(default=plain, autoreset=False, buf_size=size)
+        packer.pack(message)
     except (TypeError, ValueError, OverflowError) as error:
         raise RequestFailed(f"a message that MessagePack cannot carry: {error}") from error
-    return packed
+    return packer.getbuffer()  # without the copy of packb
 
 
 def unpack(data: Any) -> Any:
