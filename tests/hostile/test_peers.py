@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers
+from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, zmq
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
 
@@ -39,3 +39,9 @@ class TestRosTopic(HostileSuite):
 class TestRosAction(HostileSuite):
     name = "ros/action"
     servers = ros_servers.GOALS
+
+
+class TestZmq(HostileSuite):
+    name = "zmq/gr00t"
+    clients = zmq.CLIENTS
+    servers = zmq.SERVERS

@@ -36,6 +36,8 @@ LOOKS_MS: Final = 20
 """How often one who waits looks at its connection."""
 QUOTED: Final = 500
 """Letters that are shown of what a server says went wrong."""
+ROOMS: Final = 16
+"""Most pictures whose memory is kept for the next request."""
 WRONG: Final = b"ERROR"
 """What some of GR00T's servers answer where another policy serves."""
 
@@ -50,6 +52,7 @@ class ZmqClient:
         self._ours = not wiring.black_box
         self._template = template_of(wiring.options.told_by)
         self._key = read_key(wiring.options.api_key_env)
+        self._rooms: dict[tuple[int, int, int], Room] = {}
         self._link: _Link | None = None
         self._connected = False
 
@@ -94,26 +97,27 @@ class ZmqClient:
 
     def _pack(self, request: Request, trace: Trace) -> memoryview:
         """Fill the template and write it as MessagePack, marking each stage."""
-        rooms: dict[int, Room] = {}
-        pictures = [self._told(frame, rooms, trace) for frame in request.images]
+        pictures = [self._told(frame, place, trace) for place, frame in enumerate(request.images)]
         observation = self._template.fill(pictures, request.state, request.prompt)
         data = layouts.data_of(self._wiring.options.layout, observation)
         message: dict[str, Any] = {own.ENDPOINT: own.GET_ACTION, own.DATA: data, **self._token()}
         if self._ours:
             message[own.OWN] = own.parameters(request)
-        body = pack(message, rooms)
+        body = pack(message, {room.address: room for room in self._rooms.values()})
         trace.mark("msgpack_pack")
         trace.facts[PAYLOAD_BYTES] = len(body)
         return body
 
-    def _told(self, frame: Frame, rooms: dict[int, Room], trace: Trace) -> Pixels:
-        """Return a picture as it travels; what a camera has as YUYV is converted to where it is sent from."""
+    def _told(self, frame: Frame, place: int, trace: Trace) -> Pixels:
+        """Return a picture as it travels; what a camera has as YUYV is converted to where it is packed from."""
         if self._wiring.options.payload != "raw" or frame.encoding != "yuv422_yuy2":
             return told(frame, self._wiring.options.payload, trace)
-        room = Room(frame.height, frame.width)
+        if len(self._rooms) > ROOMS:
+            self._rooms.clear()
+        key = place, frame.height, frame.width
+        room = self._rooms.get(key) or self._rooms.setdefault(key, Room(frame.height, frame.width))
         yuyv_to_rgb(frame.data, room.pixels)
         trace.mark("convert")
-        rooms[room.address] = room
         return room.pixels
 
     def _token(self) -> dict[str, str]:

@@ -110,7 +110,10 @@ class ZmqServer:
 
     def _take(self, frames: list[Any], trace: Trace) -> None:
         """Have a message answered: one frame, after an envelope that ends with an empty one."""
-        connection = self._watch.of(frames[-1].get(zmq.SRCFD))
+        try:
+            connection = self._watch.of(frames[-1].get(zmq.SRCFD))
+        except zmq.ZMQError:
+            return  # before ZMTP 3 (2013) messages do not tell where they are from; so does noise that looks like it
         sizes = [len(frame) for frame in frames[1:]]
         connection.take(sizes)
         if len(frames) > ENVELOPE or len(frames) < 3 or sizes[-2]:  # noqa: PLR2004 - identity, empty, message

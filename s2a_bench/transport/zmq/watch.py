@@ -138,5 +138,3 @@ class Watch:
     def _end(self, descriptor: int) -> None:
         if (connection := self.connections.pop(descriptor, None)) is not None:
             connection.end()
-
-
