@@ -1,19 +1,24 @@
-"""Hostile peers of our ZeroMQ server and client: those of any transport over TCP, and some that greet as ZMTP wants it."""
+"""Hostile peers of our ZeroMQ server and client: any over TCP, and some that greet as ZMTP wants it."""
 
 from __future__ import annotations
 
+import socket
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from itertools import repeat
+from threading import Thread
 from typing import Any
 
 import msgpack
 import numpy as np
 
 from s2a_bench.clock import SystemClock, now_ns
-from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
+from s2a_bench.testing.hostile import FAILED, PATIENCE_S, Attack, Case, Trap
 from s2a_bench.testing.hostile.http import bomb
 from s2a_bench.testing.hostile.tcp import CLIENTS as ANY_CLIENT
 from s2a_bench.testing.hostile.tcp import NOISE, answers, crowd, sends, sends_made, servers
+from s2a_bench.transport import Wiring
 from s2a_bench.transport.zmq.npy import file_of
 
 MIB = 1 << 20
@@ -210,9 +215,45 @@ CLIENTS: tuple[Case[Attack], ...] = (
 )
 
 
-def _answers(*bodies: bytes, **more: Any) -> Trap:
-    """Return a server that greets as a REP socket and answers with one message."""
-    return answers(ready(b"REP"), message(*bodies), scheme="tcp://", **more)
+def _answers(*bodies: bytes) -> Trap:
+    """Return a server that greets as a REP socket and answers its first request with one message."""
+    return converses([message(*bodies)])
+
+
+def converses(*answers: Iterable[bytes]) -> Trap:
+    """Return a server that greets, hears each request out, answers with the pieces of one answer each, and listens."""
+
+    def serve(listener: socket.socket) -> None:
+        with suppress(OSError):
+            while True:
+                connection, _ = listener.accept()
+                Thread(target=talk, args=(connection,), daemon=True).start()
+
+    def talk(connection: socket.socket) -> None:
+        with connection, suppress(OSError):
+            connection.settimeout(PATIENCE_S * 5)
+            connection.sendall(ready(b"REP"))
+            for pieces, word in zip(answers, (b"get_action", b"s2a_marks"), strict=False):
+                heard = b""
+                while word not in heard:
+                    if not (data := connection.recv(1 << 16)):
+                        return
+                    heard += data
+                for piece in pieces:
+                    connection.sendall(piece)
+            while connection.recv(1 << 16):
+                pass
+
+    @contextmanager
+    def trap(_: Wiring[Any]) -> Iterator[str]:
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            Thread(target=serve, args=(listener,), daemon=True).start()
+            try:
+                yield "tcp://{}:{}".format(*listener.getsockname())
+            finally:
+                listener.shutdown(socket.SHUT_RDWR)
+
+    return trap
 
 
 def chunk(**parts: Any) -> bytes:
@@ -220,28 +261,7 @@ def chunk(**parts: Any) -> bytes:
     return packed([parts, {}])
 
 
-def _forever(make: Callable[[], bytes]) -> Trap:
-    return answers(ready(b"REP"), frame(b"", more=True), scheme="tcp://", again=_Again(make))
-
-
-class _Again(Sequence[bytes]):
-    """A piece that is made once it is needed."""
-
-    def __init__(self, make: Callable[[], bytes]) -> None:
-        self._make = make
-
-    def __len__(self) -> int:
-        return 1
-
-    def __getitem__(self, place: Any) -> Any:
-        if place:
-            raise IndexError
-        return self._make()
-
-    def __iter__(self) -> Iterator[bytes]:
-        yield self._make()
-
-
+MOVES = chunk(robot=np.zeros((1, 4, 7), np.float32))
 _ANSWERS = {
     "nothing": b"",
     "noise": NOISE,
@@ -272,33 +292,18 @@ SERVERS: tuple[Case[Trap], ...] = (
     Case("greeted, then gone", answers(ready(b"REP"), scheme="tcp://", then="goes"), FAILED),
     Case("greeted, then reset", answers(ready(b"REP"), scheme="tcp://", then="resets"), FAILED),
     Case("another kind of socket", answers(ready(b"PUB"), scheme="tcp://"), FAILED),
-    Case(
-        "1 GiB announced in a frame",
-        answers(ready(b"REP"), frame(b"", more=True) + frame(b"a", said=1 << 30), scheme="tcp://"),
-        FAILED,
-    ),
-    Case(
-        "half an answer, then gone", answers(ready(b"REP"), message(chunk())[:-3], scheme="tcp://", then="goes"), FAILED
-    ),
-    Case("endless frames", _forever(lambda: frame(bytes(1 << 16), more=True)), FAILED),
-    Case("endless small frames", _forever(lambda: frame(b"a" * 100, more=True) * 500), FAILED),
+    Case("endless frames", converses(repeat(frame(bytes(1 << 16), more=True))), FAILED),
+    Case("endless small frames", converses(repeat(frame(b"a" * 100, more=True) * 500)), FAILED),
     Case("two frames", _answers(b"a", b"b"), "2 frames"),
     *(Case(name, _answers(body), FAILED) for name, body in _ANSWERS.items() if name not in _UNLIKE),
     Case("an error", _answers(packed({"error": "the robot is tired"})), "^RequestFailed: .*the robot is tired"),
     Case("an error that forges lines", _answers(packed({"error": CONTROL})), "^RequestFailed: .*all is well"),
     Case("an error that is a list", _answers(packed({"error": [1]})), FAILED),
     Case("an error of 15 MiB", _answers(packed({"error": "no " * 5 * MIB})), FAILED),
-    Case(
-        "actions, then silence where the marks belong", _answers(chunk(robot=np.zeros((1, 4, 7), np.float32))), "silent"
-    ),
-    Case(
-        "marks that are none",
-        answers(
-            ready(b"REP"),
-            message(chunk(robot=np.zeros((1, 4, 7), np.float32))),
-            message(packed({"s2a": {"clock": 5}})),
-            scheme="tcp://",
-        ),
-        FAILED,
-    ),
+    Case("1 GiB announced in an answer", converses([frame(b"", more=True) + frame(b"a", said=1 << 30)]), FAILED),
+    Case("half an answer, then silence", converses([message(MOVES)[:-3]]), "^RequestFailed: .*silent"),
+    Case("an answer without a frame before it", converses([frame(MOVES)]), FAILED),
+    Case("actions, then silence where the marks belong", _answers(MOVES), "^RequestFailed: .*silent"),
+    Case("marks that are none", converses([message(MOVES)], [message(packed({"s2a": {"clock": 5}}))]), FAILED),
+    Case("marks that are an error", converses([message(MOVES)], [message(packed({"error": CONTROL}))]), FAILED),
 )

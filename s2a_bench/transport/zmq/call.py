@@ -41,7 +41,9 @@ class _Gone(Exception):
 class Office:
     """What all calls of a server share."""
 
-    def __init__(self, queued: Queued, limits: Limits, key: str, layout: str, send: Callable[[list[Any]], None]):
+    def __init__(
+        self, queued: Queued, limits: Limits, key: str, layout: str, send: Callable[[list[Any]], None]
+    ) -> None:
         """Answer with ``queued`` who has the ``key``; ``send`` takes the frames of an answer from any thread."""
         self.queued, self.limits, self.send = queued, limits, send
         self.threads = ThreadPoolExecutor(THREADS, "zmq")
@@ -80,7 +82,7 @@ class Office:
             return {}
         if endpoint == own.KILL:
             raise RequestFailed("this server is not ended over the network: stop its process")
-        known = ", ".join((own.GET_ACTION, own.PING, own.RESET, own.MODALITIES))
+        known = f"{own.GET_ACTION}, {own.PING}, {own.RESET}, {own.MODALITIES}"
         raise RequestFailed(f"Unknown endpoint: {str(endpoint)[:80]!r} is none of {known}")
 
     def promise(self, who: bytes, request_id: str) -> None:

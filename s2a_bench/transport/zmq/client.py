@@ -36,6 +36,8 @@ LOOKS_MS: Final = 20
 """How often one who waits looks at its connection."""
 QUOTED: Final = 500
 """Letters that are shown of what a server says went wrong."""
+LONGEST_S: Final = 86_400
+"""No server is waited for longer, however long it asks to."""
 ROOMS: Final = 16
 """Most pictures whose memory is kept for the next request."""
 WRONG: Final = b"ERROR"
@@ -63,7 +65,6 @@ class ZmqClient:
         try:
             link = self._open(bounds, trace)
             body = self._pack(request, trace)
-            packed_ns = trace.marks[-1][1]
             answer = self._said(link.asked(body, bounds))
             actions = layouts.actions_in(answer)
             seen_ns = now_ns()
@@ -132,8 +133,8 @@ class ZmqClient:
         if isinstance(answer, dict) and own.ERROR in answer:
             said = " ".join(struck(str(answer[own.ERROR])).split())[-QUOTED:] or "an error without words"
             wait_s = answer.get(own.RETRY)
-            asks = float(wait_s) if type(wait_s) in {int, float} and 0 <= wait_s < 1 << 20 else None  # type: ignore[operator]
-            raise RequestFailed(f"{url}: {said}", retry_after_s=asks)
+            patient = isinstance(wait_s, (int, float)) and 0 <= wait_s <= LONGEST_S
+            raise RequestFailed(f"{url}: {said}", retry_after_s=wait_s if patient else None)
         return answer
 
     def describe(self) -> dict[str, str]:

@@ -1,9 +1,9 @@
 """What stands where in GR00T's messages: observations of a robot, and chunks of actions.
 
-N1.5 is flat: ``video.<camera>`` (T, H, W, 3) uint8, ``state.<part>`` (T, D), ``annotation.<...>`` [text]; the answer is
-``action.<part>`` (H, D). N1.6 is nested: ``observation`` with ``video``, ``state`` and ``language``, all with a batch in
-front, as (B, T, H, W, 3), (B, T, D), [[text]]; the answer is [{part: (B, H, D)}, info]. Our server reads both, whichever
-comes, and answers in the same.
+N1.5 is flat: ``video.<camera>`` (T, H, W, 3) uint8, ``state.<part>`` (T, D), ``annotation.<...>`` [text]; its answer is
+``action.<part>`` (H, D). N1.6 is nested: ``observation`` with ``video``, ``state`` and ``language``, all with a batch
+in front, as (B, T, H, W, 3), (B, T, D), [[text]]; its answer is [{part: (B, H, D)}, info]. Our server reads both,
+whichever comes, and answers in the same.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ ITEM: Final = 8
 DIMENSIONS: Final = 8
 BEFORE: Final = 128
 """Bytes of the header of a picture, and of most."""
-PREFIX: Final = {(1, 0): 10, (2, 0): 12, (3, 0): 12}
+PREFIX: Final = {b"\x01\x00": 10, b"\x02\x00": 12, b"\x03\x00": 12}
 """Version -> bytes before the header's text: the magic, the version, the text's length."""
 
 
@@ -53,7 +53,7 @@ class Room:
 def file_of(array: NDArray[Any]) -> bytes:
     """Return the file of an array."""
     solid = np.ascontiguousarray(array)
-    return _head(array.shape, npy.dtype_to_descr(solid.dtype)) + solid.tobytes()
+    return _head(array.shape, solid.dtype.str) + solid.tobytes()
 
 
 def array_of(data: Any) -> NDArray[Any]:
@@ -64,19 +64,16 @@ def array_of(data: Any) -> NDArray[Any]:
     if not isinstance(data, bytes):
         raise RequestFailed(f"an array whose as_npy is {type(data).__name__}, not bytes")
     start, shape, fortran, dtype = _read_head(_head_in(data))
-    flat = np.frombuffer(data, dtype, offset=start) if _fits(len(data) - start, shape, dtype) else None
-    if flat is None:
-        raise RequestFailed(f"an array of shape {shape} and type {dtype} in {len(data) - start} bytes")
+    size = len(data) - start
+    if min(shape, default=0) < 0 or prod(shape) * dtype.itemsize != size:
+        raise RequestFailed(f"an array of shape {shape} and type {dtype} in {size} bytes")
+    flat = np.frombuffer(data, dtype, offset=start) if size else np.empty(0, dtype)
     return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
-
-
-def _fits(size: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
-    return all(length >= 0 for length in shape) and prod(shape) * dtype.itemsize == size
 
 
 def _head_in(data: bytes) -> bytes:
     """Return a file's header with what is before it."""
-    version = tuple(data[6:8])
+    version = data[6:8]
     prefix = PREFIX.get(version, 0) if data.startswith(npy.MAGIC_PREFIX) else 0
     if not prefix or len(data) < prefix:
         raise RequestFailed(f"{len(data)} bytes that are no NumPy file")
@@ -102,7 +99,7 @@ def _read_head(head: bytes) -> tuple[int, tuple[int, ...], bool, np.dtype[Any]]:
 
 
 @lru_cache(64)
-def _head(shape: tuple[int, ...], descr: Any) -> bytes:
+def _head(shape: tuple[int, ...], descr: str) -> bytes:
     file = io.BytesIO()
     npy.write_array_header_1_0(file, {"shape": shape, "fortran_order": False, "descr": descr})
     return file.getvalue()

@@ -1,8 +1,8 @@
 """Our policy server: GR00T's protocol on a ROUTER socket, so that one request does not block all other clients.
 
-One thread waits for messages; threads of a pool read and answer (`call`). libzmq allows a socket to one thread at a time,
-which a lock sees to: whoever answers sends by itself, so that no answer waits for the interpreter to change threads. So
-the waiting thread must not ask the socket, and waits for its descriptor instead, which tells of changes (ZMQ_FD).
+One thread waits for messages; threads of a pool read and answer (`call`). libzmq allows a socket to one thread at a
+time, which a lock sees to: whoever answers sends by itself, so that no answer waits for the interpreter to change
+threads. So the waiting thread must not ask the socket, and waits for its descriptor, which tells of changes (ZMQ_FD).
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class ZmqServer:
                 return
             with suppress(zmq.ZMQError):  # who asked has gone, or does not read
                 self._router.send_multipart(frames, zmq.NOBLOCK)
-            came = self._router.EVENTS & zmq.POLLIN
+            came = self._router.getsockopt(zmq.EVENTS) & int(zmq.POLLIN)  # type: ignore[operator]
         if came:  # sending has taken note of it, so that the descriptor no longer tells
             self._rouse()
 

@@ -40,7 +40,7 @@ def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS) -> memoryview:
         packer.pack(message)
     except (TypeError, ValueError, OverflowError) as error:
         raise RequestFailed(f"a message that MessagePack cannot carry: {error}") from error
-    return packer.getbuffer()  # without the copy of packb
+    return memoryview(packer.getbuffer())  # without the copy of packb
 
 
 def unpack(data: Any) -> Any:
