@@ -1,4 +1,4 @@
-"""Hostile and honest clients together on a server that runs: ``python -m benchmarks.soak http|ros [--minutes M]``.
+"""Hostile and honest clients together on a server that runs: ``python -m benchmarks.soak http|ros|shm [--minutes M]``.
 
 The server is a `serve` process, and so is its twin, which nobody attacks: the idle latency of the one is divided by
 that of the other in interleaved blocks, before the load and after it, so that what else the machine does cancels out.
@@ -32,7 +32,7 @@ import httpx
 
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.stats.change import ratio_of_blocks
-from s2a_bench.testing.hostile import http, ros
+from s2a_bench.testing.hostile import http, ros, shm
 from s2a_bench.testing.hostile.usage import Usage, family, usage
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.transport import Client, Wiring, open_client
@@ -45,11 +45,15 @@ SILENCE_S = 30.0
 """Over ROS the last messages of an answer may be lost: a client hears nothing, and asks again."""
 WARM_UP = 0.2
 """Of the minutes, before them; more where not every hostile client has come by then as often as there are attackers."""
-HOSTILE = {"http": http.CLIENTS, "ros": ros.CLIENTS}
+HOSTILE = {"http": http.CLIENTS, "ros": ros.CLIENTS, "shm": shm.CLIENTS}
 WARM_UP_ONLY = frozenset({"a prompt of 16 MiB", "8 requests of 16 MiB"})
 """Over ROS requests are received on many threads, and glibc keeps the most that each ever held (machine/tuning.py):
 with these the memory swings by 150 MiB, which would hide growth."""
-HONEST = {"http": ("http", "http/best-effort", "whole"), "ros": ("ros/topic", "ros/topic", "ros/action")}
+HONEST = {
+    "http": ("http", "http/best-effort", "whole"),
+    "ros": ("ros/topic", "ros/topic", "ros/action"),
+    "shm": ("shm", "shm", "shm"),
+}
 """What the honest clients speak; "whole" is an answer that is not streamed."""
 ATTACKERS = 3
 BLOCK = {"echo": 20}
@@ -124,8 +128,13 @@ class Result:
 def served(transport: str, engine: str, name: str, log: Path) -> Iterator[Served]:
     """Run `serve`, which ends with the context; what it writes to standard error goes to ``log``."""
     line = [sys.executable, "-m", "s2a_bench", "serve", transport, "--engine", engine]
-    own = {"http": ["--port", "0"], "ros": ["--namespace", f"/{name}_{os.getpid()}", "--max-tokens", str(TOKENS)]}
-    line += own[transport]
+    own: dict[str, tuple[list[str], str]] = {
+        "http": (["--port", "0"], r"http://[\d.:]+"),
+        "ros": (["--namespace", f"/{name}_{os.getpid()}", "--max-tokens", str(TOKENS)], rf"/{name}_\d+"),
+        "shm": ([], r"/\S+\.sock"),
+    }
+    flags, address = own[transport]
+    line += flags
     with (
         log.open("a") as errors,
         subprocess.Popen(line, stdout=subprocess.PIPE, stderr=errors, text=True) as process,  # noqa: S603 - ours
@@ -135,8 +144,7 @@ def served(transport: str, engine: str, name: str, log: Path) -> Iterator[Served
             if not select.select([process.stdout], [], [], READY_S)[0]:
                 raise TimeoutError(f"the server said nothing for {READY_S:g} s")
             said = process.stdout.readline()
-            found = re.search(r"http://[\d.:]+", said) if transport == "http" else re.search(rf"/{name}_\d+", said)
-            if found is None:
+            if (found := re.search(address, said)) is None:
                 raise RuntimeError(f"the server said: {said}")
             yield Served(process, found[0])
         finally:
@@ -145,7 +153,7 @@ def served(transport: str, engine: str, name: str, log: Path) -> Iterator[Served
 
 def told(name: str, address: str) -> Wiring[Any]:
     """Return what a client of a server is told."""
-    silence_s = PATIENCE_S if name.startswith("http") else SILENCE_S
+    silence_s = SILENCE_S if name.startswith("ros") else PATIENCE_S
     return wiring(name, address, timeout_s=silence_s, max_tokens=TOKENS)
 
 

@@ -94,6 +94,19 @@ class Remote:
     provenance: dict[str, str] = field(default_factory=dict)
     """Who answered, as `provenance.Provenance` has it; empty where the server does not tell."""
 
+    @staticmethod
+    def of_json(value: Mapping[str, Any]) -> Remote:
+        """Read what a server sent as JSON; raises ValueError, KeyError or TypeError for what can be none."""
+        return Remote(
+            clock=value["clock"],
+            marks=[(stage, stamp) for stage, stamp in value["marks"]],
+            token_ns=value["token_ns"],
+            frame_stamp_ns=value["frame_stamp_ns"],
+            frame_marks=[(stage, stamp) for stage, stamp in value["frame_marks"]],
+            facts=value["facts"],
+            provenance=value.get("provenance", {}),
+        ).check()
+
     def check(self) -> Remote:
         """Return it; raises ValueError for what came from outside and can be no server's marks."""
         marks = [*self.marks, *self.frame_marks]

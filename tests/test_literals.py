@@ -8,7 +8,7 @@ from pathlib import Path
 import s2a_bench
 
 HERE = Path(s2a_bench.__file__).parent
-NAMED = re.compile(r'"(http|ros|loopback)["/]')
+NAMED = re.compile(r'"(http|ros|loopback|shm)["/]')
 ALLOWED = {
     "harness/plan.py": (1, "what is compared unless told: the paper's two pipelines"),
     "library.py": (1, "the example in its docstring"),

@@ -24,7 +24,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import open_client
 from s2a_bench.types import Request
 
-TRANSPORTS = ("http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action")
+TRANSPORTS = ("http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action", "shm")
 WHATS = ("server killed", "server told to end", "server stopped", "client killed", "client stopped", "connection cut")
 WHENS = ("before the first request", "in the queue", "in the middle of an answer", "between requests", "while closing")
 ENDS_THE_SERVER = ("server killed", "server told to end")

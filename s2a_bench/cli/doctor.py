@@ -20,7 +20,7 @@ STYLES = {"state": "green", "advice": "cyan", "warning": "yellow", "error": "bol
 def _doctor(config: DoctorConfig, *, json_: Json = False) -> None:
     from s2a_bench.machine.doctor import LEVELS, Machine, examine, worst
 
-    findings = examine(replace(Machine(), output=config.output), all_checks())
+    findings = _of_url(config.url) if config.url else examine(replace(Machine(), output=config.output), all_checks())
     if json_:
         print_json(_as_json(findings))
     else:
@@ -30,6 +30,12 @@ def _doctor(config: DoctorConfig, *, json_: Json = False) -> None:
 
 
 doctor = command(_doctor, DoctorConfig)
+
+
+def _of_url(url: str) -> list[Finding]:
+    from s2a_bench.transport.dangers import examine
+
+    return examine(url)
 
 
 def all_checks() -> dict[str, str]:

@@ -58,15 +58,22 @@ _CODES: Final[dict[str, tuple[int, int, int]]] = {
 """Raw encoding -> channels of what OpenCV converts, its code to BGR, its code to RGB."""
 
 
-def to_bgr(frame: Frame) -> Pixels:
+def to_bgr(frame: Frame, out: Pixels | None = None) -> Pixels:
     """Return the frame's picture as (h, w, 3) ``bgr8``: its own data where it is that already, else a new array.
 
-    Raises ValueError when the data does not fit the frame's encoding.
+    With ``out`` it is there. Raises ValueError when the data does not fit the frame's encoding.
     """
-    if frame.encoding in _CODES:
+    if frame.encoding not in _CODES:
+        bgr = _decode(frame.data, cv2.IMREAD_COLOR)
+    else:
         channels, code, _ = _CODES[frame.encoding]
-        return _convert(_eight_bits(frame), channels, code)
-    return _decode(frame.data, cv2.IMREAD_COLOR)
+        data = _eight_bits(frame)
+        fits = code != AS_IT_IS and out is not None and out.shape[:2] == data.shape[:2]  # NV12 has more rows
+        bgr = _convert(data, channels, code, out if fits else None)
+    if out is not None and bgr is not out:
+        out[...] = bgr
+        return out
+    return bgr
 
 
 def to_rgb(frame: Frame) -> Pixels:

@@ -198,6 +198,8 @@ class Transport(Generic[O]):
     """Whether its server is a thread of the client's process."""
     schemes: ClassVar[tuple[str, ...]] = ()
     """Of the URLs, ``scheme://...``, that name a server of its kind which is not ours; its option `url` takes them."""
+    examines: ClassVar[str] = ""
+    """``module:function`` of what `doctor --url` looks at, see `transport.dangers`."""
     elsewhere: ClassVar[tuple[str, ...]] = ()
     """Options that, when set, name a server that is not ours."""
     serving: ClassVar[Mapping[str, Any]] = {}
@@ -284,6 +286,7 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "loopback": "s2a_bench.transport.loopback:LOOPBACK",
         "websocket": "s2a_bench.transport.websocket:WEBSOCKET",
         "zmq": "s2a_bench.transport.zmq:ZMQ",
+        "shm": "s2a_bench.transport.shm:SHM",
     },
 )
 """Name -> what is said about it."""

@@ -22,11 +22,11 @@ STAGES = {
 PREENCODED = {"jpeg": "image/jpeg", "png": "image/png"}
 
 
-def bgr_of(frame: Frame, trace: Trace) -> Frame:
-    """Convert what a camera delivers to ``bgr8``; marks `convert` where there is something to do."""
-    if frame.encoding == "bgr8":
+def bgr_of(frame: Frame, trace: Trace, out: Pixels | None = None) -> Frame:
+    """Convert what a camera delivers to ``bgr8``, into ``out`` if given; marks `convert` unless it is that."""
+    if frame.encoding == "bgr8" and out is None:
         return frame
-    converted = replace(frame, encoding="bgr8", data=to_bgr(frame))
+    converted = replace(frame, encoding="bgr8", data=to_bgr(frame, out))
     trace.mark("convert")
     return converted
 

@@ -272,3 +272,16 @@ def test_ros_args_that_are_none_are_one_line(arguments: list[str], message: str)
     assert done.returncode == 2
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_shm_says_where_memory_is_handed_over_and_leaves_no_socket(start: Start, tmp_path: Path) -> None:
+    path = tmp_path / "robot.sock"
+    process, line = start("shm", "--engine", "echo", "--socket", str(path))
+    assert line.startswith(f"serving shared memory at {path} for this user alone; ")
+    client = open_client(wiring("shm", str(path)))
+    tokens, _ = ask(client, Request("a", "hello robot", (yuyv_frame(),), max_tokens=2))
+    client.close()
+    assert "".join(token.text for token in tokens) == "hello robot"
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) in {0, -signal.SIGTERM}
+    assert not path.exists()

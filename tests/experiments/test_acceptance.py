@@ -6,6 +6,7 @@ The limits are those of the project's issue on the main job; measured medians li
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,11 +17,14 @@ import pytest
 LIMITS = {
     "raw": {"http/as-deployed": 70, "http/best-effort": 18, "http/binary": 12, "ros/topic": 7},
     "jpeg": {"http/as-deployed": 32, "http/best-effort": 18, "ros/topic": 7},
+    "alone": {"shm": 1.6},
 }
 """Payload -> cell -> most times loopback's median end to end without inference, at 640x480.
 
 Binary with JPEG is left to `make bench` to print: coding and decoding the JPEG alone is half of its limit of 12, and
-at 10.3 to 10.9 measured a busy machine would decide the test.
+at 10.3 to 10.9 measured a busy machine would decide the test. "alone" is raw pixels without the pipelines of other
+servers, which leave cold caches behind, and one token: where the other cores are busy a server that goes on to write 31
+more at once, as no model does, keeps its client from the core for .15 ms, most of what this wire costs.
 """
 
 
@@ -30,7 +34,9 @@ TRIES = 3
 
 def measured(payload: str, output: Path) -> tuple[dict[str, float], list[str]]:
     """Return the cells over their limit, with their ratio to loopback, and those whose stages leave over 5 %."""
-    arguments = ["latency", "--engine", "echo", "--transport", f"http?payload={payload},ros,loopback"]
+    transports = "shm,loopback" if payload == "alone" else f"http?payload={payload},ros,loopback"
+    arguments = ["latency", "--engine", "echo", "--transport", transports]
+    arguments += ["--max-tokens", "1"] * (payload == "alone")
     done = subprocess.run(
         [sys.executable, "-m", "s2a_bench", *arguments, "--runs", "100", "--json", "--output", str(output)],
         capture_output=True,
@@ -46,10 +52,12 @@ def measured(payload: str, output: Path) -> tuple[dict[str, float], list[str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("payload", ["raw", "jpeg"])
+@pytest.mark.parametrize("payload", [*LIMITS])
 def test_no_pipeline_is_a_straw_man_and_the_budget_closes(tmp_path: Path, payload: str) -> None:
     for _ in range(TRIES):
         found = measured(payload, tmp_path)
         if found == ({}, []):
             break
+    if payload == "alone" and found != ({}, []) and os.getloadavg()[0] > (os.cpu_count() or 1) / 2:
+        pytest.skip(f"other processes have the cores: {found}")
     assert found == ({}, [])

@@ -58,7 +58,9 @@ def handler(*, alter: bool) -> Handler:
     return handle
 
 
-@pytest.mark.parametrize("name", ["http/best-effort?payload=raw", "http/binary?payload=png", "loopback"])
+@pytest.mark.parametrize(
+    "name", ["http/best-effort?payload=raw", "http/binary?payload=png", "shm", "shm?payload=yuyv", "loopback"]
+)
 def test_one_altered_pixel_makes_a_lossless_sample_an_error(measure: Measure, name: str) -> None:
     good, bad = (measure(name, handler(alter=alter)).sample for alter in (False, True))
     assert (good.error, good.rgb_engine) == ("", good.rgb_source)

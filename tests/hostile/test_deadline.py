@@ -22,7 +22,7 @@ from tests.hostile.test_queue import CHAT, Gate, body, serving, until
 
 SOON = Limits(answer_s=1.0)
 REASON = "1 s after it came the request is still being answered"
-NAMES = ["loopback", "http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action"]
+NAMES = ["loopback", "http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action", "shm"]
 
 
 class Endless:
@@ -77,7 +77,7 @@ def test_a_request_waits_no_longer_than_to_its_deadline() -> None:
         turns.join().wait()
 
 
-@pytest.mark.parametrize("name", ["http/as-deployed", "ros/topic", "ros/action"])
+@pytest.mark.parametrize("name", ["http/as-deployed", "ros/topic", "ros/action", "shm"])
 def test_one_that_waited_to_its_deadline_is_told_and_never_begins(name: str) -> None:
     gate = Gate()
     with serving(gate, name, SOON) as address:

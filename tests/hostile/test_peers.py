@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, zmq
+from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm, zmq
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
 
@@ -45,3 +45,9 @@ class TestZmq(HostileSuite):
     name = "zmq/gr00t"
     clients = zmq.CLIENTS
     servers = zmq.SERVERS
+
+
+class TestShm(HostileSuite):
+    name = "shm"
+    clients = shm.CLIENTS
+    servers = shm.SERVERS

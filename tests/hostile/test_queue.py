@@ -173,7 +173,7 @@ class Accepting(Queued):
         yield from super().answer(request, trace, turn)
 
 
-@pytest.mark.parametrize("name", ["http/as-deployed", "http/binary", "ros/topic", "ros/action"])
+@pytest.mark.parametrize("name", ["http/as-deployed", "http/binary", "ros/topic", "ros/action", "shm"])
 def test_requests_end_in_the_order_of_their_acceptance(name: str) -> None:
     engine = Slow()
     accepting = Accepting(engine_handler(engine, pixels=False))

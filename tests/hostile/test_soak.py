@@ -26,7 +26,7 @@ def test_bodies_that_no_framework_lets_go_are_not_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("transport", ["http", "ros"])
+@pytest.mark.parametrize("transport", [*HOSTILE])
 def test_no_promise_is_broken_within_a_minute(transport: str, tmp_path: Path) -> None:
     log = tmp_path / "log"
     result = soak(transport, "echo", float(os.environ.get("S2A_SOAK_MINUTES", "0.5")), log, blocks=5)

@@ -19,7 +19,7 @@ class Asked(Options):
     """Which model answers, over which transport."""
 
     live: bool = option(False, "take the tokens of a model that really answers, about the rendered scene")
-    transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, loopback [default: ros]")
+    transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]")
     engine: EngineConfig = group(EngineConfig, only=("name", "model", "mmproj", "threads", "pace"), about="--live: ")
 
     track_file: Path | None = option(

@@ -11,4 +11,5 @@ class DoctorConfig(Options):
     """How a machine is examined."""
 
     output: Path = option(Path("results"), "folder for run folders, whose disk is looked at")
+    url: str = option("", "instead of this machine, a server that somebody else runs: what it does that is dangerous")
     strict: bool = option(False, "exit with 1 on warnings too")

@@ -56,6 +56,7 @@ class Http(Transport[HttpOptions]):
         *("fastapi", "httptools", "httpx", "json-numpy", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"),
     )
     schemes = ("http", "https")
+    examines = "s2a_bench.transport.http.dangers:examine"
     elsewhere = ("url", "llama_server")
     serving = {"port": 8080}
 

@@ -131,12 +131,4 @@ def remote_json(remote: Remote) -> dict[str, Any]:
 
 def remote_of_json(value: dict[str, Any]) -> Remote:
     """Read a server's marks from the last event; raises ValueError for what can be none."""
-    return Remote(
-        clock=value["clock"],
-        marks=[(stage, stamp) for stage, stamp in value["marks"]],
-        token_ns=value["token_ns"],
-        frame_stamp_ns=value["frame_stamp_ns"],
-        frame_marks=[(stage, stamp) for stage, stamp in value["frame_marks"]],
-        facts=value["facts"],
-        provenance=value.get("provenance", {}),
-    ).check()
+    return Remote.of_json(value)

@@ -58,6 +58,8 @@ def test_one_cell_by_hand(make_run: MakeRun) -> None:
         "pipeline": "ros",
         "variant": "topic",
         "payload": "raw",
+        "observation": "640x480",
+        "answer": "tokens",
         "connection": "keep-alive",
         "engine": "echo",
         "mode": "request",

@@ -5,7 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.latency.view.cell import LatencyCell
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, groups_present, ratios, stages_present
+from s2a_bench.experiments.latency.view.cells import (
+    Cell,
+    asked,
+    cells_of,
+    groups_present,
+    pieces_of,
+    ratios,
+    stages_present,
+)
 from s2a_bench.store.manifest import present
 from s2a_bench.writers.as_json import frame, ratio_entry, summaries
 
@@ -30,6 +38,8 @@ def about_cell(cell: Cell, run: Run) -> dict[str, Any]:
     return {
         "cell": cell.name,
         **cell.about,
+        "observation": asked(run, [cell]),
+        "answer": pieces_of(run),
         "profile": origin.profile or None,
         "emulated": cell.emulated,
         "dummy": {"real": False, "dummy": True, "none": True}.get(origin.weights),

@@ -22,6 +22,10 @@ class RequestsCell:
     engine: str
     mode: Literal["request", "stream"]
     size: Annotated[str, {"pattern": "^[0-9]+x[0-9]+$"}]
+    observation: Annotated[
+        str, about("What each request brings: sizes, number of pictures, scaling, numbers of the robot's state.")
+    ]
+    answer: Annotated[Literal["tokens", "actions"], about("What answers are made of.")]
     profile: str | None
     emulated: Annotated[bool, about("True where a profile was replayed: such numbers are not measured.")]
     dummy: Annotated[

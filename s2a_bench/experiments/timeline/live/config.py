@@ -24,7 +24,7 @@ REPLAY_SKILLS: Final = "household"
 class Live(Options):
     """Options about a model that answers."""
 
-    transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, loopback [default: ros]")
+    transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]")
     skills: str = option("household", "--live: household, driving, or a TOML file")
     task: TextOrFile = option("", "--live: what the robot should do, text or @FILE")
     robot: str = option("timed", f"--live: {', '.join(ROBOTS)}; timed only waits")

@@ -1,0 +1,38 @@
+"""What a foreign HTTP server does that is dangerous, as far as its list of models tells."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from urllib.parse import SplitResult, urlunsplit
+
+import httpx
+
+from s2a_bench.errors import S2AError, ServerDied
+from s2a_bench.machine.doctor import Finding
+from s2a_bench.transport.bounds import Bounds
+from s2a_bench.transport.dangers import PATIENCE_S, for_anybody, shown
+from s2a_bench.transport.http.bounded import BoundedClient
+from s2a_bench.transport.http.detect import getter
+from s2a_bench.transport.http.dialects.common import NO_LIST, first_model
+
+
+def examine(parts: SplitResult) -> Iterator[Finding]:
+    """Ask for the list of models without a key."""
+    url = urlunsplit(parts)
+    try:
+        with BoundedClient(Bounds(url, PATIENCE_S, 0), timeout=PATIENCE_S, trust_env=parts.scheme == "https") as client:
+            owner, model = first_model(url, getter(client, {}))
+    except ServerDied as error:
+        raise OSError(str(error).rpartition(": ")[2]) from error
+    except (*NO_LIST, S2AError, httpx.HTTPError, httpx.InvalidURL) as error:
+        yield Finding("server", "state", f"it answers, and has no list of models for everybody: {error}")
+        return
+    if model:
+        said = f"{shown(model)} of {shown(owner)}" if owner else shown(model)
+        yield for_anybody(
+            parts,
+            f"it tells everybody its models ({said}), so it answers them too",
+            "start it with a key, as llama-server --api-key, and name its variable with --api-key-env",
+        )
+    else:
+        yield Finding("server", "state", "it answers, and has no list of models for everybody")

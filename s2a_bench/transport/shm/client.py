@@ -1,0 +1,153 @@
+"""The client: pictures are converted into the shared memory itself, and pieces read where the server wrote them."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+import orjson
+
+from s2a_bench.errors import RequestFailed, ServerDied, UsageError
+from s2a_bench.facts import PAYLOAD_BYTES
+from s2a_bench.trace import Trace
+from s2a_bench.transport import Wiring
+from s2a_bench.transport.bounds import Bounds
+from s2a_bench.transport.pictures import bgr_of, encoded
+from s2a_bench.transport.shm import ShmOptions
+from s2a_bench.transport.shm.link import Link
+from s2a_bench.transport.shm.memory import PICTURES_AT
+from s2a_bench.transport.shm.pieces import Said, unpacked
+from s2a_bench.types import Action, Frame, Piece, Request, Token
+
+STEP_BYTES: Final = 1 << 20
+"""Memory for requests comes in steps; one holds a raw picture of 640x480."""
+
+
+class ShmClient:
+    """One link to a server; a request that does not fit opens another, with more memory."""
+
+    camera = None
+
+    def __init__(self, wiring: Wiring[ShmOptions], alive: Callable[[], bool]) -> None:
+        """Connect; raises ServerDied where nobody listens."""
+        self._wiring, self._alive, self._path = wiring, alive, wiring.address
+        self._payload = wiring.options.payload
+        self._link: Link | None = None
+        self._connect(STEP_BYTES)
+
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
+        """Write the request, tell of it, yield the pieces."""
+        bounds = Bounds(self._path, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
+        link, at, length = self._lay_out(request, trace)
+        done = False
+        try:
+            self._ask(link, at, length)
+            while isinstance(said := self._next(link, bounds), (Token, Action)):
+                if not said.index:
+                    trace.mark("return")
+                bounds.piece()
+                yield said
+            done = True
+            if isinstance(said, str):
+                raise RequestFailed(f"the server broke off: {said}")
+            trace.receive(said)
+        finally:
+            if not done:  # what was not read belongs to this request only
+                self.close()
+
+    def describe(self) -> dict[str, str]:
+        """Add nothing: the wiring tells all."""
+        return {}
+
+    def close(self) -> None:
+        """Close the link; the memory goes with its last user."""
+        if self._link is not None:
+            self._link.close()
+        self._link = None
+
+    def _connect(self, size: int) -> Link:
+        self.close()
+        try:
+            self._link = Link(self._path, size, self._wiring.timeout_s)
+        except OSError as error:
+            raise ServerDied(f"nobody takes a link at {self._path}: {error.strerror or error}") from error
+        return self._link
+
+    def _lay_out(self, request: Request, trace: Trace) -> tuple[Link, int, int]:
+        """Write pictures and header into memory; return the link, and where the header lies."""
+        pictures = [self._picture(frame, trace) for frame in request.images]
+        size = sum(about["bytes"] for about, _ in pictures)
+        header = _header(request, [about for about, _ in pictures])
+        needed = PICTURES_AT + size + len(header)
+        trace.mark("header_pack")
+        link = self._link
+        if link is None or link.requests.size < needed:
+            link = self._connect(-(-needed // STEP_BYTES) * STEP_BYTES)
+            trace.mark("connect")
+        at = PICTURES_AT
+        for about, frame in pictures:
+            place = link.requests.pixels[at : at + about["bytes"]]
+            if about["encoding"] == "bgr8":
+                bgr_of(frame, trace, place.reshape(frame.height, frame.width, 3))
+            else:
+                place[:] = frame.data.reshape(-1)
+            at += about["bytes"]
+        link.requests.map[at : at + len(header)] = header
+        trace.facts[PAYLOAD_BYTES] = size + len(header)
+        trace.mark("header_pack")
+        return link, at, len(header)
+
+    def _picture(self, frame: Frame, trace: Trace) -> tuple[dict[str, Any], Frame]:
+        """Return what the header says of a picture, and what is to be written."""
+        about: dict[str, Any] = {"encoding": "bgr8", "width": frame.width, "height": frame.height}
+        if self._payload == "raw":
+            return {**about, "bytes": 3 * frame.width * frame.height}, frame
+        if self._payload == "yuyv":
+            if frame.encoding != "yuv422_yuy2":
+                raise UsageError(f"`payload` yuyv: this source delivers {frame.encoding}; use raw")
+            return {**about, "encoding": frame.encoding, "bytes": frame.data.size}, frame
+        media_type, data = encoded(frame, self._payload, trace)
+        made = Frame(frame.index, frame.stamp_ns, frame.width, frame.height, "jpeg", data)
+        return {**about, "encoding": media_type, "bytes": data.size}, made
+
+    def _ask(self, link: Link, at: int, length: int) -> None:
+        try:
+            link.ask(at, length)
+        except OSError as error:
+            raise self._gone(error) from error
+
+    def _next(self, link: Link, bounds: Bounds) -> Said:
+        """Return the next piece of the answer, or its end."""
+        try:
+            data = link.next(min(self._wiring.timeout_s, bounds.left_s()))
+            bounds.came(len(data))
+            return unpacked(data)
+        except BlockingIOError as error:
+            bounds.left_s()  # tells if it was the deadline
+            raise RequestFailed(f"nothing came from {self._path} for {self._wiring.timeout_s:g} s") from error
+        except (OSError, EOFError) as error:
+            raise self._gone(error) from error
+        except (ValueError, KeyError, TypeError, struct.error) as error:
+            raise RequestFailed(f"{self._path} sent what is no answer: {error!r}") from error
+
+    def _gone(self, error: Exception) -> RequestFailed | ServerDied:
+        """Say that the other end is not there any more."""
+        if not self._alive():
+            return ServerDied(f"the server at {self._path} is gone")
+        return RequestFailed(f"{self._path} broke off: {error or 'it closed the link'}")
+
+
+def _header(request: Request, pictures: list[dict[str, Any]]) -> bytes:
+    """Pack what is no picture."""
+    return orjson.dumps(
+        {
+            "id": request.id,
+            "prompt": request.prompt,
+            "max_tokens": request.max_tokens,
+            "grammar": request.grammar,
+            "seed": request.seed,
+            "state": request.state,
+            "images": pictures,
+        }
+    )

@@ -1,0 +1,126 @@
+"""Memory that two processes share without a name, and the packets that say where in it to look.
+
+A client connects to a Unix socket (SEQPACKET) and hands over a file of memory (memfd) that it writes its requests into;
+the server hands over another, for its answers. From then on packets of 16 bytes say where something lies. They wake the
+other side about as fast as an eventfd or a futex would (docs/latency.md), and unlike these they end when it does.
+
+- Nothing has a name in /dev/shm: the memory goes when its last process does, whoever is killed and how.
+- Each side maps the other's memory for reading only, and only if its size is sealed: to read beyond the end of what the
+  other side has cut off would be a SIGBUS.
+- Whoever reads copies what it checks before it checks: the other side may write meanwhile. Raw pixels are used where
+  they lie, for any bytes are a picture.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+import struct
+from mmap import ACCESS_READ, ACCESS_WRITE, mmap
+from typing import Final
+
+import numpy as np
+
+from s2a_bench.errors import RequestFailed, TransportError
+from s2a_bench.types import Pixels
+
+HELLO: Final = struct.Struct("<8sQ")
+"""The first packet of each side: `MAGIC`, and the size of the memory that comes with it."""
+MAGIC: Final = b"S2A-SHM1"
+REFUSED: Final = b"refused:"
+"""Begins what a server says instead, with its reason."""
+PLACE: Final = struct.Struct("<QQ")
+"""All others, a client's: where a request's header lies, and its length. A server's: see `ring`."""
+PICTURES_AT: Final = 64
+"""Where a request's pictures begin, one after the other, its header behind them; first is how far answers were read."""
+ANSWER_BYTES: Final = 4 << 20
+"""What a server may be ahead of its client."""
+
+_SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
+_PACKET_BYTES: Final = 256
+_FILES: Final = struct.calcsize("i")
+
+
+class Memory:
+    """Memory of a file, ours to write or the other side's to read."""
+
+    __slots__ = ("map", "pixels", "size")
+
+    def __init__(self, file: int, size: int, *, writes: bool) -> None:
+        """Map the file, which need not stay open."""
+        self.map = mmap(file, size, access=ACCESS_WRITE if writes else ACCESS_READ)
+        self.pixels: Pixels = np.frombuffer(self.map, np.uint8)
+        self.size = size
+
+
+def offer(link: socket.socket, size: int) -> Memory:
+    """Make memory of so many bytes and hand it over; raises TransportError where there is none, OSError."""
+    try:
+        file = os.memfd_create("s2a_bench", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        try:
+            os.ftruncate(file, size)
+            fcntl.fcntl(file, fcntl.F_ADD_SEALS, _SEALS | fcntl.F_SEAL_SEAL)
+            memory = Memory(file, size, writes=True)
+        except OSError:
+            os.close(file)
+            raise
+    except OSError as error:
+        raise TransportError(f"shared memory of {size} bytes cannot be had: {error.strerror}") from error
+    try:
+        socket.send_fds(link, [HELLO.pack(MAGIC, size)], [file])
+    finally:
+        os.close(file)
+    return memory
+
+
+def accept(link: socket.socket, most: int) -> Memory:
+    """Map what the other side hands over; raises EOFError, OSError, and TransportError for what is not trusted."""
+    data, files = _receive(link)
+    try:
+        if not data:
+            raise EOFError
+        if data.startswith(REFUSED):
+            raise RequestFailed(f"the link was refused: {data[len(REFUSED) :].decode(errors='replace')}")
+        if len(data) != HELLO.size or not data.startswith(MAGIC):
+            raise TransportError("what came first was no offer of shared memory")
+        _, size = HELLO.unpack(data)
+        if len(files) != 1:
+            raise TransportError(f"memory should be one file; {len(files)} came (is the limit of open files met?)")
+        if not PICTURES_AT <= size <= most:
+            raise TransportError(f"shared memory of {size} bytes was offered; at most {most} are taken")
+        if not _is_sealed(files[0], size):
+            raise TransportError("what was offered is no memory, or its size may change")
+        return Memory(files[0], size, writes=False)
+    finally:
+        for file in files:
+            os.close(file)
+
+
+def refuse(link: socket.socket, why: str) -> None:
+    """Say why there will be no link, as far as the other side listens."""
+    link.send((REFUSED + why.encode())[:_PACKET_BYTES], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+
+
+def _receive(link: socket.socket) -> tuple[bytes, list[int]]:
+    """Return the next packet, and the files that came with it."""
+    room = socket.CMSG_SPACE(4 * _FILES)
+    try:
+        data, controls, _, _ = link.recvmsg(_PACKET_BYTES, room, socket.MSG_CMSG_CLOEXEC)
+    except ConnectionResetError:  # it left without reading all; what it said before is there still
+        data, controls, _, _ = link.recvmsg(_PACKET_BYTES, room, socket.MSG_CMSG_CLOEXEC)
+    files = [
+        file
+        for level, kind, content in controls
+        if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS)
+        for (file,) in struct.iter_unpack("i", content[: len(content) // _FILES * _FILES])
+    ]
+    return data, files
+
+
+def _is_sealed(file: int, size: int) -> bool:
+    """Whether a file is memory of at least this size, for good."""
+    try:
+        return os.fstat(file).st_size >= size and fcntl.fcntl(file, fcntl.F_GET_SEALS) & _SEALS == _SEALS
+    except OSError:  # a pipe, a file on a disk
+        return False

@@ -1,0 +1,96 @@
+"""`doctor --url`: what is told of servers that somebody else runs, and that nothing is asked of them."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from threading import Thread
+
+import pytest
+
+from s2a_bench.errors import UsageError
+from s2a_bench.machine.doctor import Finding
+from s2a_bench.testing.transport import Recorder, wiring
+from s2a_bench.transport import dangers, open_server
+from s2a_bench.transport.dangers import PREFACE, examine, shown
+
+SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
+
+
+@contextmanager
+def answering(reply: bytes) -> Iterator[tuple[str, list[bytes]]]:
+    """A server of one connection: its place, and what it heard."""
+    heard: list[bytes] = []
+    with closing(socket.create_server(("127.0.0.1", 0))) as server:
+
+        def serve() -> None:
+            connection, _ = server.accept()
+            with connection:
+                heard.append(connection.recv(4096))
+                connection.sendall(reply)
+
+        thread = Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"127.0.0.1:{server.getsockname()[1]}", heard
+        thread.join(10)
+
+
+def found(url: str) -> dict[str, Finding]:
+    return {finding.code: finding for finding in examine(url)}
+
+
+def test_grpc_is_told_of_without_calling_a_method() -> None:
+    with answering(SETTINGS) as (place, heard):
+        told = found(f"grpc://{place}")
+    assert told["pickle"].level == "warning"
+    assert "unpickles what anybody sends" in told["pickle"].message
+    assert heard == [PREFACE]
+
+
+@pytest.mark.parametrize("reply", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\0" * 9])
+def test_what_speaks_no_grpc_is_an_error(reply: bytes) -> None:
+    with answering(reply) as (place, _):
+        assert found(f"grpc://{place}")["server"].message == "what answers does not speak gRPC"
+
+
+def test_a_server_of_models_without_a_key_is_told_of() -> None:
+    told = wiring("http")
+    server = open_server(told, Recorder(["x"]))
+    thread = Thread(target=server.serve)
+    thread.start()
+    try:
+        findings = found(server.address)
+    finally:
+        server.stop()
+        thread.join()
+    assert findings["plain-text"].level == "state"
+    assert findings["no-key"].level == "advice"
+    assert "(s2a of s2a-bench)" in findings["no-key"].message
+
+
+def test_off_this_machine_both_are_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dangers, "is_here", lambda _host: False)
+    body = b'{"data": [{"id": "a\\u001b[31m"}]}'
+    with answering(b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%b" % (len(body), body)) as (place, _):
+        findings = found(f"http://{place}")
+    assert [findings[code].level for code in ("plain-text", "no-key")] == ["warning", "warning"]
+    assert findings["plain-text"].fix.startswith("ssh -L ")
+    assert findings["no-key"].message.isprintable()
+
+
+def test_nobody_there_is_one_line() -> None:
+    with closing(socket.create_server(("127.0.0.1", 0))) as server:
+        port = server.getsockname()[1]
+    for scheme in ("http", "grpc"):
+        assert found(f"{scheme}://127.0.0.1:{port}")["server"].level == "error"
+
+
+@pytest.mark.parametrize("url", ["foo://x", "http://", "grpc://:80", "http://[x", "http://a:99999999", "x", ""])
+def test_what_is_no_url_of_a_server_is_refused(url: str) -> None:
+    with pytest.raises(UsageError, match=r"^`url`: "):
+        examine(url)
+
+
+def test_what_servers_say_is_one_short_line() -> None:
+    assert shown("a\nb\x1b" + "c" * 500) == "a?b?" + "c" * 116

@@ -1,0 +1,466 @@
+"""The transport `shm` keeps the contract, and what its wire adds: nothing is left, and nobody else is let in."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+import stat
+import struct
+from collections.abc import Generator, Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from threading import Barrier, Event, Thread
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.faults.peers import Peer, serving
+from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.errors import PortInUse, RequestFailed, ServerDied, TransportError, UsageError
+from s2a_bench.frames.convert import to_bgr, to_rgb
+from s2a_bench.machine.doctor import Machine
+from s2a_bench.testing.hostile.usage import usage
+from s2a_bench.testing.transport import Connect, Recorder, TransportSuite, ask, connector, wiring, yuyv_frame
+from s2a_bench.trace import Remote, Trace
+from s2a_bench.transport import open_client, open_server
+from s2a_bench.transport.limits import Limits
+from s2a_bench.transport.shm import checks, door, ring
+from s2a_bench.transport.shm.memory import ANSWER_BYTES, PICTURES_AT, PLACE, Memory
+from s2a_bench.transport.shm.pieces import packed, unpacked
+from s2a_bench.types import Action, Frame, Request, Token
+
+NOBODY = 65534
+
+
+class TestShm(TransportSuite):
+    name = "shm"
+
+
+class TestShmYuyv(TransportSuite):
+    name = "shm?payload=yuyv"
+
+
+class TestShmJpeg(TransportSuite):
+    name, lossless = "shm?payload=jpeg", False
+
+
+class TestShmPng(TransportSuite):
+    name = "shm?payload=png"
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of this user's sockets, for this test alone."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path / f"s2a_bench-{os.getuid()}"
+
+
+@pytest.fixture
+def connect() -> Iterator[Connect]:
+    yield from connector(wiring("shm"))
+
+
+def eventually(met: Any) -> bool:
+    """Whether something comes about within ten seconds."""
+    clock, deadline = SystemClock(), now_ns() + 10 * 10**9
+    while not met():
+        if now_ns() > deadline:
+            return False
+        clock.sleep_until_ns(now_ns() + 10_000_000)
+    return True
+
+
+def memory_of(pid: int) -> list[str]:
+    """Return the files that a process has in its memory."""
+    lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    return [parts[5] for line in lines if len(parts := line.split(maxsplit=5)) > 5]
+
+
+def named_memory(*pids: int) -> list[str]:
+    """Return what processes would leave in /dev/shm if they were killed now."""
+    named = (Path(name) for pid in pids for name in memory_of(pid) if not name.endswith("(deleted)"))
+    return [path.name for path in named if path.parts[1:3] == ("dev", "shm")]
+
+
+@pytest.mark.parametrize("payload", ["raw", "png"])
+def test_several_pictures_of_unlike_sizes_arrive_with_their_very_pixels(payload: str) -> None:
+    handler = Recorder(["x"])
+    frames = tuple(yuyv_frame(width, height, seed) for seed, (width, height) in enumerate([(64, 48), (2, 2), (98, 30)]))
+    for connect in connector(wiring(f"shm?payload={payload}")):
+        ask(connect(handler), Request("a", "plan", frames))
+    (got,) = handler.requests
+    assert len(got.images) == 3
+    for image, frame in zip(got.images, frames, strict=True):
+        np.testing.assert_array_equal(image.data, to_rgb(frame))
+
+
+@pytest.mark.parametrize("encoding", ["bgr8", "rgb8"])
+def test_a_camera_of_rgb_or_bgr_is_written_once(connect: Connect, encoding: Any) -> None:
+    handler = Recorder(["x"])
+    pixels = to_bgr(yuyv_frame())
+    frame = Frame(0, now_ns(), 64, 48, encoding, pixels)
+    ask(connect(handler), Request("a", "plan", (frame,)))
+    np.testing.assert_array_equal(handler.requests[0].images[0].data, to_rgb(frame))
+
+
+def test_a_larger_picture_opens_a_link_with_more_memory_and_says_so(connect: Connect) -> None:
+    handler = Recorder(["x"] * 40)
+    client = connect(handler)
+    stages = []
+    for width in (64, 1280, 1280, 64):
+        _, trace = ask(client, Request("a", "plan", (yuyv_frame(width, width // 2),)))
+        stages.append("connect" in [stage for stage, _ in trace.marks])
+        np.testing.assert_array_equal(handler.requests[-1].images[0].data, to_rgb(yuyv_frame(width, width // 2)))
+    assert stages == [False, True, False, False]
+
+
+def test_a_client_that_does_not_read_never_holds_the_engine() -> None:
+    told = wiring("shm")
+    words = ["long " * 100] * 20_000  # more than its memory holds
+
+    def handler(request: Request, trace: Trace) -> Generator[Token, None, None]:
+        trace.mark("inference")
+        for index, word in enumerate(words[: request.max_tokens]):
+            yield Token(index, word)
+
+    for connect in connector(told):
+        slow = connect(handler)
+        answer = slow.request(Request("slow", "plan", max_tokens=len(words)), Trace())
+        next(answer)
+        with closing(open_client(replace(told, address=slow._path))) as other:  # type: ignore[attr-defined]
+            assert len(ask(other, Request("b", "plan", max_tokens=3))[0]) == 3
+        assert len(list(answer)) == len(words) - 1
+
+
+def test_a_server_that_is_killed_in_mid_answer_leaves_nothing_and_the_next_start_cleans_up(own_folder: Path) -> None:
+    with serving("shm") as server:
+        peer = Peer(wiring("shm", server.address, timeout_s=10), server.pid)
+        try:
+            peer.hear("ready", seconds=60)
+            before = usage(peer.pid).descriptors
+            peer.tell("ask")
+            peer.hear("token")
+            assert named_memory(server.pid, peer.pid) == []
+            os.kill(server.pid, 9)
+            assert peer.hear("end")["error"] == f"ServerDied: the server at {server.address} is gone"
+            assert usage(peer.pid).descriptors < before
+        finally:
+            peer.close()
+        assert Path(server.address).is_socket()  # which has a name, unlike the memory
+    with serving("shm") as second:
+        assert [*own_folder.iterdir()] == [Path(second.address)]
+        with closing(open_client(wiring("shm", second.address))) as client:
+            assert len(ask(client, Request("a", "go on", max_tokens=2))[0]) == 2
+
+
+def test_a_folder_that_somebody_keeps_locked_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(door, "_LOCK_PAUSE_S", 0)
+    handle = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        with pytest.raises(PortInUse, match=r"cannot be had: somebody keeps .* locked"):
+            open_server(wiring("shm", str(tmp_path / "robot.sock")), Recorder([]))
+    finally:
+        os.close(handle)
+
+
+def test_an_answer_stops_when_a_client_that_did_not_read_has_gone(connect: Connect) -> None:
+    begun, over = Event(), Event()
+
+    def handler(_: Request, trace: Trace) -> Generator[Token, None, None]:
+        trace.mark("inference")
+        try:
+            for index in range(10**6):
+                yield Token(index, "long " * 1000)
+                if index == 2000:  # more than its memory holds
+                    begun.set()
+                    over.wait(20)
+        finally:
+            ended.append(True)
+
+    ended: list[bool] = []
+    client = connect(handler)
+    answer = client.request(Request("a", "plan", max_tokens=60_000), Trace())
+    assert next(answer).index == 0
+    assert begun.wait(20)
+    client.close()
+    over.set()
+    assert eventually(lambda: ended)
+
+
+def test_a_client_that_is_killed_in_mid_answer_leaves_nothing() -> None:
+    with serving("shm") as server, closing(open_client(wiring("shm", server.address))) as honest:
+        ask(honest, Request("a", "go on", max_tokens=1))
+        before = usage(server.pid)
+        peer = Peer(wiring("shm", server.address), server.pid)
+        try:
+            peer.hear("ready", seconds=60)
+            peer.tell("ask")
+            peer.hear("token")
+            assert usage(server.pid).descriptors > before.descriptors
+            assert named_memory(server.pid, peer.pid) == []
+            os.kill(peer.pid, 9)
+            assert len(ask(honest, Request("a", "go on", max_tokens=2))[0]) == 2
+            assert eventually(lambda: usage(server.pid).descriptors == before.descriptors)
+            assert eventually(lambda: usage(server.pid).threads == before.threads)
+        finally:
+            peer.close()
+
+
+def test_nothing_of_the_memory_has_a_name_while_it_is_used(connect: Connect) -> None:
+    client = connect(Recorder(["x"]))
+    ask(client, Request("a", "plan", (yuyv_frame(),)))
+    assert sum("memfd:s2a_bench" in name for name in memory_of(os.getpid())) >= 4  # two, seen from both sides
+    assert named_memory(os.getpid()) == []
+
+
+def test_servers_that_start_at_once_do_not_take_each_other_for_dead() -> None:
+    number = 12
+    barrier = Barrier(number)
+    listeners: list[socket.socket] = []
+
+    def start() -> None:
+        barrier.wait()
+        listeners.append(door.listen(""))
+
+    threads = [Thread(target=start) for _ in range(number)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(listeners) == number
+    for listener in listeners:
+        door.connect(listener.getsockname(), 5).close()
+        listener.close()
+
+
+def test_the_socket_is_its_users_alone(own_folder: Path) -> None:
+    with closing(door.listen("")) as listener:
+        path = Path(listener.getsockname())
+        assert path.parent == own_folder
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert stat.S_IMODE(own_folder.stat().st_mode) == 0o700
+
+
+def test_a_folder_that_others_may_enter_is_refused_in_one_line(own_folder: Path) -> None:
+    own_folder.mkdir(mode=0o755)
+    with pytest.raises(TransportError, match=r"is not a folder of ours alone: remove it, or name a `socket`"):
+        open_server(wiring("shm"), Recorder([]))
+
+
+def test_a_link_in_place_of_the_folder_is_refused(own_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    own_folder.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(TransportError, match="is not a folder of ours alone"):
+        open_server(wiring("shm"), Recorder([]))
+
+
+def test_a_socket_of_ones_own_is_used_once_and_never_takes_the_place_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "robot.sock"
+    told = wiring("shm", str(path))
+    with closing(door.listen(str(path))), pytest.raises(PortInUse, match=r"`socket`: .*robot.sock cannot be had"):
+        open_server(told, Recorder([]))
+    assert path.is_socket()  # as of a server that was killed
+    server = open_server(told, Recorder([]))
+    server.stop()
+    server.stop()
+    assert not path.exists()
+    path.write_text("mine")
+    with pytest.raises(PortInUse):
+        open_server(told, Recorder([]))
+    assert path.read_text() == "mine"
+    with pytest.raises(PortInUse, match="nowhere"):
+        open_server(wiring("shm", str(tmp_path / "nowhere" / "a.sock")), Recorder([]))
+
+
+def test_a_client_of_another_user_hears_why_it_is_refused(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.transport.shm.server.may_ask", lambda _: False)
+    with pytest.raises(RequestFailed, match="the link was refused: this server answers its own user only"):
+        ask(connect(Recorder(["x"])), Request("a", "plan"))
+
+
+def test_who_may_ask_is_the_user_or_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with one, other:
+        assert door.user_of(one) == os.getuid()
+        for user, may in ((os.getuid(), True), (door.ROOT, True), (NOBODY, False)):
+            monkeypatch.setattr(door, "user_of", lambda _, user=user: user)
+            assert door.may_ask(one) is may
+
+
+def test_pictures_are_not_handed_to_another_users_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    with closing(door.listen("")) as listener:
+        monkeypatch.setattr(door, "user_of", lambda _: NOBODY)
+        monkeypatch.setattr(door.os, "getuid", lambda: 1000)
+        with pytest.raises(TransportError, match="is another user's"):
+            open_client(wiring("shm", listener.getsockname()))
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")
+@pytest.mark.parametrize("mode", [0o600, 0o666])
+def test_another_user_of_the_machine_gets_no_memory(tmp_path: Path, mode: int) -> None:
+    """At the permissions; and at the kernel's word of who asks, where somebody has opened these."""
+    path = tmp_path / "robot.sock"
+    for folder in (tmp_path, tmp_path.parent, tmp_path.parent.parent):
+        folder.chmod(0o755)
+    for connect in connector(wiring("shm", str(path))):
+        connect(Recorder(["x"]))
+        path.chmod(mode)
+        child = os.fork()
+        if not child:
+            os._exit(_as_nobody(str(path)))
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == (1 if mode == 0o600 else 2)
+
+
+def _as_nobody(path: str) -> int:
+    """Return 1 where the socket cannot be opened, 2 where all that comes is a refusal, 0 otherwise."""
+    os.setgid(NOBODY)
+    os.setuid(NOBODY)
+    link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    link.settimeout(10)
+    try:
+        link.connect(path)
+    except PermissionError:
+        return 1
+    data, files, _, _ = socket.recv_fds(link, 256, 4)
+    return 2 if data.startswith(b"refused:") and not files and not link.recv(1) else 0
+
+
+def test_a_link_too_many_hears_why() -> None:
+    told = replace(wiring("shm"), limits=Limits(connections=1))
+    for connect in connector(told):
+        client = connect(Recorder(["x"]))
+        ask(client, Request("a", "plan"))
+        with pytest.raises(RequestFailed, match="refused: 1 links are open already"):
+            ask(open_client(replace(told, address=client._path)), Request("b", "plan"))  # type: ignore[attr-defined]
+        ask(client, Request("a", "plan"))
+
+
+def test_requests_under_way_are_limited_together() -> None:
+    for connect in connector(replace(wiring("shm"), limits=Limits(in_flight_mib=0.001))):
+        client = connect(Recorder(["x"]))
+        with pytest.raises(RequestFailed, match="are under way already"):
+            ask(client, Request("a", "plan", (yuyv_frame(),)))
+        assert len(ask(client, Request("a", "plan"))[0]) == 1
+
+
+def test_memory_above_the_limit_is_refused() -> None:
+    for connect in connector(replace(wiring("shm"), limits=Limits(body_mib=2))):
+        client = connect(Recorder(["x"]))
+        with pytest.raises(RequestFailed, match=r"refused: shared memory of \d+ bytes was offered; at most"):
+            ask(client, Request("a", "plan", (yuyv_frame(1280, 960),)))
+        assert len(ask(client, Request("a", "plan"))[0]) == 1
+
+
+def test_nobody_there_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ServerDied, match=r"nobody takes a link at .*: No such file or directory"):
+        open_client(wiring("shm", str(tmp_path / "nobody.sock")))
+
+
+def test_a_handler_that_breaks_is_heard_of(connect: Connect) -> None:
+    def handler(*_: Any) -> Generator[Token, None, None]:
+        yield Token(0, "x")
+        raise ZeroDivisionError
+
+    client = connect(handler)
+    for _ in range(2):
+        with pytest.raises(RequestFailed, match="Internal Server Error"):
+            ask(client, Request("a", "plan"))
+
+
+@pytest.mark.parametrize("gone", ["os.memfd_create", "socket.SO_PEERCRED"])
+def test_a_system_without_such_memory_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch, gone: str) -> None:
+    monkeypatch.delattr(gone)
+    for opens in (lambda: open_client(wiring("shm", "x")), lambda: open_server(wiring("shm"), Recorder([]))):
+        with pytest.raises(UsageError, match=r"`transport` shm: it needs Linux \(memfd_create, SO_PEERCRED\); this is"):
+            opens()
+    found = checks.shared_memory(Machine())
+    assert found
+    assert (found.code, found.level, found.fix) == ("shared-memory", "advice", "leave it out")
+
+
+def test_a_sandbox_that_forbids_such_memory_is_named(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_: Any) -> int:
+        raise PermissionError(1, "Operation not permitted")
+
+    assert checks.shared_memory(Machine()) is None
+    monkeypatch.setattr(os, "memfd_create", forbidden)
+    found = checks.shared_memory(Machine())
+    assert found
+    assert "memfd_create: Operation not permitted" in found.message
+    with pytest.raises(TransportError, match=r"shared memory of \d+ bytes cannot be had: Operation not permitted"):
+        connect(Recorder(["x"]))
+
+
+SAID = st.one_of(
+    st.builds(
+        Token, st.integers(0, 2**32 - 1), st.text(st.characters(exclude_categories=["Cs"])), st.integers(-1, 2**40)
+    ),
+    st.text(st.characters(exclude_categories=["Cs"])),
+    st.builds(Remote, st.text("abc"), st.lists(st.tuples(st.text("abc"), st.integers(0, 2**61)))),
+)
+
+
+@given(SAID)
+def test_what_is_packed_is_what_is_read(said: Token | Remote | str) -> None:
+    assert unpacked(packed(said)) == said
+
+
+@given(st.binary(max_size=40))
+def test_any_bytes_are_a_piece_or_one_of_these_errors(data: bytes) -> None:
+    try:
+        said = unpacked(data)
+    except (RequestFailed, ValueError, KeyError, TypeError, struct.error):
+        return
+    assert isinstance(said, (Token, Action, Remote, str))
+
+
+def memory(size: int) -> tuple[Memory, Memory]:
+    """Return the two views of the same memory: the writer's, the reader's."""
+    file = os.memfd_create("test")
+    try:
+        os.ftruncate(file, size)
+        return Memory(file, size, writes=True), Memory(file, size, writes=False)
+    finally:
+        os.close(file)
+
+
+@given(
+    st.lists(st.tuples(st.integers(1, ring.PIECE_BYTES), st.integers(0, 5)), max_size=12),
+    st.lists(st.integers(1, 50), max_size=5),
+)
+def test_pieces_of_any_sizes_come_in_order_however_late_they_are_read(
+    large: list[tuple[int, int]], small: list[int]
+) -> None:
+    told, heard = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    (answers, answers_read), (requests, requests_read) = memory(ANSWER_BYTES), memory(PICTURES_AT)
+    with told, heard:
+        heard.setblocking(False)
+        writer, reader = ring.Writer(told, answers, requests_read), ring.Reader(answers_read, requests)
+        for _ in range(2):
+            writer.begin()
+            reader.begin()
+            sent, got = [], []
+
+            def take(most: int) -> None:
+                for _ in range(most):
+                    try:
+                        packet = heard.recv(PLACE.size + 1)
+                    except BlockingIOError:
+                        return
+                    piece = reader.read(packet)
+                    got.append((len(piece), piece[0], piece[-1]))  # noqa: B023 - called within this turn
+
+            for number, (size, reads) in enumerate([*large, *((size, 0) for size in small)]):
+                sent.append((size, number, number))
+                writer.send(bytes([number]) * size)
+                take(reads)
+            while got != sent and len(got) < len(sent):
+                take(1)
+                writer.catch_up()
+            assert got == sent
