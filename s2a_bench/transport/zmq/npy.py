@@ -53,7 +53,7 @@ class Room:
 def file_of(array: NDArray[Any]) -> bytes:
     """Return the file of an array."""
     solid = np.ascontiguousarray(array)
-    return _head(array.shape, solid.dtype.str) + solid.tobytes()
+    return b"".join((_head(array.shape, solid.dtype.str), solid.reshape(-1).view(np.uint8).data))
 
 
 def array_of(data: Any) -> NDArray[Any]:
