@@ -20,7 +20,7 @@ from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.trace import RESIDUAL, Trace
-from s2a_bench.transport import Wiring, open_client
+from s2a_bench.transport import TRANSPORTS, Wiring, open_client
 from s2a_bench.types import Request
 
 TOKENS, PER_S = 24, 25.0
@@ -97,7 +97,8 @@ def _lives(pid: int) -> bool:
 @contextmanager
 def relayed(address: str) -> Iterator[tuple[str, Callable[[], None]]]:
     """Pass bytes on between an address of its own and a server's; the second value cuts all, for good."""
-    host, _, port = address.removeprefix("http://").rpartition(":")
+    scheme, _, place = address.rpartition("//")
+    host, _, port = place.rpartition(":")
     sockets: list[socket.socket] = []
     listener = socket.create_server(("127.0.0.1", 0))
 
@@ -127,7 +128,7 @@ def relayed(address: str) -> Iterator[tuple[str, Callable[[], None]]]:
 
     Thread(target=serve, daemon=True).start()
     try:
-        yield "http://{}:{}".format(*listener.getsockname()), cut
+        yield "{}//{}:{}".format(scheme, *listener.getsockname()), cut
     finally:
         cut()
 
@@ -139,7 +140,9 @@ def serving(transport: str) -> Iterator[OwnServer]:
     if transport.startswith("ros"):
         told = replace(told, address=f"/faults_{next(_numbers)}")
     with tempfile.TemporaryDirectory() as folder:
-        server = OwnServer("faulty", ServerJob(told, EngineConfig(name="echo", pace=PER_S)), Path(folder) / "log")
+        can = TRANSPORTS[told.transport].answers(told.variant, told.options)
+        engine = EngineConfig(name="echo", pace=PER_S, answer=can[0], horizon=TOKENS)
+        server = OwnServer("faulty", ServerJob(told, engine), Path(folder) / "log")
         with server:
             server.wait_ready()
             yield server
