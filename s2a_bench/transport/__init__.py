@@ -284,9 +284,9 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "http": "s2a_bench.transport.http:HTTP",
         "ros": "s2a_bench.transport.ros:ROS",
         "loopback": "s2a_bench.transport.loopback:LOOPBACK",
+        "shm": "s2a_bench.transport.shm:SHM",
         "websocket": "s2a_bench.transport.websocket:WEBSOCKET",
         "zmq": "s2a_bench.transport.zmq:ZMQ",
-        "shm": "s2a_bench.transport.shm:SHM",
     },
 )
 """Name -> what is said about it."""

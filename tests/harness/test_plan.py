@@ -129,7 +129,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
 
 def test_the_stages_are_those_of_the_transports_in_the_order_of_the_path() -> None:
     assert [*RequestsConfig(transports=("ros",)).stages] == [
-        *("capture", "convert", "image_encode", "cdr_pack", "connect", "network", "accept", "cdr_parse"),
+        *("capture", "convert", "resize", "image_encode", "cdr_pack", "connect", "network", "accept", "cdr_parse"),
         *("image_decode", "yuv_decode", "channel_swap", "queue", "preprocess", "inference", "server", "return"),
     ]
     assert "cdr_pack" not in RequestsConfig(transports=("http",)).stages

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm, zmq
+from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm, websocket, zmq
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
 
@@ -51,3 +51,18 @@ class TestShm(HostileSuite):
     name = "shm"
     clients = shm.CLIENTS
     servers = shm.SERVERS
+
+
+class TestWebsocket(HostileSuite):
+    name = "websocket/openpi"
+    clients = websocket.CLIENTS
+    servers = websocket.SERVERS
+
+    @classmethod
+    def told(cls) -> Wiring[Any]:
+        return replace(super().told(), limits=Limits(head_s=2, body_s=3))  # three cases wait for them
+
+
+class TestWebsocketStreamed(HostileSuite):
+    name = "websocket/openpi-stream"
+    servers = websocket.SERVERS

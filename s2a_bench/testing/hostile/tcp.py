@@ -17,6 +17,8 @@ from s2a_bench.transport import Wiring
 Then: TypeAlias = Literal["waits", "goes", "resets"]
 """What a peer does after its last byte: it listens until the other side closes, or closes itself, orderly or not."""
 Pieces: TypeAlias = "Sequence[bytes] | Callable[[], Sequence[bytes]]"
+Said: TypeAlias = "bytes | Callable[[bytes], bytes]"
+"""Bytes, or what makes them of those that came first."""
 GIB = 1 << 30
 NOISE = random.Random(1).randbytes(1 << 16)
 ENDLESS = [bytes(1 << 16)] * (1 << 16)
@@ -76,14 +78,14 @@ def crowd(number: int, attack: Attack) -> Attack:
     return together
 
 
-def answers(*pieces: bytes, then: Then = "waits", scheme: str = "", again: Sequence[bytes] = ()) -> Trap:
+def answers(*pieces: Said, then: Then = "waits", scheme: str = "", again: Sequence[bytes] = ()) -> Trap:
     """Return a server that answers whatever comes with pieces, and then with those of ``again`` for ever."""
 
     @contextmanager
     def trap(_: Wiring[Any]) -> Iterator[str]:
         over = Event()
 
-        def endless() -> Iterator[bytes]:
+        def endless() -> Iterator[Said]:
             yield from pieces
             while again and not over.is_set():
                 yield from again
@@ -105,13 +107,13 @@ def answers(*pieces: bytes, then: Then = "waits", scheme: str = "", again: Seque
     return trap
 
 
-def _answer(connection: socket.socket, pieces: Iterator[bytes], then: Then, over: Event) -> None:
+def _answer(connection: socket.socket, pieces: Iterator[Said], then: Then, over: Event) -> None:
     """Answer one connection."""
     with connection, suppress(OSError):
         connection.settimeout(0.5)
-        connection.recv(1 << 16)
+        heard = connection.recv(1 << 16)
         for piece in pieces:
-            connection.sendall(piece)
+            connection.sendall(piece(heard) if callable(piece) else piece)
         if then == "resets":
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             return

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Literal
-from urllib.parse import parse_qsl, urlsplit
 
 from pydantic import field_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import TextOrFile, option
-from s2a_bench.secrets import is_secret
 from s2a_bench.transport.http.dialects import DIALECTS
 from s2a_bench.transport.options import SERVER, SERVING, Options
+from s2a_bench.transport.urls import checked_url
 
 
 class HttpOptions(Options):
@@ -40,15 +38,7 @@ class HttpOptions(Options):
     @field_validator("url")
     @classmethod
     def _names_a_server(cls, url: str) -> str:
-        if url and not _is_url(url):
-            shown = re.sub(r"[^/]*@", "***@", url.partition("?")[0])
-            raise ValueError(f"'{shown}' should start with http:// or https:// and name a host")
-        if url and "@" in urlsplit(url).netloc:
-            raise ValueError("leave the password out, which would be kept with the results; see `api_key_env`")
-        for name, _ in parse_qsl(urlsplit(url).query, keep_blank_values=True):
-            if is_secret(name):
-                raise ValueError(f"leave '{name}' out, which would be kept with the results; see `api_key_env`")
-        return url
+        return checked_url(url, ("http", "https"))
 
     @field_validator("dialect")
     @classmethod
@@ -79,12 +69,3 @@ class HttpOptions(Options):
     def spoken(self) -> str:
         """Return the dialect that a black box is known to speak, or nothing."""
         return "llama-server" if self.llama_server else self.dialect
-
-
-def _is_url(text: str) -> bool:
-    """Whether a text names an HTTP server."""
-    try:
-        parts = urlsplit(text)
-        return parts.scheme in {"http", "https"} and bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        return False

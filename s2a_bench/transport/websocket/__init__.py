@@ -16,6 +16,8 @@ from s2a_bench.transport.websocket.options import SCHEMES, WebsocketOptions
 
 VARIANTS = ("openpi", "openpi-stream")
 OPENPI, STREAM = VARIANTS
+PACKAGES = ("msgpack", "websockets")
+"""What the extra of its name brings."""
 PREV_TOTAL_MS = Fact("prev_total_ms", "ms", "what a policy server says that the connection's last request took")
 TIMING = {str(fact): fact for fact in (INFER_MS, PREV_TOTAL_MS)}
 """The keys of ``server_timing`` that are facts."""
@@ -29,6 +31,7 @@ class Websocket(Transport[WebsocketOptions]):
     variants = VARIANTS
     payloads = ("raw", "jpeg", "jpeg-preencoded", "png")
     schemes = SCHEMES
+    examines = "s2a_bench.transport.websocket.dangers:examine"
     stages = {
         "msgpack_pack": "pack",
         "frame_pack": "pack",  # the client masks what it sends (RFC 6455, 5.3)
@@ -39,7 +42,7 @@ class Websocket(Transport[WebsocketOptions]):
     order = 20
     looks = {OPENPI: ("#882255", "-"), STREAM: ("#882255", "--")}
     compared_with = ("ros", "loopback")
-    packages = ("msgpack", "uvloop", "websockets")
+    packages = (*PACKAGES, "uvloop")
     elsewhere = ("url",)
     serving = {"port": 8000}
 
@@ -99,7 +102,7 @@ class Websocket(Transport[WebsocketOptions]):
 
     def _need(self) -> None:
         """Raise MissingExtra where its libraries are not installed."""
-        for module in ("msgpack", "websockets"):
+        for module in PACKAGES:
             extras.need(module, self.name)
 
 

@@ -109,6 +109,7 @@ class Call:
         observation = unpackb(message)
         trace.mark("msgpack_parse")
         request = own.request_of(observation, trace, self._office.limits, ours=self._peer.ours)
+        trace.mark("msgpack_parse")
         turn = self._turn = self._office.queued.turns.join()
         if turn.come is None:
             self._answer(request, trace, turn)

@@ -65,7 +65,7 @@ class WebsocketClient:
         except Broken as error:
             if not self._alive():
                 raise ServerDied(f"the server is gone: {error}") from error
-            raise
+            raise RequestFailed(str(error)) from error
         finally:
             if not whole:
                 self.close()

@@ -8,13 +8,12 @@ once goes through the loop, in order. One request runs at a time; one more may c
 from __future__ import annotations
 
 import asyncio
-import os
 import socket
 from asyncio import AbstractEventLoop, TimerHandle, Transport
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from http import HTTPStatus
-from threading import Lock
 from typing import Final, cast
 
 from websockets.frames import CloseCode, Frame, Opcode
@@ -30,13 +29,15 @@ from s2a_bench.transport.turns import STUCK_S
 from s2a_bench.transport.websocket import STREAM_PATH, own
 from s2a_bench.transport.websocket.call import Call, Office
 from s2a_bench.transport.websocket.link import QUIET
+from s2a_bench.transport.websocket.outlet import Outlet
 
 LINGER_S: Final = 1.0
 """Time for a client to read a refusal, or to answer that the connection closes."""
 LARGE_BYTES: Final = 1 << 25
 """Memory of a message from here on goes back to the system."""
 ERROR_LETTERS: Final = 1000
-POLL_S: Final = 0.005
+CONTROL_BYTES: Final = 256
+END_OF_HEAD: Final = b"\r\n\r\n"
 
 
 class House:
@@ -61,13 +62,13 @@ class Door(asyncio.Protocol):
         # a browser says where its page is from, and no page may drive a robot (RFC 6455, 10.2)
         self._protocol = ServerProtocol(origins=[None], max_size=self._limits.body_bytes, logger=QUIET)
         self._message = bytearray()
-        self._held = self._head_bytes = 0
+        self._head = bytearray()
+        self._held = 0
         self._call: Call | None = None
         self._call_bytes = 0
         self._next: tuple[bytes, int] | None = None
         self._timer: TimerHandle | None = None
-        self._paused = self._over = False
-        self._writing, self._spilling = Lock(), 0
+        self._full = self._paused = self._over = False
 
     # the loop's side
 
@@ -78,25 +79,36 @@ class Door(asyncio.Protocol):
         with suppress(OSError):
             plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             plain.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        self._out = socket.socket(fileno=os.dup(plain.fileno()))
+        self._out = Outlet(self._transport, self._loop)
         self._house.doors.add(self)
-        if len(self._house.doors) > self._limits.connections:
-            self._reject(HTTPStatus.SERVICE_UNAVAILABLE, f"{self._limits.connections} connections are open already")
-            return
-        self._in_time(
-            self._limits.head_s, lambda: self._reject(HTTPStatus.REQUEST_TIMEOUT, "the handshake took too long")
-        )
+        self._full = len(self._house.doors) > self._limits.connections
+        late = partial(self._reject, HTTPStatus.REQUEST_TIMEOUT, "the handshake took too long")
+        self._in_time(LINGER_S if self._full else self._limits.head_s, late)
 
     def data_received(self, data: bytes) -> None:
         """Take what comes: the handshake, then frames."""
         came_ns = now_ns()
         if self._over:
+            self._agree(data)
+            return
+        if self._full:
+            self._reject(HTTPStatus.SERVICE_UNAVAILABLE, f"{self._limits.connections} connections are open already")
             return
         if self._protocol.state is State.CONNECTING:
-            self._head_bytes += len(data)
-            if self._head_bytes > self._limits.header_bytes:
-                self._reject(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "the headers are too long")
+            self._head += data
+            end = self._head.find(END_OF_HEAD) + len(END_OF_HEAD)
+            if end < len(END_OF_HEAD) or end > self._limits.header_bytes:
+                if len(self._head) > self._limits.header_bytes:
+                    self._reject(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "the headers are too long")
                 return
+            # what follows is not looked at before it is known that there may be frames
+            data, head, self._head = bytes(self._head[end:]), bytes(self._head[:end]), bytearray()
+            self._feed(head, came_ns)
+        if data and not self._over:
+            self._feed(data, came_ns)
+
+    def _feed(self, data: bytes, came_ns: int) -> None:
+        """Have bytes read as what the protocol expects now."""
         self._protocol.receive_data(data)
         for event in self._protocol.events_received():
             if isinstance(event, Handshake):
@@ -128,7 +140,7 @@ class Door(asyncio.Protocol):
     def pause_writing(self) -> None:
         """Take no more requests of a client that does not read its answers."""
         self._paused = True
-        self._transport.pause_reading()
+        self._reads(False)
 
     def resume_writing(self) -> None:
         """Go on."""
@@ -183,7 +195,7 @@ class Door(asyncio.Protocol):
             self._refuse("more than two requests at once", CloseCode.POLICY_VIOLATION)
         elif self._call is not None:
             self._next = message, came_ns
-            self._transport.pause_reading()
+            self._reads(False)
         else:
             trace = Trace()
             trace.marks.append(("network", came_ns))
@@ -200,7 +212,7 @@ class Door(asyncio.Protocol):
                 self._stop_timer()
             elif self._timer is None and self._next is None:
                 late = f"a message took more than {self._limits.body_s:g} s"
-                self._in_time(self._limits.body_s, lambda: self._refuse(late, CloseCode.POLICY_VIOLATION))
+                self._in_time(self._limits.body_s, partial(self._refuse, late, CloseCode.POLICY_VIOLATION))
         self._hold(coming + self._call_bytes + (len(self._next[0]) if self._next else 0))
         if coming and self._house.held > self._limits.in_flight_bytes:
             words = f"requests of {self._limits.in_flight_bytes} bytes are under way already; come again later"
@@ -212,7 +224,11 @@ class Door(asyncio.Protocol):
 
     def _read_on(self) -> None:
         if self._next is None and not self._paused and not self._over:
-            self._transport.resume_reading()
+            self._reads(True)
+
+    def _reads(self, reads: bool) -> None:
+        with suppress(RuntimeError):  # it is closing
+            (self._transport.resume_reading if reads else self._transport.pause_reading)()
 
     def _over_call(self, error: str) -> None:
         """Take the next request; after an error close, as openpi's server does."""
@@ -254,7 +270,7 @@ class Door(asyncio.Protocol):
             return
         body = f"{words}\n".encode(errors="backslashreplace")
         head = f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Type: text/plain; charset=utf-8\r\n"
-        self._send(f"{head}Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body)
+        self._out.send(f"{head}Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body)
         self._end()
 
     def _end(self, linger_s: float = LINGER_S) -> None:
@@ -269,15 +285,25 @@ class Door(asyncio.Protocol):
         self._message.clear()
         self._protocol.reader.discard()
         self._hold(self._call_bytes)
-        self._transport.resume_reading()
+        self._reads(True)
         self._loop.call_later(linger_s, self._transport.close)
+
+    def _agree(self, data: bytes) -> None:
+        """Close at once where the client answers that the connection closes; all else is thrown away."""
+        protocol = self._protocol
+        waits = protocol.close_sent is not None and protocol.close_rcvd is None
+        if waits and len(data) <= CONTROL_BYTES:
+            protocol.receive_data(data)
+            protocol.events_received()
+            if protocol.close_rcvd is not None:
+                self._transport.close()
 
     def _flush(self) -> bool:
         """Send what the protocol has to say; return whether it had anything."""
         told = self._protocol.data_to_send()
         pieces = [piece for piece in told if piece != SEND_EOF]
         for piece in pieces:
-            self._send(piece)
+            self._out.send(piece)
         if len(pieces) < len(told) and (pieces or self._protocol.state is not State.CONNECTING):
             agreed = self._protocol.close_rcvd is not None and self._protocol.close_sent is not None
             self._end(0 if agreed else LINGER_S)
@@ -300,36 +326,9 @@ class Door(asyncio.Protocol):
             return
         opcode = Opcode.TEXT if isinstance(message, str) else Opcode.BINARY
         data = message.encode() if isinstance(message, str) else message
-        self._send(Frame(opcode, data).serialize(mask=False))
+        self._out.send(Frame(opcode, data).serialize(mask=False))
 
     def answered(self, error: str) -> None:
         """Let the loop go on with the next request, or close after an error."""
         with suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._over_call, error)
-
-    def _send(self, data: bytes) -> None:
-        """Write on this thread for as long as the client reads as fast."""
-        with self._writing:
-            if not self._spilling:
-                try:
-                    sent = self._out.send(data, socket.MSG_DONTWAIT)
-                except BlockingIOError:
-                    sent = 0
-                except OSError:
-                    return  # it has gone, and the loop hears of it
-                data = data[sent:]
-            if data:
-                self._spilling += 1
-                with suppress(RuntimeError):  # the loop has ended
-                    self._loop.call_soon_threadsafe(self._spill, data)
-
-    def _spill(self, data: bytes) -> None:
-        """Write what the socket did not take; until that is gone, all else goes this way too."""
-        closing = self._transport.is_closing()
-        if data and not closing:
-            self._transport.write(data)
-        with self._writing:
-            if not closing and self._transport.get_write_buffer_size():
-                self._loop.call_later(POLL_S, self._spill, b"")
-            else:
-                self._spilling -= 1

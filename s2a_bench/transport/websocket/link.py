@@ -1,7 +1,7 @@
 """The client's connection: websockets' protocol without its threads, on one blocking socket with bounds.
 
-By measurement the fastest of websockets' clients (docs/measuring.md): its threaded one hands every message over between
-two threads. What a server sends counts and takes time, whatever it is; messages are never compressed.
+websockets' own client waits with a thread of its own and bounds single reads. Here all that a server sends counts and
+takes time of one request, and it is as fast (docs/measuring.md). Messages are never compressed.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import socket
 import ssl
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from select import POLLIN, poll
@@ -28,6 +29,7 @@ PIECE = 1 << 18
 MESSAGE_BYTES = 1 << 26
 """No answer is larger; the bounds of a request are tighter."""
 QUOTED = 200
+DATA = frozenset({Opcode.TEXT, Opcode.BINARY, Opcode.CONT})
 QUIET = logging.getLogger("s2a_bench.websocket")
 QUIET.addHandler(logging.NullHandler())
 QUIET.propagate = False
@@ -44,6 +46,7 @@ class Link:
         """Connect and shake hands; raises ServerDied, RequestFailed, TransportError."""
         self.bounds = bounds
         self._url, self._timeout_s = url, timeout_s
+        self._ready: deque[Frame] = deque()
         self._message = bytearray()
         self._text = False
         try:
@@ -83,11 +86,12 @@ class Link:
             raise RequestFailed(f"{self._url}: no TLS: {error}") from error
 
     def alive(self) -> bool:
-        """Whether the connection may be used again; answers what came meanwhile, as pings."""
+        """Whether the connection may be used again: nothing came unasked but pings, which are answered."""
         with suppress(RequestFailed):
             while self._pending():
                 self._read()
-        return self._protocol.state is State.OPEN and not self._message
+        stray = any(frame.opcode in DATA for frame in self._frames())
+        return self._protocol.state is State.OPEN and not (self._message or stray)
 
     def _pending(self) -> bool:
         if self._protocol.state is not State.OPEN:
@@ -119,15 +123,13 @@ class Link:
 
     def _frames(self) -> Iterator[Frame]:
         """Take the frames that are there, one at a time: what follows a message stays for the next."""
-        events = self._protocol.events
-        while events:
-            frame = events.pop(0)
-            if isinstance(frame, Frame):
-                yield frame
+        self._ready.extend(event for event in self._protocol.events_received() if isinstance(event, Frame))
+        while self._ready:
+            yield self._ready.popleft()
 
     def _joined(self, frame: Frame) -> bytes | str | None:
         """Add a frame to the message; return it when it is whole."""
-        if frame.opcode not in {Opcode.TEXT, Opcode.BINARY, Opcode.CONT}:
+        if frame.opcode not in DATA:
             return None
         if frame.opcode is not Opcode.CONT:
             self._text = frame.opcode is Opcode.TEXT

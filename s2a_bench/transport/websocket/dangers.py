@@ -1,0 +1,58 @@
+"""What a foreign policy server over WebSocket does that is dangerous, as its greeting tells: nothing is asked of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from urllib.parse import SplitResult, urlunsplit
+
+from s2a_bench import extras
+from s2a_bench.errors import S2AError, ServerDied
+from s2a_bench.machine.doctor import Finding
+from s2a_bench.transport.bounds import Bounds
+from s2a_bench.transport.dangers import PATIENCE_S, for_anybody, shown
+from s2a_bench.transport.websocket import PACKAGES
+
+PAGE = "https://example.org"
+
+
+def examine(parts: SplitResult) -> Iterator[Finding]:
+    """Shake hands without a key, and once more as a page in somebody's browser would."""
+    for module in PACKAGES:
+        extras.need(module, "websocket")
+    url = urlunsplit(parts)
+    try:
+        said = _greeting(url, {})
+    except ServerDied as error:
+        raise OSError(str(error).rpartition(": ")[2]) from error
+    except S2AError as error:
+        yield Finding("server", "state", f"it answers, and greets nobody without a key: {error}")
+        return
+    yield for_anybody(
+        parts,
+        f"it greets everybody ({said}), so it answers them too",
+        "let it listen on 127.0.0.1 alone and reach it by ssh -L, or put a proxy that wants a key before it",
+    )
+    try:
+        _greeting(url, {"Origin": PAGE})
+    except S2AError:
+        return
+    yield Finding(
+        "any-page",
+        "warning",
+        "it does not look where a handshake comes from: a page of any site in a browser that reaches it may ask it",
+        "let it refuse handshakes with an Origin header; robots' clients send none",
+    )
+
+
+def _greeting(url: str, headers: Mapping[str, str]) -> str:
+    """Return what a server says of itself, in a few words."""
+    from s2a_bench.transport.websocket.codec import unpackb
+    from s2a_bench.transport.websocket.link import Link
+
+    with closing(Link(url, headers, Bounds(url, PATIENCE_S, 0), PATIENCE_S)) as link:
+        message = link.receive()
+    if isinstance(message, str):
+        return shown(message)
+    metadata = unpackb(message)
+    return shown(", ".join(map(str, metadata)) if isinstance(metadata, dict) else type(metadata).__name__) or "nothing"

@@ -1,0 +1,688 @@
+"""openpi's protocol: our server for anybody's clients, our client for anybody's servers."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from socket import create_server
+from threading import Event, Thread
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import Frame, Opcode
+from websockets.sync.client import connect as plain_connect
+from websockets.sync.server import serve as plain_serve
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageError
+from s2a_bench.inference import EngineConfig
+from s2a_bench.testing.transport import Connect, Recorder, ask, connector, wiring, yuyv_frame
+from s2a_bench.trace import Trace, budget
+from s2a_bench.transport import Client, Handler, Server, open_client, open_server
+from s2a_bench.transport.dangers import examine
+from s2a_bench.transport.limits import Limits
+from s2a_bench.transport.turns import Queued
+from s2a_bench.transport.websocket.codec import packb, unpackb
+from s2a_bench.types import Action, Piece, Request
+
+CHUNK = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
+pytestmark = pytest.mark.filterwarnings("ignore:connect.. must be used as a context manager:DeprecationWarning")
+
+
+@contextmanager
+def serving(handler: Handler, address: str = "", limits: Limits | None = None, **options: Any) -> Iterator[Server]:
+    told = wiring("websocket", address, **options)
+    server = open_server(replace(told, limits=limits or told.limits), handler)
+    thread = Thread(target=server.serve)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.stop()
+        thread.join()
+
+
+@pytest.fixture
+def connect() -> Iterator[Connect]:
+    yield from connector(wiring("websocket/openpi", payload="raw"))
+
+
+@contextmanager
+def robot(address: str, path: str = "", **more: Any) -> Iterator[Any]:
+    """A plain WebSocket client, greeted."""
+    with plain_connect(address + path, compression=None, max_size=None, proxy=None, close_timeout=1, **more) as socket:
+        yield socket, unpackb(socket.recv())
+
+
+def get(address: str, path: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(address.replace("ws:", "http:") + path, timeout=10) as response:  # noqa: S310
+            return response.status, response.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+class Slow:
+    """A handler whose answer waits until it is let go."""
+
+    def __init__(self, answer: Any = CHUNK) -> None:
+        self.answer = answer
+        self.began, self.go, self.ended = Event(), Event(), Event()
+
+    def __call__(self, _: Request, trace: Trace) -> Generator[Piece, None, None]:
+        try:
+            for index, values in enumerate(self.answer):
+                if index == len(self.answer) - 1:
+                    self.began.set()
+                    assert self.go.wait(20)
+                trace.mark("inference")
+                trace.token_ns.append(now_ns())
+                yield Action(index, values)
+        finally:
+            self.ended.set()
+
+
+# anybody's clients at our server
+
+
+def openpi(address: str, **more: Any) -> Any:
+    return pytest.importorskip("openpi_client.websocket_client_policy").WebsocketClientPolicy(address, **more)
+
+
+def test_openpi_client_gets_actions_from_our_server() -> None:
+    handler = Recorder(list(CHUNK))
+    queued = Queued.around(handler)
+    queued.settings, queued.provenance = EngineConfig(name="echo", answer="actions", horizon=4), {"engine": "echo"}
+    with serving(queued) as server:
+        policy = openpi(server.address)
+        metadata = policy.get_server_metadata()
+        first, second = (
+            policy.infer({"observation/image": np.zeros((8, 9, 3), np.uint8), "prompt": "go"}) for _ in "ab"
+        )
+        policy._ws.close()
+    assert (metadata["server"], metadata["engine"], metadata["action_horizon"]) == ("s2a-bench", "echo", 4)
+    assert metadata["provenance"] == {"engine": "echo"}
+    assert set(first) == {"actions", "server_timing"}  # no marks for others
+    assert first["actions"].dtype == np.float32
+    np.testing.assert_array_equal(first["actions"], CHUNK)
+    assert set(first["server_timing"]) == {"infer_ms"}
+    assert set(second["server_timing"]) == {"infer_ms", "prev_total_ms"}
+    assert handler.requests[0].prompt == "go"
+    assert handler.requests[0].images[0].data.shape == (8, 9, 3)
+
+
+@pytest.mark.parametrize("dtype", ["bool", "int8", "uint16", ">i4", "int64", "float16", "float32", ">f8", "S3", "U3"])
+def test_openpi_client_sends_arrays_of_every_type(dtype: str) -> None:
+    handler = Recorder(list(CHUNK))
+    sent = np.ones((2, 3)).astype(dtype)
+    with serving(handler) as server:
+        policy = openpi(server.address)
+        policy.infer({"x": sent, "y": np.float32(2.5), "prompt": "go"})
+        policy._ws.close()
+    assert handler.requests[0].state == ((1.0,) * 6 if sent.dtype.kind == "f" else ()) + (2.5,)
+
+
+def test_openpi_client_gets_an_error_as_text_and_the_connection_closes_with_1011() -> None:
+    handler = Recorder(list(CHUNK))
+    handler.fail_at = 0
+    with serving(handler) as server:
+        policy = openpi(server.address)
+        with pytest.raises(RuntimeError, match=r"^Error in inference server:\nthe engine has had enough$"):
+            policy.infer({"prompt": "go"})
+        with pytest.raises(ConnectionClosed) as closed:
+            policy._ws.recv()
+        assert closed.value.rcvd
+        assert closed.value.rcvd.code == 1011
+        handler.fail_at = None
+        assert len(openpi(server.address).infer({"prompt": "go"})["actions"]) == 4
+
+
+def test_openpi_client_with_its_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOT_KEY", "open sesame")
+    with serving(Recorder(list(CHUNK)), api_key_env="ROBOT_KEY") as server:
+        policy = openpi(server.address, api_key="open sesame")
+        assert policy.infer({"prompt": "go"})["actions"].shape == (4, 3)
+        policy._ws.close()
+        for key in ("guess", None):
+            with pytest.raises(InvalidStatus) as refused:
+                openpi(server.address, api_key=key)
+            assert refused.value.response.status_code == 401
+        assert get(server.address, "/healthz") == (200, "OK\n")
+        told = replace(wiring("websocket", api_key_env="ROBOT_KEY"), address=server.address)
+        client = open_client(told)
+        assert len(ask(client, Request("a", "go"))[0]) == 4
+        client.close()
+        with pytest.raises(RequestFailed, match=r"answered 401: this server wants its key.*see `api_key_env`"):
+            ask(open_client(replace(wiring("websocket"), address=server.address)), Request("a", "go"))
+
+
+def test_policy_websocket_client_gets_actions_from_our_server() -> None:
+    peer = pytest.importorskip("policy_websocket")
+    with serving(Recorder(list(CHUNK))) as server:
+        policy = peer.WebsocketClientPolicy(server.address)
+        np.testing.assert_array_equal(policy.infer({"state": np.zeros(7), "prompt": "go"})["actions"], CHUNK)
+        policy.close()
+
+
+def test_a_stranger_asks_for_the_stream() -> None:
+    with serving(Recorder(list(CHUNK))) as server, robot(server.address, "/stream") as (socket, _):
+        socket.send(packb({"prompt": "go"}))
+        messages = [unpackb(socket.recv()) for _ in range(5)]
+    assert [message["type"] for message in messages] == ["partial"] * 4 + ["final"]
+    for index, message in enumerate(messages[:4]):
+        np.testing.assert_array_equal(message["actions"], CHUNK[[index]])
+        assert message["action_indices"].tolist() == [index]
+    np.testing.assert_array_equal(messages[4]["actions"], CHUNK)
+    assert "infer_ms" in messages[4]["server_timing"]
+
+
+def test_health_and_pings_are_answered_while_a_request_runs() -> None:
+    handler = Slow()
+    with serving(handler) as server, robot(server.address) as (socket, _):
+        socket.send(packb({"prompt": "go"}))
+        assert handler.began.wait(20)
+        assert get(server.address, "/healthz") == (200, "OK\n")
+        assert socket.ping().wait(20)
+        handler.go.set()
+        assert unpackb(socket.recv())["actions"].shape == (4, 3)
+
+
+def test_a_request_that_comes_early_waits_for_the_one_before() -> None:
+    handler = Slow()
+    with serving(handler) as server, robot(server.address) as (socket, _):
+        for _ in "ab":
+            socket.send(packb({"prompt": "go"}))
+        assert handler.began.wait(20)
+        handler.go.set()
+        assert [unpackb(socket.recv())["actions"].shape for _ in "ab"] == [(4, 3)] * 2
+
+
+def test_messages_in_fragments_are_joined() -> None:
+    handler = Recorder(list(CHUNK))
+    with serving(handler) as server, robot(server.address) as (socket, _):
+        body = packb({"prompt": "go on"})
+        socket.send([body[:3], body[3:9], b"", body[9:]])
+        assert unpackb(socket.recv())["actions"].shape == (4, 3)
+    assert handler.requests[0].prompt == "go on"
+
+
+def closed_with(socket: Any) -> tuple[str, int]:
+    """Return the text, and the code that the connection is closed with after it."""
+    said = socket.recv(timeout=20)
+    with pytest.raises(ConnectionClosed) as closed:
+        socket.recv(timeout=20)
+    assert closed.value.rcvd
+    return said, closed.value.rcvd.code
+
+
+@pytest.mark.parametrize(
+    ("message", "says", "code"),
+    [
+        ("an observation as text", "a binary message, not a text", 1003),
+        (b"\xc1", "bytes that are no message", 1011),
+        (packb([1]), "an observation is a dictionary", 1011),
+        (packb({"image": np.zeros((4, 4), np.uint8)}), "image: a picture of shape", 1011),
+    ],
+)
+def test_what_is_no_observation_is_refused_in_a_line(message: Any, says: str, code: int) -> None:
+    with serving(Recorder(list(CHUNK))) as server, robot(server.address) as (socket, _):
+        socket.send(message)
+        said, got = closed_with(socket)
+    assert says in said
+    assert got == code
+
+
+def test_a_message_that_is_too_large_is_refused_before_it_comes() -> None:
+    with serving(Recorder(list(CHUNK)), limits=Limits(body_mib=0.1)) as server, robot(server.address) as (socket, _):
+        socket.socket.sendall(b"\x82\xff" + (1 << 30).to_bytes(8, "big"))
+        with pytest.raises(ConnectionClosed) as closed:
+            socket.recv(timeout=20)
+        assert closed.value.rcvd
+        assert closed.value.rcvd.code == 1009
+
+
+def test_requests_that_are_too_much_together_are_refused() -> None:
+    handler = Slow()
+    limits = Limits(in_flight_mib=1.0)
+    with (
+        serving(handler, limits=limits) as server,
+        robot(server.address) as (first, _),
+        robot(server.address) as (other, _),
+    ):
+        first.send(packb({"image": np.zeros((512, 512, 3), np.uint8)}))
+        assert handler.began.wait(20)
+        other.send(packb({"image": np.zeros((512, 512, 3), np.uint8)}))
+        said, code = closed_with(other)
+        handler.go.set()
+        assert unpackb(first.recv())["actions"].shape == (4, 3)
+    assert "come again later" in said
+    assert code == 1013
+
+
+def test_too_many_connections_are_refused() -> None:
+    with (
+        serving(Recorder(list(CHUNK)), limits=Limits(connections=1)) as server,
+        robot(server.address),
+        pytest.raises(InvalidStatus, match="503"),
+        robot(server.address),
+    ):
+        pass
+
+
+def test_a_message_that_does_not_end_is_given_up() -> None:
+    with serving(Recorder(list(CHUNK)), limits=Limits(body_s=0.2)) as server, robot(server.address) as (socket, _):
+        socket.socket.sendall(b"\x82\xff" + (1 << 20).to_bytes(8, "big") + b"abcdefg")
+        said, code = closed_with(socket)
+    assert "a message took more than 0.2 s" in said
+    assert code == 1008
+
+
+def test_one_too_many_that_waits_is_told_so() -> None:
+    handler = Slow()
+    with (
+        serving(handler, limits=Limits(waiting=0)) as server,
+        robot(server.address) as (first, _),
+        robot(server.address) as (other, _),
+    ):
+        first.send(packb({"prompt": "go"}))
+        assert handler.began.wait(20)
+        other.send(packb({"prompt": "go"}))
+        said, _ = closed_with(other)
+        handler.go.set()
+    assert "requests are waiting for the engine already" in said
+
+
+def test_those_that_wait_are_answered_in_turn_and_one_that_goes_gives_its_place_up() -> None:
+    handler = Slow()
+    with serving(handler) as server, ExitStack() as stack:
+        sockets = [stack.enter_context(robot(server.address))[0] for _ in "abc"]
+        for socket in sockets:
+            socket.send(packb({"prompt": "go"}))
+        assert handler.began.wait(20)
+        sockets[1].close()
+        handler.go.set()
+        for socket in (sockets[0], sockets[2]):
+            assert unpackb(socket.recv(timeout=20))["actions"].shape == (4, 3)
+
+
+def test_a_wait_ends_at_the_deadline() -> None:
+    handler = Slow()
+    with (
+        serving(handler, limits=Limits(answer_s=0.3)) as server,
+        robot(server.address) as (first, _),
+        robot(server.address) as (other, _),
+    ):
+        first.send(packb({"prompt": "go"}))
+        assert handler.began.wait(20)
+        other.send(packb({"prompt": "go"}))
+        said, _ = closed_with(other)
+        handler.go.set()
+    assert "still waiting for the engine" in said
+
+
+def test_an_answer_that_nobody_wants_any_more_ends() -> None:
+    handler = Slow(np.zeros((1000, 2), np.float32))
+    with serving(handler) as server:
+        with robot(server.address, "/stream") as (socket, _):
+            socket.send(packb({"prompt": "go"}))
+            assert unpackb(socket.recv())["type"] == "partial"
+        handler.go.set()
+        assert handler.ended.wait(20)
+        with robot(server.address) as (socket, _):
+            socket.send(packb({"prompt": "go"}))
+            assert len(unpackb(socket.recv())["actions"]) == 1000
+
+
+def test_no_page_of_a_browser_may_ask() -> None:
+    with (
+        serving(Recorder(list(CHUNK))) as server,
+        pytest.raises(InvalidStatus, match="403"),
+        robot(server.address, origin="https://example.org"),
+    ):
+        pass
+
+
+def test_what_is_no_websocket_is_told_so() -> None:
+    with serving(Recorder(list(CHUNK))) as server:
+        status, said = get(server.address, "/")
+    assert status == 426
+    assert "WebSocket" in said
+
+
+def test_tokens_do_not_travel() -> None:
+    with serving(Recorder(["x"])) as server, robot(server.address) as (socket, _):
+        socket.send(packb({"prompt": "go"}))
+        said, _ = closed_with(socket)
+    assert "choose `answer` actions" in said
+
+
+def test_what_breaks_inside_is_not_shown() -> None:
+    def broken(_: Request, trace: Trace) -> Generator[Piece, None, None]:
+        trace.mark("inference")
+        raise KeyError("/home/secret")
+        yield
+
+    with serving(broken) as server, robot(server.address) as (socket, _):
+        socket.send(packb({"prompt": "go"}))
+        said, _ = closed_with(socket)
+    assert said == "internal error; the server's log has it"
+
+
+def test_off_this_machine_strangers_need_a_key() -> None:
+    with pytest.raises(UsageError, match="`api_key_env`, or let everybody in with `no_auth`"):
+        open_server(wiring("websocket", "0.0.0.0:0"), Recorder([]))
+    with serving(Recorder(list(CHUNK)), no_auth=True) as server:
+        assert server.address
+
+
+def test_a_port_in_use_is_named() -> None:
+    with serving(Recorder([])) as server:
+        port = server.address.rpartition(":")[2]
+        with pytest.raises(TransportError, match=f"`port`: {port} is in use"):
+            open_server(wiring("websocket", f"127.0.0.1:{port}"), Recorder([]))
+
+
+def test_the_doctor_tells_of_a_server_without_a_key_that_refuses_pages() -> None:
+    with serving(Recorder(list(CHUNK))) as server:
+        found = {finding.code: finding for finding in examine(server.address)}
+    assert "it greets everybody (server, provenance)" in found["no-key"].message
+    assert "any-page" not in found
+
+
+def test_the_doctor_tells_of_a_server_that_any_page_may_ask() -> None:
+    with told_by(lambda _: b"") as address:
+        found = {finding.code: finding for finding in examine(address)}
+    assert {"plain-text", "no-key", "any-page"} == set(found)
+
+
+def test_the_doctor_tells_of_a_server_with_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOT_KEY", "open sesame")
+    with serving(Recorder(list(CHUNK)), api_key_env="ROBOT_KEY") as server:
+        found = {finding.code: finding for finding in examine(server.address)}
+    assert "greets nobody without a key" in found["server"].message
+    assert {finding.level for finding in examine("ws://127.0.0.1:9")} == {"state", "error"}
+
+
+# our client
+
+
+def test_the_parts_of_a_picture_are_marked(connect: Connect) -> None:
+    _, trace = ask(connect(Recorder(list(CHUNK))), Request("a", "go", (yuyv_frame(),)))
+    spent = budget(trace.chain()).stages_ns
+    own = {"msgpack_pack", "frame_pack", "connect", "network", "frame_parse", "msgpack_parse", "inference", "return"}
+    assert set(spent) == own | {"convert"}
+    assert {"infer_ms", "payload_bytes"} <= set(trace.facts)
+    assert "reconnects" not in trace.facts
+
+
+def test_the_first_action_of_a_stream_comes_before_the_last_is_there() -> None:
+    handler = Slow()
+    with serving(handler) as server:
+        client = open_client(replace(wiring("websocket/openpi-stream"), address=server.address))
+        actions = client.request(Request("a", "go"), Trace())
+        assert [next(actions).index for _ in range(3)] == [0, 1, 2]
+        handler.go.set()
+        assert [action.index for action in actions] == [3]
+        client.close()
+
+
+def test_a_server_that_came_back_is_connected_to_again() -> None:
+    handler = Recorder(list(CHUNK))
+    with serving(handler) as server:
+        client = open_client(replace(wiring("websocket"), address=server.address))
+        ask(client, Request("a", "go"))
+    with serving(handler, server.address) as again:
+        assert again.address == server.address
+        _, trace = ask(client, Request("b", "go"))
+        assert trace.facts["reconnects"] == 1
+        client.close()
+
+
+def test_an_address_where_nobody_is() -> None:
+    client = open_client(replace(wiring("websocket"), address="ws://127.0.0.1:9"))
+    with pytest.raises(ServerDied, match=r"nothing answers at ws://127.0.0.1:9"):
+        ask(client, Request("a", "go"))
+
+
+@pytest.mark.parametrize(
+    ("url", "says"),
+    [("http://a:1", "should start with ws:// or wss://"), ("ws://me:word@a:1", "leave the password out")],
+)
+def test_urls_that_are_none_are_refused(url: str, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        wiring("websocket", url=url)
+
+
+def test_a_foreign_server_takes_pixels_unless_its_template_says_otherwise(tmp_path: Path) -> None:
+    (tmp_path / "files.toml").write_text('image = "{image:0|bytes}"\n')
+    pixels = wiring("websocket", url="ws://a:1")
+    files = wiring("websocket", url="ws://a:1", template=str(tmp_path / "files.toml"))
+    assert (pixels.options.payload, files.options.payload) == ("raw", "jpeg")
+
+
+# somebody else's servers
+
+
+@contextmanager
+def told_by(answer: Callable[[Any], Any], metadata: Any = None) -> Iterator[str]:
+    """A server that answers each observation by a function: bytes, or a text as an error."""
+
+    def handle(socket: Any) -> None:
+        socket.send(packb(metadata or {}))
+        for message in socket:
+            socket.send(answer(unpackb(message)))
+
+    with plain_serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
+        thread = Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield "ws://{}:{}".format(*server.socket.getsockname()[:2])
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@contextmanager
+def foreign(address: str, name: str = "websocket/openpi", **options: Any) -> Iterator[Client]:
+    client = open_client(wiring(name, url=address, **options))
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def test_a_foreign_server_is_told_what_its_template_says_and_nothing_else() -> None:
+    seen: list[Any] = []
+
+    def answer(observation: Any) -> bytes:
+        seen.append(observation)
+        return packb({"actions": CHUNK.astype(np.float64), "server_timing": {"infer_ms": 1e-4}})
+
+    with told_by(answer, {"model": "pi0", "secret": b"x"}) as address, foreign(address, template="droid") as client:
+        frames = (yuyv_frame(64, 48, 1), yuyv_frame(64, 48, 2))
+        actions, trace = ask(client, Request("a", "go", frames, state=tuple(range(8))))
+        assert client.describe() == {"url": address, "template": "droid", "model": "pi0"}
+    (observation,) = seen
+    assert {key: getattr(value, "shape", value) for key, value in observation.items()} == {
+        "observation/exterior_image_1_left": (48, 64, 3),
+        "observation/wrist_image_left": (48, 64, 3),
+        "observation/joint_position": (7,),
+        "observation/gripper_position": (1,),
+        "prompt": "go",
+    }
+    np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)
+    spent = budget(trace.chain()).stages_ns
+    assert {"server", "inference"} <= set(spent)
+    assert spent["inference"] == 100
+    assert trace.facts["infer_ms"] == 1e-4
+
+
+@pytest.mark.parametrize("timing", [None, {"infer_ms": 1e9}, {"infer_ms": float("nan")}, {"infer_ms": "5"}, [1]])
+def test_times_that_cannot_be_split_nothing(timing: Any) -> None:
+    with told_by(lambda _: packb({"actions": CHUNK, "server_timing": timing})) as address, foreign(address) as client:
+        _, trace = ask(client, Request("a", "go"))
+    stages = budget(trace.chain()).stages_ns
+    assert "server" in stages
+    assert "inference" not in stages
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [
+        ("Traceback (most recent call last):\n  File x\nKeyError: 'state'\n", "File x KeyError: 'state'$"),
+        (packb({"nothing": 1}), "an answer without actions: nothing"),
+        (packb([1, 2]), "an answer without actions: list"),
+        (packb({"actions": np.full((2, 2), np.nan)}), "actions: not finite numbers"),
+        (packb({"actions": np.zeros((2, 2, 2))}), r"actions: shape \(2, 2, 2\)"),
+        (packb({"actions": "up"}), "actions: "),
+        (b"\xc1", "bytes that are no message"),
+        (msgpack.packb({b"__ndarray__": True, b"dtype": "|O", b"data": b"", b"shape": []}), "does not travel"),
+    ],
+)
+def test_answers_that_are_none_are_one_line_and_the_next_request_may_succeed(answer: Any, says: str) -> None:
+    answers = [answer, packb({"actions": CHUNK})]
+    with told_by(lambda _: answers.pop(0)) as address, foreign(address) as client:
+        with pytest.raises(RequestFailed, match=says) as failed:
+            ask(client, Request("a", "go"))
+        assert str(failed.value).isprintable()
+        assert len(ask(client, Request("b", "go"))[0]) == 4
+
+
+def test_what_comes_unasked_is_no_answer_to_the_next_request() -> None:
+    def twice(socket: Any) -> None:
+        socket.send(packb({}))
+        for message in socket:
+            number = unpackb(message)["state"][0]
+            answer = Frame(Opcode.BINARY, packb({"actions": np.array([[number]])})).serialize(mask=False)
+            socket.socket.sendall(answer * 2)
+
+    with plain_serve(twice, "127.0.0.1", 0, compression=None) as server:
+        thread = Thread(target=server.serve_forever)
+        thread.start()
+        address = "ws://{}:{}".format(*server.socket.getsockname()[:2])
+        with foreign(address, template="aloha") as client:
+            for number in (1.0, 2.0, 3.0):
+                (action,), _ = ask(client, Request("a", "go", (yuyv_frame(),), state=(number,) * 14))
+                assert action.values.tolist() == [number]
+        server.shutdown()
+        thread.join()
+
+
+def test_a_foreign_stream_is_read_whether_or_not_its_last_frame_repeats_it() -> None:
+    def streaming(socket: Any) -> None:
+        socket.send(packb({}))
+        socket.recv()
+        for at in (0, 1):
+            socket.send(packb({"type": "partial", "actions": CHUNK[at : at + 1]}))
+        socket.send(packb({"type": "final", "actions": CHUNK, "server_timing": {"infer_ms": 3.0}}))
+        socket.recv()
+
+    with plain_serve(streaming, "127.0.0.1", 0, compression=None) as server:
+        thread = Thread(target=server.serve_forever)
+        thread.start()
+        address = "ws://{}:{}".format(*server.socket.getsockname()[:2])
+        with foreign(address, "websocket/openpi-stream") as client:
+            actions, trace = ask(client, Request("a", "go"))
+        server.shutdown()
+        thread.join()
+    assert [action.index for action in actions] == [0, 1, 2, 3]
+    np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)
+    assert "inference" not in budget(trace.chain()).stages_ns  # the first action came long before it was over
+
+
+POLICY = """
+import sys, time, numpy as np
+from policy_websocket import BasePolicy, WebsocketPolicyServer
+class Policy(BasePolicy):
+    def infer(self, obs):
+        if obs["prompt"] == "fail":
+            raise ValueError("no such task")
+        if obs["prompt"] == "wait":
+            print("waiting", flush=True)
+            time.sleep(60)
+        return {"actions": np.outer(np.arange(4), obs["observation/state"]) + obs["observation/image"].sum()}
+    def reset(self): pass
+WebsocketPolicyServer(Policy(), host="127.0.0.1", port=int(sys.argv[1]), metadata={"robot": "none"}).serve_forever()
+"""
+
+
+@pytest.fixture
+def free_port() -> int:
+    with create_server(("127.0.0.1", 0)) as found:
+        port: int = found.getsockname()[1]
+        return port
+
+
+@pytest.fixture
+def policy_server(free_port: int) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    pytest.importorskip("policy_websocket")
+    line = [sys.executable, "-c", POLICY, str(free_port)]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:
+        address = f"ws://127.0.0.1:{free_port}"
+        deadline = now_ns() + 30_000_000_000
+        while True:
+            try:
+                if get(address, "/healthz")[0] == 200:
+                    break
+            except OSError:
+                assert now_ns() < deadline
+        yield process, address
+        process.send_signal(signal.SIGKILL)
+
+
+def test_our_client_gets_actions_from_policy_websocket(policy_server: tuple[subprocess.Popen[str], str]) -> None:
+    _, address = policy_server
+    with foreign(address) as client:
+        for _ in "ab":
+            actions, trace = ask(client, Request("a", "go", (yuyv_frame(),), state=(0.5, 1.0)))
+            assert len(actions) == 4
+            assert np.diff([action.values for action in actions], axis=0).tolist() == [[0.5, 1.0]] * 3
+            assert {"server", "inference"} <= set(budget(trace.chain()).stages_ns)
+        assert trace.facts["prev_total_ms"] > 0
+        with pytest.raises(RequestFailed, match="ValueError: no such task"):
+            ask(client, Request("a", "fail", (yuyv_frame(),), state=(0.5,)))
+        assert len(ask(client, Request("a", "go", (yuyv_frame(),), state=(0.5,)))[0]) == 4
+        assert client.describe()["robot"] == "none"
+
+
+def test_policy_websocket_killed_in_mid_request_is_one_line(policy_server: tuple[subprocess.Popen[str], str]) -> None:
+    process, address = policy_server
+    with foreign(address) as client:
+        ask(client, Request("a", "go", (yuyv_frame(),), state=(0.5,)))
+
+        def kill() -> None:
+            assert process.stdout
+            process.stdout.readline()
+            process.kill()
+
+        killer = Thread(target=kill)
+        killer.start()
+        with pytest.raises((RequestFailed, ServerDied)) as failed:
+            ask(client, Request("a", "wait", (yuyv_frame(),), state=(0.5,)))
+        killer.join()
+        assert address in str(failed.value)
+        assert str(failed.value).isprintable()
+        process.wait()
+        with pytest.raises(ServerDied, match="nothing answers"):
+            ask(client, Request("a", "go", (yuyv_frame(),), state=(0.5,)))
+
+
+def test_an_answer_that_no_socket_takes_at_once_comes_whole() -> None:
+    chunk = np.random.default_rng(1).normal(size=(4096, 200)).astype(np.float32)
+    handler = Recorder(list(chunk))
+    with serving(handler) as server, robot(server.address) as (socket, _):
+        for _ in "ab":
+            socket.send(packb({"prompt": "go"}))
+        for _ in "ab":
+            np.testing.assert_array_equal(unpackb(socket.recv(timeout=20))["actions"], chunk)
