@@ -1,4 +1,4 @@
-"""Hostile and honest clients together on a server that runs: ``python -m benchmarks.soak http|ros|shm|zmq [--minutes M]``.
+"""Hostile and honest clients together on a server: ``python -m benchmarks.soak http|ros|shm|zmq [--minutes M]``.
 
 The server is a `serve` process, and so is its twin, which nobody attacks: the idle latency of the one is divided by
 that of the other in interleaved blocks, before the load and after it, so that what else the machine does cancels out.

@@ -23,6 +23,7 @@ from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client, open_server
+from s2a_bench.transport.dangers import examine
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.types import Action, Piece, Request
@@ -273,6 +274,27 @@ class TestServer:
             assert "action.robot" in last("get_action", flat(), s2a={"id": "last"})
         assert held.ids == ["first", "last"]
 
+    def test_requests_of_several_clients_are_all_answered(self) -> None:
+        handler = Recorder(list(CHUNK))
+        failed: list[Exception] = []
+
+        def asks(address: str) -> None:
+            try:
+                with robot(address) as client:
+                    for number in range(20):
+                        assert len(ask(client, Request(f"{number}", "go", (yuyv_frame(),)))[0]) == 4
+            except Exception as error:  # noqa: BLE001 - a finding
+                failed.append(error)
+
+        with serving(handler) as server:
+            threads = [Thread(target=asks, args=(server.address,)) for _ in range(6)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join(60)
+        assert failed == []
+        assert len(handler.requests) == 120
+
     def test_a_full_queue_refuses(self) -> None:
         held = Held()
         with serving(held, Limits(waiting=0)) as server, ExitStack() as stack:
@@ -448,6 +470,31 @@ class TestBlackBox:
     def test_other_urls_are_refused(self, url: str) -> None:
         with pytest.raises(UsageError, match="`url`"):
             one_pipeline("zmq", url=url)
+
+
+class TestDangers:
+    def test_who_answers_everybody_is_told_of_by_a_ping(self) -> None:
+        told: list[Any] = []
+
+        def answers(request: Any) -> Any:
+            told.append(request)
+            return {"status": "ok"}
+
+        with policy(answers) as url:
+            found = {finding.code: finding for finding in examine(url)}
+        assert told == [{"endpoint": "ping"}]
+        assert found["no-key"].level == "advice"
+        assert "`kill`" in found["no-key"].message
+        assert found["pickle"].level == "advice"
+
+    def test_a_key_is_no_danger(self) -> None:
+        with policy(lambda _: {"error": "Unauthorized: Invalid API token"}) as url:
+            found = {finding.code: finding for finding in examine(url)}
+        assert "no-key" not in found
+        assert "Invalid API token" in found["server"].message
+
+    def test_where_nothing_answers_it_is_told(self) -> None:
+        assert [finding.level for finding in examine("tcp://127.0.0.1:1") if finding.code == "server"] == ["error"]
 
 
 def test_it_carries_actions_and_state_alone() -> None:

@@ -15,6 +15,8 @@ from s2a_bench.transport import ACTIONS, Client, Handler, Server, Transport, Wir
 from s2a_bench.transport.zmq.options import SCHEMES, ZmqOptions
 
 GR00T = "gr00t"
+PACKAGES = ("msgpack", "zmq")
+"""What the extra of its name brings, by the names under which they are imported."""
 
 
 class Zmq(Transport[ZmqOptions]):
@@ -25,6 +27,7 @@ class Zmq(Transport[ZmqOptions]):
     variants = (GR00T,)
     payloads = ("raw", "jpeg", "jpeg-preencoded", "png")
     schemes = SCHEMES
+    examines = "s2a_bench.transport.zmq.dangers:examine"
     stages = {"msgpack_pack": "pack", "msgpack_parse": "parse"}
     tells = (PAYLOAD_BYTES, RECONNECTS)
     order = 22
@@ -90,7 +93,7 @@ class Zmq(Transport[ZmqOptions]):
 
     def _need(self) -> None:
         """Raise MissingExtra where its libraries are not installed."""
-        for module in ("msgpack", "zmq"):
+        for module in PACKAGES:
             extras.need(module, self.name)
 
 

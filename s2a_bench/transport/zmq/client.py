@@ -55,7 +55,7 @@ class ZmqClient:
         self._template = template_of(wiring.options.told_by)
         self._key = read_key(wiring.options.api_key_env)
         self._rooms: dict[tuple[int, int, int], Room] = {}
-        self._link: _Link | None = None
+        self._link: Link | None = None
         self._connected = False
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
@@ -83,14 +83,14 @@ class ZmqClient:
             if not whole:
                 self.close()
 
-    def _open(self, bounds: Bounds, trace: Trace) -> _Link:
+    def _open(self, bounds: Bounds, trace: Trace) -> Link:
         """Return the kept connection, or a new one that both sides have greeted over, marking `connect`."""
         if self._link is not None and not self._link.stands():
             self.close()
         if self._link is None:
             if self._connected:
                 trace.facts[RECONNECTS] = 1.0
-            self._link = _Link(self._wiring.address, self._wiring.timeout_s, self._alive)
+            self._link = Link(self._wiring.address, self._wiring.timeout_s, self._alive)
             self._link.greet(bounds)
             self._connected = True
             trace.mark("connect")
@@ -148,10 +148,11 @@ class ZmqClient:
             self._link = None
 
 
-class _Link:
+class Link:
     """One REQ socket and its connection, bounded in time and bytes."""
 
     def __init__(self, url: str, timeout_s: float, alive: Callable[[], bool]) -> None:
+        """Begin to connect; raises TransportError for a URL that is none."""
         self._url, self._timeout_s, self._alive = url, timeout_s, alive
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.REQ)
