@@ -26,6 +26,7 @@ from s2a_bench.transport import Client, Handler, Server, open_client, open_serve
 from s2a_bench.transport.dangers import examine
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
+from s2a_bench.transport.zmq.watch import Watch
 from s2a_bench.types import Action, Piece, Request
 
 CHUNK = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
@@ -340,6 +341,46 @@ class TestServer:
     def test_a_port_in_use_is_told(self) -> None:
         with serving(Recorder([])) as server, pytest.raises(PortInUse, match="is in use"):
             open_server(wiring("zmq/gr00t", server.address), Recorder([]))
+
+
+class TestWatch:
+    def test_a_message_is_of_the_connection_that_has_the_descriptor_now(self) -> None:
+        context = zmq.Context()
+        router = context.socket(zmq.ROUTER)
+        watch = Watch(router)
+        port = router.bind_to_random_port("tcp://127.0.0.1")
+        descriptors = []
+        for _ in range(3):
+            peer = context.socket(zmq.REQ)
+            peer.connect(f"tcp://127.0.0.1:{port}")
+            peer.send(b"go")
+            descriptor = router.recv_multipart(copy=False)[-1].get(zmq.SRCFD)
+            connection = watch.of(descriptor)
+            watch.hear()
+            assert not connection.gone
+            descriptors.append(descriptor)
+            watch.monitor.poll(0)
+            peer.close(0)
+            until(lambda: bool(watch.monitor.poll(1)))  # it has gone, and that is not heard yet
+        watch.close()
+        context.destroy(0)
+        assert len(set(descriptors)) < 3
+
+    def test_what_came_and_is_not_complete_is_counted(self) -> None:
+        context = zmq.Context()
+        router = context.socket(zmq.ROUTER)
+        watch = Watch(router)
+        port = router.bind_to_random_port("tcp://127.0.0.1")
+        peer = context.socket(zmq.DEALER)
+        peer.connect(f"tcp://127.0.0.1:{port}")
+        for sizes in ((0, 10), (0, 255), (0, 256), (1, 1 << 20)):
+            peer.send_multipart([bytes(size) for size in sizes])
+            frames = router.recv_multipart(copy=False)
+            connection = watch.of(frames[-1].get(zmq.SRCFD))
+            connection.take([len(frame) for frame in frames[1:]])
+            assert 0 < connection.look() < 200  # the greeting alone
+        watch.close()
+        context.destroy(0)
 
 
 class TestBlackBox:

@@ -91,7 +91,7 @@ class Watch:
     def hear(self) -> list[Connection]:
         """Take note of what has happened; return the connections that are new."""
         new = []
-        while self.monitor.poll(0):
+        while self.monitor.getsockopt(zmq.EVENTS) & int(zmq.POLLIN):
             event, value = EVENT.unpack(self.monitor.recv_multipart()[0])
             if event in BEGUN:
                 self.met = True
@@ -108,9 +108,11 @@ class Watch:
         return new
 
     def of(self, descriptor: int) -> Connection:
-        """Return the connection that a message came over."""
-        if descriptor not in self.connections:
-            self.hear()
+        """Return the connection that a message came over.
+
+        What happened before comes first: the same descriptor may have been that of another connection, which is gone.
+        """
+        self.hear()
         return self.connections.get(descriptor) or self.connections.setdefault(descriptor, Connection(descriptor))
 
     def keep(self, limits: Limits, in_flight: int, at_ns: int) -> None:
