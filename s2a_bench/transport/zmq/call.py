@@ -27,8 +27,8 @@ from s2a_bench.types import Piece, Request
 
 THREADS: Final = 8
 """One answers; the others read what comes meanwhile."""
-KEPT: Final = 1024
-"""Requests whose marks are kept until they are asked for, the latest."""
+KEPT: Final = 128
+"""Requests whose marks are kept until they are asked for, the latest; those of a long answer are half a megabyte."""
 
 
 UNKNOWN: Final = RequestFailed("marks of a request that is not known, or whose marks were asked for already")
@@ -50,7 +50,7 @@ class Office:
         self.calls: set[Call] = set()
         self._key, self._layout = key.encode(), layout
         self._lock = Lock()
-        self._marks: OrderedDict[tuple[bytes, str], memoryview | Call | None] = OrderedDict()
+        self._marks: OrderedDict[tuple[bytes, str], bytes | Call | None] = OrderedDict()
 
     @property
     def in_flight(self) -> int:
@@ -60,7 +60,7 @@ class Office:
     def refuse_more(self, size: int) -> None:
         """Raise Busy where there is no room for one more request of ``size`` bytes."""
         if len(self.calls) > self.limits.waiting + 2 * THREADS or self.in_flight + size > self.limits.in_flight_bytes:
-            raise Busy("too many requests are not answered yet; come again later", retry_after_s=RETRY_AFTER_S)
+            raise Busy("too many requests are under way; come again later", retry_after_s=RETRY_AFTER_S)
 
     def check_key(self, message: dict[Any, Any]) -> None:
         """Raise RequestFailed for a message without the key, compared in constant time."""
@@ -96,7 +96,7 @@ class Office:
             if isinstance(asked, Call):
                 asked.refuse(UNKNOWN)
 
-    def keep(self, who: bytes, request_id: str, marks: memoryview) -> None:
+    def keep(self, who: bytes, request_id: str, marks: bytes) -> None:
         """Hand marks to who has asked for them, or keep them."""
         with self._lock:
             asked = self._marks.pop((who, request_id), None)
@@ -112,7 +112,7 @@ class Office:
             if marks is None:
                 self._marks[who, request_id] = call
                 return
-            if not isinstance(marks, memoryview):
+            if not isinstance(marks, bytes):
                 raise UNKNOWN
             del self._marks[who, request_id]
         call.say(marks)
@@ -146,7 +146,7 @@ class Call:
         elif at_ns > turn.deadline_ns:
             goes_on()
 
-    def say(self, message: memoryview) -> None:
+    def say(self, message: bytes | memoryview) -> None:
         """Answer, and be over."""
         self._office.calls.discard(self)
         self._office.send([*self._envelope, message])
@@ -235,7 +235,7 @@ class Call:
             self._office.promise(who, request.id)
         self.say(answer)
         if told is not None:
-            self._office.keep(who, request.id, pack(own.remote_message(trace.to_remote())))
+            self._office.keep(who, request.id, bytes(pack(own.remote_message(trace.to_remote()))))
 
     def _wanted(self, pieces: Generator[Piece, None, None]) -> Generator[Piece, None, None]:
         """Yield the pieces for as long as somebody wants them."""

@@ -18,6 +18,7 @@ import zmq
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, PortInUse, TransportError
+from s2a_bench.machine.tuning import give_back_memory
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.credentials import key_for
@@ -30,6 +31,10 @@ LOOKS_MS: Final = 20
 """How often connections are looked at: over loopback 60 MB may come meanwhile."""
 QUEUED: Final = 8
 """Messages of one client that libzmq keeps for us; those beyond wait in its own machine."""
+LARGE_BYTES: Final = 1 << 25
+"""From here on memory that was held goes back to the system."""
+LINGER_NS: Final = 1_000_000_000
+"""How long no more than that is held before it does."""
 ENVELOPE: Final = 4
 """Most frames before a message."""
 
@@ -77,10 +82,10 @@ class ZmqServer:
         poller = select.poll()
         for readable in (self._router.FD, self._woken, self._watch.monitor.FD):
             poller.register(readable, select.POLLIN)
-        looked_ns, more = 0, True
+        looked_ns, more, much_ns = 0, True, 0
         try:
             while not self._stopped:
-                busy = self._watch.connections or self._office.calls
+                busy = self._watch.connections or self._office.calls or much_ns
                 poller.poll(0 if more else LOOKS_MS if busy else None)
                 with suppress(BlockingIOError):
                     self._woken.recv(4096)
@@ -88,7 +93,11 @@ class ZmqServer:
                 self._watch.hear()
                 if (at_ns := now_ns()) - looked_ns > LOOKS_MS * 1e6:
                     looked_ns = at_ns
-                    self._watch.keep(self._limits, self._office.in_flight, at_ns)
+                    if self._watch.keep(self._limits, self._office.in_flight, at_ns) >= LARGE_BYTES:
+                        much_ns = at_ns
+                    elif much_ns and at_ns - much_ns > LINGER_NS:
+                        much_ns = 0
+                        give_back_memory()
                     for call in list(self._office.calls):
                         call.look(at_ns)
         finally:

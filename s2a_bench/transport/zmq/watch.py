@@ -115,8 +115,11 @@ class Watch:
         self.hear()
         return self.connections.get(descriptor) or self.connections.setdefault(descriptor, Connection(descriptor))
 
-    def keep(self, limits: Limits, in_flight: int, at_ns: int) -> None:
-        """Shut the connections down that go beyond a server's limits; ``in_flight`` bytes wait for their answer."""
+    def keep(self, limits: Limits, in_flight: int, at_ns: int) -> int:
+        """Shut the connections down that go beyond a server's limits; ``in_flight`` bytes wait for their answer.
+
+        Returns how many bytes are held, those included.
+        """
         for connection in list(self.connections.values())[limits.connections :]:
             connection.shut()
         for connection in self.connections.values():
@@ -126,8 +129,9 @@ class Watch:
             late = connection.begun_ns and at_ns - connection.begun_ns > limits.body_s * 1e9
             if late or connection.held > limits.body_bytes + ROOM:
                 connection.shut()
-        if in_flight > limits.in_flight_bytes + ROOM:
+        if in_flight > limits.in_flight_bytes + ROOM and self.connections:
             max(self.connections.values(), key=lambda connection: connection.held).shut()
+        return in_flight
 
     def close(self) -> None:
         """Stop watching."""
