@@ -72,6 +72,7 @@ class ZmqServer:
         self.address: str = self._router.get_string(zmq.LAST_ENDPOINT)
         self._office = Office(Queued.around(handler, wiring.limits), wiring.limits, key, options.layout, self._send)
         self._stopped = False
+        self._much_ns = 0
 
     def describe(self) -> dict[str, str | int]:
         """Say what serves."""
@@ -82,10 +83,10 @@ class ZmqServer:
         poller = select.poll()
         for readable in (self._router.FD, self._woken, self._watch.monitor.FD):
             poller.register(readable, select.POLLIN)
-        looked_ns, more, much_ns = 0, True, 0
+        looked_ns, more = 0, True
         try:
             while not self._stopped:
-                busy = self._watch.connections or self._office.calls or much_ns
+                busy = self._watch.connections or self._office.calls or self._much_ns
                 poller.poll(0 if more else LOOKS_MS if busy else None)
                 with suppress(BlockingIOError):
                     self._woken.recv(4096)
@@ -94,9 +95,9 @@ class ZmqServer:
                 if (at_ns := now_ns()) - looked_ns > LOOKS_MS * 1e6:
                     looked_ns = at_ns
                     if self._watch.keep(self._limits, self._office.in_flight, at_ns) >= LARGE_BYTES:
-                        much_ns = at_ns
-                    elif much_ns and at_ns - much_ns > LINGER_NS:
-                        much_ns = 0
+                        self._much_ns = at_ns
+                    elif self._much_ns and at_ns - self._much_ns > LINGER_NS:
+                        self._much_ns = 0
                         give_back_memory()
                     for call in list(self._office.calls):
                         call.look(at_ns)
@@ -129,6 +130,8 @@ class ZmqServer:
             return  # no REQ socket sent this, so that nobody waits for an answer
         envelope = [frame.bytes for frame in frames[:-1]]
         size = sizes[-1]
+        if size >= LARGE_BYTES:
+            self._much_ns = trace.marks[0][1]
         try:
             self._office.refuse_more(size)
         except Busy as error:
