@@ -24,7 +24,10 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import open_client
 from s2a_bench.types import Request
 
-TRANSPORTS = ("http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action", "shm", "zmq/gr00t")
+TRANSPORTS = (
+    *("http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action", "shm"),
+    *("websocket/openpi-stream", "zmq/gr00t"),
+)
 WHOLE = ("zmq/gr00t",)
 """Those whose answers come as one."""
 BEGUN_S = 0.3
@@ -49,7 +52,7 @@ class Fault:
     @property
     def applies(self) -> bool:
         """Whether there is such a thing: DDS has no connection, and who waits for its turn asked for something."""
-        return self.what != "connection cut" or self.transport.startswith(("http", "zmq"))
+        return self.what != "connection cut" or self.transport.startswith(("http", "websocket", "zmq"))
 
     @property
     def promised(self) -> tuple[str, ...]:

@@ -139,9 +139,9 @@ def serving(transport: str) -> Iterator[OwnServer]:
     told = wiring(transport, timeout_s=SILENCE_S, max_tokens=TOKENS)
     if transport.startswith("ros"):
         told = replace(told, address=f"/faults_{next(_numbers)}")
+    answer = TRANSPORTS[told.transport].answers(told.variant, told.options)[0]
+    engine = EngineConfig(name="echo", pace=PER_S, answer=answer, horizon=TOKENS)
     with tempfile.TemporaryDirectory() as folder:
-        can = TRANSPORTS[told.transport].answers(told.variant, told.options)
-        engine = EngineConfig(name="echo", pace=PER_S, answer=can[0], horizon=TOKENS)
         server = OwnServer("faulty", ServerJob(told, engine), Path(folder) / "log")
         with server:
             server.wait_ready()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.store.run import read_run
 from s2a_bench.testing.transport import ask, wiring, yuyv_frame
 from s2a_bench.transport import open_client
-from s2a_bench.types import Request
+from s2a_bench.types import Action, Request
 
 ONE_BY_ONE = ("--feedback-interval", "0")
 """The echo engine is faster than any model: without this its tokens share feedbacks."""
@@ -285,3 +286,15 @@ def test_shm_says_where_memory_is_handed_over_and_leaves_no_socket(start: Start,
     process.send_signal(signal.SIGTERM)
     assert process.wait(30) in {0, -signal.SIGTERM}
     assert not path.exists()
+
+
+def test_a_policy_server_says_where_it_is_and_answers_with_chunks(start: Start) -> None:
+    process, line = start("websocket/openpi", "--engine", "echo", "--port", "0", "--horizon", "5", "--action-dim", "3")
+    address = re.search(r"at (ws://\S+), streamed at \1/stream; ", line)
+    assert address
+    client = open_client(wiring("websocket", address[1]))
+    actions, _ = ask(client, Request("a", "hello robot", (yuyv_frame(),), max_tokens=50))
+    client.close()
+    assert [action.values.shape for action in actions if isinstance(action, Action)] == [(3,)] * 5
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) in {0, -signal.SIGTERM}

@@ -18,13 +18,15 @@ LIMITS = {
     "raw": {"http/as-deployed": 70, "http/best-effort": 18, "http/binary": 12, "ros/topic": 7},
     "jpeg": {"http/as-deployed": 32, "http/best-effort": 18, "ros/topic": 7},
     "alone": {"shm": 1.6},
+    "actions": {"websocket/openpi": 8},
 }
 """Payload -> cell -> most times loopback's median end to end without inference, at 640x480.
 
 Binary with JPEG is left to `make bench` to print: coding and decoding the JPEG alone is half of its limit of 12, and
 at 10.3 to 10.9 measured a busy machine would decide the test. "alone" is raw pixels without the pipelines of other
 servers, which leave cold caches behind, and one token: where the other cores are busy a server that goes on to write 31
-more at once, as no model does, keeps its client from the core for .15 ms, most of what this wire costs.
+more at once, as no model does, keeps its client from the core for .15 ms, most of what this wire costs. "actions" is
+raw pixels and chunks of 16 actions.
 """
 
 
@@ -34,7 +36,8 @@ TRIES = 3
 
 def measured(payload: str, output: Path) -> tuple[dict[str, float], list[str]]:
     """Return the cells over their limit, with their ratio to loopback, and those whose stages leave over 5 %."""
-    transports = "shm,loopback" if payload == "alone" else f"http?payload={payload},ros,loopback"
+    own = {"alone": "shm,loopback", "actions": "websocket?payload=raw,loopback"}
+    transports = own.get(payload, f"http?payload={payload},ros,loopback")
     arguments = ["latency", "--engine", "echo", "--transport", transports]
     arguments += ["--max-tokens", "1"] * (payload == "alone")
     done = subprocess.run(

@@ -21,6 +21,7 @@ from starlette.testclient import TestClient
 from s2a_bench.boards.file import parse_profile
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.bag import Recording
+from s2a_bench.frames.convert import encode_png
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.plan.parser import Parser
@@ -36,15 +37,19 @@ from s2a_bench.store.requests import EARLIER_STAGES, TOKENS, TokenRow, samples_t
 from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.trace import Remote, Trace
+from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
 from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS
 from s2a_bench.transport.http.reading import of_json, of_picture
 from s2a_bench.transport.http.server import _received, application
 from s2a_bench.transport.limits import LIMITS
+from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.pipeline import pipelines
 from s2a_bench.transport.ros import wire
+from s2a_bench.transport.websocket.codec import packb, unpackb
+from s2a_bench.transport.websocket.own import remote_message, remote_of, request_of
 from s2a_bench.types import Frame, Request, Token
 from tests.plan.test_parser import FORMATS
 from tests.servers.speakers import SPEAKERS
@@ -238,6 +243,23 @@ METADATA = b"""rosbag2_bagfile_information:
   compression_mode: ""
   relative_file_paths: []
 """
+
+
+def read_observation(data: bytes) -> None:
+    """Read what a policy server is asked, and what its client is answered."""
+    message = unpackb(data)
+    request_of(message, Trace(), LIMITS, ours=True)
+    actions_of(message.get("actions") if isinstance(message, dict) else message)
+
+
+def observations() -> list[bytes]:
+    """Return observations and answers."""
+    picture = np.zeros((4, 6, 3), np.uint8)
+    told = {"image": picture, "more": [picture.transpose(2, 0, 1), encode_png(picture)], "gripper": np.float32(0.5)}
+    told |= {"state": np.zeros(7), "prompt": "go", "s2a": {"id": "a", "max_tokens": 5, "seed": 1, "grammar": "x"}}
+    return [packb(told), packb({**told, "actions": np.zeros((4, 2))}), packb({"actions": [[1, 2.5]]})]
+
+
 NAMES = [b"http/binary?payload=png&connection=per-request", b"ros/topic?result_timeout=2.5", b"loopback", b"ros/action"]
 RAW = b"application/x-raw; width=6; height=4; encoding=bgr8"
 
@@ -261,4 +283,14 @@ TARGETS = {
     "raw": Target(lambda data: decoded(data.decode("utf-8", "replace"), bytes(72), Trace()), lambda: [RAW]),
     "pipeline": Target(lambda data: pipelines([data.decode("utf-8", "replace")]), lambda: NAMES),
     "yaml": Target(read_yaml, lambda: [METADATA]),
+    "observation": Target(read_observation, observations),
+    "marks": Target(lambda data: remote_of(unpackb(data)), lambda: [packb(remote_message(Trace().to_remote()))]),
+    "template": Target(
+        lambda data: template_of(str(as_file("t.toml", data))), tomls("s2a_bench/transport/templates/*.toml")
+    ),
+    "template, JSON": Target(
+        lambda data: template_of(str(as_file("t.json", data))),
+        lambda: [b'{"a": "{image:0|CHW}", "b?": [["{state:0:7}"]], "prompt": "Task: {prompt}"}'],
+        json=True,
+    ),
 }

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.frames import open_source
 from s2a_bench.frames.convert import bgr_to_rgb, encode_jpeg, yuyv_to_bgr
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.pixels import rgb_fingerprint
-from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.inference import EngineConfig, open_engine
@@ -38,16 +38,16 @@ def measure() -> Iterator[Measure]:
             connecting = connector(cell.wiring(timeout_s=20))
             client = next(connecting)(handler)
             stack.callback(connecting.close)  # type: ignore[attr-defined]  # a generator
-            config = RequestsConfig(transports=name, max_tokens=3)
+            config = LatencyConfig(transports=name, max_tokens=3)
             session = Session(cell, client, RequestFeed(source, preencoded=False), config)
             return session.measure(Place(0, 0, warmup=False))
 
         yield run
 
 
-def handler(*, alter: bool) -> Handler:
+def handler(*, alter: bool, answer: str = "tokens") -> Handler:
     """An echo engine before which a pixel may be altered."""
-    inner = engine_handler(open_engine(EngineConfig(name="echo")))
+    inner = engine_handler(open_engine(EngineConfig(name="echo", answer=answer)))
 
     def handle(request: Request, trace: Trace) -> Generator[Token, None, None]:
         (image,) = request.images
@@ -59,10 +59,15 @@ def handler(*, alter: bool) -> Handler:
 
 
 @pytest.mark.parametrize(
-    "name", ["http/best-effort?payload=raw", "http/binary?payload=png", "shm", "shm?payload=yuyv", "loopback"]
+    "name",
+    [
+        *("http/best-effort?payload=raw", "http/binary?payload=png", "shm", "shm?payload=yuyv", "loopback"),
+        *("websocket/openpi", "websocket/openpi-stream?payload=png"),
+    ],
 )
 def test_one_altered_pixel_makes_a_lossless_sample_an_error(measure: Measure, name: str) -> None:
-    good, bad = (measure(name, handler(alter=alter)).sample for alter in (False, True))
+    answer = one_pipeline(name).answers[0]
+    good, bad = (measure(name, handler(alter=alter, answer=answer)).sample for alter in (False, True))
     assert (good.error, good.rgb_engine) == ("", good.rgb_source)
     assert good.rgb_source is not None
     assert "other pixels" in bad.error

@@ -686,3 +686,24 @@ def test_an_answer_that_no_socket_takes_at_once_comes_whole() -> None:
             socket.send(packb({"prompt": "go"}))
         for _ in "ab":
             np.testing.assert_array_equal(unpackb(socket.recv(timeout=20))["actions"], chunk)
+
+
+@pytest.mark.parametrize("path", ["", "/stream"])
+def test_an_answer_that_does_not_end_is_given_up_at_the_deadline(path: str) -> None:
+    ended = Event()
+
+    def endless(_: Request, trace: Trace) -> Generator[Piece, None, None]:
+        try:
+            for index in range(10**9):
+                trace.token_ns[:] = [now_ns()]
+                yield Action(index, CHUNK[0])
+        finally:
+            ended.set()
+
+    with serving(endless, limits=Limits(answer_s=0.3)) as server, robot(server.address, path) as (socket, _):
+        socket.send(packb({"prompt": "go"}))
+        said: Any = b""
+        while isinstance(said, bytes):
+            said = socket.recv(timeout=20)
+    assert "still being answered" in said
+    assert ended.is_set()

@@ -40,7 +40,7 @@ class Websocket(Transport[WebsocketOptions]):
     }
     tells = (PAYLOAD_BYTES, RECONNECTS, INFER_MS, PREV_TOTAL_MS)
     order = 20
-    looks = {OPENPI: ("#882255", "-"), STREAM: ("#882255", "--")}
+    looks = {OPENPI: ("#000000", "-"), STREAM: ("#000000", "--")}
     compared_with = ("ros", "loopback")
     packages = (*PACKAGES, "uvloop")
     elsewhere = ("url",)

@@ -147,6 +147,11 @@ class Door(asyncio.Protocol):
         self._paused = False
         self._read_on()
 
+    @property
+    def busy(self) -> bool:
+        """Whether a request is under way."""
+        return self._call is not None
+
     def hang_up(self) -> None:
         """End the connection, as the server does."""
         self._close(CloseCode.GOING_AWAY, "the server stops")

@@ -19,6 +19,7 @@ from s2a_bench.transport.websocket.codec import packb
 from s2a_bench.transport.websocket.door import Door, House
 from s2a_bench.transport.websocket.options import WebsocketOptions
 
+GRACE_S = 1.0
 CLOSING_S = 0.01
 """Time for the loop to close what is broken off."""
 
@@ -69,12 +70,16 @@ class WebsocketServer:
         async with server:
             await self._stopped.wait()
             server.close()
+            for _ in range(round(GRACE_S / CLOSING_S)):
+                if not any(door.busy for door in self._house.doors):
+                    break
+                await asyncio.sleep(CLOSING_S)
             for door in list(self._house.doors):
                 door.hang_up()
             self._house.office.threads.shutdown(wait=False, cancel_futures=True)
             await asyncio.sleep(CLOSING_S)
 
     def stop(self) -> None:
-        """Break off what is under way."""
+        """Finish the requests under way, for a second at most."""
         with suppress(RuntimeError):  # it has ended already
             self._loop.call_soon_threadsafe(self._stopped.set)
