@@ -24,6 +24,7 @@ EXTRAS: Final = {
     "websocket": "policies over WebSocket, as openpi serves them",
     "zmq": "policies over ZeroMQ, as GR00T serves them",
     "carla": "the carla simulator",
+    "zenoh": "ROS 2 over Zenoh, as rmw_zenoh speaks it",
 }
 """Extra -> what it is for."""
 BY_HAND: Final = ("ray", "carla")

@@ -14,6 +14,7 @@ from pkgutil import resolve_name
 from typing import Any, Literal, Protocol, TypeAlias
 
 from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.ros.router import Router
 
 Tuning: TypeAlias = Literal["tuned", "default"]
 
@@ -302,23 +303,34 @@ class Middleware(Protocol):
 MIDDLEWARES: dict[str, str] = {
     "cyclonedds": "s2a_bench.ros.cyclone:CycloneMiddleware",
     "rclpy": "s2a_bench.ros.rclpy_middleware:RclpyMiddleware",
+    "zenoh": "s2a_bench.ros.zenoh_middleware:ZenohMiddleware",
 }
-"""Name -> class, built as ``Class(domain_id, tuning, node_name)``."""
+"""Name -> class, built as ``Class(domain_id, tuning, node_name)``; of what is `ROUTED` with a `Router` behind that."""
+ROUTED = frozenset({"zenoh"})
+"""Middlewares whose nodes meet at a router."""
 WAYS_OUT = {
-    "cyclonedds": "it has wheels for x86-64 only: elsewhere source a ROS 2 installation, whose rclpy is taken then "
-    "(source /opt/ros/<distribution>/setup.bash), or leave ros out of --transport",
+    "cyclonedds": "it has wheels for x86-64 only: elsewhere use --middleware zenoh (pip install 's2a-bench[zenoh]'), "
+    "or the rclpy of a ROS 2 (source /opt/ros/<distribution>/setup.bash), or leave ros out of --transport",
     "rclpy": "it comes with ROS 2: source /opt/ros/<distribution>/setup.bash, or use --middleware cyclonedds",
+    "zenoh": "pip install 's2a-bench[zenoh]', or use --middleware cyclonedds",
 }
 
 
 def default_middleware(environ: Mapping[str, str]) -> str:
-    """Choose rclpy inside a sourced ROS 2 environment whose rclpy this Python finds, else cyclonedds."""
+    """Choose rclpy inside a sourced ROS 2 environment that has it for this Python, else cyclonedds, else zenoh."""
     sourced = environ.get("ROS_DISTRO") and environ.get("AMENT_PREFIX_PATH")
-    return "rclpy" if sourced and find_spec("rclpy") else "cyclonedds"
+    if sourced and find_spec("rclpy"):
+        return "rclpy"
+    return "zenoh" if find_spec("zenoh") and not find_spec("cyclonedds") else "cyclonedds"
 
 
 def open_middleware(
-    name: str = "", *, domain_id: int = 0, tuning: Tuning = "tuned", node_name: str = "/s2a_bench"
+    name: str = "",
+    *,
+    domain_id: int = 0,
+    tuning: Tuning = "tuned",
+    node_name: str = "/s2a_bench",
+    router: Router | None = None,
 ) -> Middleware:
     """Join a ROS 2 domain as the node ``node_name``, its namespace included; `default_middleware` without a name.
 
@@ -331,5 +343,6 @@ def open_middleware(
         implementation = resolve_name(MIDDLEWARES[name])
     except ModuleNotFoundError as error:
         raise TransportError(f"middleware {name} is not installed ({error}); {WAYS_OUT[name]}") from error
-    middleware: Middleware = implementation(domain_id, tuning, node_name)
+    more = (router or Router(),) if name in ROUTED else ()
+    middleware: Middleware = implementation(domain_id, tuning, node_name, *more)
     return middleware

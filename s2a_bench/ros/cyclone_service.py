@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from threading import Lock, Thread
 from typing import Any
@@ -11,13 +10,12 @@ from cyclonedds.domain import DomainParticipant
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import REQUEST_BYTES, QoS
+from s2a_bench.ros import QoS
 from s2a_bench.ros.dds import Waiter
-from s2a_bench.ros.dds_service import BODY_AT, HEADER, HEADER_AT, ServiceClient, ServiceServer
+from s2a_bench.ros.dds_service import BODY_AT, Caller, ServiceClient, ServiceServer
 from s2a_bench.ros.messages import DEFAULT_VERSION
+from s2a_bench.ros.service import Offered
 from s2a_bench.ros.waiting import WAIT_SLICE_NS, appeared
-
-_log = logging.getLogger(__name__)
 
 
 class CycloneServices:
@@ -27,7 +25,7 @@ class CycloneServices:
         """Start the thread that answers."""
         self._participant = participant
         self._waiter = Waiter(participant, [])
-        self._offered: list[_Offered] = []
+        self._offered: list[tuple[ServiceServer, Offered[Caller]]] = []
         self._lock = Lock()
         self._thread = Thread(target=self._serve, name="services", daemon=True)
         self._thread.start()
@@ -36,7 +34,7 @@ class CycloneServices:
         """Create the service ``/name`` and answer it from now on."""
         server = ServiceServer(self._participant, name, type_name, DEFAULT_VERSION, qos)
         with self._lock:
-            self._offered = [*self._offered, _Offered(name, server, answer)]
+            self._offered = [*self._offered, (server, Offered(name, server, answer, BODY_AT))]
             self._waiter.watch(server.reader)
         return server
 
@@ -47,34 +45,10 @@ class CycloneServices:
 
     def _serve(self) -> None:
         while not self._waiter.interrupted:
-            for offered in self._offered:
-                for packed in offered.server.reader.arrived():
-                    offered.handle(packed)
+            for server, offered in self._offered:
+                for packed in server.reader.arrived():
+                    offered.handle(packed, server.caller(packed))
             self._waiter.wait_until(now_ns() + WAIT_SLICE_NS)
-
-
-class _Offered:
-    """One service and what answers it."""
-
-    def __init__(self, name: str, server: ServiceServer, answer: Callable[[Any], Any]) -> None:
-        self.server = server
-        self._name, self._answer = name, answer
-        self._said = ""
-
-    def handle(self, packed: memoryview) -> None:
-        """Answer one request, unless its client has left; what cannot be answered is dropped."""
-        sender = self.server.reader.sender()
-        try:
-            if not BODY_AT < len(packed) <= REQUEST_BYTES:
-                raise TransportError(f"{len(packed)} bytes are no request; the most is {REQUEST_BYTES}")
-            response = self.server.pack(self._answer(self.server.unpack(packed)))
-            if self.server.await_client(sender):
-                self.server.reply(response, HEADER.unpack_from(packed, HEADER_AT))
-        except Exception as error:  # noqa: BLE001 - a stranger's request is no reason to stop
-            said = type(error).__name__  # not its text, which a stranger can make a new one each time
-            if said != self._said:
-                self._said = said
-                _log.warning("%s: dropped a request: %s", self._name, str(error)[:200])
 
 
 class CycloneServiceClient:

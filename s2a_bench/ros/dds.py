@@ -37,12 +37,12 @@ from cyclonedds.topic import Topic
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS
+from s2a_bench.ros.action_client import AT_ONCE
+from s2a_bench.ros.messages import dds_type_name
 from s2a_bench.ros.waiting import WAIT_SLICE_NS
 
 FOREVER_NS = 2**63 - 1
 ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
-AT_ONCE = 1000
-"""More than that is not taken before what has come is looked at."""
 
 
 class _Outgoing(ct.Structure):
@@ -96,12 +96,6 @@ class _Loan:
     def __del__(self) -> None:
         _library().ddsi_serdata_to_ser_unref(self._referenced, ct.byref(self._slice))
         _library().ddsi_serdata_unref(self._serdata)
-
-
-def dds_type_name(type_name: str) -> str:
-    """Turn ``pkg/msg/Name`` into ROS 2's DDS type name ``pkg::msg::dds_::Name_``."""
-    package, kind, name = type_name.split("/")
-    return f"{package}::{kind}::dds_::{name}_"
 
 
 @cache

@@ -55,6 +55,14 @@ class Peer:
     type_hash: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Who asked: the writer of a request, and the request's header, under which its reply goes."""
+
+    sender: int
+    header: tuple[int, int]
+
+
 class _End:
     """What client and server have in common."""
 
@@ -106,6 +114,7 @@ class ServiceClient(_End):
     def __init__(self, participant: DomainParticipant, name: str, type_name: str, version: str) -> None:
         """Create both endpoints of the service ``/name``."""
         super().__init__(participant, name, type_name, version, ("clientid", "serviceid"))
+        self.hashed_type = self.request_type
         self._guid = self.writer.entity.get_instance_handle() % 2**64
         self._numbers = count(1)
         self._pending: dict[int, bytes] = {}
@@ -157,6 +166,19 @@ class ServiceServer(_End):
         """Send a reply under the header of its request."""
         HEADER.pack_into(packed, HEADER_AT, *header)
         self.writer.send(packed)
+
+    def caller(self, packed: memoryview) -> Caller:
+        """Return who sent the request that was taken last; of one that is too short for a header, nobody's."""
+        header = HEADER.unpack_from(packed, HEADER_AT) if len(packed) >= BODY_AT else (0, 0)
+        return Caller(self.reader.sender(), header)
+
+    def respond(self, packed: bytearray, caller: Caller) -> None:
+        """Send a reply to who asked."""
+        self.reply(packed, caller.header)
+
+    def reaches(self, caller: Caller) -> bool:
+        """Wait until replies reach who asked."""
+        return self.await_client(caller.sender)
 
     def unpack(self, packed: memoryview) -> Any:
         """Deserialise a request's body; raises TransportError."""

@@ -2,7 +2,8 @@
 
 A service gives ``X_Request`` and ``X_Response``; an action gives goal, result and feedback, the two services around
 them and the feedback message. Beside each request and response stands ``...__wire``: the body behind the header
-``uint64 guid, int64 seq`` with which rmw_cyclonedds sends it.
+``uint64 guid, int64 seq`` with which rmw_cyclonedds sends it. ``X`` and ``X_Event`` are never sent: the hash of a
+service, which rmw_zenoh has in its keys, is that of ``X``.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ STATUS: Description = (Nodetype.BASE, ("int8", 0))
 ACCEPTED: Description = (Nodetype.BASE, ("bool", 0))
 GOAL_ID: Description = (Nodetype.NAME, "unique_identifier_msgs/msg/UUID")
 STAMP: Description = (Nodetype.NAME, "builtin_interfaces/msg/Time")
+EVENT_INFO: Description = (Nodetype.NAME, "service_msgs/msg/ServiceEventInfo")
 
 PARTS = {
     "msg": ("",),
@@ -92,8 +94,13 @@ def _derived(name: str, kind: str) -> Iterator[tuple[str, tuple[list[Any], Field
         }
         yield from ((name + suffix, ([], fields)) for suffix, fields in parts.items())
     for service in services:
-        for half in (service + "_Request", service + "_Response"):
+        request, response, event = (service + part for part in ("_Request", "_Response", "_Event"))
+        for half in (request, response):
             yield half + "__wire", ([], [("guid", GUID), ("seq", SEQUENCE), ("body", (Nodetype.NAME, half))])
+        at_most_one = [(Nodetype.SEQUENCE, ((Nodetype.NAME, half), 1)) for half in (request, response)]
+        yield event, ([], [("info", EVENT_INFO), ("request", at_most_one[0]), ("response", at_most_one[1])])
+        whole = (("request_message", request), ("response_message", response), ("event_message", event))
+        yield service, ([], [(part, (Nodetype.NAME, of)) for part, of in whole])
 
 
 def char_as_uint8(description: Description) -> Description:

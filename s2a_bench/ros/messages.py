@@ -132,6 +132,12 @@ def version_of(type_name: str, announced: str) -> str | None:
     return next((version for version in VERSIONS if announced == type_hash(type_name, version)), None)
 
 
+def dds_type_name(type_name: str) -> str:
+    """Turn ``pkg/msg/Name`` into ROS 2's DDS type name ``pkg::msg::dds_::Name_``."""
+    package, kind, name = type_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
 @cache
 def type_hash(type_name: str, version: str = DEFAULT_VERSION) -> str:
     """Return the type's REP-2016 hash, ``RIHS01_`` and 64 hex digits."""

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 from collections import Counter
+from importlib.util import find_spec
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -57,6 +58,18 @@ def test_one_run_compares_all_pipelines(tmp_path: Path) -> None:
         assert (kept.path / name).stat().st_size > 0
     assert len(list((kept.path / "figures").glob("*.png"))) == 3
     assert len(list((kept.path / "figures").glob("*.pdf"))) == 3
+
+
+@pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")
+def test_two_servers_of_a_run_are_each_the_zenoh_router_of_their_clients(tmp_path: Path) -> None:
+    cells = "ros/topic?middleware=zenoh,ros/action?middleware=zenoh,ros/topic?middleware=zenoh&qos=sensor_data"
+    run(*SMALL, "--transport", cells, "--mode", "stream", output=tmp_path)
+    kept = only_run(tmp_path)
+    assert (kept.samples["error"] == "").all()
+    assert len(set(kept.samples["cell"])) == 3
+    servers = [server["transport"] for server in kept.manifest["servers"].values()]
+    assert [server["router_is"] for server in servers] == ["this process"] * 2
+    assert len({server["router"] for server in servers}) == 2
 
 
 def test_blocks_hold_every_cell_once_in_changing_order(tmp_path: Path) -> None:

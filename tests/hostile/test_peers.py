@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any
+
+import pytest
 
 from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm, websocket, zmq
 from s2a_bench.transport import Wiring
@@ -45,6 +48,22 @@ class TestZmq(HostileSuite):
     name = "zmq/gr00t"
     clients = zmq.CLIENTS
     servers = zmq.SERVERS
+
+
+needs_zenoh = pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")
+
+
+@needs_zenoh
+class TestRosTopicOverZenoh(HostileSuite):
+    name = "ros/topic?middleware=zenoh"
+    clients = ros.CLIENTS
+    servers = ros_servers.TOKENS
+
+
+@needs_zenoh
+class TestRosActionOverZenoh(HostileSuite):
+    name = "ros/action?middleware=zenoh"
+    servers = ros_servers.GOALS
 
 
 class TestShm(HostileSuite):

@@ -171,7 +171,8 @@ def test_a_well_kept_jetson_has_nothing_to_mend(make: Make) -> None:
 
 def test_an_empty_tree_fails_no_check(make: Make) -> None:
     found = examine(make({}), HARDWARE)
-    assert {finding.code for finding in found} == {"gpu", "cpus", "disk", "dds", "ros", "middleware", "cameras"}
+    always = {"gpu", "cpus", "disk", "dds", "ros", "middleware", "zenoh", "cameras"}
+    assert {finding.code for finding in found} == always
     assert worst(found) == "state"
 
 
@@ -346,6 +347,27 @@ def test_a_missing_middleware_is_an_error_that_names_rclpy(make: Make) -> None:
     assert finding.level == "error"
     assert "rclpy" in finding.fix
     assert "/opt/ros/" in finding.fix
+
+
+@pytest.mark.parametrize(
+    ("tree", "says"),
+    [
+        ({}, "no router listens at tcp/127.0.0.1:7447"),
+        ({"proc/net/tcp": "  sl  local st\n  0: 0100007F:1D17 00000000:0000 0A 0\n"}, "a router listens at tcp/"),
+        ({"proc/net/tcp6": "  sl  local st\n  0: 0:1D17 0:0000 0A 0\n"}, "a router listens at tcp/"),
+        ({"proc/net/tcp": "  0: 0100007F:9999 0100007F:1D17 01 0\n  1: 0100007F:1D17 0:0 01 0\nx\n"}, "no router"),
+    ],
+)
+def test_zenohs_router_is_looked_for(make: Make, tree: dict[str, str], says: str) -> None:
+    finding = see(make(tree, finds=lambda _package: True), "zenoh")
+    assert finding.level == "state"
+    assert finding.message.startswith(says)
+
+
+def test_how_to_get_zenoh_is_told(make: Make) -> None:
+    finding = see(make({}, finds=lambda _package: False), "zenoh")
+    assert (finding.level, finding.message) == ("state", "not installed")
+    assert finding.fix.startswith("pip install 's2a-bench[zenoh]'")
 
 
 def test_cameras_are_listed_with_their_formats(make: Make) -> None:

@@ -42,8 +42,8 @@ def test_a_domain_takes_one_configuration_per_process(dds_domain: int) -> None:
 
 
 def test_an_unknown_middleware_is_named() -> None:
-    with pytest.raises(UsageError, match="'zenoh' is none of cyclonedds"):
-        open_middleware("zenoh")
+    with pytest.raises(UsageError, match="'iceoryx' is none of cyclonedds, rclpy, zenoh"):
+        open_middleware("iceoryx")
 
 
 def test_a_missing_package_is_named_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.ros import ActionServer, Rejected, Result, ServerGoal, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
-from s2a_bench.ros.cyclone_server import CycloneServerGoal
+from s2a_bench.ros.action_server import ServedGoal
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
 from s2a_bench.testing.transport import Recorder, ask, connector, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
@@ -312,15 +312,15 @@ def test_a_handler_that_breaks_fails_its_goal_only(dds_domain: int) -> None:
 
 
 def test_a_goal_that_cannot_start_ends_and_says_why(dds_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    execute = CycloneServerGoal.executing
+    execute = ServedGoal.executing
     failures = [TransportError("no status can be sent")]
 
-    def executing(goal: CycloneServerGoal) -> bool:
+    def executing(goal: ServedGoal[Any]) -> bool:
         if failures:
             raise failures.pop()
         return execute(goal)
 
-    monkeypatch.setattr(CycloneServerGoal, "executing", executing)
+    monkeypatch.setattr(ServedGoal, "executing", executing)
     told = wiring("ros/action", "/test_start", domain_id=dds_domain)
     with closing(connector(told)) as connecting:
         client = next(connecting)(Recorder(["fine"]))

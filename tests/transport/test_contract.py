@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any
 
 import pytest
@@ -90,3 +91,23 @@ class TestZmq(TransportSuite):
 
 class TestZmqJpeg(TransportSuite):
     name, lossless, whole = "zmq/gr00t?payload=jpeg", False, True
+
+
+needs_zenoh = pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")
+
+
+@needs_zenoh
+@pytest.mark.parametrize("payload", ["raw", "yuyv", "png"])
+class TestRosTopicOverZenoh(TransportSuite):
+    @pytest.fixture
+    def told(self, dds_domain: int, payload: str) -> Wiring[Any]:
+        return wiring("ros/topic?middleware=zenoh", domain_id=dds_domain, payload=payload)
+
+
+@needs_zenoh
+class TestRosActionOverZenoh(TransportSuite):
+    carries_id_and_limit = False
+
+    @pytest.fixture
+    def told(self, dds_domain: int) -> Wiring[Any]:
+        return wiring("ros/action?middleware=zenoh", domain_id=dds_domain, max_tokens=2000)

@@ -1,10 +1,11 @@
-"""Our server as a node that behaves: parameters, /rosout and /diagnostics, as a peer on Cyclone DDS meets them."""
+"""Our server as a node that behaves: parameters, /rosout and /diagnostics, as a peer on DDS or Zenoh meets them."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from threading import Thread
 from typing import Any
 
@@ -13,20 +14,19 @@ import pytest
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed
 from s2a_bench.inference import EngineConfig
-from s2a_bench.ros import Middleware, QoS, Subscription, open_middleware
+from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.diagnostics import ARRAY, Finding, Level, diagnostic_array
 from s2a_bench.ros.parameters import PARAMETER, SERVICE, value_message, value_of
 from s2a_bench.ros.rosout import LOG, LONGEST, log_message
 from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace
-from s2a_bench.transport import open_client, open_server
+from s2a_bench.transport import Wiring, open_client, open_server
+from s2a_bench.transport.ros.joining import join
 from s2a_bench.transport.ros.node import EVENT, Activity, snake
 from s2a_bench.transport.ros.server import RosServer
 from s2a_bench.transport.turns import STUCK_S, Queued
 from s2a_bench.types import Request
-
-pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
 NODE = "/behaves/brain"
 WAIT_S = 20.0
@@ -38,17 +38,24 @@ def stack() -> Iterator[ExitStack]:
         yield whole
 
 
+@pytest.fixture(params=["cyclonedds", "zenoh"])
+def told(request: pytest.FixtureRequest, dds_domain: int) -> Wiring[Any]:
+    """What a server is told, over each middleware that comes from PyPI."""
+    pytest.importorskip(request.param, reason=f"{request.param} is not installed")
+    options = {"middleware": request.param, "domain_id": dds_domain, "node_api": True, "node_name": "brain"}
+    return wiring("ros/topic?max_tokens=9", "/behaves", **options)
+
+
 @pytest.fixture
-def peer(stack: ExitStack, dds_domain: int) -> Middleware:
-    middleware = open_middleware("cyclonedds", domain_id=dds_domain)
+def peer(stack: ExitStack, told: Wiring[Any], server: RosServer) -> Middleware:
+    middleware = join(replace(told, address=server.address), "peer")
     stack.callback(middleware.close)
     return middleware
 
 
 @pytest.fixture
-def server(stack: ExitStack, dds_domain: int) -> RosServer:
+def server(stack: ExitStack, told: Wiring[Any]) -> RosServer:
     """A server as `serve ros` starts it."""
-    told = wiring("ros/topic?max_tokens=9", "/behaves", domain_id=dds_domain, node_api=True, node_name="brain")
     handler = Queued.around(Recorder(["a", "b"]))
     handler.settings = EngineConfig(name="echo")
     server = open_server(told, handler)
@@ -103,18 +110,18 @@ def test_a_limit_can_be_set_while_it_runs_and_everybody_hears(peer: Middleware, 
     assert (server._action.max_tokens, server._action.feedback_interval_ns) == (3, 250_000_000)
 
 
-def test_what_is_logged_is_on_rosout_for_who_joins_later(server: RosServer, peer: Middleware) -> None:
+def test_what_is_logged_is_on_rosout_for_who_joins_later(peer: Middleware) -> None:
     logging.getLogger("s2a_bench.somewhere").warning("the %s is low", "battery")
     rosout = peer.subscription("/rosout", LOG, QoS(depth=1000, latched=True))
     log = received(rosout, lambda log: "battery" in log.msg)
     assert (log.name, log.level, log.msg) == ("behaves.brain", 30, "the battery is low")
     assert log.file.endswith("test_ros_node.py")
-    assert server.address == "/behaves"
 
 
-@pytest.mark.usefixtures("server")
-def test_diagnostics_tell_of_requests_and_the_camera(peer: Middleware, stack: ExitStack, dds_domain: int) -> None:
-    client = open_client(wiring("ros/topic", "/behaves", domain_id=dds_domain))
+def test_diagnostics_tell_of_requests_and_the_camera(
+    peer: Middleware, server: RosServer, stack: ExitStack, told: Wiring[Any]
+) -> None:
+    client = open_client(replace(told, address=server.address))
     stack.callback(client.close)
     diagnostics = peer.subscription("/diagnostics", ARRAY, QoS())
     assert client.camera is not None
@@ -136,9 +143,9 @@ def test_diagnostics_tell_of_requests_and_the_camera(peer: Middleware, stack: Ex
 
 
 def test_a_request_that_cannot_be_prepared_is_a_failure(
-    server: RosServer, stack: ExitStack, dds_domain: int, caplog: pytest.LogCaptureFixture
+    server: RosServer, stack: ExitStack, told: Wiring[Any], caplog: pytest.LogCaptureFixture
 ) -> None:
-    client = open_client(wiring("ros/topic", "/behaves", domain_id=dds_domain))
+    client = open_client(replace(told, address=server.address))
     stack.callback(client.close)
     for _ in range(2):
         with pytest.raises(RequestFailed):
@@ -205,6 +212,7 @@ def test_diagnostics_survive_the_wire() -> None:
     assert ros.type_hash(ARRAY) == "RIHS01_" + generated
 
 
+@pytest.mark.parametrize("told", ["cyclonedds"], indirect=True)
 def test_rosout_and_parameter_events_have_the_qos_that_was_recorded(server: RosServer, dds_domain: int) -> None:
     import json
     from pathlib import Path

@@ -20,7 +20,7 @@ from s2a_bench.testing.hostile.tcp import NOISE
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.ros.action import ACTION
 from s2a_bench.transport.ros.camera import CAMERA, POLL_S
-from s2a_bench.transport.ros.joining import domain_of, join, wait_until
+from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
 from s2a_bench.transport.ros.wire import READER_QOS, request_message
 from s2a_bench.types import Frame, Request
 
@@ -38,8 +38,8 @@ def publishes(
     def attack(told: Wiring[Any]) -> str:
         errors: list[str] = []
         with closing(join(told, "hostile")) as middleware:
-            tokens = middleware.subscription(told.address + "/token", ros.TOKEN, READER_QOS)
-            publisher = middleware.publisher(told.address + topic, kind, qos)
+            tokens = middleware.subscription(namespace_of(told) + "/token", ros.TOKEN, READER_QOS)
+            publisher = middleware.publisher(namespace_of(told) + topic, kind, qos)
             wait_until(lambda: bool(publisher.matched() and tokens.matched()), lambda: True, "no server to attack")
             for packed in make():
                 publisher.send(bytearray(packed))
@@ -58,7 +58,7 @@ def sends_goals(acts: Callable[[Any], Iterable[Any]]) -> Attack:
 
     def attack(told: Wiring[Any]) -> str:
         with closing(join(told, "hostile")) as middleware:
-            client = middleware.action_client(told.address + ACTION, GENERATE_RESPONSE)
+            client = middleware.action_client(namespace_of(told) + ACTION, GENERATE_RESPONSE)
             wait_until(client.server_present, lambda: True, "no server to attack")
             return "\n".join(str(said) for said in acts(client))
 

@@ -20,7 +20,7 @@ from s2a_bench.testing.hostile.tcp import NOISE
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.ros.action import ACTION, MARKS
 from s2a_bench.transport.ros.camera import CAMERA, CAMERA_QOS, POLL_S
-from s2a_bench.transport.ros.joining import join
+from s2a_bench.transport.ros.joining import AT, join, settled
 from s2a_bench.transport.ros.wire import READER_QOS, TOKEN_QOS, token_message
 from s2a_bench.types import Token
 
@@ -52,7 +52,8 @@ def tokens(reply: Reply) -> Trap:
     @contextmanager
     def trap(told: Wiring[Any]) -> Iterator[str]:
         namespace, over = f"/hostile_{next(_numbers)}", Event()
-        middleware = join(told, "server")
+        told, host = settled(told)
+        middleware = join(told, "server", host=host)
         requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
         publisher = middleware.publisher(namespace + "/token", ros.TOKEN, TOKEN_QOS)
         kept = middleware.subscription(namespace + CAMERA, ros.IMAGE, CAMERA_QOS["reliable"])
@@ -68,7 +69,7 @@ def tokens(reply: Reply) -> Trap:
                             publisher.send(bytearray(piece))
 
         with _running(middleware, over, requests, run):
-            yield namespace
+            yield namespace + "".join(told.address.partition(AT)[1:])
         del kept  # the client waits until it has matched all
 
     return trap
@@ -116,7 +117,8 @@ def goals(answer: Callable[[ServerGoal, Event, Callable[[], None]], None]) -> Tr
     @contextmanager
     def trap(told: Wiring[Any]) -> Iterator[str]:
         namespace, over = f"/hostile_{next(_numbers)}", Event()
-        middleware = join(told, "server")
+        told, host = settled(told)
+        middleware = join(told, "server", host=host)
         server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE)
         kept = [
             middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS),
@@ -130,7 +132,7 @@ def goals(answer: Callable[[ServerGoal, Event, Callable[[], None]], None]) -> Tr
                         answer(goal, over, middleware.close)
 
         with _running(middleware, over, server, run):
-            yield namespace
+            yield namespace + "".join(told.address.partition(AT)[1:])
         del kept  # the client waits until it has matched all
 
     return trap

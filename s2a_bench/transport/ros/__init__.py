@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import count
 from secrets import token_hex
 
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_STAMP_AGE_MS, PAYLOAD_BYTES, STALE_FRAMES, Fact
+from s2a_bench.ros.router import ROUTER
 from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, Server, Transport, Wiring
 from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
@@ -33,18 +35,20 @@ class Ros(Transport[RosOptions]):
     tells = (PAYLOAD_BYTES, CAMERA_FRAMES, CAMERA_AGE_MS, CAMERA_STAMP_AGE_MS, STALE_FRAMES, UNREADABLE_N)
     order = 20
     looks = {TOPIC: ("#0072B2", "-"), ACTION: ("#56B4E9", "--")}
-    packages = ("cyclonedds", "rosbags")
+    packages = ("cyclonedds", "eclipse-zenoh", "rosbags")
     checks = {
         "rmem-max": "s2a_bench.machine.doctor.robot:rmem_max",
         "dds": "s2a_bench.transport.ros.checks:dds",
         "ros": "s2a_bench.transport.ros.checks:ros",
         "middleware": "s2a_bench.transport.ros.checks:middleware",
+        "zenoh": "s2a_bench.transport.ros.checks:zenoh",
         "dds-buffers": "s2a_bench.transport.ros.buffers:check",
     }
     watches_udp = True
     elsewhere = ("action",)
     serving = {
         "namespace": "/llama",
+        "router": ROUTER,
         "qos": "sensor_data",  # matches reliable cameras as well as best-effort ones
         "feedback_interval": 0.002,
         "max_tokens": 512,
@@ -83,8 +87,11 @@ class Ros(Transport[RosOptions]):
     def check(self, variant: str, options: RosOptions, *, mode: str, engine: str) -> None:  # noqa: ARG002
         """Refuse what a goal cannot carry, and a stream that nobody keeps."""
         from s2a_bench.ros.config import domain_id
+        from s2a_bench.transport.ros.joining import is_routed
 
         domain_id(os.environ)
+        if options.router and not is_routed(options):
+            raise UsageError("`router` is Zenoh's: choose `middleware` zenoh, or leave it out")
         if options.action and variant != ACTION:
             raise UsageError(f"`action` is spoken by ros/{ACTION}, not by ros/{variant}")
         if options.action and mode == "stream":
@@ -123,11 +130,13 @@ class Ros(Transport[RosOptions]):
     def ready(self, wiring: Wiring[RosOptions], address: str) -> str:
         """Return the names of action and camera."""
         from s2a_bench.transport.ros.camera import CAMERA
-        from s2a_bench.transport.ros.joining import domain_of, remapped
+        from s2a_bench.transport.ros.joining import AT, place_of, remapped
 
         names = remapped(wiring)
-        action, camera = (names.get(name, name) for name in (f"{address}/generate_response", address + CAMERA))
-        return f"serving action {action}, camera {camera}, in DDS domain {domain_of(wiring)}"
+        namespace, hosted, _ = address.partition(AT)
+        action, camera = (names.get(name, name) for name in (f"{namespace}/generate_response", namespace + CAMERA))
+        where = place_of(replace(wiring, address=address)) + (", which this server is" if hosted else "")
+        return f"serving action {action}, camera {camera}, in {where}"
 
 
 ROS = Ros()

@@ -21,7 +21,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import CameraSink, Wiring
 from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.ros.camera import POLL_S, CameraPublisher, picture_message
-from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
+from s2a_bench.transport.ros.joining import join, namespace_of, place_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, READER_QOS, readable, remote_of, told_by
 from s2a_bench.types import Request, Token
@@ -87,7 +87,7 @@ class GenerateClient:
             raise
 
     def _wait(self, arrived: Callable[[], bool]) -> None:
-        absent = f"no action server appeared at {self._name} in DDS domain {domain_of(self._wiring)}"
+        absent = f"no action server appeared at {self._name} in {place_of(self._wiring)}"
         wait_until(arrived, self._alive, absent)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:

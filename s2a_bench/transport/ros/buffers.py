@@ -36,6 +36,8 @@ def against_loss(middleware: str, environ: Mapping[str, str]) -> str:
         return f"--qos reliable, and on both sides: {cyclone_line(environ)}; {KERNEL}"
     if dds == "cyclonedds":
         return f"--qos reliable, --dds-tuning tuned, and {KERNEL}"
+    if dds == "zenoh":
+        return "--qos reliable: what is best effort is dropped where Zenoh's link is busy"
     if dds == FAST:
         return f"--qos reliable, and on both sides: {fast_line(environ)}; {KERNEL}"
     return f"--qos reliable, larger receive buffers for {dds}, and {KERNEL}"

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import platform
+from typing import Final
 from xml.etree import ElementTree as ET
 
 from s2a_bench.errors import UsageError
+from s2a_bench.extras import how_to_install
 from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.ros import WAYS_OUT, default_middleware
 from s2a_bench.ros.config import configuration, domain_id
+from s2a_bench.ros.router import ROUTER, endpoint_of
+
+STATE_AT: Final = 3
+"""The column of /proc/net/tcp that tells a socket's state."""
+LISTEN: Final = "0A"
 
 
 def dds(machine: Machine) -> Finding:
@@ -72,3 +79,14 @@ def middleware(machine: Machine) -> Finding:
     if machine.finds(name):
         return Finding("middleware", "state", f"{name} (--middleware takes another)")
     return Finding("middleware", "error", f"{name} is not installed, so --transport ros cannot run", WAYS_OUT[name])
+
+
+def zenoh(machine: Machine) -> Finding | None:
+    """Return whether Zenoh can be spoken, and whether a router listens where rmw_zenoh's nodes look for one."""
+    if not machine.finds("zenoh"):
+        return Finding("zenoh", "state", "not installed", how_to_install("zenoh"))
+    port = f":{endpoint_of(ROUTER)[2]:04X}"
+    lines = [line.split() for name in ("tcp", "tcp6") for line in (machine.read(f"proc/net/{name}") or "").splitlines()]
+    there = any(len(line) > STATE_AT and line[1].endswith(port) and line[STATE_AT] == LISTEN for line in lines)
+    told = "a router listens" if there else "no router listens"
+    return Finding("zenoh", "state", f"{told} at {ROUTER}{'' if there else ': serve ros --middleware zenoh starts it'}")

@@ -1,21 +1,25 @@
-"""Joining the DDS domain of a wiring, alone under its namespace where that matters."""
+"""Joining the domain of a wiring, alone under its namespace where that matters."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 
 from s2a_bench.errors import MissingInterface, ServerDied, TransportError
-from s2a_bench.ros import Middleware, QoS, Tuning, open_middleware
+from s2a_bench.ros import ROUTED, Middleware, QoS, Tuning, default_middleware, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE
 from s2a_bench.ros.remap import Remapped, table
+from s2a_bench.ros.router import ROUTER, Router, free_endpoint, listens, may_host
 from s2a_bench.ros.waiting import appeared
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA
 from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
+AT = "@"
+"""In an address, between the namespace and the router that the server is itself."""
 MATCH_TIMEOUT_S = 15.0
 SETTLE_S = 0.3
 """Time to discover a server that is there already."""
@@ -23,7 +27,8 @@ SETTLE_S = 0.3
 
 def namespace_of(wiring: Wiring[RosOptions]) -> str:
     """Return where our topics are; somebody else's action is not under it."""
-    return (not wiring.options.action and wiring.address) or wiring.options.namespace or NAMESPACE
+    address = wiring.address.partition(AT)[0]
+    return (not wiring.options.action and address) or wiring.options.namespace or NAMESPACE
 
 
 def domain_of(wiring: Wiring[RosOptions]) -> int:
@@ -32,16 +37,51 @@ def domain_of(wiring: Wiring[RosOptions]) -> int:
     return domain_id(os.environ) if said is None else said
 
 
+def is_routed(options: RosOptions) -> bool:
+    """Return whether the nodes meet at a router."""
+    return (options.middleware or default_middleware(os.environ)) in ROUTED
+
+
+def router_of(wiring: Wiring[RosOptions]) -> str:
+    """Return the endpoint of the router: of the server's own, else the one that is told, else rmw_zenoh's."""
+    return wiring.address.partition(AT)[2] or wiring.options.router or ROUTER
+
+
+def place_of(wiring: Wiring[RosOptions]) -> str:
+    """Return where nodes of a wiring meet, in words."""
+    domain = f"domain {domain_of(wiring)}"
+    return f"{domain} of the Zenoh router {router_of(wiring)}" if is_routed(wiring.options) else f"DDS {domain}"
+
+
+def settled(wiring: Wiring[RosOptions]) -> tuple[Wiring[RosOptions], bool]:
+    """Return a server's wiring, and whether it is to be the router itself, which is then in its address.
+
+    It is where none is told, so that each server of a run has its own, and where none listens on loopback as told.
+    """
+    if not is_routed(wiring.options):
+        return wiring, False
+    told = wiring.address.partition(AT)[2] or wiring.options.router
+    if told and (listens(told) or not may_host(told)):
+        return wiring, False
+    return replace(wiring, address=f"{namespace_of(wiring)}{AT}{told or free_endpoint()}"), True
+
+
 def server_name(wiring: Wiring[RosOptions]) -> str:
     """Return the server's node, its namespace included."""
     return f"{namespace_of(wiring)}/{wiring.options.node_name}"
 
 
-def join(wiring: Wiring[RosOptions], role: str) -> Middleware:
-    """Join the wiring's domain as the node ``<namespace>/<role>``, the server under its own name."""
+def join(wiring: Wiring[RosOptions], role: str, *, host: bool = False) -> Middleware:
+    """Join the wiring's domain as the node ``<namespace>/<role>``, the server under its own name; or be its router."""
     tuning: Tuning = wiring.options.dds_tuning
     name = server_name(wiring) if role == "server" else f"{namespace_of(wiring)}/{role}"
-    joined = open_middleware(wiring.options.middleware, domain_id=domain_of(wiring), tuning=tuning, node_name=name)
+    joined = open_middleware(
+        wiring.options.middleware,
+        domain_id=domain_of(wiring),
+        tuning=tuning,
+        node_name=name,
+        router=Router(router_of(wiring), host),
+    )
     names = remapped(wiring)
     return Remapped(joined, names) if names else joined
 
@@ -70,7 +110,7 @@ def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
         probe.subscription(namespace + "/token", ros.TOKEN, QoS()).take(SETTLE_S)
         if publisher.matched() or offered():
             raise TransportError(
-                f"another server answers under {namespace} in DDS domain {domain_of(wiring)}: stop it, "
+                f"another server answers under {namespace} in {place_of(wiring)}: stop it, "
                 "or choose another domain with ROS_DOMAIN_ID or another `namespace`"
             )
     finally:

@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import field_validator
 
 from s2a_bench.options import Names, option
+from s2a_bench.ros.router import ROUTER, endpoint_of
 from s2a_bench.transport.options import SERVER, SERVING, Options
 
 NAMESPACE = "/s2a_bench"
@@ -29,7 +30,12 @@ class RosOptions(Options):
     )
     namespace: str = option("", "namespace of the topics [default: a new one for each run]", side=SERVER)
     domain_id: int | None = option(None, "DDS domain [default: ROS_DOMAIN_ID, else 0]", ge=0, le=232, side=SERVER)
-    middleware: str = option("", "cyclonedds, rclpy [default: rclpy in a sourced ROS 2 environment]", side=SERVER)
+    middleware: str = option(
+        "", "cyclonedds, zenoh, rclpy [default: rclpy in a sourced ROS 2 environment]", side=SERVER
+    )
+    router: str = option(
+        "", f"Zenoh's router, as {ROUTER}; a server starts it on loopback [default: one of the run's own]", side=SERVER
+    )
     qos: Literal["reliable", "sensor_data"] = option(
         "reliable", "the camera topic's: reliable, sensor_data (best effort)", side=SERVER
     )
@@ -83,6 +89,13 @@ class RosOptions(Options):
     def _is_a_name(cls, text: str) -> str:
         if text and not NAME.fullmatch(text):
             raise ValueError(f"'{text}' should look like /name or /name/name: letters, digits, underscores")
+        return text
+
+    @field_validator("router")
+    @classmethod
+    def _is_an_endpoint(cls, text: str) -> str:
+        if text:
+            endpoint_of(text)
         return text
 
     @field_validator("middleware")

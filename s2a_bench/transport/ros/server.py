@@ -25,7 +25,7 @@ from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros import ACTION
 from s2a_bench.transport.ros.action_front import ActionFront
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
-from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company
+from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company, settled
 from s2a_bench.transport.ros.node import Activity, NodeApi
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.topic import TopicFront
@@ -101,14 +101,16 @@ class RosServer:
 
     def __init__(self, wiring: Wiring[RosOptions], handler: Handler) -> None:
         """Join the domain and create all topics; raises TransportError where another server answers already."""
-        self.address = namespace_of(wiring)
+        wiring, host = settled(wiring)
+        self.address = wiring.address if host else namespace_of(wiring)
+        namespace = namespace_of(wiring)
         self._queued = Queued.around(handler, wiring.limits)
         self._limits, self._held_bytes, self._holding = wiring.limits, 0, Lock()
-        if not wiring.restarted:
-            refuse_company(wiring, self.address)
-        self.middleware = join(wiring, "server")
-        self._cache = CameraCache(self.middleware, self.address, wiring.options, wiring.limits)
-        self._fronts: list[Front] = [TopicFront(self.middleware, self.address, wiring.limits)]
+        if not (wiring.restarted or host):
+            refuse_company(wiring, namespace)
+        self.middleware = join(wiring, "server", host=host)
+        self._cache = CameraCache(self.middleware, namespace, wiring.options, wiring.limits)
+        self._fronts: list[Front] = [TopicFront(self.middleware, namespace, wiring.limits)]
         self._action: ActionFront | None = None
         try:
             self._action = ActionFront(self.middleware, wiring, self._queued.honours)
@@ -119,7 +121,7 @@ class RosServer:
                 raise
             _log.warning("the action is not served: %s", missing)
         self._origin = self.middleware.publisher(  # kept: what is latched goes with its writer
-            self.address + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
+            namespace + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
         )
         self._origin.send(self._origin.pack(provenance_message(self._queued.provenance)))
         self._stopped = Event()

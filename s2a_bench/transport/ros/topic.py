@@ -17,7 +17,7 @@ from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.limits import Limits, whole_number
 from s2a_bench.transport.ros.camera import POLL_S, CameraPublisher, picture_message, picture_of
-from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
+from s2a_bench.transport.ros.joining import join, namespace_of, place_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.wire import (
     READER_QOS,
@@ -49,7 +49,7 @@ class TopicClient:
         self._subscription = self.middleware.subscription(namespace + "/token", ros.TOKEN, READER_QOS)
         self.camera = CameraPublisher(self.middleware, namespace, wiring.options.payload, wiring.options.qos)
         ends = (self._publisher, self._subscription, self.camera)  # volatile: what is sent before they match is lost
-        absent = f"no server appeared under {namespace} in DDS domain {domain_of(wiring)}"
+        absent = f"no server appeared under {namespace} in {place_of(wiring)}"
         try:
             wait_until(lambda: all(end.matched() for end in ends), alive, absent)
         except TransportError:

@@ -1,0 +1,61 @@
+"""The router at which the nodes of some middlewares meet: where it is, and whether it is there. No Zenoh needed."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import socket
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Final
+
+from s2a_bench.errors import UsageError
+
+ROUTER: Final = "tcp/127.0.0.1:7447"
+"""Where rmw_zenoh's nodes look for their router."""
+ENDPOINT: Final = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):([0-9]{1,5})")
+LOOK_S: Final = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Router:
+    """Where nodes meet; ``host``: our session is the router itself."""
+
+    endpoint: str = ROUTER
+    host: bool = False
+
+
+def endpoint_of(text: str) -> tuple[str, str, int]:
+    """Return protocol, host and port of an endpoint as ``tcp/127.0.0.1:7447``; raises UsageError."""
+    found = ENDPOINT.fullmatch(text)
+    if not found or not 0 < int(found[3]) < 2**16:
+        raise UsageError(f"router: '{text[:100]}' should look like {ROUTER}")
+    return found[1], found[2].strip("[]"), int(found[3])
+
+
+def listens(endpoint: str) -> bool:
+    """Return whether somebody listens there; of what is not TCP, as if so."""
+    protocol, host, port = endpoint_of(endpoint)
+    if protocol != "tcp":
+        return True
+    try:
+        socket.create_connection((host, port), LOOK_S).close()
+    except OSError:
+        return False
+    return True
+
+
+def may_host(endpoint: str) -> bool:
+    """Return whether a server of ours may be the router there without asking who comes: on loopback."""
+    protocol, host, _ = endpoint_of(endpoint)
+    try:
+        return protocol == "tcp" and (host == "localhost" or ipaddress.ip_address(host).is_loopback)
+    except ValueError:
+        return False
+
+
+def free_endpoint() -> str:
+    """Return an endpoint on loopback where nobody listens."""
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -1,0 +1,109 @@
+"""How rmw_zenoh names things: key expressions, liveliness tokens, and the attachment of each message. No I/O.
+
+After rmw_zenoh_cpp (``docs/design.md``, ``liveliness_utils.cpp``, ``attachment_helpers.cpp``) as Jazzy has it from
+0.2.4 on, with 33 bytes of attachment; Humble's is alike, but for type hashes, which it does not know.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import dataclass
+from typing import Final
+
+import xxhash
+
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import QoS
+from s2a_bench.ros.messages import dds_type_name, type_hash
+
+ADMIN: Final = "@ros2_lv"
+NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT = "NN", "MP", "MS", "SS", "SC"
+"""Kinds of entities."""
+NO_HASH: Final = "TypeHashNotSupported"
+"""Humble's."""
+PARTS: Final = 13
+"""Of the token of an entity that is no node."""
+LONGEST: Final = 2048
+"""A longer token is nobody's."""
+ATTACHMENT: Final = struct.Struct("<qqB16s")
+"""Sequence number, source time in ns of ROS time, 16, and the sender's gid."""
+BEST_EFFORT, TRANSIENT_LOCAL, KEEP_ALL = "2", "1", "2"
+"""``rmw_qos_profile_t``'s numbers; the defaults are left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entity:
+    """What a liveliness token tells of an endpoint."""
+
+    kind: str
+    name: str
+    """With % for /."""
+    type_name: str
+    """As ``sensor_msgs::msg::dds_::Image_``."""
+    type_hash: str
+
+
+def mangled(name: str) -> str:
+    """Return a name as a token has it; the root namespace is one %."""
+    return name.replace("/", "%")
+
+
+def wire_hash(type_name: str, version: str) -> str:
+    """Return the type hash in keys; the type of a service is the service itself, neither of its halves."""
+    return NO_HASH if os.environ.get("ROS_DISTRO") == "humble" else type_hash(type_name, version)
+
+
+def key(domain_id: int, name: str, type_name: str, hashed: str) -> str:
+    """Return the key expression of a topic or service ``/name`` of ROS type ``pkg/kind/Name``."""
+    return f"{domain_id}/{name.strip('/')}/{dds_type_name(type_name)}/{hashed}"
+
+
+def qos_text(qos: QoS) -> str:
+    """Return a QoS as tokens have it: what is ROS's default is empty, and the depth always told."""
+    history = f",{qos.depth}" if qos.depth else f"{KEEP_ALL},"
+    seconds, nanoseconds = divmod(round(qos.lifespan_s * 1e9), 1_000_000_000)
+    lifespan = f"{seconds},{nanoseconds}" if qos.lifespan_s else ","
+    reliability, durability = "" if qos.reliable else BEST_EFFORT, TRANSIENT_LOCAL if qos.latched else ""
+    return f"{reliability}:{durability}:{history}:,:{lifespan}:,,"
+
+
+def node_token(domain_id: int, session: str, node_name: str) -> str:
+    """Return the token of the one node ``/namespace/name`` of a session."""
+    return _token(domain_id, session, 0, NODE, node_name)
+
+
+def endpoint_token(domain_id: int, session: str, number: int, node_name: str, entity: Entity, qos: QoS) -> str:
+    """Return the token of a node's endpoint."""
+    head = _token(domain_id, session, number, entity.kind, node_name)
+    return f"{head}/{entity.name}/{entity.type_name}/{entity.type_hash}/{qos_text(qos)}"
+
+
+def _token(domain_id: int, session: str, number: int, kind: str, node_name: str) -> str:
+    namespace, _, name = node_name.rpartition("/")
+    return f"{ADMIN}/{domain_id}/{session}/0/{number}/{kind}/%/{mangled(namespace or '/')}/{name}"
+
+
+def entity_of(token: str) -> Entity | None:
+    """Read the token of an endpoint; None for a node's, and for what is none."""
+    parts = token.split("/") if len(token) <= LONGEST else []
+    if len(parts) != PARTS or parts[0] != ADMIN:
+        return None
+    kind, name, type_name, hashed = parts[5], *parts[9:12]
+    return Entity(kind, name, type_name, hashed) if name.startswith("%") else None
+
+
+def gid_of(token: str) -> bytes:
+    """Return an endpoint's gid: XXH3-128 of its token, the low half first."""
+    return int.to_bytes(xxhash.xxh3_128_intdigest(token.encode()), 16, "little")
+
+
+def attached(data: bytes) -> tuple[int, int, bytes]:
+    """Read an attachment: (sequence number, source time, gid); raises TransportError for what is none."""
+    if len(data) == ATTACHMENT.size:
+        sequence, source_ns, size, gid = ATTACHMENT.unpack(data)
+        if size == len(gid):
+            return sequence, source_ns, gid
+    raise TransportError(
+        f"{len(data)} bytes of attachment, where rmw_zenoh 0.2.4 and later have {ATTACHMENT.size}: update the peer"
+    )

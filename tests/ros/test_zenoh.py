@@ -1,0 +1,432 @@
+"""Zenoh keeps the contract of middlewares and actions, in the names of rmw_zenoh."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import (
+    MIDDLEWARES,
+    REQUEST_BYTES,
+    Accepted,
+    ActionClient,
+    Feedback,
+    Middleware,
+    QoS,
+    Rejected,
+    Result,
+    default_middleware,
+    llama,
+    open_middleware,
+)
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.router import Router, endpoint_of, free_endpoint, listens
+from s2a_bench.testing.action import NAME, ActionSuite, event, offer, receive, send, start, text_of
+from s2a_bench.testing.middleware import GET_TYPES, STRING, WAIT_S, Join, MiddlewareSuite, text, wait_matched
+
+zenoh = pytest.importorskip("zenoh", reason="the extra zenoh is not installed")
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def join(endpoint: str, dds_domain: int) -> Iterator[Join]:
+    """Join sessions of which the first is the router."""
+    with ExitStack() as stack:
+        joined: list[Middleware] = []
+
+        def join() -> Middleware:
+            middleware = open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint, host=not joined))
+            joined.append(middleware)
+            stack.callback(middleware.close)
+            return middleware
+
+        yield join
+
+
+@pytest.fixture
+def routed(endpoint: str, dds_domain: int) -> Iterator[Join]:
+    """Join sessions that meet at a router that is none of them."""
+    with ExitStack() as stack:
+
+        def join(host: bool = False) -> Middleware:
+            middleware = open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint, host=host))
+            stack.callback(middleware.close)
+            return middleware
+
+        join(host=True)
+        yield join
+
+
+class TestZenoh(MiddlewareSuite):
+    @pytest.fixture
+    def join(self, join: Join) -> Join:
+        return join
+
+
+class TestZenohThroughARouter(MiddlewareSuite):
+    @pytest.fixture
+    def join(self, routed: Join) -> Join:
+        return routed
+
+
+class TestZenohActions(ActionSuite):
+    @pytest.fixture
+    def join(self, join: Join) -> Join:
+        return join
+
+
+class TestZenohActionsThroughARouter(ActionSuite):
+    @pytest.fixture
+    def join(self, routed: Join) -> Join:
+        return routed
+
+
+@pytest.fixture
+def stranger(routed: Join, endpoint: str) -> Iterator[Any]:
+    """A session that is no ROS node."""
+    from s2a_bench.ros.zenoh_session import open_session
+
+    del routed
+    session = open_session(endpoint, host=False)
+    yield session
+    session.close()
+
+
+def until(met: Callable[[], object]) -> None:
+    deadline = now_ns() + int(WAIT_S * 1e9)
+    while not met():
+        assert now_ns() < deadline, "it did not come about"
+        time.sleep(0.002)
+
+
+def tokens_of(session: Any, domain: int) -> list[str]:
+    replies = session.liveliness().get(f"@ros2_lv/{domain}/**")
+    return sorted(str(reply.ok.key_expr) for reply in replies)
+
+
+def test_peers_see_our_node_and_its_endpoints_until_it_leaves(stranger: Any, endpoint: str, dds_domain: int) -> None:
+    named = open_middleware("zenoh", domain_id=dds_domain, node_name="/robot/brain", router=Router(endpoint))
+    ends = (
+        named.publisher("/camera", ros.IMAGE, QoS(depth=1)),
+        named.subscription("/camera", ros.IMAGE, QoS(depth=5, reliable=False)),
+        named.service_client("/ask", GET_TYPES),
+        named.action_client(NAME, llama.GENERATE_RESPONSE),
+    )
+    named.service("/ask", GET_TYPES, lambda _: None)
+    named.action_server(NAME, llama.GENERATE_RESPONSE)
+    until(lambda: sum("/brain/" in token for token in tokens_of(stranger, dds_domain)) == 14)
+    seen = [token.split("/")[5:] for token in tokens_of(stranger, dds_domain) if "/brain" in token]
+    assert ["NN", "%", "%robot", "brain"] in seen
+    image = ("sensor_msgs::msg::dds_::Image_", ros.type_hash(ros.IMAGE))
+    asks = ("rcl_interfaces::srv::dds_::GetParameterTypes_", ros.type_hash(GET_TYPES))
+    who = ["%", "%robot", "brain"]
+    assert ["MP", *who, "%camera", *image, "::,1:,:,:,,"] in seen
+    assert ["MS", *who, "%camera", *image, "2::,5:,:,:,,"] in seen
+    for kind in ("SS", "SC"):
+        assert [kind, *who, "%ask", *asks, "::,10:,:,:,,"] in seen
+        for service in ("send_goal", "get_result", "cancel_goal"):
+            assert any(
+                each[0] == kind and each[4:5] == [f"%llama%generate_response%_action%{service}"] for each in seen
+            )
+    assert len([each for each in seen if each[0] in {"MP", "MS"}]) == 6
+    del ends
+    named.close()
+    until(lambda: not any("/brain" in token for token in tokens_of(stranger, dds_domain)))
+
+
+def test_an_endpoint_that_is_no_longer_used_is_gone(stranger: Any, routed: Join, dds_domain: int) -> None:
+    middleware = routed()
+    publisher = middleware.publisher("/brief", STRING, QoS())
+    until(lambda: any("%brief" in token for token in tokens_of(stranger, dds_domain)))
+    del publisher
+    until(lambda: not any("%brief" in token for token in tokens_of(stranger, dds_domain)))
+
+
+def test_a_latched_topic_is_there_for_who_joins_later(routed: Join) -> None:
+    publisher = routed().publisher("/latched", STRING, QoS(depth=2, latched=True))
+    for value in ("one", "two", "three"):
+        publisher.send(publisher.pack(text(value)))
+    late = routed().subscription("/latched", STRING, QoS(depth=5, latched=True))
+    assert [late.unpack(late.take(WAIT_S)).data for _ in range(2)] == ["two", "three"]
+    publisher.send(publisher.pack(text("four")))
+    assert late.unpack(late.take(WAIT_S)).data == "four"
+    assert late.take(0.05) is None
+
+
+def test_nothing_listens_beyond_loopback(join: Join) -> None:
+    before = {*links()}
+    join()
+    join()
+    inodes = {link[8:-1] for link in map(str, {*links()} - before) if link.startswith("socket:")}
+    rows = [
+        (kind, row[1], row[3])
+        for kind in ("tcp", "tcp6", "udp", "udp6")
+        for row in map(str.split, Path("/proc/net", kind).read_text().splitlines()[1:])
+        if row[9] in inodes
+    ]
+    listening = {at.partition(":")[0] for kind, at, state in rows if kind.startswith("tcp") and state == "0A"}
+    assert listening == {"0100007F"}
+    assert not [at for kind, at, _ in rows if kind.startswith("udp")]
+
+
+def links() -> Iterator[Path]:
+    """What this process has open."""
+    for each in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):
+            yield each.readlink()
+
+
+@pytest.mark.parametrize("attachment", [None, b"", bytes(20), bytes(33), b"\xff" * 1000])
+def test_a_message_without_its_attachment_is_dropped_and_told_once(
+    routed: Join, stranger: Any, attachment: bytes | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    publisher, subscription = (
+        routed().publisher("/topic", STRING, QoS()),
+        routed().subscription("/topic", STRING, QoS(0)),
+    )
+    wait_matched(publisher, subscription)
+    key = f"{publisher._node.domain_id}/topic/std_msgs::msg::dds_::String_/{ros.type_hash(STRING)}"  # type: ignore[attr-defined]
+    for _ in range(20):
+        stranger.put(key, bytes(publisher.pack(text("x"))), attachment=attachment)
+    publisher.send(publisher.pack(text("whole")))
+    assert subscription.unpack(subscription.take(WAIT_S)).data == "whole"
+    until(lambda: subscription.take(0.05) is None and caplog.records)
+    assert [record.getMessage()[:26] for record in caplog.records] == ["/topic: dropped a message:"]
+
+
+def test_a_message_past_its_lifespan_is_not_delivered(routed: Join, stranger: Any) -> None:
+    from s2a_bench.ros.zenoh_names import ATTACHMENT
+
+    publisher = routed().publisher("/brief", STRING, QoS(lifespan_s=10))
+    subscription = routed().subscription("/brief", STRING, QoS(0, lifespan_s=10))
+    wait_matched(publisher, subscription)
+    old = ATTACHMENT.pack(1, time.time_ns() - 11_000_000_000, 16, bytes(16))
+    stranger.put(f"*/brief/**/{ros.type_hash(STRING)}", bytes(publisher.pack(text("old"))), attachment=old)
+    publisher.send(publisher.pack(text("young")))
+    assert subscription.unpack(subscription.take(WAIT_S)).data == "young"
+
+
+@pytest.mark.parametrize("payload", [b"", b"\0", b"\0\1\0\0", b"\0\1\0\0" + b"\xff" * 64, b"\0\1\0\0" + b"\x7f" * 5000])
+def test_a_damaged_message_is_an_error_of_ours(routed: Join, stranger: Any, payload: bytes) -> None:
+    from s2a_bench.ros.zenoh_names import ATTACHMENT
+
+    subscription = routed().subscription("/topic", ros.IMAGE, QoS(0))
+    stamp = ATTACHMENT.pack(1, time.time_ns(), 16, bytes(16))
+    publisher = stranger.declare_publisher(f"*/topic/**/{ros.type_hash(ros.IMAGE)}")
+    until(lambda: publisher.matching_status.matching)
+    publisher.put(payload, attachment=stamp)
+    packed = subscription.take(WAIT_S)
+    assert packed is not None
+    assert packed == payload
+    with pytest.raises(TransportError, match="received bytes that are no sensor_msgs/msg/Image"):
+        subscription.unpack(packed)
+
+
+def test_garbage_to_a_service_is_dropped_and_told_once(
+    routed: Join, stranger: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    from s2a_bench.ros.zenoh_names import ATTACHMENT
+
+    routed().service("/ask", GET_TYPES, lambda asked: ros.default(GET_TYPES + "_Response", types=[len(asked.names)]))
+    client = routed().service_client("/ask", GET_TYPES)
+    assert client.call(ros.default(GET_TYPES + "_Request", names=["a"]), WAIT_S).types.tolist() == [1]
+    stamp, head = ATTACHMENT.pack(1, 0, 16, bytes(16)), b"\0\1\0\0"
+    key = f"*/ask/**/{ros.type_hash(GET_TYPES)}"
+    for body in (b"", head, head + b"\xff\xff\xff\x7f", head + b"\xff" * 64, head + bytes(REQUEST_BYTES)):
+        for _ in range(10):
+            assert [*stranger.get(key, payload=body, attachment=stamp)] == [], "no reply, and the query ends"
+    assert [*stranger.get(key)] == []
+    assert [*stranger.get(key, payload=head, attachment=bytes(7))] == []
+    assert client.call(ros.default(GET_TYPES + "_Request", names=["a", "b"]), WAIT_S).types.tolist() == [2]
+    said = [record.getMessage().partition(":")[2] for record in caplog.records]
+    assert [one[:24] for one in said] == [" dropped a request: 0 by", " dropped a request: 0 by"]
+
+
+def test_malformed_requests_leave_an_action_up(routed: Join, stranger: Any, caplog: pytest.LogCaptureFixture) -> None:
+    from s2a_bench.ros.zenoh_names import ATTACHMENT
+
+    action = offer(routed)
+    stamp = ATTACHMENT.pack(1, 0, 16, bytes(16))
+    for service in ("send_goal", "cancel_goal", "get_result"):
+        for body in (b"", b"\0\1\0\0", b"\0\1\0\0" + bytes(9)):
+            assert action.server.next_goal(0) is None
+            stranger.get(f"*{NAME}/_action/{service}/**", payload=body, attachment=stamp)
+            assert action.server.next_goal(0.05) is None
+    damaged = action.client.pack(llama.generate_goal("p"))
+    damaged[20:24] = b"\xff\xff\xff\x7f"  # the prompt's length
+    action.client.send(damaged)
+    goal = receive(action.server)
+    with pytest.raises(TransportError, match="received bytes that are no llama_msgs/action/GenerateResponse_SendGoal"):
+        goal.unpack()
+    goal.reject()
+    event(action.client, Rejected)
+    start(action).succeed(llama.text_result("x"))
+    event(action.client, Result)
+    assert all("dropped a" in record.getMessage() for record in caplog.records)
+
+
+def test_versions_of_llama_msgs_that_differ_are_told_on_both_sides(
+    routed: Join, caplog: pytest.LogCaptureFixture
+) -> None:
+    routed().action_server(NAME, llama.GENERATE_RESPONSE, version="4.4")
+    client = routed().action_client(NAME, llama.GENERATE_RESPONSE)
+    assert client.wait_for_server(WAIT_S)
+    assert client.server_version() == "4.4"
+    until(lambda: caplog.messages)
+    assert caplog.messages == [
+        f"{NAME}: a client waits in vain: it speaks llama_msgs 6.0, this server 4.4 (--llama-msgs)"
+    ]
+    spoken = routed().action_client(NAME, llama.GENERATE_RESPONSE, "4.4")
+    assert spoken.wait_for_server(WAIT_S)
+    assert spoken.server_version() == "4.4"
+
+
+def test_without_a_router_one_line_says_where_to_get_one(endpoint: str) -> None:
+    with pytest.raises(TransportError, match=rf"no Zenoh router answers at {endpoint} .*: start one \(ros2 run"):
+        open_middleware("zenoh", router=Router(endpoint))
+
+
+def test_a_router_that_says_nothing_is_given_up(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.ros.zenoh_session.OPEN_MS", 100)
+    with socket.create_server(("127.0.0.1", endpoint_of(endpoint)[2])), pytest.raises(TransportError, match="no Zenoh"):
+        open_middleware("zenoh", router=Router(endpoint))
+
+
+def test_a_port_that_is_taken_is_named(endpoint: str) -> None:
+    with (
+        socket.create_server(("127.0.0.1", endpoint_of(endpoint)[2])),
+        pytest.raises(TransportError, match=r"cannot be the Zenoh router .*`router`"),
+    ):
+        open_middleware("zenoh", router=Router(endpoint, host=True))
+
+
+def test_noise_at_the_routers_port_does_no_harm(join: Join, endpoint: str) -> None:
+    publisher, subscription = join().publisher("/topic", STRING, QoS()), join().subscription("/topic", STRING, QoS(0))
+    wait_matched(publisher, subscription)
+    at = ("127.0.0.1", endpoint_of(endpoint)[2])
+    for noise in (b"", b"\xff" * 70_000, b"GET / HTTP/1.1\r\n\r\n", b"\x05\x00\x01\x09" + bytes(5)):
+        with socket.create_connection(at) as link, suppress(OSError):
+            link.sendall(noise)
+    publisher.send(publisher.pack(text("whole")))
+    assert subscription.unpack(subscription.take(WAIT_S)).data == "whole"
+
+
+def test_an_inbox_is_bounded_and_says_once_that_it_is_full(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from s2a_bench.ros import zenoh_inbox
+
+    monkeypatch.setattr(zenoh_inbox, "HELD_BYTES", 10_000)
+    inbox: Any = zenoh_inbox.Inbox("/x", zenoh_inbox.Bell())
+    took = [inbox.put(number, 1000) for number in range(9)]
+    assert took == [True] * 4 + [False] * 5
+    assert [*inbox.arrived()] == [0, 1, 2, 3]
+    assert inbox.put(9, 1000)
+    assert caplog.messages == ["/x: messages are dropped: 0 MiB wait to be taken"]
+    small: Any = zenoh_inbox.Inbox("/y", zenoh_inbox.Bell(), most_bytes=5000)
+    assert [small.put(number, 1000) for number in range(3)] == [True, True, False]
+    last: Any = zenoh_inbox.Inbox("/x", zenoh_inbox.Bell(), depth=2)
+    assert all(last.put(number, 1000) for number in range(9))
+    assert [*last.arrived()] == [7, 8]
+
+
+def test_a_closed_middleware_is_told_of(join: Join) -> None:
+    middleware = join()
+    publisher, client = middleware.publisher("/topic", STRING, QoS()), middleware.service_client("/ask", GET_TYPES)
+    middleware.close()
+    with pytest.raises(TransportError, match=r"Zenoh: /topic: .*closed"):
+        publisher.send(publisher.pack(text("x")))
+    with pytest.raises(TransportError, match="no server of the service /ask appeared"):
+        client.call(ros.default(GET_TYPES + "_Request"), 0.05)
+    with pytest.raises(TransportError, match="the middleware is closed"):
+        middleware.subscription("/topic", STRING, QoS())
+
+
+def test_a_message_that_is_too_large_is_dropped_and_the_next_arrives(
+    endpoint: str, dds_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("s2a_bench.ros.zenoh_session.MESSAGE_BYTES", 1 << 20)
+    with ExitStack() as stack:
+        ends = [open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint, host)) for host in (True, False)]
+        for each in ends:
+            stack.callback(each.close)
+        publisher, subscription = ends[1].publisher("/x", STRING, QoS()), ends[0].subscription("/x", STRING, QoS(0))
+        wait_matched(publisher, subscription)
+        for value in ("a" * (3 << 20), "whole"):
+            publisher.send(publisher.pack(text(value)))
+        assert subscription.unpack(subscription.take(WAIT_S)).data == "whole"
+
+
+SERVER_PROCESS = """
+import sys
+from s2a_bench.ros import llama, open_middleware
+from s2a_bench.ros.router import Router
+middleware = open_middleware("zenoh", domain_id=int(sys.argv[1]), router=Router(sys.argv[2], host=True))
+server = middleware.action_server(sys.argv[3], llama.GENERATE_RESPONSE)
+goal = server.next_goal(60)
+goal.accept()
+words = goal.unpack().prompt.split()
+goal.executing()
+for number, word in enumerate(words):
+    goal.feedback(llama.token_feedback(word, number))
+goal.succeed(llama.text_result(" ".join(words)))
+sys.stdin.read()
+"""
+
+
+def test_a_server_that_was_the_router_may_die_and_come_back(endpoint: str, dds_domain: int) -> None:
+    words = [f"word{number}" for number in range(200)]
+
+    def served() -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-c", SERVER_PROCESS, str(dds_domain), endpoint, NAME]
+        return subprocess.Popen(command, stdin=subprocess.PIPE)
+
+    def answers(client: ActionClient) -> None:
+        assert client.wait_for_server(WAIT_S)
+        sent = send(client, " ".join(words))
+        assert event(client, Accepted).goal_id == sent
+        assert [text_of(client, event(client, Feedback)) for _ in words] == words
+        assert client.unpack_result(event(client, Result).packed).response.text == " ".join(words)
+
+    with served() as server:
+        until(lambda: listens(endpoint))
+        middleware = open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint))
+        client = middleware.action_client(NAME, llama.GENERATE_RESPONSE)
+        answers(client)
+        server.kill()
+    until(lambda: not client.server_present())
+    with served() as server:
+        answers(client)
+        server.kill()
+    middleware.close()
+
+
+def test_a_missing_package_is_named_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(MIDDLEWARES, "zenoh", "s2a_bench.ros.no_such_module:X")
+    with pytest.raises(TransportError, match=r"zenoh is not installed.*pip install 's2a-bench\[zenoh\]'"):
+        open_middleware("zenoh")
+
+
+@pytest.mark.parametrize(
+    ("there", "expected"),
+    [({"cyclonedds", "zenoh"}, "cyclonedds"), ({"zenoh"}, "zenoh"), ({"cyclonedds"}, "cyclonedds"), ((), "cyclonedds")],
+)
+def test_zenoh_is_the_default_where_it_alone_is_there(
+    there: set[str], expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("s2a_bench.ros.find_spec", lambda name: name in there or None)
+    assert default_middleware({}) == expected
