@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import socket
 import struct
+import sys
 from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any, Final
@@ -18,6 +19,8 @@ import zmq
 
 from s2a_bench.transport.limits import Limits
 
+LINUX: Final = sys.platform == "linux"
+TCP_INFO: Final = 11
 RECEIVED: Final = struct.Struct("=128xQ")
 """``tcpi_bytes_received`` in Linux's struct tcp_info, 4.1 and later."""
 EVENT: Final = struct.Struct("=HI")
@@ -58,7 +61,7 @@ class Connection:
         """Return how many bytes came that are in no complete message; 0 where the kernel does not tell."""
         told = b""
         with suppress(OSError):
-            told = self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256) if self._socket else b""
+            told = self._socket.getsockopt(socket.IPPROTO_TCP, TCP_INFO, 256) if self._socket and LINUX else b""
         self.held = max(0, RECEIVED.unpack_from(told)[0] - self._taken) if len(told) >= RECEIVED.size else 0
         return self.held
 
