@@ -270,6 +270,24 @@ def test_requests_that_are_too_much_together_are_refused() -> None:
     assert code == 1013
 
 
+def test_small_requests_that_are_too_much_together_are_refused() -> None:
+    handler = Slow()
+    body = packb({"prompt": "go" * 2000})
+    with serving(handler, limits=Limits(in_flight_mib=0.009)) as server, ExitStack() as stack:
+        first, other, third = (stack.enter_context(robot(server.address))[0] for _ in "abc")
+        first.send(body)
+        assert handler.began.wait(20)
+        other.send(body)
+        assert other.ping().wait(20)
+        third.send(body)
+        said, code = closed_with(third)
+        handler.go.set()
+        for socket in (first, other):
+            assert unpackb(socket.recv(timeout=20))["actions"].shape == (4, 3)
+    assert "come again later" in said
+    assert code == 1013
+
+
 def test_too_many_connections_are_refused() -> None:
     with (
         serving(Recorder(list(CHUNK)), limits=Limits(connections=1)) as server,

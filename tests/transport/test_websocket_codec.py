@@ -116,6 +116,10 @@ def test_bytes_that_are_no_message_are_refused_in_a_line(name: str) -> None:
     assert len(str(failed.value)) < 300
 
 
+def test_a_number_beyond_its_type_is_infinite() -> None:
+    assert np.isinf(unpackb(generic(1e300, "<f4")))
+
+
 def test_what_is_read_cannot_be_changed_and_shares_no_memory_with_others() -> None:
     got = unpackb(ndarray())
     assert not got.flags.writeable

@@ -106,6 +106,8 @@ class Call:
         self._peer.answered(said)
 
     def _read(self, message: bytes, trace: Trace) -> None:
+        if self._gone:
+            raise _Gone
         observation = unpackb(message)
         trace.mark("msgpack_parse")
         request = own.request_of(observation, trace, self._office.limits, ours=self._peer.ours)

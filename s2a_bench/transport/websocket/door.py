@@ -196,7 +196,9 @@ class Door(asyncio.Protocol):
 
     def _asked(self, message: bytes, came_ns: int) -> None:
         """Answer a message, when the one before is answered."""
-        if self._next is not None:
+        if self._house.held - self._held + self._call_bytes + len(message) > self._limits.in_flight_bytes:
+            self._refuse_for_now()
+        elif self._next is not None:
             self._refuse("more than two requests at once", CloseCode.POLICY_VIOLATION)
         elif self._call is not None:
             self._next = message, came_ns
@@ -220,8 +222,7 @@ class Door(asyncio.Protocol):
                 self._in_time(self._limits.body_s, partial(self._refuse, late, CloseCode.POLICY_VIOLATION))
         self._hold(coming + self._call_bytes + (len(self._next[0]) if self._next else 0))
         if coming and self._house.held > self._limits.in_flight_bytes:
-            words = f"requests of {self._limits.in_flight_bytes} bytes are under way already; come again later"
-            self._refuse(words, CloseCode.TRY_AGAIN_LATER)
+            self._refuse_for_now()
 
     def _hold(self, size: int) -> None:
         self._house.held += size - self._held
@@ -252,6 +253,10 @@ class Door(asyncio.Protocol):
                 self._asked(message, came_ns)
             self._read_on()
             self._count()
+
+    def _refuse_for_now(self) -> None:
+        words = f"requests of {self._limits.in_flight_bytes} bytes are under way already; come again later"
+        self._refuse(words, CloseCode.TRY_AGAIN_LATER)
 
     def _refuse(self, words: str, code: CloseCode) -> None:
         """Say what is wrong in a text, and close."""
