@@ -12,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
-from threading import Lock
+from threading import Event, Lock
 from typing import Any, Final
 
 from s2a_bench.clock import now_ns
@@ -31,6 +31,8 @@ KEPT: Final = 128
 """Requests whose marks are kept until they are asked for, the latest; those of a long answer are half a megabyte."""
 
 
+ASKED_S: Final = 0.005
+"""How long marks wait to be found for somebody who asks for them."""
 UNKNOWN: Final = RequestFailed("marks of a request that is not known, or whose marks were asked for already")
 
 
@@ -50,7 +52,7 @@ class Office:
         self.calls: set[Call] = set()
         self._key, self._layout = key.encode(), layout
         self._lock = Lock()
-        self._marks: OrderedDict[tuple[bytes, str], bytes | Call | None] = OrderedDict()
+        self._marks: OrderedDict[tuple[bytes, str], Promise] = OrderedDict()
 
     @property
     def in_flight(self) -> int:
@@ -85,37 +87,53 @@ class Office:
         known = f"{own.GET_ACTION}, {own.PING}, {own.RESET}, {own.MODALITIES}"
         raise RequestFailed(f"Unknown endpoint: {str(endpoint)[:80]!r} is none of {known}")
 
-    def promise(self, who: bytes, request_id: str) -> None:
+    def promise(self, who: bytes, request_id: str) -> Promise:
         """Remember that somebody will ask for a request's marks."""
+        promised = Promise()
         with self._lock:
             lost = [self._marks.pop((who, request_id), None)]
-            self._marks[who, request_id] = None
+            self._marks[who, request_id] = promised
             if len(self._marks) > KEPT:
                 lost.append(self._marks.popitem(last=False)[1])
-        for asked in lost:
-            if isinstance(asked, Call):
-                asked.refuse(UNKNOWN)
+        for each in lost:
+            if each is not None and each.call is not None:
+                each.call.refuse(UNKNOWN)
+        return promised
 
-    def keep(self, who: bytes, request_id: str, marks: bytes) -> None:
+    def keep(self, who: bytes, request_id: str, promised: Promise, marks: bytes) -> None:
         """Hand marks to who has asked for them, or keep them."""
         with self._lock:
-            asked = self._marks.pop((who, request_id), None)
-            if not isinstance(asked, Call):
-                self._marks[who, request_id] = marks
-        if isinstance(asked, Call):
-            asked.say(marks)
+            promised.marks, call = marks, promised.call
+            if call is None or self._marks.get((who, request_id)) is not promised:
+                return
+            del self._marks[who, request_id]
+        call.say(marks)
 
     def ask(self, who: bytes, request_id: str, call: Call) -> None:
         """Answer a call with marks, or let it wait for them; raises RequestFailed for a request that nobody knows."""
         with self._lock:
-            marks = self._marks.get((who, request_id), UNKNOWN)
-            if marks is None:
-                self._marks[who, request_id] = call
-                return
-            if not isinstance(marks, bytes):
+            promised = self._marks.get((who, request_id))
+            if promised is None or promised.call is not None:
                 raise UNKNOWN
+            marks = promised.marks
+            if marks is None:
+                promised.call = call
+                promised.asked.set()
+                return
             del self._marks[who, request_id]
         call.say(marks)
+
+
+class Promise:
+    """The marks of a request, once they are found, and who has asked for them."""
+
+    __slots__ = ("asked", "call", "marks")
+
+    def __init__(self) -> None:
+        """Promise marks that are still to be found."""
+        self.asked = Event()
+        self.call: Call | None = None
+        self.marks: bytes | None = None
 
 
 class Call:
@@ -231,11 +249,12 @@ class Call:
         pieces = whole(self._wanted(self._office.queued.answer(request, trace, turn)), trace)
         answer = pack(form(pieces))
         who = self._envelope[0]
-        if told is not None:
-            self._office.promise(who, request.id)
+        promised = None if told is None else self._office.promise(who, request.id)
         self.say(answer)
-        if told is not None:
-            self._office.keep(who, request.id, bytes(pack(own.remote_message(trace.to_remote()))))
+        if promised is not None:
+            promised.asked.wait(ASKED_S)  # or the answer's way would be slower for what is computed now
+            marks = bytes(pack(own.remote_message(trace.to_remote())))
+            self._office.keep(who, request.id, promised, marks)
 
     def _wanted(self, pieces: Generator[Piece, None, None]) -> Generator[Piece, None, None]:
         """Yield the pieces for as long as somebody wants them."""
