@@ -1,4 +1,4 @@
-"""Hostile and honest clients together on a server that runs: ``python -m benchmarks.soak http|ros|shm [--minutes M]``.
+"""Hostile and honest clients together on a server: ``python -m benchmarks.soak http|ros|shm|zmq [--minutes M]``.
 
 The server is a `serve` process, and so is its twin, which nobody attacks: the idle latency of the one is divided by
 that of the other in interleaved blocks, before the load and after it, so that what else the machine does cancels out.
@@ -32,7 +32,7 @@ import httpx
 
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.stats.change import ratio_of_blocks
-from s2a_bench.testing.hostile import http, ros, shm
+from s2a_bench.testing.hostile import http, ros, shm, zmq
 from s2a_bench.testing.hostile.usage import Usage, family, usage
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.transport import Client, Wiring, open_client
@@ -45,7 +45,7 @@ SILENCE_S = 30.0
 """Over ROS the last messages of an answer may be lost: a client hears nothing, and asks again."""
 WARM_UP = 0.2
 """Of the minutes, before them; more where not every hostile client has come by then as often as there are attackers."""
-HOSTILE = {"http": http.CLIENTS, "ros": ros.CLIENTS, "shm": shm.CLIENTS}
+HOSTILE = {"http": http.CLIENTS, "ros": ros.CLIENTS, "shm": shm.CLIENTS, "zmq": zmq.CLIENTS}
 WARM_UP_ONLY = frozenset({"a prompt of 16 MiB", "8 requests of 16 MiB"})
 """Over ROS requests are received on many threads, and glibc keeps the most that each ever held (machine/tuning.py):
 with these the memory swings by 150 MiB, which would hide growth."""
@@ -53,6 +53,7 @@ HONEST = {
     "http": ("http", "http/best-effort", "whole"),
     "ros": ("ros/topic", "ros/topic", "ros/action"),
     "shm": ("shm", "shm", "shm"),
+    "zmq": ("zmq", "zmq", "zmq?layout=n1.5"),
 }
 """What the honest clients speak; "whole" is an answer that is not streamed."""
 ATTACKERS = 3
@@ -132,6 +133,7 @@ def served(transport: str, engine: str, name: str, log: Path) -> Iterator[Served
         "http": (["--port", "0"], r"http://[\d.:]+"),
         "ros": (["--namespace", f"/{name}_{os.getpid()}", "--max-tokens", str(TOKENS)], rf"/{name}_\d+"),
         "shm": ([], r"/\S+\.sock"),
+        "zmq": (["--port", "0"], r"tcp://[\d.:]+"),
     }
     flags, address = own[transport]
     line += flags

@@ -22,6 +22,7 @@ EXTRAS: Final = {
     "openvla": "the openvla dialect",
     "ray": "sweeps on a Ray cluster",
     "websocket": "policies over WebSocket, as openpi serves them",
+    "zmq": "policies over ZeroMQ, as GR00T serves them",
     "carla": "the carla simulator",
     "zenoh": "ROS 2 over Zenoh, as rmw_zenoh speaks it",
 }

@@ -26,8 +26,12 @@ from s2a_bench.types import Request
 
 TRANSPORTS = (
     *("http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action", "shm"),
-    "websocket/openpi-stream",
+    *("websocket/openpi-stream", "zmq/gr00t"),
 )
+WHOLE = ("zmq/gr00t",)
+"""Those whose answers come as one."""
+BEGUN_S = 0.3
+"""How long after a request its answer has begun, where nobody sees it."""
 WHATS = ("server killed", "server told to end", "server stopped", "client killed", "client stopped", "connection cut")
 WHENS = ("before the first request", "in the queue", "in the middle of an answer", "between requests", "while closing")
 ENDS_THE_SERVER = ("server killed", "server told to end")
@@ -48,7 +52,7 @@ class Fault:
     @property
     def applies(self) -> bool:
         """Whether there is such a thing: DDS has no connection, and who waits for its turn asked for something."""
-        return self.what != "connection cut" or self.transport.startswith(("http", "websocket"))
+        return self.what != "connection cut" or self.transport.startswith(("http", "websocket", "zmq"))
 
     @property
     def promised(self) -> tuple[str, ...]:
@@ -110,7 +114,7 @@ def happens(fault: Fault, server: OwnServer) -> str:
             over = Event()
             stack.callback(_occupied(server, fault.transport, over).join)
             stack.callback(over.set)
-        _reach(fault.when, peer)
+        _reach(fault, peer)
         stack.callback(_strike(fault.what, server, peer, cut))
         return _outcome(fault, server, peer)
 
@@ -129,19 +133,22 @@ def _occupied(server: OwnServer, transport: str, over: Event) -> Thread:
 
     thread = Thread(target=hold, daemon=True)
     thread.start()
-    started.wait(BOUND_S)
+    started.wait(BEGUN_S if transport in WHOLE else BOUND_S)
     return thread
 
 
-def _reach(when: str, peer: Peer) -> None:
+def _reach(fault: Fault, peer: Peer) -> None:
     """Bring the client to the moment of the fault."""
+    when = fault.when
     if when in {"between requests", "while closing"}:
         peer.tell("ask")
         peer.hear("end")
     elif when != "before the first request":
         peer.tell("ask")
         peer.hear("asking")
-        if when == "in the middle of an answer":
+        if when == "in the middle of an answer" and fault.transport in WHOLE:
+            time.sleep(BEGUN_S)
+        elif when == "in the middle of an answer":
             peer.hear("token")
         else:
             time.sleep(0.2)  # it is on its way into the queue, where the first one's second has just begun

@@ -286,6 +286,7 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "loopback": "s2a_bench.transport.loopback:LOOPBACK",
         "shm": "s2a_bench.transport.shm:SHM",
         "websocket": "s2a_bench.transport.websocket:WEBSOCKET",
+        "zmq": "s2a_bench.transport.zmq:ZMQ",
     },
 )
 """Name -> what is said about it."""

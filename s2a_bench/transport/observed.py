@@ -1,9 +1,9 @@
 """What a server makes of an observation whose keys it does not know: pictures, the robot's state, the prompt.
 
 Policies name their keys as they like. So every array of uint8 is a picture, (H, W, 3) or (3, H, W) pixels in RGB with
-any axes of batch and time in front, or (n,) the bytes of a JPEG or PNG, as bytes are; every number with a fraction, or
-array of such, is part of the state; the prompt is the text under ``prompt``, else the first text there is. All in the
-order of the keys. Whole numbers and truths are ignored.
+any axes of batch and time in front, or (n,) the bytes of a JPEG or PNG, as bytes are, with axes of 1 in front; every
+number with a fraction, or array of such, is part of the state; the prompt is the text under ``prompt``, else the first
+text there is. All in the order of the keys. Whole numbers and truths are ignored.
 """
 
 from __future__ import annotations
@@ -70,11 +70,12 @@ def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
 
 def _pictures(key: str, value: Any, trace: Trace, limits: Limits) -> Sequence[Frame]:
     """Return the pictures of one array."""
-    if isinstance(value, bytes) or value.ndim == 1:
-        if not len(value):
+    data = value if isinstance(value, bytes) else value.reshape(-1)
+    if data is value or value.ndim == 1 or (len(data) == value.shape[-1] and len(data) != COLOURS):
+        if not len(data):
             raise RequestFailed(f"{key}: an empty picture")
         try:
-            return [decoded("image", memoryview(value), trace, limits)]
+            return [decoded("image", memoryview(data), trace, limits)]
         except RequestFailed as error:
             raise RequestFailed(f"{key}: {error}") from error
     shape = value.shape

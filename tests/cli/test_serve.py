@@ -295,6 +295,20 @@ def test_ros_args_that_are_none_are_one_line(arguments: list[str], message: str)
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_zmq_says_where_a_policy_is_asked_and_ends_with_a_signal(start: Start) -> None:
+    process, line = start("zmq", "--engine", "echo", "--port", "0", "--horizon", "5", "--action-dim", "2")
+    found = re.search(r"serving GR00T's protocol at (tcp://127\.0\.0\.1:\d+)", line)
+    assert found
+    client = open_client(wiring("zmq", found[1]))
+    try:
+        actions, _ = ask(client, Request("a", "pick it up", max_tokens=20))
+    finally:
+        client.close()
+    assert len(actions) == 5
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 0
+
+
 def test_shm_says_where_memory_is_handed_over_and_leaves_no_socket(start: Start, tmp_path: Path) -> None:
     path = tmp_path / "robot.sock"
     process, line = start("shm", "--engine", "echo", "--socket", str(path))

@@ -50,7 +50,10 @@ from s2a_bench.transport.pipeline import pipelines
 from s2a_bench.transport.ros import wire
 from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.transport.websocket.own import remote_message, remote_of, request_of
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.transport.zmq import layouts
+from s2a_bench.transport.zmq import own as gr00t_own
+from s2a_bench.transport.zmq import wire as gr00t
+from s2a_bench.types import Action, Frame, Request, Token
 from tests.plan.test_parser import FORMATS
 from tests.servers.speakers import SPEAKERS
 
@@ -260,6 +263,34 @@ def observations() -> list[bytes]:
     return [packb(told), packb({**told, "actions": np.zeros((4, 2))}), packb({"actions": [[1, 2.5]]})]
 
 
+def read_gr00t(data: bytes) -> None:
+    """Read what a GR00T server is asked, and what its client is answered."""
+    message = gr00t.unpack(data)
+    if isinstance(message, dict):
+        observation, layout = layouts.observation_in(message.get("data"))
+        gr00t_own.request_of(observation, gr00t_own.told_in(message) or {}, Trace(), LIMITS)
+        layouts.answer_of(observation, layout, [Action(0, np.zeros(2, np.float32))])
+    with suppress(RequestFailed):
+        gr00t_own.remote_of(message)
+    layouts.actions_in(message)
+
+
+def gr00ts() -> list[bytes]:
+    """Return requests of both layouts, answers, and marks."""
+    picture, state = np.zeros((1, 4, 6, 3), np.uint8), np.zeros((1, 5), np.float64)
+    flat = {"video.a": picture, "state.a": state, "annotation.human.task_description": ["go"]}
+    nested = {"video": {"a": picture[None]}, "state": {"a": state[None]}, "language": {"task": [["go"]]}}
+    told = {"id": "a", "max_tokens": 5, "seed": 1, "grammar": "x"}
+    messages = [
+        {"endpoint": "get_action", "data": flat, "s2a": told},
+        {"endpoint": "get_action", "data": {"observation": nested, "options": None}},
+        [{"a": np.zeros((1, 4, 2)), "b": np.zeros((1, 4, 1))}, {}],
+        {"action.a": np.zeros((4, 2), np.float32)},
+        gr00t_own.remote_message(Trace().to_remote()),
+    ]
+    return [bytes(gr00t.pack(message)) for message in messages]
+
+
 NAMES = [b"http/binary?payload=png&connection=per-request", b"ros/topic?result_timeout=2.5", b"loopback", b"ros/action"]
 RAW = b"application/x-raw; width=6; height=4; encoding=bgr8"
 
@@ -285,6 +316,7 @@ TARGETS = {
     "yaml": Target(read_yaml, lambda: [METADATA]),
     "observation": Target(read_observation, observations),
     "marks": Target(lambda data: remote_of(unpackb(data)), lambda: [packb(remote_message(Trace().to_remote()))]),
+    "gr00t": Target(read_gr00t, gr00ts),
     "template": Target(
         lambda data: template_of(str(as_file("t.toml", data))), tomls("s2a_bench/transport/templates/*.toml")
     ),

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm, websocket
+from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm, websocket, zmq
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
 
@@ -42,6 +42,12 @@ class TestRosTopic(HostileSuite):
 class TestRosAction(HostileSuite):
     name = "ros/action"
     servers = ros_servers.GOALS
+
+
+class TestZmq(HostileSuite):
+    name = "zmq/gr00t"
+    clients = zmq.CLIENTS
+    servers = zmq.SERVERS
 
 
 needs_zenoh = pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")

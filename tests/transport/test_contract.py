@@ -79,6 +79,20 @@ class TestWebsocketJpeg(TransportSuite):
     name, lossless, whole = "websocket/openpi?payload=jpeg", False, True
 
 
+@pytest.mark.parametrize("layout", ["n1.6", "n1.5"])
+@pytest.mark.parametrize("payload", ["raw", "png"])
+class TestZmq(TransportSuite):
+    whole = True
+
+    @pytest.fixture
+    def told(self, layout: str, payload: str) -> Wiring[Any]:
+        return wiring("zmq/gr00t", layout=layout, payload=payload)
+
+
+class TestZmqJpeg(TransportSuite):
+    name, lossless, whole = "zmq/gr00t?payload=jpeg", False, True
+
+
 needs_zenoh = pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import socket
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from threading import Event, Thread
 from typing import Any, Literal, TypeAlias
@@ -39,7 +39,7 @@ def sends(*pieces: bytes, then: Then = "waits", seconds: float = 2.0, every_s: f
 
 
 def sends_made(
-    make: Callable[[], Sequence[bytes]], *, then: Then = "waits", seconds: float = 2.0, every_s: float = 0.0
+    make: Callable[[], Iterable[bytes]], *, then: Then = "waits", seconds: float = 2.0, every_s: float = 0.0
 ) -> Attack:
     """Return a client like that of `sends`, whose pieces are made when it is called."""
 

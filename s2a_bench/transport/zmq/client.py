@@ -1,0 +1,231 @@
+"""The client of GR00T's protocol: fill the template, pack, send, read the chunk, and mark each step.
+
+A REQ socket takes one answer a request, so our own server is asked for its marks once the chunk is there. A foreign one
+tells none: all from the last byte that was packed to the chunk is the stage `server`. A socket whose request failed is
+thrown away, for it would wait for that answer for ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+import zmq
+
+from s2a_bench.clock import clock_id, now_ns
+from s2a_bench.errors import RequestFailed, ServerDied, TransportError
+from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
+from s2a_bench.frames.convert import yuyv_to_rgb
+from s2a_bench.secrets import struck
+from s2a_bench.trace import Trace
+from s2a_bench.transport import Wiring
+from s2a_bench.transport.bounds import Bounds
+from s2a_bench.transport.credentials import read_key
+from s2a_bench.transport.observation import template_of
+from s2a_bench.transport.pictures import told
+from s2a_bench.transport.zmq import layouts, own
+from s2a_bench.transport.zmq.npy import Room
+from s2a_bench.transport.zmq.options import ZmqOptions
+from s2a_bench.transport.zmq.watch import ROOM, Watch
+from s2a_bench.transport.zmq.wire import pack, unpack
+from s2a_bench.types import Frame, Piece, Pixels, Request
+
+ANSWER_BYTES: Final = 16 << 20
+"""Most bytes of an answer, whatever its request asked for; libzmq does not take more."""
+LOOKS_MS: Final = 20
+"""How often one who waits looks at its connection."""
+QUOTED: Final = 500
+"""Letters that are shown of what a server says went wrong."""
+LONGEST_S: Final = 86_400
+"""No server is waited for longer, however long it asks to."""
+ROOMS: Final = 16
+"""Most pictures whose memory is kept for the next request."""
+WRONG: Final = b"ERROR"
+"""What some of GR00T's servers answer where another policy serves."""
+
+
+class ZmqClient:
+    """Asks one policy server."""
+
+    def __init__(self, wiring: Wiring[ZmqOptions], alive: Callable[[], bool]) -> None:
+        """Prepare to ask the server at ``wiring.address``; the first request connects."""
+        self.camera = None
+        self._wiring, self._alive = wiring, alive
+        self._ours = not wiring.black_box
+        self._template = template_of(wiring.options.told_by)
+        self._key = read_key(wiring.options.api_key_env)
+        self._rooms: dict[tuple[int, int, int], Room] = {}
+        self._link: Link | None = None
+        self._connected = False
+
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
+        """Send the observation and yield the actions of its answer."""
+        bounds = Bounds(self._wiring.address, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
+        whole = False
+        try:
+            link = self._open(bounds, trace)
+            body = self._pack(request, trace)
+            answer = self._said(link.asked(body, bounds))
+            actions = layouts.actions_in(answer)
+            seen_ns = now_ns()
+            whole = True
+            for action in actions:
+                bounds.piece()
+                yield action
+            if self._ours:
+                whole = False
+                asked = {own.ENDPOINT: own.MARKS, own.OWN: {"id": request.id}, **self._token()}
+                trace.receive(own.remote_of(self._said(link.asked(pack(asked), bounds))))
+                whole = True
+            here = trace.remote is not None and trace.remote.clock == clock_id()
+            trace.marks.append(("return" if here else "server", seen_ns))
+        finally:
+            if not whole:
+                self.close()
+
+    def _open(self, bounds: Bounds, trace: Trace) -> Link:
+        """Return the kept connection, or a new one that both sides have greeted over, marking `connect`."""
+        if self._link is not None and not self._link.stands():
+            self.close()
+        if self._link is None:
+            if self._connected:
+                trace.facts[RECONNECTS] = 1.0
+            self._link = Link(self._wiring.address, self._wiring.timeout_s, self._alive)
+            self._link.greet(bounds)
+            self._connected = True
+            trace.mark("connect")
+        return self._link
+
+    def _pack(self, request: Request, trace: Trace) -> memoryview:
+        """Fill the template and write it as MessagePack, marking each stage."""
+        pictures = [self._told(frame, place, trace) for place, frame in enumerate(request.images)]
+        observation = self._template.fill(pictures, request.state, request.prompt)
+        data = layouts.data_of(self._wiring.options.layout, observation)
+        message: dict[str, Any] = {own.ENDPOINT: own.GET_ACTION, own.DATA: data, **self._token()}
+        if self._ours:
+            message[own.OWN] = own.parameters(request)
+        body = pack(message, {room.address: room for room in self._rooms.values()})
+        trace.mark("msgpack_pack")
+        trace.facts[PAYLOAD_BYTES] = len(body)
+        return body
+
+    def _told(self, frame: Frame, place: int, trace: Trace) -> Pixels:
+        """Return a picture as it travels; what a camera has as YUYV is converted to where it is packed from."""
+        if self._wiring.options.payload != "raw" or frame.encoding != "yuv422_yuy2":
+            return told(frame, self._wiring.options.payload, trace)
+        if len(self._rooms) > ROOMS:
+            self._rooms.clear()
+        key = place, frame.height, frame.width
+        room = self._rooms.get(key) or self._rooms.setdefault(key, Room(frame.height, frame.width))
+        yuyv_to_rgb(frame.data, room.pixels)
+        trace.mark("convert")
+        return room.pixels
+
+    def _token(self) -> dict[str, str]:
+        return {own.TOKEN: self._key} if self._key else {}
+
+    def _said(self, message: bytes) -> Any:
+        """Return an answer; raises RequestFailed for an error."""
+        url = self._wiring.address
+        if message == WRONG:
+            raise RequestFailed(f"{url} answered {WRONG.decode()}: it serves another kind of policy")
+        answer = unpack(message)
+        if isinstance(answer, dict) and own.ERROR in answer:
+            said = " ".join(struck(str(answer[own.ERROR])).split())[-QUOTED:] or "an error without words"
+            wait_s = answer.get(own.RETRY)
+            patient = isinstance(wait_s, (int, float)) and 0 <= wait_s <= LONGEST_S
+            raise RequestFailed(f"{url}: {said}", retry_after_s=wait_s if patient else None)
+        return answer
+
+    def describe(self) -> dict[str, str]:
+        """Return who is asked, and what for, for the manifest."""
+        return {"url": self._wiring.address, "template": self._template.name}
+
+    def close(self) -> None:
+        """Close the kept connection."""
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+
+class Link:
+    """One REQ socket and its connection, bounded in time and bytes."""
+
+    def __init__(self, url: str, timeout_s: float, alive: Callable[[], bool]) -> None:
+        """Begin to connect; raises TransportError for a URL that is none."""
+        self._url, self._timeout_s, self._alive = url, timeout_s, alive
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.REQ)
+        self._socket.linger = 0
+        self._socket.maxmsgsize = ANSWER_BYTES
+        self._socket.rcvtimeo = self._socket.sndtimeo = max(1, round(timeout_s * 1e3))
+        self._socket.ipv6 = "[" in url
+        self._watch = Watch(self._socket)
+        self._poller = zmq.Poller()
+        self._poller.register(self._watch.monitor, zmq.POLLIN)
+        try:
+            self._socket.connect(url)
+        except zmq.ZMQError as error:
+            self.close()
+            raise TransportError(f"`url`: cannot connect to {url}: {error.strerror}") from error
+
+    def stands(self) -> bool:
+        """Whether the connection is still there."""
+        self._watch.hear()
+        return bool(self._watch.connections)
+
+    def greet(self, bounds: Bounds) -> None:
+        """Wait until both sides have greeted; raises ServerDied or RequestFailed."""
+        ends_ns = self._patience_ns(bounds)
+        while not any(connection.ready for connection in self._watch.connections.values()):
+            self._poller.poll(LOOKS_MS)
+            self._watch.hear()
+            if not self._watch.connections and self._watch.met:
+                raise self._broke("; is it a ZeroMQ peer?")
+            if self._watch.refused and not self._watch.met:
+                raise ServerDied(f"nothing answers at {self._url}")
+            self._check(ends_ns, bounds)
+        self._poller.register(self._socket, zmq.POLLIN)
+
+    def asked(self, body: memoryview, bounds: Bounds) -> bytes:
+        """Send a request; return its answer."""
+        try:
+            self._socket.send(body, copy=False)
+            ends_ns = self._patience_ns(bounds)
+            while self._socket not in dict(self._poller.poll(LOOKS_MS)):
+                self._watch.hear()
+                if not self._watch.connections:
+                    raise self._broke()
+                self._check(ends_ns, bounds)
+            frames = self._socket.recv_multipart(zmq.NOBLOCK)
+        except zmq.ZMQError as error:
+            raise RequestFailed(f"{self._url}: {error.strerror}") from error
+        for connection in self._watch.connections.values():
+            connection.take([0, *map(len, frames)])
+        bounds.came(sum(map(len, frames)))
+        if len(frames) != 1:
+            raise RequestFailed(f"{self._url} answered with {len(frames)} frames, not one")
+        return frames[0]
+
+    def _check(self, ends_ns: int, bounds: Bounds) -> None:
+        """Raise what says why waiting has to end."""
+        bounds.left_s()
+        if now_ns() > ends_ns:
+            raise RequestFailed(f"{self._url} was silent for too long: {self._timeout_s:g} s")
+        if not self._alive():
+            raise ServerDied(f"the server at {self._url} is gone")
+        if sum(connection.look() for connection in self._watch.connections.values()) > ANSWER_BYTES + ROOM:
+            raise RequestFailed(f"{self._url} sent more than the {ANSWER_BYTES} bytes that an answer may have")
+
+    def _broke(self, doubt: str = "") -> TransportError:
+        if not self._alive():
+            return ServerDied(f"the server at {self._url} is gone")
+        return RequestFailed(f"{self._url} broke the connection{doubt}")
+
+    def _patience_ns(self, bounds: Bounds) -> int:
+        return now_ns() + round(min(self._timeout_s, bounds.left_s()) * 1e9)
+
+    def close(self) -> None:
+        """Close the connection, whatever is on its way."""
+        self._watch.close()
+        self._context.destroy(0)

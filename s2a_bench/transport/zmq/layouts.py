@@ -1,0 +1,101 @@
+"""What stands where in GR00T's messages: observations of a robot, and chunks of actions.
+
+N1.5 is flat: ``video.<camera>`` (T, H, W, 3) uint8, ``state.<part>`` (T, D), ``annotation.<...>`` [text]; its answer is
+``action.<part>`` (H, D). N1.6 is nested: ``observation`` with ``video``, ``state`` and ``language``, all with a batch
+in front, as (B, T, H, W, 3), (B, T, D), [[text]]; its answer is [{part: (B, H, D)}, info]. Our server reads both,
+whichever comes, and answers in the same.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from s2a_bench.errors import EngineError, RequestFailed
+from s2a_bench.transport.chunks import actions_of
+from s2a_bench.types import Action, Piece
+
+N1_5, N1_6 = "n1.5", "n1.6"
+OBSERVATION: Final = "observation"
+NAMES: Final = {
+    "video": "ego_view",
+    "state": "robot",
+    "action": "robot",
+    "language": "annotation.human.task_description",
+}
+"""Modality -> the key that our server tells of; whatever the keys are, it reads them."""
+STATE_AXES, PICTURE_AXES = 2, 4
+"""Of N1.5's arrays without a batch."""
+
+
+def data_of(layout: str, observation: dict[str, Any]) -> dict[str, Any]:
+    """Return the ``data`` of a request for actions."""
+    return observation if layout == N1_5 else {OBSERVATION: observation, "options": None}
+
+
+def observation_in(data: Any) -> tuple[Any, str]:
+    """Return the observation in the ``data`` of a request, and its layout."""
+    nested = data.get(OBSERVATION) if isinstance(data, dict) else None
+    return (nested, N1_6) if isinstance(nested, dict) else (data, N1_5)
+
+
+def answer_of(observation: Mapping[Any, Any], layout: str, pieces: Sequence[Piece]) -> Any:
+    """Return what a request is answered; raises EngineError for tokens, and for nothing."""
+    if not all(isinstance(piece, Action) for piece in pieces):
+        raise EngineError("the engine answers with tokens, and this protocol knows actions; choose `answer` actions")
+    if not pieces:
+        raise EngineError("the engine answered with no action at all")
+    chunk = np.stack([piece.values for piece in pieces if isinstance(piece, Action)])
+    if layout == N1_6:
+        return [{NAMES["action"]: chunk[np.newaxis]}, {}]
+    return {f"action.{NAMES['action']}": chunk[np.newaxis] if _batched(observation) else chunk}
+
+
+def actions_in(answer: Any) -> list[Action]:
+    """Return the chunk of an answer of either layout, the parts of an action side by side; raises RequestFailed."""
+    parts = answer[0] if isinstance(answer, list) and answer else answer
+    if not isinstance(parts, dict):
+        raise RequestFailed(f"actions should be a map of arrays, not {type(parts).__name__}")
+    named = {name: part for name, part in parts.items() if str(name).startswith("action")} or parts
+    rows = [_rows(name, part) for name, part in named.items()]
+    if len({len(part) for part in rows}) != 1:
+        told = ", ".join(f"{str(name)[:40]} {part.shape}" for name, part in zip(named, rows, strict=True))
+        raise RequestFailed(f"parts of actions that are of one length: there are {told or 'none'}")
+    return actions_of(rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1))
+
+
+def modalities(layout: str) -> dict[str, Any]:
+    """Return what ``get_modality_config`` tells of our server."""
+    configs: dict[str, Any] = {}
+    for modality, name in NAMES.items():
+        key = f"{modality}.{name}" if layout == N1_5 and modality != "language" else name
+        config: dict[str, Any] = {"delta_indices": [0], "modality_keys": [key]}
+        if layout == N1_6:
+            config |= dict.fromkeys(("sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"))
+        said = json.dumps(config) if layout == N1_5 else config
+        configs[modality] = {"__ModalityConfig_class__": True, "as_json": said}
+    return configs
+
+
+def _batched(flat: Mapping[Any, Any]) -> bool:
+    """Return whether N1.5's arrays have a batch in front: as GR00T finds it, by the states, else by the pictures."""
+    arrays = {str(key): value.ndim for key, value in flat.items() if isinstance(value, np.ndarray)}
+    states = [axes for key, axes in arrays.items() if "state" in key]
+    return min(states) > STATE_AXES if states else any(axes > PICTURE_AXES for axes in arrays.values())
+
+
+def _rows(name: Any, part: Any) -> NDArray[Any]:
+    """Return one part of the actions as (H, D)."""
+    try:
+        array = np.asarray(part)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise RequestFailed(f"action '{name}' is no array: {error}") from error
+    if array.ndim == 3 and len(array) == 1:  # noqa: PLR2004 - a batch of one
+        array = array[0]
+    if array.dtype.kind not in "fiu" or array.ndim not in {1, 2} or not array.size:
+        raise RequestFailed(f"action '{name}' of shape {array.shape} and type {array.dtype}, not numbers (H, D)")
+    return array.reshape(len(array), -1)

@@ -1,0 +1,137 @@
+"""Arrays in MessagePack, as GR00T writes them."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+
+from s2a_bench.errors import EngineError, RequestFailed
+from s2a_bench.transport.zmq.layouts import actions_in, answer_of, modalities
+from s2a_bench.transport.zmq.npy import Room, array_of, file_of
+from s2a_bench.transport.zmq.wire import MAP, VALUES, pack, unpack
+from s2a_bench.types import Token
+
+DTYPES = ["bool", "int8", "uint8", ">u2", "int32", "uint64", "float16", "float32", ">f4", "float64"]
+SHAPES = [(), (3,), (0,), (2, 3), (0, 3), (1, 1, 4, 5, 3)]
+
+
+def saved(array: Any, **more: Any) -> bytes:
+    output = io.BytesIO()
+    np.save(output, array, **more)
+    return output.getvalue()
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_files_are_numpys_byte_for_byte(dtype: str, shape: tuple[int, ...]) -> None:
+    array = np.arange(np.prod(shape, dtype=int)).astype(dtype).reshape(shape)
+    assert file_of(array) == saved(array)
+    got = array_of(saved(array))
+    assert (got.dtype, got.shape, got.tobytes()) == (array.dtype, array.shape, array.tobytes())
+
+
+def test_fortrans_order_comes_back() -> None:
+    array = np.asfortranarray(np.arange(24).reshape(2, 3, 4))
+    np.testing.assert_array_equal(array_of(saved(array)), array)
+
+
+def test_an_array_with_gaps_travels_as_its_elements() -> None:
+    array = np.arange(24, dtype=np.uint8).reshape(4, 6)[:, ::2]
+    np.testing.assert_array_equal(unpack(pack(array)), array)
+
+
+def test_reading_copies_nothing() -> None:
+    data = saved(np.arange(100, dtype=np.uint8))
+    assert np.shares_memory(array_of(data), np.frombuffer(data, np.uint8))
+
+
+@pytest.mark.parametrize("outer", [(), (1,), (1, 1), (1, 1, 1)])
+def test_a_picture_is_packed_from_its_room(outer: tuple[int, ...]) -> None:
+    room = Room(48, 64)
+    room.pixels[:] = np.random.default_rng(1).integers(0, 256, room.pixels.shape)
+    picture = room.pixels.reshape(*outer, 48, 64, 3)
+    file = room.file(picture)
+    assert file is not None
+    assert bytes(file) == saved(picture)
+    assert pack({"a": picture}, {room.address: room}) == pack({"a": picture})
+
+
+def test_what_is_not_all_of_a_room_is_packed_as_it_is() -> None:
+    room = Room(4, 4)
+    room.pixels[:] = 1
+    for part in (room.pixels[:2], room.pixels[..., :1], room.pixels.transpose(2, 0, 1)):
+        np.testing.assert_array_equal(unpack(pack(part, {room.address: room})), part)
+
+
+@pytest.mark.parametrize(
+    "array", [np.array([{}], object), np.zeros(2, "i4,f4"), np.zeros(2, complex), np.array(["a"]), np.array([b"a"])]
+)
+def test_only_numbers_are_read(array: Any) -> None:
+    with pytest.raises(RequestFailed, match="numbers are taken, nothing else"):
+        array_of(saved(array, allow_pickle=True))
+
+
+def test_nothing_is_unpickled() -> None:
+    class Trap:
+        def __reduce__(self) -> Any:
+            return pytest.fail, ("it was unpickled",)
+
+    for data in (pickle.dumps(Trap()), saved(np.array([Trap()], object), allow_pickle=True)):
+        with pytest.raises(RequestFailed):
+            unpack(msgpack.packb({"__ndarray_class__": True, "as_npy": data}))
+
+
+def test_no_other_class_becomes_anything() -> None:
+    told = {"__ModalityConfig_class__": True, "as_json": "{}"}
+    assert unpack(pack(told)) == told
+
+
+@pytest.mark.parametrize("size", [-1, 1, 100])
+def test_a_file_is_as_long_as_it_says(size: int) -> None:
+    data = saved(np.zeros(10, np.float32))
+    with pytest.raises(RequestFailed, match="an array of shape"):
+        array_of(data[:size] if size < 0 else data + bytes(size))
+
+
+def test_a_message_has_not_more_values_than_are_read() -> None:
+    unpack(pack({str(number): 0 for number in range(MAP)}))
+    with pytest.raises(RequestFailed, match="no message"):
+        unpack(pack({str(number): 0 for number in range(MAP + 1)}))
+    with pytest.raises(RequestFailed, match=f"more than {VALUES} values"):
+        unpack(pack([[0] * 4000 for _ in range(20)]))
+
+
+def test_what_is_no_value_does_not_travel() -> None:
+    with pytest.raises(RequestFailed, match="object is none of its types"):
+        pack({"a": object()})
+
+
+@pytest.mark.parametrize(
+    ("answer", "expected"),
+    [
+        ([{"a": np.ones((1, 2, 3)), "b": np.zeros((1, 2, 1))}, {}], [[1, 1, 1, 0]] * 2),
+        ([{"a": [[[1.0], [2.0]]]}, {}], [[1], [2]]),
+        ({"action.a": np.ones((2, 1)), "action.b": np.zeros(2), "took": 5}, [[1, 0]] * 2),
+        ({"action": np.ones((2, 2))}, [[1, 1]] * 2),
+        ({"a": np.ones((2, 2), np.float16)}, [[1, 1]] * 2),
+    ],
+)
+def test_parts_of_actions_stand_side_by_side(answer: Any, expected: Any) -> None:
+    assert [action.values.tolist() for action in actions_in(answer)] == expected
+
+
+def test_neither_tokens_nor_nothing_are_an_answer() -> None:
+    with pytest.raises(EngineError, match="choose `answer` actions"):
+        answer_of({}, "n1.6", [Token(0, "go")])
+    with pytest.raises(EngineError, match="no action at all"):
+        answer_of({}, "n1.6", [])
+
+
+@pytest.mark.parametrize("layout", ["n1.5", "n1.6"])
+def test_every_modality_has_keys(layout: str) -> None:
+    assert {config["__ModalityConfig_class__"] for config in modalities(layout).values()} == {True}
