@@ -47,5 +47,5 @@ def lay_out(table: TextTable) -> RenderableType:
 def _broken(name: str) -> str:
     """Break the header of a column of numbers."""
     if name.startswith("ratio to "):
-        return name.replace("ratio to ", "ratio to\n")
+        return name.replace("ratio to ", "ratio to\n").replace("?", "?\n")
     return name.replace("/", "/\n") if " " not in name else name.replace(" infer", "\ninfer")

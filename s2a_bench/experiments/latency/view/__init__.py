@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 _FULL_CELLS = 2
 """As many cells leave room for mean ± sd beside the medians."""
+_SUMMARY_COLUMNS = 9
+"""With more columns than these, ratios to more than two cells, the spread is told in short."""
 _STAGE_CELLS = 5
 """With more cells than these the cells become rows."""
 
@@ -25,19 +27,23 @@ def show(run: Run, *, against: str = "", verbose: bool = False, **_: Any) -> Sho
     from s2a_bench.experiments.latency.view.cells import cells_of
     from s2a_bench.experiments.latency.view.figures import latency_figures
     from s2a_bench.experiments.latency.view.sentences import latency_sentences
-    from s2a_bench.experiments.latency.view.tables import group_table, latency_tables, stage_table
+    from s2a_bench.experiments.latency.view.tables import group_table, latency_tables, stage_table, summary_table
 
     n = len(cells_of(run))
     tables = latency_tables(run)
     stages = group_table(run) if n > _STAGE_CELLS else stage_table(run, full=n <= _FULL_CELLS)
     printed = _printed(run)
     compared = tables["summary" if "summary" in printed else "summary-e2e"]
+    narrow = {"stages": stages}
+    for name, metric in (("summary", "e2e_without_inference"), ("summary-e2e", "e2e")):
+        if len(tables[name].header) > _SUMMARY_COLUMNS:
+            narrow[name] = summary_table(run, metric, brief=True)
     return Shown(
         sentences=latency_sentences(run),
         tables=tables,
         main=[name for name in ("summary", "summary-model", "stages") if name in tables],
         printed=[name for name in tables if name in printed],
-        narrow={"stages": stages},
+        narrow=narrow,
         notes=[" ".join(dict.fromkeys((*stages.notes, *compared.notes))), *(_verbose(run) if verbose else ())],
         csvs=csv_texts(run),
         figures=latency_figures(run, against_paper=against == "paper"),

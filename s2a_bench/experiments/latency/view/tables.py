@@ -93,8 +93,11 @@ def group_table(run: Run) -> TextTable:
     return TextTable("Groups of stages in ms: medians", header, rows, 1, notes=_notes(run, cells))
 
 
-def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
-    """Lay out what a publication quotes: n, spread, percentiles, and the ratios to what is compared with."""
+def summary_table(run: Run, metric: str = "e2e_without_inference", *, brief: bool = False) -> TextTable:
+    """Lay out what a publication quotes: n, spread, percentiles, and the ratios to what is compared with.
+
+    A ``brief`` one leaves room for more ratios than two: of the spread it has p99.
+    """
     cells = cells_of(run)
     bases = [
         base for base in cells if base.values_ms(metric).size and any(cell.is_compared_with(base) for cell in cells)
@@ -111,8 +114,10 @@ def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
         over = {base.name: _ratio(cell, base, metric, run.bootstrap_seed) for base in bases}
         found += [ratio for ratio in over.values() if ratio]
         ratios = ("1" if cell.name == base else interval(ratio) for base, ratio in over.items())
-        rows.append((cell.name, str(cell.n), str(cell.errors), *numbers, *ratios))
-    header = ("cell", "n", "errors", "mean ± sd", "median", "p90", "p99", *(f"ratio to {base.name}" for base in bases))
+        shown = (numbers[1], numbers[3]) if brief else (str(cell.n), str(cell.errors), *numbers)
+        rows.append((cell.name, *shown, *ratios))
+    figures = ("median", "p99") if brief else ("n", "errors", "mean ± sd", "median", "p90", "p99")
+    header = ("cell", *figures, *(f"ratio to {base.name}" for base in bases))
     title = f"{TITLES[metric]} in ms; ratios of medians [95 % interval]"
     return TextTable(title, header, rows, 1, notes=(*_notes(run, cells), *filter(None, [launches_note(found)])))
 
