@@ -164,6 +164,11 @@ class Mode(Protocol):
         """Return the time from one action's arrival to the next one's; 0 where chunks arrive whole."""
         return 0
 
+    @property
+    def blocks(self) -> bool:
+        """Return whether the control loop waits for the answer."""
+        return False
+
     def stepper(self, setting: Setting) -> ChunkStepper:
         """Follow one robot."""
         ...

@@ -46,6 +46,7 @@ class Sync(Laid):
     """Ask when the chunk is used up, and stand still meanwhile: the loop is blocked while it stalls."""
 
     name: ClassVar[str] = "sync"
+    blocks: ClassVar[bool] = True
 
     execute: Execute = 0
 
