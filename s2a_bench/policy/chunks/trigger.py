@@ -20,6 +20,7 @@ from s2a_bench.policy.chunks.closed import slow_down
 from s2a_bench.policy.conformal import EPSILON, Calibration, Guarantee, Tracker, choose
 
 if TYPE_CHECKING:
+    from s2a_bench.policy import Floats
     from s2a_bench.policy.chunks import Ints, Setting
 
 NS: Final = 1e9
@@ -153,21 +154,37 @@ class Tracked:
         self.tracker.learn(float(latency_ns), stalled=stalled)
 
 
-def follow(rule: Rule, latency_ns: Ints, setting: Setting, most: int) -> tuple[Ints, Ints]:
-    """Return each cycle's trigger and stall in ticks, shape (R,) both, of a queue whose rule learns every latency.
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """What a rule did cycle by cycle: arrays of shape (R,)."""
 
-    The trigger decides when the request leaves, so the rule knows all latencies but this one. Nothing is slowed down.
+    trigger: Ints
+    beta: Floats
+    """By how much the actions left at the request were slowed down."""
+    stall_ticks: Ints
+    """In ticks of that length."""
+
+
+def follow(rule: Rule, latency_ns: Ints, setting: Setting, most: int, slowest: float = 1.0) -> Followed:
+    """Follow a robot whose rule learns every latency, shape (R,), after the cycle that it decided.
+
+    Its trigger is at most ``most``, and where that is not enough its actions are up to ``slowest`` times slower
+    (time-scaling; 1 for never). The stalls are those of `closed.queue_stall_ticks`, for ``most`` below s.
     """
     import numpy as np
 
-    delay = setting.delay_ticks(latency_ns)
-    triggers = np.empty_like(delay)
-    for place, (latency, ticks) in enumerate(zip(latency_ns.tolist(), delay.tolist(), strict=True)):
+    triggers, betas, stalls = np.empty(latency_ns.size, np.int64), np.ones(latency_ns.size), np.zeros_like(latency_ns)
+    for place, latency in enumerate(latency_ns.tolist()):
         ready = rule.latency_ns
-        triggers[place] = most if math.isinf(ready) else min(most, _ticks(ready, setting))
-        rule.learn(latency, stalled=ticks > triggers[place])
-    stall = np.maximum(0, delay - triggers)
-    return triggers, stall
+        chosen = Trigger(most, slowest) if math.isinf(ready) else trigger(ready, setting, most)
+        slowed = setting
+        if chosen.beta > 1 and slowest > 1:
+            betas[place] = min(chosen.beta, slowest)
+            slowed = setting.slowed(betas[place])
+        triggers[place] = chosen.ticks
+        stalls[place] = max(0, _ticks(latency, slowed) - chosen.ticks)
+        rule.learn(latency, stalled=bool(stalls[place]))
+    return Followed(triggers, betas, stalls)
 
 
 def _ticks(latency_ns: float, setting: Setting) -> int:

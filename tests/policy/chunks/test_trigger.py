@@ -149,8 +149,8 @@ def test_tracking_brings_a_machine_that_drifts_back_to_epsilon(latencies: Gaps, 
     }
     stalls, waits = {}, {}
     for name, rule in rules.items():
-        triggers, stall = follow(rule, fresh, setting, 60)
-        stalls[name], waits[name] = float(np.mean(stall > 0)), float(triggers.mean())
+        found = follow(rule, fresh, setting, 60)
+        stalls[name], waits[name] = float(np.mean(found.stall_ticks > 0)), float(found.trigger.mean())
     assert 0.006 < stalls["tracked"] < 0.0115
     assert stalls["fixed"] > 0.025 or scale == 1.0
     assert stalls["maximum"] < 0.001
@@ -161,12 +161,12 @@ def test_tracking_brings_a_machine_that_drifts_back_to_epsilon(latencies: Gaps, 
 def test_the_maximum_never_forgets_one_outlier_and_tracking_does() -> None:
     setting, latency_ns = Setting(20 * MS, 64), np.full(2000, 50 * MS)
     latency_ns[500] = 900 * MS
-    triggers, stall = follow(Maximum(), latency_ns, setting, 60)
-    assert set(triggers[501:].tolist()) == {45}
-    assert np.flatnonzero(stall).tolist() == [0, 500]
-    triggers, stall = follow(Tracked.begin(latency_ns[:500], 0.01, step=0.002), latency_ns[500:], setting, 60)
-    assert set(triggers.tolist()) == {2}
-    assert np.flatnonzero(stall).tolist() == [0]
+    found = follow(Maximum(), latency_ns, setting, 60)
+    assert set(found.trigger[501:].tolist()) == {45}
+    assert np.flatnonzero(found.stall_ticks).tolist() == [0, 500]
+    found = follow(Tracked.begin(latency_ns[:500], 0.01, step=0.002), latency_ns[500:], setting, 60)
+    assert set(found.trigger.tolist()) == {2}
+    assert np.flatnonzero(found.stall_ticks).tolist() == [0]
 
 
 @given(
@@ -221,8 +221,26 @@ def test_the_oracle_s_trigger_is_the_smallest_safe_one(rounding: Rounding) -> No
 def test_a_rule_that_needs_the_greatest_trigger_gets_it() -> None:
     assert trigger(math.inf, Setting(20, 8), 5) == Trigger(5, 1.0)
     assert Tracked.begin([1.0] * 50, 0.01).latency_ns == math.inf  # too few to promise 1 %
-    triggers, stall = follow(Tracked.begin([1.0] * 50, 0.01), np.array([90, 110, 130]), Setting(20, 8), 5)
-    assert (triggers.tolist(), stall.tolist()) == ([5, 5, 5], [0, 0, 1])
+    found = follow(Tracked.begin([1.0] * 50, 0.01), np.array([90, 110, 130]), Setting(20, 8), 5)
+    assert (found.trigger.tolist(), found.stall_ticks.tolist()) == ([5, 5, 5], [0, 0, 1])
+    found = follow(Tracked.begin([1.0] * 50, 0.01), np.array([90, 110, 130]), Setting(20, 8), 5, slowest=1.5)
+    assert (found.beta.tolist(), found.stall_ticks.tolist()) == ([1.5, 1.5, 1.5], [0, 0, 0])
+
+
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_a_tracked_robot_slows_down_while_its_latencies_exceed_the_slack(rounding: Rounding) -> None:
+    setting, latencies = Setting(20 * MS, 16, rounding), Lognormal(0.05, 0.2)
+    known = draw(latencies, np.random.default_rng(1), 2000)
+    fresh = draw(latencies, np.random.default_rng(2), 30_000)
+    fresh[10_000:20_000] *= 2  # above the slack of 80 ms for a while
+    stiff = follow(Tracked.begin(known), fresh, setting, 4)
+    found = follow(Tracked.begin(known), fresh, setting, 4, slowest=4.0)
+    assert np.mean(stiff.stall_ticks > 0) > 0.1
+    assert np.mean(found.stall_ticks > 0) < 0.0115
+    assert (stiff.beta == 1).all()
+    assert found.beta[:10_000].mean() < 1.03
+    assert 1.6 < found.beta[12_000:20_000].mean() < 2.6
+    assert found.beta[24_000:].mean() < 1.03
     with pytest.raises(UsageError, match="98 calibration plans promise"):
         calibrate(np.arange(98))
     with pytest.raises(ValueError, match="any speed"):
