@@ -78,10 +78,12 @@ class Found:
     """Of the first action of a chunk, over the oracle's: the part of an age that the trigger decides."""
 
 
-def study(settings: int, *families: str) -> dict[str, Found]:
+def study(settings: int, *families: str, period_ns: int = 0) -> dict[str, Found]:
     found: dict[str, Found] = {}
     for family, seed in product(families, range(settings)):
         latencies, setting = world(seed, family)
+        if period_ns:
+            setting = Setting(period_ns, 10**6)
         known = draw(latencies, np.random.default_rng([seed, 2]), CALIBRATION)
         fresh = draw(latencies, np.random.default_rng([seed, 3]), FRESH)
         chosen = {
@@ -122,8 +124,9 @@ def test_a_calibrated_trigger_stalls_as_rarely_as_asked() -> None:
 
 
 @pytest.mark.slow
-def test_so_it_does_in_each_of_200_settings() -> None:
-    found = study(100, "lognormal", "bimodal")
+@pytest.mark.parametrize("period_ns", [0, MS // 10], ids=["control rates", "as good as no grid"])
+def test_so_it_does_in_each_of_200_settings(period_ns: int) -> None:
+    found = study(100, "lognormal", "bimodal", period_ns=period_ns)
     assert len(found["oracle"].stalls) == 200
     judge(found)
 
