@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 Rounding: TypeAlias = Literal["floor", "ceil"]
 """floor: an action leaves at the end of its tick, so that one whose chunk arrives within the tick is in time (Real-time
-chunking, arXiv 2506.07339, section 3). ceil: it leaves at the tick's start (lerobot). They differ by one tick unless L
+chunking, arXiv 2506.07339). ceil: it leaves at the tick's start (lerobot). They differ by one tick unless L
 is a multiple of Delta t."""
 
 

@@ -40,10 +40,21 @@ def queue_stall_s(latency_s: ArrayLike, trigger: int, period_s: float) -> Floats
 def queue_stall_ticks(delay_ticks: Ints, trigger: int) -> Ints:
     """Return max(0, d - m): the stall at each boundary under queue, and under aggregate too.
 
-    For m < s with any latency; m = s allows no later request than the answer, and so needs known <= max(d, m). In
-    aggregate s is H - m, and m < H / 2. Sync is m = 0.
+    For m < s with latencies of any size, each cycle by itself; `steady_stall_ticks` is for any m. In aggregate s is
+    H - m, and m < H / 2. Sync is m = 0.
     """
     stall: Ints = np.maximum(0, delay_ticks - trigger)
+    return stall
+
+
+def steady_stall_ticks(ready_ticks: Ints, known_ticks: Ints, trigger: int, execute: int) -> Ints:
+    """Return max(0, ready - m, known - s), the stall at each boundary of queue and streamed at constant latency.
+
+    For any m. A chunk may begin ``ready`` ticks after its request: d, and for streamed S0 in ticks; ``known`` is when
+    the next request may follow from its last action. known - s is what no trigger helps against: one answer at a time
+    takes longer than its actions last, as actions that arrive more slowly than they are executed always do.
+    """
+    stall: Ints = np.maximum(np.maximum(0, ready_ticks - trigger), known_ticks - execute)
     return stall
 
 

@@ -102,7 +102,11 @@ class Fixed:
 
 @dataclass(slots=True)
 class Maximum:
-    """The greatest latency there has been: lerobot's latency tracker. It never forgets."""
+    """The greatest latency there has been, for ever: `max` of lerobot's latency tracker (policies/rtc).
+
+    lerobot takes ceil(max / Delta t) for the delay that the model assumes; its trigger is a fixed number of actions.
+    Here the same number is the trigger, the least that would have been safe so far.
+    """
 
     latency_ns: float = 0.0
 

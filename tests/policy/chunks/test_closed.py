@@ -13,7 +13,7 @@ from scipy import stats
 
 from s2a_bench.policy.chunks import Mode, Rounding, Setting, mode
 from s2a_bench.policy.chunks.aggregate import Aggregate
-from s2a_bench.policy.chunks.append import Queue, Sync
+from s2a_bench.policy.chunks.append import Queue, Streamed, Sync
 from s2a_bench.policy.chunks.closed import (
     jump_actions,
     mean_reaction_s,
@@ -27,6 +27,7 @@ from s2a_bench.policy.chunks.closed import (
     slack_ticks,
     slow_down,
     stall_share,
+    steady_stall_ticks,
     sync_motion_share,
 )
 from s2a_bench.policy.chunks.replace import Replace
@@ -93,6 +94,25 @@ def test_a_queue_stalls_for_what_the_delay_exceeds_the_trigger_by(
     assert (boundaries(log)[0] == 0) == (trigger >= none_from)
 
 
+@steady
+@given(
+    latency=st.integers(0, 300),
+    trigger=st.integers(0, 12),
+    s=st.integers(1, 9),
+    gap=st.integers(0, 50),
+    rounding=ROUNDINGS,
+)
+def test_with_any_trigger_it_stalls_for_what_answers_take_longer_than_they_last_too(
+    latency: int, trigger: int, s: int, gap: int, rounding: Rounding
+) -> None:
+    setting = Setting(PERIOD, 9, rounding)
+    made = Streamed(trigger, s, gap * 1e-9)
+    log = plainly(made, constant(latency, 60), setting)
+    ready = setting.delay_ticks(np.array(latency)) + made.hold_ticks(setting)
+    known = setting.known_ticks(np.array(latency + (s - 1) * gap))
+    assert boundaries(log)[40] == int(steady_stall_ticks(ready, known, trigger, s))
+
+
 @given(latency=st.integers(0, 400), trigger=st.integers(0, 8), s=st.integers(1, 9))
 def test_without_a_tick_the_stall_is_the_latency_less_what_is_left(latency: int, trigger: int, s: int) -> None:
     assume(trigger <= s)
@@ -108,6 +128,7 @@ def test_a_queue_that_asks_before_it_has_what_it_asked_for_stalls_otherwise() ->
     # m = s = 2 and 2.5 ticks: no request can follow from the answer before one of its two actions has left.
     setting = Setting(PERIOD, 2)
     assert int(queue_stall_ticks(np.array(2), 2)) == 0
+    assert int(steady_stall_ticks(np.array(2), np.array(3), 2, 2)) == 1
     assert boundaries(plainly(Queue(2), constant(50), setting)) == [1] * 7
     assert not any(boundaries(plainly(Queue(2), constant(50), Setting(PERIOD, 3))))
     # m = 9 > s = 2 and d = 3 > s: an answer takes longer than it lasts, whatever the trigger.
