@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-coverage bench-policy bench-ray test test-all check check-platforms fuzz hostile core mutate setup clean
+.PHONY: bench bench-chunks bench-coverage bench-policy bench-ray test test-all check check-platforms fuzz hostile core mutate setup clean
 
 # The main job: the transports alone (no model) with raw pixels and with JPEG, for which wheels suffice; then llama.cpp
 # is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
@@ -16,6 +16,10 @@ bench: core
 	$(BIN)/s2a-bench latency --engine echo --transport http,ros,shm,loopback --launches 3 --runs 34
 	@$(PYTHON) tools/setup.py
 	$(BIN)/s2a-bench latency
+
+# How many control ticks a second the modes of acting on chunks simulate.
+bench-chunks: setup
+	$(BIN)/python -m benchmarks.chunk_speed
 
 # How often the intervals of ratios hold the truth, and what comparisons see; a few minutes.
 bench-coverage: setup

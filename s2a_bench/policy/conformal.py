@@ -19,6 +19,7 @@ that the prior may have been fitted to; with a prior of its own plans the first 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -170,14 +171,15 @@ class Tracker:
         self.epsilon = epsilon
         self.step = step
         self.level = epsilon
-        self._scores = deque(first, maxlen=len(first))
+        self._scores = deque(first)
+        self._sorted = sorted(first)
 
     @property
     def caution(self) -> float:
         """Return lambda for the next plan."""
-        count = len(self._scores)
+        count = len(self._sorted)
         above = min(math.floor((count + 1) * self.level + ROUNDING), count) - 1
-        return math.inf if above < 0 else sorted(self._scores)[count - 1 - above]
+        return math.inf if above < 0 else self._sorted[count - 1 - above]
 
     def learn(self, score: float, *, stalled: bool) -> None:
         """Learn how a plan went: whether it stalled, and its score, which its recorded arrivals tell afterwards.
@@ -186,6 +188,8 @@ class Tracker:
         """
         self.level = min(self.level + self.step * (self.epsilon - stalled), CEILING * self.epsilon)
         self._scores.append(score)
+        insort(self._sorted, score)
+        del self._sorted[bisect_left(self._sorted, self._scores.popleft())]
 
     def state(self) -> dict[str, Any]:
         """Return level and scores as plain data; an infinite score is null."""

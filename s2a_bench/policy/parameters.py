@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import Field, fields, is_dataclass
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 from s2a_bench.errors import UsageError
-from s2a_bench.policy import Policy
+
+T = TypeVar("T")
 
 
-def build(made_by: Callable[..., Policy], written: str) -> Policy:
-    """Build ``name?parameter=value&...``; raises UsageError naming the policy, the parameter, and those there are."""
+def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
+    """Build ``name?parameter=value&...``; raises UsageError naming ``field``, the parameter, and those there are."""
     name, _, given = written.partition("?")
     if not given:
         return made_by()
@@ -26,16 +27,16 @@ def build(made_by: Callable[..., Policy], written: str) -> Policy:
         parameter, _, text = pair.partition("=")
         if parameter not in types or parameter in values:
             wrong = "is given twice" if parameter in values else "is no parameter"
-            raise UsageError(f"`policy`: {name}: '{parameter}' {wrong}; {known}")
-        values[parameter] = _value(types[parameter], text, f"`policy`: {name}: {parameter} = '{text}'", known)
+            raise UsageError(f"`{field}`: {name}: '{parameter}' {wrong}; {known}")
+        values[parameter] = _value(types[parameter], text, f"`{field}`: {name}: {parameter} = '{text}'", known)
     try:
         return made_by(**values)
     except UsageError as error:
-        raise UsageError(f"`policy`: {name}: {error}; {known}") from error
+        raise UsageError(f"`{field}`: {name}: {error}; {known}") from error
 
 
-def canonical(name: str, policy: Policy) -> str:
-    """Write a policy with its parameters in the order of their names, those at their default left out."""
+def canonical(name: str, policy: object) -> str:
+    """Write a policy or mode with its parameters in the order of their names, those at their default left out."""
     given = {}
     for field in _parameters(type(policy)):
         value = getattr(policy, field.name)
@@ -54,7 +55,7 @@ def _value(type_: Any, text: str, what: str, known: str) -> Any:
         raise UsageError(f"{what}: {wrong[0].lower()}{wrong[1:]}; {known}") from error
 
 
-def _types(made_by: Callable[..., Policy]) -> dict[str, Any]:
+def _types(made_by: Callable[..., object]) -> dict[str, Any]:
     """Return each parameter's type, as annotated."""
     parameters = _parameters(made_by)
     hints = get_type_hints(made_by, include_extras=True) if parameters else {}

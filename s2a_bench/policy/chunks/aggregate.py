@@ -1,0 +1,135 @@
+"""Overlapping actions are blended: the timing and the weights of lerobot's asynchronous inference.
+
+An action of index i is due when i more actions have been executed since its chunk's observation: a stall shifts what is
+due, and loses nothing. lerobot sends an observation in every tick with few actions left, of which the server takes the
+newest when it is free; here one request is under way at a time, which is the same for observations that travel at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, TypeAlias
+
+from pydantic import Field
+
+from s2a_bench.policy.chunks import Action, Cycles, Setting
+from s2a_bench.policy.chunks.cycles import Laid
+
+if TYPE_CHECKING:
+    from s2a_bench.policy import Floats
+    from s2a_bench.policy.chunks import ChunkStepper, Ints
+
+Kind: TypeAlias = Literal["weighted_average", "latest_only", "average", "conservative"]
+WEIGHTS: Final[Mapping[Kind, float]] = {
+    "weighted_average": 0.7,
+    "latest_only": 1.0,
+    "average": 0.5,
+    "conservative": 0.3,
+}
+"""The new action's weight by kind; the one in the queue has the rest (lerobot, AGGREGATE_FUNCTIONS)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Aggregate(Laid):
+    """Ask when ``trigger`` actions are left; what arrives is blended into them where both have an action."""
+
+    name: ClassVar[str] = "aggregate"
+
+    trigger: Annotated[int, Field(ge=0)] = 0
+    kind: Kind = "weighted_average"
+
+    def stepper(self, setting: Setting) -> ChunkStepper:
+        """Follow one robot."""
+        return AggregateStepper(self.trigger, setting.horizon)
+
+    def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
+        """Say what becomes of requests with latencies of shape (R,), in ns.
+
+        With q actions left at the request, min(d, q) of the new chunk are past when it arrives.
+        """
+        import numpy as np
+
+        from s2a_bench.policy.chunks.cycles import assemble
+
+        delay, horizon, most = setting.delay_ticks(latency_ns), setting.horizon, self.trigger
+        known = setting.known_ticks(latency_ns)
+        if 2 * most < horizon:  # what is left on arrival is above the trigger whatever the delay
+            first = np.minimum(delay, most)
+            first[:1] = 0
+            leaves = np.concatenate(([0], np.cumsum(delay + horizon - first - most)))
+        else:
+            leaves_at, skipped, left = [0], [], 0
+            for ticks, here_at in zip(delay.tolist(), known.tolist(), strict=True):
+                skipped.append(min(ticks, left))
+                here, here_left = leaves_at[-1] + ticks, horizon - skipped[-1]
+                leaves_at.append(max(here + here_left - most, leaves_at[-1] + max(here_at, 1)))
+                left = max(here_left - (leaves_at[-1] - here), 0)
+            leaves, first = np.array(leaves_at), np.array(skipped, np.int64)
+        request = leaves[:-1]
+        usable = request + delay
+        until = np.minimum(np.append(usable[1:], leaves[-1]), usable + horizon - first)
+        return assemble(request, usable, usable, first, until, ticks=int(leaves[-1]), horizon=horizon)
+
+    def blended_age(self, cycles: Cycles) -> Floats:
+        """Return the mean age behind each executed action in ticks, shape (K,): ages weighted as actions are.
+
+        NaN for no action. `Ticks.age` is that of the newest observation in the blend.
+        """
+        import numpy as np
+
+        from s2a_bench.policy.chunks.cycles import lay
+
+        ticks, weight = lay(cycles), WEIGHTS[self.kind]
+        acted = np.flatnonzero(ticks.chunk >= 0)
+        newest, index = ticks.chunk[acted], ticks.index[acted]
+        due = np.searchsorted(acted, cycles.request_tick)  # what is due first, in actions since the start
+        action = due[newest] + index
+        age, rest = np.zeros(acted.size), np.ones(acted.size)
+        open_, chunk = np.arange(acted.size), newest
+        while open_.size:
+            older = chunk - 1
+            also = (older >= 0) & (action[open_] < due[np.maximum(older, 0)] + cycles.horizon)
+            share = np.where(also, weight, 1.0) * rest[open_]
+            age[open_] += share * (acted[open_] - cycles.request_tick[chunk])
+            rest[open_] -= share
+            open_, chunk = open_[also], older[also]
+        blended = np.full(cycles.ticks, np.nan)
+        blended[acted] = age
+        return blended
+
+
+@dataclass(slots=True)
+class AggregateStepper:
+    """The newest chunk, and how many of its actions are past."""
+
+    trigger: int
+    horizon: int
+    newest: int = -1
+    past: int = 0
+    """Actions executed since the newest chunk's observation."""
+    asked: int = 0
+    since_asked: int = 0
+    """Actions executed since the observation under way."""
+    under_way: bool = False
+
+    def arrived(self, request: int, actions: int, tick: int) -> None:  # noqa: ARG002 - chunks arrive whole, whenever
+        """Take over behind what has been executed since the observation."""
+        self.newest, self.past, self.under_way = request, self.since_asked, False
+
+    def ask(self, tick: int) -> bool:  # noqa: ARG002 - whenever few are left
+        """Ask when few actions are left, and no chunk is under way."""
+        left = self.horizon - self.past if self.newest >= 0 else 0
+        if self.under_way or left > self.trigger:
+            return False
+        self.asked += 1
+        self.under_way, self.since_asked = True, 0
+        return True
+
+    def act(self, tick: int) -> Action | None:  # noqa: ARG002 - whatever is next
+        """Execute the next action."""
+        if self.newest < 0 or self.past == self.horizon:
+            return None
+        self.past += 1
+        self.since_asked += 1
+        return Action(self.newest, self.past - 1)

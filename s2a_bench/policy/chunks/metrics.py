@@ -1,0 +1,107 @@
+"""What a simulation of chunks comes to, in numbers; ticks are control ticks, and all count from the first action on.
+
+The first request has no boundary: waiting for it is the time to first action, not a stall.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from s2a_bench.policy import Floats
+    from s2a_bench.policy.chunks import Cycles, Ints, Mode, Setting, Ticks
+
+
+@dataclass(frozen=True, slots=True)
+class Metrics:
+    """One robot's run; NaN where there is nothing to count."""
+
+    first_action_tick: int
+    """Time to first action; the run's length where there was none."""
+    ticks: int
+    """From the first action on."""
+    stall_ticks: int
+    stall_share: float
+    """Of ``ticks``."""
+    longest_stall_ticks: int
+    p_stall_cycle: float
+    """Share of the boundaries, from one executed chunk to the next, with a stall."""
+    age_ticks_mean: float
+    """Of the observation behind an executed action."""
+    age_ticks_p99: float
+    age_ticks_max: float
+    thrown_away_share: float
+    """Actions never executed, of all chunks but the last one executed and those after it."""
+    jump_mean: float
+    """Mean of |jump| over the boundaries."""
+    jump_max: float
+    requests: int
+    blocked_ticks: int
+    """Ticks in which the control loop waits for an answer, the first included; 0 unless the mode blocks."""
+
+
+def measure(mode: Mode, cycles: Cycles, ticks: Ticks) -> Metrics:
+    """Count a mode's run."""
+    settled, age = cycles.settled, ticks.age[ticks.age >= 0]
+    first = int(np.argmax(ticks.chunk >= 0)) if age.size else cycles.ticks
+    stall_ticks, length = int(ticks.stalled.sum()), cycles.ticks - first
+    last = int(np.flatnonzero(cycles.executed)[-1]) if age.size else 0
+    jump = np.abs(cycles.jump[settled])
+    return Metrics(
+        first_action_tick=first,
+        ticks=length,
+        stall_ticks=stall_ticks,
+        stall_share=stall_ticks / length if length else np.nan,
+        longest_stall_ticks=_longest(ticks),
+        p_stall_cycle=_mean(cycles.stall_ticks[settled] > 0),
+        age_ticks_mean=_mean(age),
+        age_ticks_p99=float(np.quantile(age, 0.99)) if age.size else np.nan,
+        age_ticks_max=float(age.max()) if age.size else np.nan,
+        thrown_away_share=_mean(cycles.thrown_away[:last]) / cycles.horizon,
+        jump_mean=_mean(jump),
+        jump_max=float(jump.max()) if jump.size else np.nan,
+        requests=cycles.request_tick.size,
+        blocked_ticks=(stall_ticks + first) if mode.blocks else 0,
+    )
+
+
+def reaction_ticks(cycles: Cycles, moment_ticks: Floats) -> Floats:
+    """Return how long after events, at any moments (M,) in ticks, the first action that knows of them is executed.
+
+    That is the first action of a chunk observed at the event or later; an action counts at its tick's start, so where
+    it leaves at the end one tick more passes. NaN for events that no executed chunk of the run knows of.
+    """
+    used = np.flatnonzero(cycles.executed)
+    place = np.searchsorted(cycles.request_tick[used], moment_ticks)
+    start = np.append(cycles.start_tick[used].astype(np.float64), np.nan)
+    return start[place] - moment_ticks
+
+
+def margin_ticks(mode: Mode, latency_ns: Ints, setting: Setting) -> int:
+    """Return the stability margin, in ticks: by how much all latencies, shape (R,), may grow without a stall.
+
+    -1 for a run that stalls as it is. All of it counts, so that a longer run has a smaller margin.
+    """
+    added = 0
+    while added <= 2 * setting.horizon and not _stalls(mode, latency_ns + added * setting.period_ns, setting):
+        added += 1
+    return added - 1
+
+
+def _stalls(mode: Mode, latency_ns: Ints, setting: Setting) -> bool:
+    return bool(mode.ticks(latency_ns, setting).stalled.any())
+
+
+def _longest(ticks: Ticks) -> int:
+    edges = np.diff(ticks.stalled.astype(np.int8), prepend=0, append=0)
+    lengths = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
+    return int(lengths.max(initial=0))
+
+
+def _mean(values: NDArray[Any]) -> float:
+    return float(values.mean()) if values.size else float("nan")

@@ -1,0 +1,100 @@
+"""Ask every s ticks; a new chunk takes over where it is due: real-time chunking and its family, as far as timing goes.
+
+An action of index i is due i ticks after its chunk's observation, on the clock: a stall loses the actions that were due
+meanwhile. The first chunk of all is due from the tick on which it arrives.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from s2a_bench.policy.chunks import Action, Cycles, Setting
+from s2a_bench.policy.chunks.cycles import Laid
+
+if TYPE_CHECKING:
+    from s2a_bench.policy.chunks import ChunkStepper, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Replace(Laid):
+    """Ask ``execute`` ticks after the last request; what arrives takes over at its index now - observation.
+
+    ``under_way=one`` waits for the answer before it asks again, so that a cycle lasts max(s, ceil(L / Delta t)) ticks;
+    ``many`` does not, and drops an answer that a newer one has overtaken. With ``assumed`` >= 0 a chunk takes over at
+    that index whatever the delay was: a fixed estimate of d, which makes the robot jump by estimate - d actions.
+    """
+
+    name: ClassVar[str] = "replace"
+
+    execute: Annotated[int, Field(ge=1)] = 8
+    under_way: Literal["one", "many"] = "one"
+    assumed: Annotated[int, Field(ge=-1)] = -1
+
+    def stepper(self, setting: Setting) -> ChunkStepper:
+        """Follow one robot."""
+        return ReplaceStepper(self, setting.horizon)
+
+    def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
+        """Say what becomes of requests with latencies of shape (R,), in ns."""
+        import numpy as np
+
+        from s2a_bench.policy.chunks.cycles import assemble
+
+        delay = setting.delay_ticks(latency_ns)
+        step = np.full(delay.size, self.execute)
+        if self.under_way == "one":
+            step = np.maximum(step, setting.known_ticks(latency_ns))
+        step[:1] = delay[:1] + self.execute
+        leaves = np.concatenate(([0], np.cumsum(step)))
+        request = leaves[:-1]
+        usable = request + delay
+        first = delay.copy() if self.assumed < 0 else np.full_like(delay, self.assumed)
+        first[:1] = 0
+        newer = np.append(np.minimum.accumulate(usable[:0:-1])[::-1], leaves[-1])
+        until = np.minimum(newer, usable + setting.horizon - first)
+        return assemble(request, usable, usable, first, until, ticks=int(leaves[-1]), horizon=setting.horizon)
+
+
+@dataclass(slots=True)
+class ReplaceStepper:
+    """The newest chunk, and from when on its actions are due."""
+
+    rule: Replace
+    horizon: int
+    next_ask: int = 0
+    asked_at: deque[tuple[int, int]] = field(default_factory=deque)
+    """Requests under way, and when they left."""
+    asked: int = 0
+    newest: int = -1
+    due_from: int = 0
+
+    def arrived(self, request: int, actions: int, tick: int) -> None:  # noqa: ARG002 - chunks arrive whole
+        """Take over, unless a newer chunk has."""
+        left_at = dict(self.asked_at)[request]
+        self.asked_at.remove((request, left_at))
+        if request == 0:
+            self.next_ask = tick + self.rule.execute
+        if request > self.newest:
+            self.newest = request
+            self.due_from = left_at if self.rule.assumed < 0 else tick - self.rule.assumed
+            if request == 0:
+                self.due_from = tick
+
+    def ask(self, tick: int) -> bool:
+        """Ask every so many ticks, and first of all at once."""
+        waits = self.asked_at and (self.rule.under_way == "one" or self.newest < 0)
+        if tick < self.next_ask or waits:
+            return False
+        self.asked_at.append((self.asked, tick))
+        self.asked += 1
+        self.next_ask = tick + self.rule.execute
+        return True
+
+    def act(self, tick: int) -> Action | None:
+        """Execute the action that is due."""
+        index = tick - self.due_from
+        return Action(self.newest, index) if self.newest >= 0 and index < self.horizon else None
