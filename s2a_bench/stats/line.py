@@ -1,8 +1,8 @@
 """Straight lines through groups of measurements, a fixed cost and a cost a unit, with intervals, and where two cross.
 
 A line minimises the *relative* distances of the groups' medians from it: times of small and of large pictures count
-alike. Intervals are percentiles of a bootstrap within each group (Efron and Tibshirani, An Introduction to the
-Bootstrap, 13.3): they hold for the moments that were measured.
+alike. Intervals are percentiles of a bootstrap of two stages (Davison and Hinkley, Bootstrap Methods, 3.8): groups of
+the same x, which are launches, are drawn with replacement, and so are the values within each.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ class Estimate:
 class Line:
     """``y = fixed + slope x``.
 
-    ``worst`` is the largest distance of a group's median from the line, as a share of it: above a tenth or so, what was
-    measured is no line. ``draws`` are (fixed, slope) of the bootstrap: float64 (draws, 2).
+    ``off`` is the root mean square of the medians' distances from the line, as shares of it. ``draws`` are
+    (fixed, slope) of the bootstrap: float64 (draws, 2).
     """
 
     fixed: Estimate
     slope: Estimate
-    worst: float
+    off: float
     draws: Floats
 
     def at(self, x: float) -> float:
@@ -59,17 +59,21 @@ def fit_line(groups: Sequence[tuple[float, Floats]], seed: int = 0) -> Line | No
         return None
     rng = np.random.default_rng(seed)
     y = np.array([np.median(values) for _, values in groups])
-    drawn = np.stack(
-        [np.median(values[rng.integers(values.size, size=(DRAWS, values.size))], 1) for _, values in groups]
-    )
+    picks = [rng.integers(values.size, size=(DRAWS, values.size)) for _, values in groups]
+    within = np.stack([np.median(values[pick], 1) for (_, values), pick in zip(groups, picks, strict=True)])
+    drawn = np.empty_like(within)
+    for size in set(x.tolist()):
+        launches = np.flatnonzero(x == size)
+        which = launches[rng.integers(launches.size, size=(launches.size, DRAWS))]
+        drawn[launches] = within[which, rng.integers(DRAWS, size=which.shape)]
     fixed, slope = _fit(x, y[:, None])
     draws = np.stack(_fit(x, drawn), 1)
-    worst = float(np.max(np.abs(y / (fixed[0] + slope[0] * x) - 1)))
+    off = float(np.sqrt(np.mean(np.square(y / (fixed[0] + slope[0] * x) - 1))))
     (low, low_slope), (high, high_slope) = np.percentile(draws, LIMITS, 0)
     return Line(
         Estimate(float(fixed[0]), float(low), float(high)),
         Estimate(float(slope[0]), float(low_slope), float(high_slope)),
-        worst,
+        off,
         draws,
     )
 

@@ -31,7 +31,7 @@ GROUP_FILLS: Final = {
 
 RESIDUAL_FILL: Final = ("#FFFFFF", "//////")
 
-_OTHER_LOOKS: Final = (("#56B4E9", "-."), ("#F0E442", "--"), ("#999999", ":"), ("#000000", "-"))
+_OTHER_LOOKS: Final = (("#56B4E9", "-."), ("#F0E442", "--"), ("#999999", ":"), ("#666666", "-"))
 
 
 def cell_looks(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, str]]:

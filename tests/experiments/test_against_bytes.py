@@ -9,6 +9,8 @@ import pytest
 
 from s2a_bench.experiments.latency.view.against_bytes import against_bytes, build_lines, crossings, shown
 from s2a_bench.store.run import Run
+from s2a_bench.transport import TRANSPORTS
+from s2a_bench.writers.style import _OTHER_LOOKS
 
 MakeRun = Callable[..., Run]
 FIXED = {"http/binary": 1.0, "ros/topic": 0.2, "loopback": 0.1}
@@ -75,3 +77,8 @@ def test_tables_and_figure_say_what_answered(runs: list[Run]) -> None:
     assert [line.get_label() for line in axes.lines] == ["http/binary", "ros/topic", "loopback"]
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
     assert build_lines(runs, against_bytes(runs)).axes
+
+
+def test_every_transport_looks_like_no_other() -> None:
+    looks = [look for _, each in TRANSPORTS.loaded() for look in each.looks.values()]
+    assert len({*looks, *_OTHER_LOOKS}) == len(looks) + len(_OTHER_LOOKS)

@@ -31,7 +31,7 @@ class Zmq(Transport[ZmqOptions]):
     stages = {"msgpack_pack": "pack", "msgpack_parse": "parse"}
     tells = (PAYLOAD_BYTES, RECONNECTS)
     order = 22
-    looks = {GR00T: ("#6A3D9A", "-")}
+    looks = {GR00T: ("#8C510A", "-")}
     compared_with = ("ros", "loopback")
     packages = ("msgpack", "pyzmq")
     elsewhere = ("url",)
