@@ -1,0 +1,88 @@
+"""The rows of a run of chunks: cells, and the first ticks of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, make_dataclass
+from typing import Annotated, Final
+
+from s2a_bench.experiments.chunks.metrics import METRICS
+from s2a_bench.store.bounds import Count, Many, NonNegative, Positive, about
+from s2a_bench.store.schema import Table
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AboutCell:
+    """What a row of `CHUNKS` says of its cell besides the metrics."""
+
+    cell: str
+    mode: Annotated[str, about("With the parameters that are not at their defaults.")]
+    rule: Annotated[str, about("What chose the trigger: calibrated, tracked, ...; given where the mode names it.")]
+    latency: Annotated[str, about("Where latencies come from, as --latency names it.")]
+    latency_s: Annotated[NonNegative, about("The mean.")]
+    latency_s_p99: NonNegative
+    rounding: Annotated[str, about("The convention for d: floor or ceil of latency over control tick.")]
+    delta_t_s: Positive
+    horizon: Annotated[Many, about("H, actions of a chunk.")]
+    execution_horizon: Annotated[Count, about("s, ticks that a chunk is to be executed for.")]
+    requests: Many
+    trigger: Annotated[
+        NonNegative | None, about("m, actions left at the next request; its mean where a rule moves it.")
+    ] = None
+
+
+ChunkRow: Final = make_dataclass(
+    "ChunkRow",
+    [
+        (name, Annotated[(int if metric.whole else float) | None, metric.schema], field(default=None))
+        for name, metric in METRICS.items()
+    ],
+    bases=(AboutCell,),
+    frozen=True,
+    slots=True,
+    kw_only=True,
+)
+"""A mode and rule under a source of latencies, with a column a metric."""
+
+
+@dataclass(frozen=True, slots=True)
+class TickRow:
+    """One control tick: which request's chunk the action was from, its place there, and the age of the observation.
+
+    ``chunk``, ``index`` and ``age_ticks`` are null for a tick without an action; ``stalled`` if the robot had begun.
+    """
+
+    cell: str
+    tick: int
+    chunk: int | None
+    index: int | None
+    age_ticks: int | None
+    stalled: bool
+
+
+@dataclass(frozen=True, slots=True)
+class RequestRow:
+    """One request: when it left, how long its chunk took, when and from which action on it was executed.
+
+    ``start_tick`` and ``first_index`` are null where no action of it was; ``jump`` is by how many actions the robot was
+    thrown ahead, or back where below 0.
+    """
+
+    cell: str
+    request: int
+    request_tick: int
+    latency_ns: int
+    delay_ticks: int
+    start_tick: int | None
+    first_index: int | None
+    executed: int
+    thrown_away: int
+    stall_ticks: int
+    jump: int | None
+
+
+CHUNKS: Final[Table[AboutCell]] = Table("chunks", ChunkRow)
+"""One row a mode, rule and source of latencies."""
+TICKS: Final[Table[TickRow]] = Table("chunk_ticks", TickRow)
+"""One row a control tick, the first of each cell."""
+REQUESTS: Final[Table[RequestRow]] = Table("chunk_requests", RequestRow)
+"""One row a request that left within those ticks."""
