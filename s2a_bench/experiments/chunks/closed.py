@@ -17,6 +17,7 @@ from s2a_bench.policy.chunks.replace import Replace
 from s2a_bench.policy.chunks.varied import Varied
 
 if TYPE_CHECKING:
+    from s2a_bench.policy import Floats
     from s2a_bench.policy.chunks import Ints, Mode, Setting
 
 
@@ -34,6 +35,24 @@ class Closed:
         if self.wait_ticks is None or self.cycle_ticks is None:
             return None
         return mean_reaction_s(self.wait_ticks, self.cycle_ticks)
+
+    def reaction_ticks(self, shares: Floats) -> Floats | None:
+        """Return the quantiles of the time from an event at a uniform moment to the reaction, for shares of any shape.
+
+        An event falls into a cycle with a chance in proportion to its length, anywhere within it; what is left of the
+        cycle and the next request's wait add up. For constant waits and cycles it is U(w, w + c). Both are whole ticks,
+        so that the distribution is linear between them.
+        """
+        if self.wait_ticks is None or self.cycle_ticks is None:
+            return None
+        rest = np.arange(int(self.cycle_ticks.max()) + 1)
+        longer = np.bincount(self.cycle_ticks, minlength=rest.size)[::-1].cumsum()[::-1]  # cycles of k ticks or more
+        within = longer[1:] / self.cycle_ticks.sum()  # of an event k to k + 1 ticks before the next one
+        least = int(self.wait_ticks.min())
+        waits = np.bincount(self.wait_ticks - least) / self.wait_ticks.size
+        reached = np.concatenate(([0.0], np.cumsum(np.convolve(waits, within))))
+        found: Floats = np.interp(shares, reached, least + np.arange(reached.size))
+        return found
 
 
 def execution_horizon(mode: Mode, setting: Setting) -> int:

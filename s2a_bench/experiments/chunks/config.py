@@ -52,6 +52,9 @@ class ChunksConfig(Options):
     )
     tokens_per_action: int = option(7, "tokens of an action, where a profile answers", ge=1, le=1000)
     shown_ticks: int = option(120, "control ticks of each row that are kept", ge=0, le=100_000)
+    stability: int = option(
+        33, "mean latencies of the stability diagram of the first replace, from 0 to H ticks; 0 for none", ge=0, le=1000
+    )
     seed: int = option(0, "seed of everything that is drawn", ge=0)
 
     @property

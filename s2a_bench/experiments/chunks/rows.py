@@ -1,4 +1,4 @@
-"""The rows of a run of chunks: cells, and the first ticks of each."""
+"""The rows of a run of chunks: cells, the first ticks of each, and what is varied besides."""
 
 from __future__ import annotations
 
@@ -80,9 +80,54 @@ class RequestRow:
     jump: int | None
 
 
+@dataclass(frozen=True, slots=True)
+class TriggerRow:
+    """One trigger of queue under one source of latencies; ``p_stall_closed`` is the share of d above it."""
+
+    latency: str
+    mode: str
+    execution_horizon: int
+    trigger: int
+    boundaries: int
+    p_stall_cycle: float
+    p_stall_low: float
+    p_stall_high: float
+    p_stall_closed: float | None
+    age_ticks_mean: float
+
+
+@dataclass(frozen=True, slots=True)
+class StabilityRow:
+    """A mode at one mean latency and execution horizon: the source's latencies, all longer or shorter by one factor."""
+
+    latency: str
+    mode: str
+    latency_s: float
+    execution_horizon: int
+    requests: int
+    stall_share: float | None
+    p_stall_cycle: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class ReactionRow:
+    """A quantile of a cell's reaction times: as simulated, and by the closed form where it holds."""
+
+    cell: str
+    share: float
+    reaction_s: float
+    closed_s: float | None
+
+
 CHUNKS: Final[Table[AboutCell]] = Table("chunks", ChunkRow)
 """One row a mode, rule and source of latencies."""
 TICKS: Final[Table[TickRow]] = Table("chunk_ticks", TickRow)
 """One row a control tick, the first of each cell."""
 REQUESTS: Final[Table[RequestRow]] = Table("chunk_requests", RequestRow)
 """One row a request that left within those ticks."""
+TRIGGERS: Final[Table[TriggerRow]] = Table("chunk_triggers", TriggerRow)
+"""One row a trigger and source of latencies."""
+STABILITY: Final[Table[StabilityRow]] = Table("chunk_stability", StabilityRow)
+"""One row a mean latency and execution horizon."""
+REACTIONS: Final[Table[ReactionRow]] = Table("chunk_reactions", ReactionRow)
+"""One row a cell and quantile."""

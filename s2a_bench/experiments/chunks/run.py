@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells, draw
 from s2a_bench.experiments.chunks.config import ChunksConfig
-from s2a_bench.experiments.chunks.rows import CHUNKS, REQUESTS, TICKS
-from s2a_bench.experiments.chunks.to_rows import chunk_row, request_rows, tick_rows
+from s2a_bench.experiments.chunks.rows import CHUNKS, REACTIONS, REQUESTS, STABILITY, TICKS, TRIGGERS
+from s2a_bench.experiments.chunks.to_rows import chunk_row, reaction_rows, reactions_s, request_rows, tick_rows
+from s2a_bench.experiments.chunks.varying import stability_rows, trigger_rows
 from s2a_bench.experiments.study.worlds import generator
 from s2a_bench.machine import environment
 from s2a_bench.provenance import Origins, Provenance
@@ -36,19 +37,26 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
             Provenance.computed(), {cell.cell: cell.drawn.source.provenance for cell in tried}
         ).to_manifest(),
     }
-    with RunWriter.create(output, "chunks", manifest, (CHUNKS, TICKS, REQUESTS)) as writer:
+    with RunWriter.create(output, "chunks", manifest, (CHUNKS, REACTIONS, TICKS, REQUESTS)) as writer:
         progress.opened(writer.path)
         progress.stage("acting in virtual time")
+        progress.expect(len(tried))
         for cell in tried:
             _simulate(config, cell, writer)
+            progress.advance()
+        for each in drawn:
+            writer.append(TRIGGERS, trigger_rows(config, each))
+        writer.append(STABILITY, stability_rows(config, drawn[0]))
         return writer.path
 
 
 def _simulate(config: ChunksConfig, cell: Cell, writer: RunWriter) -> None:
     setting, latency_ns = config.setting, cell.drawn.judged
     cycles, ticks = cell.mode.cycles(latency_ns, setting), cell.mode.ticks(latency_ns, setting)
-    events = generator(config.seed, "chunks events")
-    writer.append(CHUNKS, [chunk_row(cell, setting, cycles, ticks, epsilon=config.epsilon, rng=events)])
+    reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
+    row = chunk_row(cell, setting, cycles, ticks, epsilon=config.epsilon, reaction_s=reaction_s)
+    writer.append(CHUNKS, [row])
+    writer.append(REACTIONS, reaction_rows(cell, latency_ns, setting, reaction_s))
     writer.append(TICKS, tick_rows(cell.cell, ticks, config.shown_ticks))
     writer.append(REQUESTS, request_rows(cell.cell, latency_ns, cycles, config.shown_ticks))
 

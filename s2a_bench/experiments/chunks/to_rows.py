@@ -11,7 +11,7 @@ import numpy as np
 
 from s2a_bench.experiments.chunks.closed import assumed_ticks, beta, closed, execution_horizon
 from s2a_bench.experiments.chunks.metrics import METRICS
-from s2a_bench.experiments.chunks.rows import AboutCell, ChunkRow, RequestRow, TickRow
+from s2a_bench.experiments.chunks.rows import AboutCell, ChunkRow, ReactionRow, RequestRow, TickRow
 from s2a_bench.policy.chunks.metrics import margin_ticks, measure, reaction_ticks
 from s2a_bench.policy.conformal import upper_bound
 
@@ -20,19 +20,21 @@ if TYPE_CHECKING:
     from s2a_bench.policy import Floats
     from s2a_bench.policy.chunks import Cycles, Ints, Setting, Ticks
 
-EVENTS: Final = 20_000
+EVENTS: Final = 100_000
 """Moments of events that reactions are measured at."""
+SHARES: Final = np.linspace(0, 1, 51)
+"""Of the quantiles of reaction times that are kept."""
 _SIDE: Final = 0.975
 """Confidence of each end of a two-sided 95 % interval."""
 
 
 def chunk_row(
-    cell: Cell, setting: Setting, cycles: Cycles, ticks: Ticks, *, epsilon: float, rng: np.random.Generator
+    cell: Cell, setting: Setting, cycles: Cycles, ticks: Ticks, *, epsilon: float, reaction_s: Floats
 ) -> AboutCell:
-    """Describe a cell's run; ``rng`` draws the moments of events, ``epsilon`` is the share that may stall."""
+    """Describe a cell's run; ``reaction_s`` are its reaction times, ``epsilon`` is the share that may stall."""
     latency_s = cell.drawn.judged / 1e9
     triggers = cell.triggers or ((cell.mode.trigger,) if hasattr(cell.mode, "trigger") else ())
-    values = metrics_of(cell, setting, cycles, ticks, rng)
+    values = metrics_of(cell, setting, cycles, ticks, reaction_s)
     values["slow_down"] = beta(cell.mode, cell.drawn.judged, setting, epsilon)
     row: AboutCell = ChunkRow(
         cell=cell.cell,
@@ -53,14 +55,14 @@ def chunk_row(
 
 
 def metrics_of(
-    cell: Cell, setting: Setting, cycles: Cycles, ticks: Ticks, rng: np.random.Generator
+    cell: Cell, setting: Setting, cycles: Cycles, ticks: Ticks, reaction_s: Floats
 ) -> dict[str, float | None]:
     """Return the value of every metric of what was simulated; NaN or None where there is none."""
     period_s, latency_ns = setting.period_ns / 1e9, cell.drawn.judged
     found: dict[str, Any] = asdict(measure(cell.mode, cycles, ticks))
     settled = cycles.settled
     boundaries, stalled = int(settled.sum()), int((cycles.stall_ticks[settled] > 0).sum())
-    reaction_s = reactions_s(cycles, ticks, setting, rng)
+    low, high = interval(stalled, boundaries)
     expected = closed(cell.mode, latency_ns, setting)
     mean_reaction = expected.mean_reaction_ticks
     delay = cycles.delay_ticks
@@ -70,8 +72,8 @@ def metrics_of(
         "stall_ticks_per_s": found["stall_ticks"] / length / period_s,
         "boundaries": boundaries,
         "stalled_cycles": stalled,
-        "p_stall_low": 1 - upper_bound(boundaries - stalled, boundaries, _SIDE) if boundaries else None,
-        "p_stall_high": upper_bound(stalled, boundaries, _SIDE) if boundaries else None,
+        "p_stall_low": low,
+        "p_stall_high": high,
         "p_stall_closed": expected.p_stall,
         "reaction_s_mean": float(reaction_s.mean()) if reaction_s.size else None,
         "reaction_s_p99": float(np.quantile(reaction_s, 0.99)) if reaction_s.size else None,
@@ -87,6 +89,13 @@ def metrics_of(
     }
 
 
+def interval(stalled: int, cycles: int) -> tuple[float | None, float | None]:
+    """Return the two-sided 95 % interval of a share (Clopper and Pearson); None of nothing."""
+    if not cycles:
+        return None, None
+    return 1 - upper_bound(cycles - stalled, cycles, _SIDE), upper_bound(stalled, cycles, _SIDE)
+
+
 def reactions_s(cycles: Cycles, ticks: Ticks, setting: Setting, rng: np.random.Generator) -> Floats:
     """Return the reaction times to events at uniform moments from the first action to the last request, in s."""
     acted = ticks.chunk >= 0
@@ -95,6 +104,18 @@ def reactions_s(cycles: Cycles, ticks: Ticks, setting: Setting, rng: np.random.G
     moments = rng.uniform(int(acted.argmax()), max(int(cycles.request_tick[-1]), int(acted.argmax())), EVENTS)
     found = reaction_ticks(cycles, moments) * (setting.period_ns / 1e9)
     return found[~np.isnan(found)]
+
+
+def reaction_rows(cell: Cell, latency_ns: Ints, setting: Setting, reaction_s: Floats) -> Iterator[ReactionRow]:
+    """Yield the quantiles of a cell's reaction times, none where there are none."""
+    if not reaction_s.size:
+        return
+    period_s = setting.period_ns / 1e9
+    told = closed(cell.mode, latency_ns, setting).reaction_ticks(SHARES)
+    found = np.quantile(reaction_s, SHARES).tolist()
+    closed_s = [None] * SHARES.size if told is None else (told * period_s).tolist()
+    for share, simulated_s, expected_s in zip(SHARES.tolist(), found, closed_s, strict=True):
+        yield ReactionRow(cell.cell, share, simulated_s, expected_s)
 
 
 def tick_rows(cell: str, ticks: Ticks, most: int) -> Iterator[TickRow]:

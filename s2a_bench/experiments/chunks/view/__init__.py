@@ -1,4 +1,4 @@
-"""How a run of chunks is shown: its tables, sentences and JSON."""
+"""How a run of chunks is shown: its tables, figures, sentences and JSON."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 def show(run: Run, **_: Any) -> Shown:
     """Return what a run of chunks shows."""
+    from s2a_bench.experiments.chunks.view.figures import chunk_figures
     from s2a_bench.experiments.chunks.view.tables import chunk_csv, chunk_json, chunk_sentences, chunk_tables
 
     tables = chunk_tables(run)
@@ -21,5 +22,6 @@ def show(run: Run, **_: Any) -> Shown:
         main=["chunks"],
         notes=tables["chunks"].notes,
         csvs=chunk_csv(run),
+        figures=chunk_figures(run),
         json=lambda: chunk_json(run),
     )
