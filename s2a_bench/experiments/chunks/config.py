@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import BeforeValidator
@@ -55,6 +56,9 @@ class ChunksConfig(Options):
     stability: int = option(
         33, "mean latencies of the stability diagram of the first replace, from 0 to H ticks; 0 for none", ge=0, le=1000
     )
+    export_delays: Path | None = option(
+        None, "also write each request's times, L and d as CSV, for other simulators; of one source of latencies"
+    )
     seed: int = option(0, "seed of everything that is drawn", ge=0)
 
     @property
@@ -106,6 +110,7 @@ class ChunksConfig(Options):
         for field in ("modes", "latency"):
             if not getattr(self, field):
                 raise UsageError(f"`{field}`: name at least one")
+        self._check_export()
         for source in self.sources:
             recorded = source.recorded_ns
             learnt = self.calibration_cycles if recorded is None else min(self.calibration_cycles, recorded.size // 2)
@@ -114,9 +119,21 @@ class ChunksConfig(Options):
             if recorded is not None and recorded.size - learnt * self.with_rules < 2:  # noqa: PLR2004 - a boundary
                 raise UsageError(f"`latency`: {source.name} has {recorded.size} latencies; two or more are needed")
 
+    def _check_export(self) -> None:
+        file = self.export_delays
+        if file is None:
+            return
+        if len(self.sources) != 1:
+            names = ", ".join(source.name for source in self.sources)
+            raise UsageError(f"`export_delays`: {len(self.sources)} sources of `latency`, {names}; name one of them")
+        if file.suffix != ".csv" or not file.parent.is_dir():
+            raise UsageError(f"`export_delays`: {file} should be a .csv file in a folder that there is")
+
     def to_manifest(self) -> dict[str, Any]:
         """Return the options as plain data, with the numbers that follow from others."""
-        return {**self.model_dump(), "modes": list(self.made), "period_ns": self.setting.period_ns}
+        file = None if self.export_delays is None else str(self.export_delays)
+        more = {"modes": list(self.made), "period_ns": self.setting.period_ns, "export_delays": file}
+        return {**self.model_dump(), **more}
 
 
 def _promised(name: str, learnt: int, epsilon: float, check: Any) -> None:

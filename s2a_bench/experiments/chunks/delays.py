@@ -18,14 +18,15 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import StoreError, UsageError
 
 if TYPE_CHECKING:
-    from s2a_bench.policy.chunks import Ints
+    from s2a_bench.experiments.chunks.cells import Drawn
+    from s2a_bench.policy.chunks import Ints, Mode, Setting
 
 LATENCY: Final = {"latency_ns": 1, "latency_ms": 1_000_000, "latency_s": 1_000_000_000}
 """Column -> ns in its unit."""
@@ -86,7 +87,37 @@ def _latency(row: Mapping[str, str], latency_of: Callable[[Mapping[str, str]], f
     return round(latency_ns)
 
 
-def write_delays(path: Path, rows: list[dict[str, object]]) -> None:
+def delay_rows(drawn: Drawn, mode: Mode, setting: Setting) -> Iterator[dict[str, object]]:
+    """Yield a row a request: of measured latencies when each really was made, else as ``mode`` makes them.
+
+    Of a measured run all requests that count are there, also those that rules learn from.
+    """
+    source = drawn.source
+    requests = source.requests or _simulated(drawn, mode, setting)
+    for number, request in enumerate(requests):
+        yield {
+            "request": number,
+            "provenance": source.provenance.code,
+            **{name: "" if value is None else value for name, value in request.items()},
+            "d": _delay(request["latency_ns"], setting),
+            "rounding": setting.rounding,
+            "delta_t_ns": setting.period_ns,
+        }
+
+
+def _simulated(drawn: Drawn, mode: Mode, setting: Setting) -> Iterator[dict[str, object]]:
+    asked_ns = mode.cycles(drawn.judged, setting).request_tick * setting.period_ns
+    for at_ns, latency_ns in zip(asked_ns.tolist(), drawn.judged.tolist(), strict=True):
+        yield {"observation_ns": at_ns, "received_ns": at_ns + latency_ns, "latency_ns": latency_ns}
+
+
+def _delay(latency_ns: object, setting: Setting) -> int:
+    import numpy as np
+
+    return int(setting.delay_ticks(np.array([latency_ns], np.int64))[0])
+
+
+def write_delays(path: Path, rows: Iterable[Mapping[str, object]]) -> None:
     """Write rows, each with some of `COLUMNS`; raises StoreError where that fails."""
     try:
         with path.open("w", encoding="utf-8", newline="") as file:

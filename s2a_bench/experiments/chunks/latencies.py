@@ -6,7 +6,8 @@ pauses come alone. Successive values of a family that remembers (markov, bursty,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 EXAMPLE: Final = "lognormal:mean_ms=80,cv=0.5"
 LONGEST_MS: Final = 3_600_000.0
+_PARAMETER: Final = re.compile(r"\s*\w+\s*=")
 _KINDS: Final = "should be a number of ms, a family, a .csv file, a run folder, or a profile of 'profile list'"
 
 
@@ -37,6 +39,8 @@ class Source:
     tokens: int = 0
     """Tokens of a chunk, where a profile answers."""
     weights: str = NONE
+    requests: tuple[Mapping[str, object], ...] = ()
+    """Of measured ones what is known of each request, by the columns of `delays.COLUMNS`."""
 
     @property
     def provenance(self) -> Provenance:
@@ -62,9 +66,9 @@ class Source:
 
 
 def sources(written: str, tokens: int) -> Iterator[Source]:
-    """Read one source as people write it, each cell of a run folder by itself; raises S2AError naming the field.
+    """Read one source as people write it; raises S2AError naming the field.
 
-    ``tokens`` are those of a chunk, where a profile answers.
+    A run folder has a source a cell, FOLDER#CELL one alone. ``tokens`` are those of a chunk, where a profile answers.
     """
     if (constant := _number(written)) is not None:
         if not 0 <= constant <= LONGEST_MS:
@@ -76,10 +80,10 @@ def sources(written: str, tokens: int) -> Iterator[Source]:
         from s2a_bench.experiments.chunks.delays import read_delays
 
         yield Source(written, recorded_ns=read_delays(Path(written)))
-    elif Path(written).is_dir():
+    elif Path(folder := written.partition("#")[0]).is_dir():
         from s2a_bench.experiments.chunks.measured import measured
 
-        yield from measured(Path(written))
+        yield from measured(Path(folder), written.partition("#")[2])
     else:
         yield _of_profile(written, tokens)
 
@@ -113,7 +117,7 @@ def split(value: object) -> object:
         return tuple(map(str, value)) if isinstance(value, (list, tuple)) else (str(value),)
     found: list[str] = []
     for part in (part.strip() for part in value.split(",") if part.strip()):
-        goes_on = found and ":" in found[-1] and "=" in part and ":" not in part
+        goes_on = found and ":" in found[-1] and _PARAMETER.match(part)
         found[-1:] = [f"{found[-1]},{part}"] if goes_on else [*found[-1:], part]
     return tuple(dict.fromkeys(found))
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells, draw
 from s2a_bench.experiments.chunks.config import ChunksConfig
+from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
 from s2a_bench.experiments.chunks.rows import CHUNKS, REACTIONS, REQUESTS, STABILITY, TICKS, TRIGGERS
 from s2a_bench.experiments.chunks.to_rows import chunk_row, reaction_rows, reactions_s, request_rows, tick_rows
 from s2a_bench.experiments.chunks.varying import stability_rows, trigger_rows
@@ -47,6 +48,8 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
         for each in drawn:
             writer.append(TRIGGERS, trigger_rows(config, each))
         writer.append(STABILITY, stability_rows(config, drawn[0]))
+        if config.export_delays is not None:
+            write_delays(config.export_delays, delay_rows(drawn[0], tried[0].mode, config.setting))
         return writer.path
 
 

@@ -26,10 +26,14 @@ def drawn(written: str, count: int = 2000) -> np.ndarray:
 
 
 def test_commas_stand_between_sources_and_between_the_parameters_of_a_family() -> None:
-    assert split("40, lognormal:mean_ms=80,cv=.5,runs/a.csv,bursty:mean_ms=9,cv=0,burst_tokens=3,within=.1") == (
+    assert split(
+        "40, lognormal:mean_ms=80,cv=.5,runs/a.csv,runs/b#ros/topic?payload=yuyv,"
+        "bursty:mean_ms=9,cv=0,burst_tokens=3,within=.1"
+    ) == (
         "40",
         "lognormal:mean_ms=80,cv=.5",
         "runs/a.csv",
+        "runs/b#ros/topic?payload=yuyv",
         "bursty:mean_ms=9,cv=0,burst_tokens=3,within=.1",
     )
     assert split("40,40,60") == ("40", "60")

@@ -68,7 +68,7 @@ def build_lanes(run: Run) -> Figure:
         draw_lane(axes, lane, place, oldest)
     axes.set_yticks(range(len(lanes)), [_label(lane, several=several) for lane in lanes])
     axes.tick_params(axis="y", length=0)
-    axes.set_ylim(len(lanes) - 0.4, -0.6)
+    axes.set_ylim(len(lanes) - 0.33, -0.6)
     axes.set_xlim(0, max(len(lane.ticks) for lane in lanes))
     axes.set_xlabel("control tick")
     figure.legend(handles=_legend(oldest), loc="outside lower center", ncols=5, columnspacing=1.0)

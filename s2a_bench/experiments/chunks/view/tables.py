@@ -185,4 +185,6 @@ def _notes(run: Run) -> Iterator[str]:
             f"Rules choose m of queue: calibrated for P(stall) <= {asked['epsilon']:.2%}, tracked from there, "
             "lerobot's maximum, the mean, an oracle that knows the distribution. All others saw the same cycles before."
         )
-    yield Note("EMULATED: latencies are given, ticks are counted, nothing was measured.", EMULATED)
+    yield Note(
+        "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
+    )
