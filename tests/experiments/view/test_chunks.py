@@ -11,7 +11,7 @@ from s2a_bench.experiments.chunks import EXPERIMENT
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.chunks.view.figures import build_reactions, build_stability, build_triggers
-from s2a_bench.experiments.chunks.view.lanes import build_lanes, lanes_of
+from s2a_bench.experiments.chunks.view.lanes import build_lanes, lanes_of, short
 from s2a_bench.experiments.chunks.view.tables import action_table, chunk_sentences, delay_table, stall_table
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
@@ -90,7 +90,8 @@ def test_triggers_are_a_line_a_source_with_a_mark_a_rule(run: Run) -> None:
     axes = drawn(run, build_triggers).axes[0]
     assert axes.get_yscale() == "log"
     labels = {str(line.get_label()) for line in axes.lines}
-    assert {"60", "lognormal:mean_ms=80,cv=.5", "calibrated", "oracle", "epsilon = 0.01"} <= labels
+    assert {"60", "lognormal:mean_ms=80,cv=.5", "calibrated", "oracle"} <= labels
+    assert [text.get_text() for text in axes.texts] == ["epsilon = 0.01"]
 
 
 def test_reactions_have_the_closed_form_drawn_over_them(run: Run) -> None:
@@ -110,6 +111,11 @@ def test_every_figure_is_written_and_says_where_its_numbers_come_from(run: Run) 
         "triggers.png",
         "reactions.png",
     ]
+
+
+def test_a_long_name_is_cut_and_a_short_one_is_not() -> None:
+    assert short("bimodal:mean_ms=80", 30) == "bimodal:mean_ms=80"
+    assert short("bimodal:mean_ms=80", 10) == "bimodal..."
 
 
 def test_what_a_run_has_no_rows_for_is_not_drawn(tmp_path_factory: pytest.TempPathFactory) -> None:

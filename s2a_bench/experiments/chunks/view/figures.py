@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.experiments.chunks.rows import REACTIONS, STABILITY, TRIGGERS
+from s2a_bench.experiments.chunks.view.lanes import build_lanes, lanes_of, short
 from s2a_bench.experiments.chunks.view.tables import rows_of, sources_of
 from s2a_bench.writers.figures import LINE_CHARS, new_figure
 
@@ -39,8 +40,6 @@ _BULK: Final = 0.985
 
 def chunk_figures(run: Run) -> dict[str, Callable[[], Figure]]:
     """Return each figure that the run has rows for, by its file's name."""
-    from s2a_bench.experiments.chunks.view.lanes import build_lanes, lanes_of
-
     found: dict[str, Callable[[], Figure]] = {}
     if lanes_of(run):
         found["lanes"] = partial(build_lanes, run)
@@ -92,21 +91,21 @@ def build_triggers(run: Run) -> Figure:
     """Draw P(stall) over the trigger with its closed form, a line a source, and where each rule ends up."""
     rows = run.table(TRIGGERS)
     epsilon = float(run.manifest["configuration"]["epsilon"])
-    figure = new_figure(
-        2.9,
-        _title(
-            run, "P(stall) of queue against its trigger", "line: closed form; dots: simulated; 0 lies at the bottom"
-        ),
-    )
-    axes = figure.subplots()
     groups = sources_of(rows_of(run))[:_MOST_PANELS]
+    more = "line: closed form; dots: simulated; 0 lies at the bottom"
+    figure = new_figure(2.6 + 0.16 * len(groups), _title(run, "P(stall) against the trigger of queue", more))
+    axes = figure.subplots()
+    sources: list[Any] = []
+    rules: list[Any] = []
     floor = min(epsilon, 1 / max(int(rows["boundaries"].max()), 1)) / 2
     for place, (name, cells) in enumerate(groups):
         colour, line, _ = LOOKS[place % len(LOOKS)]
         mine = rows[rows["latency"] == name]
         told = mine[mine["p_stall_closed"].notna()]
         closed = np.maximum(told["p_stall_closed"].to_numpy(dtype="float64"), floor)
-        axes.plot(told["trigger"].to_numpy(dtype="float64"), closed, line, color=colour, linewidth=0.9, label=name)
+        axes.plot(told["trigger"].to_numpy(dtype="float64"), closed, line, color=colour, linewidth=0.9)
+        label = short(name, LINE_CHARS - 8)
+        sources += axes.plot([], [], line, color=colour, label=label)
         share = mine["p_stall_cycle"].to_numpy(dtype="float64")
         above = share - mine["p_stall_low"].to_numpy(dtype="float64")
         below = mine["p_stall_high"].to_numpy(dtype="float64") - share
@@ -126,13 +125,16 @@ def build_triggers(run: Run) -> Figure:
                     axes.plot(cell["trigger"], at, marker, color=colour, markerfacecolor="none", markersize=7)
     for rule, marker in _RULES.items():
         if any(cell["rule"] == rule for _, cells in groups for cell in cells):
-            axes.plot([], [], marker, color=_INK, markerfacecolor="none", markersize=6, linestyle="none", label=rule)
-    axes.axhline(epsilon, color=_INK, linestyle=":", linewidth=0.8, label=f"epsilon = {epsilon:.3g}")
+            look: dict[str, Any] = {"markerfacecolor": "none", "markersize": 6, "linestyle": "none"}
+            rules += axes.plot([], [], marker, color=_INK, label=rule, **look)
+    axes.axhline(epsilon, color=_INK, linestyle=":", linewidth=0.8)
+    axes.text(0.01, epsilon, f"epsilon = {epsilon:.3g}", transform=axes.get_yaxis_transform(), va="bottom")
     axes.set_yscale("log")
     axes.set_ylim(floor * 0.8, 1.3)
     axes.set_xlabel("trigger, m (actions left at the request)")
     axes.set_ylabel("P(stall) a cycle")
-    figure.legend(loc="outside lower center", ncols=2, columnspacing=1.0)
+    axes.legend(handles=rules, loc="upper right", ncols=2, columnspacing=1.0)
+    figure.legend(handles=sources, loc="outside lower center")
     return figure
 
 
@@ -150,7 +152,7 @@ def build_reactions(run: Run) -> Figure:
             colour, line, _ = LOOKS[names.index(_who(cell)) % len(LOOKS)]
             mine = rows[rows["cell"] == cell["cell"]]
             _draw_distribution(axes, mine, colour, line)
-        axes.set_title(textwrap.shorten(source, LINE_CHARS, placeholder="..."), loc="left", pad=2)
+        axes.set_title(short(source, LINE_CHARS), loc="left", pad=2)
         axes.set_ylim(0, 1)
         shown = rows[rows["cell"].isin([cell["cell"] for cell in cells if _drawn(cell)]) & (rows["share"] <= _BULK)]
         axes.set_xlim(0, float(shown["reaction_s"].max()) * 1e3 * 1.15)

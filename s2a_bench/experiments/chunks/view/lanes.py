@@ -115,7 +115,12 @@ def _runs(values: np.ndarray) -> list[tuple[int, int]]:
 def _label(lane: Lane, *, several: bool) -> str:
     name = lane.name if lane.rule == "given" else f"{lane.name}, {lane.rule}"
     parts = [name, lane.source] if several else [name]
-    return "\n".join(textwrap.shorten(part, 30, placeholder="...") for part in parts)
+    return "\n".join(short(part, 30) for part in parts)
+
+
+def short(text: str, most: int) -> str:
+    """Return a text of ``most`` letters at most, cut off: `textwrap.shorten` leaves nothing of one long word."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def _legend(oldest: int) -> list[object]:
