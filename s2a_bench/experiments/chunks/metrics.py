@@ -61,6 +61,7 @@ METRICS: Final[Mapping[str, ChunkMetric]] = {
         _ticks("age_ticks_mean", "age", "Of the observation behind an executed action."),
         _ticks("age_ticks_p99", "p99", "Its 99th percentile."),
         _ticks("age_ticks_max", "max", "The greatest."),
+        _ticks("age_ticks_blended", "blended", "Its mean where actions are blended: ages weighted as the actions are."),
         _number("reaction_s_mean", "s", "reaction", "From an event to the start of the first tick that knows of it."),
         _number("reaction_s_p99", "s", "p99", "Its 99th percentile."),
         _number("reaction_s_closed", "s", "closed form", "Its mean by the closed form, in ticks, where that holds."),

@@ -12,6 +12,7 @@ import numpy as np
 from s2a_bench.experiments.chunks.closed import assumed_ticks, beta, closed, execution_horizon
 from s2a_bench.experiments.chunks.metrics import METRICS
 from s2a_bench.experiments.chunks.rows import AboutCell, ChunkRow, ReactionRow, RequestRow, TickRow
+from s2a_bench.policy.chunks.aggregate import Aggregate
 from s2a_bench.policy.chunks.metrics import margin_ticks, measure, reaction_ticks
 from s2a_bench.policy.conformal import upper_bound
 
@@ -75,6 +76,7 @@ def metrics_of(
         "p_stall_low": low,
         "p_stall_high": high,
         "p_stall_closed": expected.p_stall,
+        "age_ticks_blended": _blended(cell, cycles),
         "reaction_s_mean": float(reaction_s.mean()) if reaction_s.size else None,
         "reaction_s_p99": float(np.quantile(reaction_s, 0.99)) if reaction_s.size else None,
         "reaction_s_closed": None if mean_reaction is None else mean_reaction * period_s,
@@ -145,6 +147,14 @@ def request_rows(cell: str, latency_ns: Ints, cycles: Cycles, most: int) -> Iter
             stall_ticks=int(cycles.stall_ticks[request]),
             jump=int(cycles.jump[request]) if executed else None,
         )
+
+
+def _blended(cell: Cell, cycles: Cycles) -> float | None:
+    """Return the mean age behind blended actions, in ticks."""
+    if not isinstance(cell.mode, Aggregate):
+        return None
+    age = cell.mode.blended_age(cycles)
+    return float(np.nanmean(age)) if np.isfinite(age).any() else None
 
 
 def _later(assumed: Any) -> Any:

@@ -80,6 +80,16 @@ def test_with_random_latencies_closed_forms_lie_within_the_interval(run: Run) ->
     assert (told["p_stall_closed"] <= told["p_stall_high"] + 1e-9).all()
 
 
+def test_blended_actions_are_older_than_the_newest_observation_in_them(tmp_path: Path) -> None:
+    kinds = ("latest_only", "weighted_average", "average", "conservative")
+    modes = [f"aggregate?trigger=6&kind={kind}" for kind in kinds]
+    table = ran(tmp_path, modes=modes, latency="60", cycles=500).table(CHUNKS)
+    assert len(set(table["age_ticks_mean"])) == 1
+    assert table["age_ticks_blended"].iloc[0] == pytest.approx(table["age_ticks_mean"].iloc[0])
+    assert table["age_ticks_blended"].is_monotonic_increasing
+    assert table["age_ticks_blended"].is_unique
+
+
 def test_rules_choose_between_the_mean_that_stalls_and_the_maximum_that_is_old(run: Run) -> None:
     found = {rule: row(run, "queue", "lognormal:mean_ms=80,cv=.5", rule) for rule in ChunksConfig().rules}
     assert found["mean"]["p_stall_cycle"] > 0.2
