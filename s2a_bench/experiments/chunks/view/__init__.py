@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 def show(run: Run, **_: Any) -> Shown:
     """Return what a run of chunks shows."""
     from s2a_bench.experiments.chunks.view.figures import chunk_figures
+    from s2a_bench.experiments.chunks.view.lanes import lanes_of
     from s2a_bench.experiments.chunks.view.tables import chunk_csv, chunk_json, chunk_sentences, chunk_tables
 
     tables = chunk_tables(run)
@@ -24,4 +25,5 @@ def show(run: Run, **_: Any) -> Shown:
         csvs=chunk_csv(run),
         figures=chunk_figures(run),
         json=lambda: chunk_json(run),
+        lanes=lanes_of(run),
     )

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 MOST_LANES: Final = 12
 """More would not be legible; chunk_ticks.csv has all."""
 WIDE_IN: Final = 7.16
-_CHUNKS: Final = ("#0072B2", "#56B4E9", "#009E73")
+COLOURS: Final = ("#0072B2", "#56B4E9", "#009E73")
+"""Of chunks that follow one another."""
 _STALL: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
 _BAR: Final = 0.34
 _AGE: Final = 0.42
@@ -39,6 +40,12 @@ class Lane:
     source: str
     ticks: pd.DataFrame
     requests: pd.DataFrame
+    period_s: float
+
+    @property
+    def title(self) -> str:
+        """Return the mode, and the rule that chose its trigger if one did."""
+        return self.name if self.rule == "given" else f"{self.name}, {self.rule}"
 
 
 def lanes_of(run: Run) -> list[Lane]:
@@ -49,7 +56,7 @@ def lanes_of(run: Run) -> list[Lane]:
         mine = ticks[ticks["cell"] == row["cell"]]
         if len(mine) and row["rule"] in {"given", "calibrated"}:
             asked = requests[requests["cell"] == row["cell"]]
-            found.append(Lane(row["mode"], row["rule"], row["latency"], mine, asked))
+            found.append(Lane(row["mode"], row["rule"], row["latency"], mine, asked, row["delta_t_s"]))
     return found[:MOST_LANES]
 
 
@@ -80,12 +87,12 @@ def draw_lane(axes: Axes, lane: Lane, place: int, oldest: int) -> None:
     top = place - _BAR / 2
     chunk = lane.ticks["chunk"].fillna(-1).to_numpy(dtype="int64")
     stalled = lane.ticks["stalled"].to_numpy(dtype="bool")
-    for first, last in _runs(np.where(stalled, -2, chunk)):
+    for first, last in runs_of(np.where(stalled, -2, chunk)):
         width = last - first
         if stalled[first]:
             axes.broken_barh([(first, width)], (top, _BAR), **_STALL)
         elif chunk[first] >= 0:
-            axes.broken_barh([(first, width)], (top, _BAR), color=_CHUNKS[chunk[first] % len(_CHUNKS)], linewidth=0)
+            axes.broken_barh([(first, width)], (top, _BAR), color=COLOURS[chunk[first] % len(COLOURS)], linewidth=0)
     for row in lane.requests.to_dict("records"):
         leaves, usable = row["request_tick"], row["request_tick"] + row["delay_ticks"]
         axes.hlines(top - 0.07, leaves, usable, "#666666", linewidth=0.7)
@@ -105,7 +112,7 @@ def draw_lane(axes: Axes, lane: Lane, place: int, oldest: int) -> None:
     )
 
 
-def _runs(values: np.ndarray) -> list[tuple[int, int]]:
+def runs_of(values: np.ndarray) -> list[tuple[int, int]]:
     """Return from where to before where values are the same."""
     edges = np.flatnonzero(np.diff(values)) + 1
     bounds = [0, *edges.tolist(), values.size]
@@ -113,8 +120,7 @@ def _runs(values: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _label(lane: Lane, *, several: bool) -> str:
-    name = lane.name if lane.rule == "given" else f"{lane.name}, {lane.rule}"
-    parts = [name, lane.source] if several else [name]
+    parts = [lane.title, lane.source] if several else [lane.title]
     return "\n".join(short(part, 30) for part in parts)
 
 
@@ -128,7 +134,7 @@ def _legend(oldest: int) -> list[object]:
     from matplotlib.patches import Patch
 
     return [
-        Patch(color=_CHUNKS[0], label="actions of one chunk (\N{MINUS SIGN}k: thrown away)"),
+        Patch(color=COLOURS[0], label="actions of one chunk (\N{MINUS SIGN}k: thrown away)"),
         Patch(**_STALL, label="stall"),
         Line2D([], [], color="#666666", linewidth=0.7, marker="|", markersize=3, label="request to usable chunk"),
         Line2D([], [], color="#D55E00", linewidth=0.7, label=f"age of the observation, down to {oldest} ticks"),
