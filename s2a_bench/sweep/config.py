@@ -14,7 +14,7 @@ class SweepConfig(Options):
     """A sweep to start, or one to go on with."""
 
     file: str = option(
-        "", "sweep file (TOML), or the name of one: paper, quick; not needed with --resume", argument=True
+        "", "sweep file (TOML), or the name of one: paper, quick, transports; not needed with --resume", argument=True
     )
     resume: Path | None = option(None, "folder of a sweep that was interrupted: run what it has not run yet")
     retry_failed: bool = option(False, "with --resume: run the cells that failed once more")

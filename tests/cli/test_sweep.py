@@ -281,7 +281,7 @@ def test_the_papers_sweep_is_36_timelines(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         ([], "name a sweep file, or the folder of a sweep with --resume"),
-        (["nothing"], "'nothing' is none of paper, quick, and no path"),
+        (["nothing"], "'nothing' is none of paper, quick, transports, and no path"),
         (["none.toml"], "cannot read the sweep file none.toml"),
         (["paper", "--retry-failed"], "--retry-failed: name the sweep's folder with --resume"),
         (["paper", "--ray", "local", "--board", "x"], "--board and --ray are two things"),

@@ -196,7 +196,9 @@ def test_a_real_recording_does_not_reject_the_parametric_replay_of_another(
         write_profile(document(config, [*warm, *recorded], engine.describe(), []), path, force=False)
         assert replayed_ns(path, "trace", 100, 16) == [answer.gaps_ns for answer in recorded]
         played = np.ravel(replayed_ns(path, "parametric", 1, 600_001))
-        assert played.mean() == pytest.approx(np.mean([answer.gaps_ns for answer in recorded]), rel=0.01)
+        spread = 4 * played.std() / played.size**0.5  # a recording with long pauses has a mean that is hard to meet
+        recorded_mean = np.mean([answer.gaps_ns for answer in recorded])
+        assert played.mean() == pytest.approx(recorded_mean, rel=0.01, abs=spread)
         unseen = [random.choice(pair[1].gaps_ns) for pair in pairs]
         assert ks_2samp(unseen, played[:1500] * 1.3).pvalue < 0.01  # it would notice
         rejected.append(ks_2samp(unseen, played[:1500]).pvalue <= 0.01)

@@ -37,8 +37,8 @@ def test_type_hashes_of_the_parameter_services_are_those_of_a_real_ros(name: str
 
 
 def request(**fields: Any) -> Any:
-    whole = {"id": "a", "prompt": "p", "grammar": "", "max_tokens": 1, "seed": 0, "images": [], "compressed_images": []}
-    return ros.message(ros.REQUEST, **(whole | fields))
+    whole = {"id": "a", "prompt": "p", "max_tokens": 1, "state": ros.float32_array([0.5, -2.0])}
+    return ros.default(ros.REQUEST, "6.0", **(whole | fields))
 
 
 def test_cdr_of_a_string_message_by_hand() -> None:
@@ -61,6 +61,7 @@ def test_any_request_survives_cdr(prompt: str, pixels: np.ndarray) -> None:
     sent = request(prompt=prompt, images=[ros.image_message(frame, 7_000_000_009, "camera")])
     got = ros.deserialise(memoryview(ros.serialise(sent, ros.REQUEST)), ros.REQUEST)
     assert got.prompt == prompt
+    assert got.state.tolist() == [0.5, -2.0]
     received = ros.frame_of_image(got.images[0])
     assert (received.width, received.height, received.encoding) == (width, height, "bgr8")
     assert received.stamp_ns == 7_000_000_009

@@ -16,7 +16,8 @@ from s2a_bench.frames import open_source
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros import record
 from s2a_bench.ros.record import Recorder
-from s2a_bench.types import Frame
+from s2a_bench.transport.ros.wire import token_message
+from s2a_bench.types import Frame, Token
 
 STRING = "std_msgs/msg/String"
 
@@ -26,7 +27,7 @@ def cdr(text: str) -> bytearray:
 
 
 def token(index: int) -> Any:
-    return ros.message(ros.TOKEN, id="r", index=index, text=f"t{index}", token=index, last=False, error="", marks=[])
+    return token_message("r", Token(index, f"t{index}", index), last=False)
 
 
 def read(path: Path) -> list[tuple[str, str, int, bytes]]:

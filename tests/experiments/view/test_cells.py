@@ -28,9 +28,9 @@ HAND = {
 
 def test_cells_stand_in_a_fixed_order_whatever_the_order_of_the_samples(make_run: MakeRun) -> None:
     stages = {"capture": 1, "inference": 1, "return": 1}
-    names = ["loopback", "zmq", "ros/topic", "http/binary", "http/as-deployed", "http/best-effort"]
+    names = ["loopback", "pigeon", "ros/topic", "http/binary", "http/as-deployed", "http/best-effort"]
     run = make_run(dict.fromkeys(names, stages), n=2)
-    expected = ["http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "loopback", "zmq"]
+    expected = ["http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "loopback", "pigeon"]
     assert [cell.name for cell in cells_of(run)] == expected
 
 
