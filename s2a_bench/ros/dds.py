@@ -147,6 +147,16 @@ def _matched(ask: Callable[[], list[int]]) -> list[int]:
             return ask()
 
 
+def _known(ask: Callable[[int], Any], handle: int) -> Any:
+    """Return what is known of a peer, None if it has left, even while its quality of service was being read."""
+    try:
+        return ask(handle)
+    except Exception as error:
+        if str(error).startswith("Callfunc"):  # a bare Exception, of cyclonedds' C extension
+            return None
+        raise
+
+
 class RawWriter:
     """A DataWriter that sends ready CDR; callable from any thread."""
 
@@ -170,7 +180,7 @@ class RawWriter:
     def endpoints(self) -> Iterator[Any]:
         """Yield what is known of each matched reader, a DcpsEndpoint."""
         for handle in _matched(self.entity.get_matched_subscriptions):
-            if (endpoint := self.entity.get_matched_subscription_data(handle)) is not None:
+            if (endpoint := _known(self.entity.get_matched_subscription_data, handle)) is not None:
                 yield endpoint
 
     def peers(self) -> Iterator[dict[str, str]]:
@@ -220,7 +230,7 @@ class RawReader:
 
     def endpoint(self, handle: int) -> Any:
         """Return what is known of one matched writer, a DcpsEndpoint; None if it has left."""
-        return self.entity.get_matched_publication_data(handle)
+        return _known(self.entity.get_matched_publication_data, handle)
 
     def endpoints(self) -> Iterator[Any]:
         """Yield what is known of each matched writer."""

@@ -197,8 +197,10 @@ class TransportSuite:
         assert trace.chain()[-1][0] == "return"
 
     def test_several_pictures_and_the_state_reach_the_handler(self, connect: Connect, told: Wiring[Any]) -> None:
+        if not TRANSPORTS[told.transport].takes_state(told.variant, told.options):
+            pytest.skip(f"{told.transport}/{told.variant} carries no observations of policies")
         handler = self.handler(told, ["x"])
-        state = (0.5, -1.25, 3.0) if TRANSPORTS[told.transport].takes_state(told.variant, told.options) else ()
+        state = (0.5, -1.25, 3.0)
         frames = tuple(yuyv_frame(width, height, seed=width) for width, height in ((64, 48), (32, 32), (48, 64)))
         ask(connect(handler), Request("a", "plan", frames, state=state))
         (got,) = handler.requests

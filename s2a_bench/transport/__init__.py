@@ -194,6 +194,8 @@ class Transport(Generic[O]):
     """Code -> ``module:function`` of the doctor's checks that are about it."""
     watches_udp: ClassVar[bool] = False
     """Whether UDP packets that the machine drops during a run are a reason for doubt."""
+    for_policies: ClassVar[bool] = False
+    """Whether its own server and client carry actions as well as tokens, and the robot's state."""
     in_process: ClassVar[bool] = False
     """Whether its server is a thread of the client's process."""
     schemes: ClassVar[tuple[str, ...]] = ()
@@ -227,11 +229,11 @@ class Transport(Generic[O]):
 
     def answers(self, variant: str, options: O) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
         """Return what answers over a variant can be made of: tokens, actions."""
-        return (TOKENS,) if self.foreign_by(options) else (TOKENS, ACTIONS)
+        return (TOKENS, ACTIONS) if self.for_policies and not self.foreign_by(options) else (TOKENS,)
 
     def takes_state(self, variant: str, options: O) -> bool:  # noqa: ARG002 - for subclasses
         """Whether a request over a variant can carry the robot's state."""
-        return not self.foreign_by(options)
+        return self.for_policies and not self.foreign_by(options)
 
     def told(self, options: O) -> Sequence[Fact]:  # noqa: ARG002 - for subclasses
         """Return the facts that may be told with these options, by somebody else's server too."""

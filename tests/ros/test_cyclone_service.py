@@ -52,3 +52,18 @@ def test_garbage_is_dropped_and_logged_once(join: Join, caplog: pytest.LogCaptur
     client = join().service_client(NAME, GET_TYPES)
     assert client.call(ros.default(GET_TYPES + "_Request", names=["abc"]), WAIT_S).types.tolist() == [3]
     assert sum("dropped a request" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_a_peer_that_leaves_while_it_is_looked_at_is_nobody() -> None:
+    from s2a_bench.ros.dds import _known
+
+    def errored(_handle: int) -> None:
+        raise Exception("Callfunc cqos errored.")  # noqa: TRY002 - as cyclonedds does
+
+    def wrong(_handle: int) -> None:
+        raise Exception("something else")  # noqa: TRY002
+
+    assert _known(errored, 1) is None
+    assert _known(lambda handle: handle, 7) == 7
+    with pytest.raises(Exception, match="something else"):
+        _known(wrong, 1)

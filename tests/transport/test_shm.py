@@ -147,7 +147,11 @@ def test_a_server_that_is_killed_in_mid_answer_leaves_nothing_and_the_next_start
             peer.hear("token")
             assert named_memory(server.pid, peer.pid) == []
             os.kill(server.pid, 9)
-            assert peer.hear("end")["error"] == f"ServerDied: the server at {server.address} is gone"
+            error = peer.hear("end")["error"]  # the link may break before the process is seen as ended
+            assert error in {
+                f"ServerDied: the server at {server.address} is gone",
+                f"RequestFailed: {server.address} broke off: it closed the link",
+            }
             assert usage(peer.pid).descriptors < before
         finally:
             peer.close()

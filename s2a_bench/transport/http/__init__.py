@@ -33,6 +33,7 @@ class Http(Transport[HttpOptions]):
     """Base64 and JSON as usually deployed, at their best, the binary control, and llama.cpp's own server."""
 
     name = "http"
+    for_policies = True
     options = HttpOptions
     variants = VARIANTS
     payloads = ("jpeg", "jpeg-preencoded", "png", "raw")

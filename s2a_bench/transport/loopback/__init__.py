@@ -12,6 +12,7 @@ class Loopback(Transport[Options]):
     """A call within the process; no picture travels, whatever the payload is."""
 
     name = "loopback"
+    for_policies = True
     options = Options
     stages = {"hand_over": "parse"}  # making of the request what the handler takes
     order = 100

@@ -27,6 +27,7 @@ class Shm(Transport[ShmOptions]):
     """Request, picture and tokens lie in shared memory; nothing but their places goes through the kernel."""
 
     name = "shm"
+    for_policies = True
     options = ShmOptions
     payloads = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
     stages: ClassVar[Mapping[str, str]] = {"header_pack": "pack", "header_parse": "parse"}

@@ -135,7 +135,7 @@ class ShmClient:
         """Say that the other end is not there any more."""
         if not self._alive():
             return ServerDied(f"the server at {self._path} is gone")
-        return RequestFailed(f"{self._path} broke off: {error or 'it closed the link'}")
+        return RequestFailed(f"{self._path} broke off: {str(error) or 'it closed the link'}")
 
 
 def _header(request: Request, pictures: list[dict[str, Any]]) -> bytes:

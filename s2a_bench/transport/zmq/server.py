@@ -31,7 +31,7 @@ LOOKS_MS: Final = 20
 """How often connections are looked at: over loopback 60 MB may come meanwhile."""
 QUEUED: Final = 8
 """Messages of one client that libzmq keeps for us; those beyond wait in its own machine."""
-LARGE_BYTES: Final = 1 << 25
+LARGE_BYTES: Final = 1 << 22
 """From here on memory that was held goes back to the system."""
 LINGER_NS: Final = 1_000_000_000
 """How long no more than that is held before it does."""
