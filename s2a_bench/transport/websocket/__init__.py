@@ -7,12 +7,13 @@ what a template says (`transport.observation`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from s2a_bench import extras
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS, Fact
-from s2a_bench.transport import ACTIONS, Client, Handler, Server, Transport, Wiring
-from s2a_bench.transport.websocket.options import SCHEMES, WebsocketOptions
+from s2a_bench.transport import ACTIONS, Client, Handler, Server, Wiring
+from s2a_bench.transport.listening import Listening
+from s2a_bench.transport.websocket.options import WebsocketOptions
 
 VARIANTS = ("openpi", "openpi-stream")
 OPENPI, STREAM = VARIANTS
@@ -23,14 +24,14 @@ TIMING = {str(fact): fact for fact in (INFER_MS, PREV_TOTAL_MS)}
 """The keys of ``server_timing`` that are facts."""
 
 
-class Websocket(Transport[WebsocketOptions]):
+class Websocket(Listening[WebsocketOptions]):
     """Policies over WebSocket, whole or streamed."""
 
     name = "websocket"
     options = WebsocketOptions
     variants = VARIANTS
     payloads = ("raw", "jpeg", "jpeg-preencoded", "png")
-    schemes = SCHEMES
+    schemes = WebsocketOptions.SCHEMES
     examines = "s2a_bench.transport.websocket.dangers:examine"
     stages = {
         "msgpack_pack": "pack",
@@ -84,15 +85,6 @@ class Websocket(Transport[WebsocketOptions]):
 
         self._need()
         read_key(options.api_key_env)
-
-    def foreign(self, options: WebsocketOptions) -> str:
-        """Return the URL that a user gave."""
-        return options.url
-
-    def bind(self, options: WebsocketOptions, taken: Sequence[str]) -> str:
-        """Return ``host:port``, with any free port where another server of ours has this one."""
-        wanted = f"{options.host}:{options.port}"
-        return f"{options.host}:0" if wanted in taken else wanted
 
     def ready(self, wiring: Wiring[WebsocketOptions], address: str) -> str:
         """Return where policies are asked, and by whom."""

@@ -2,35 +2,16 @@
 
 from __future__ import annotations
 
-from pydantic import field_validator
+from typing import ClassVar
 
-from s2a_bench.errors import UsageError
 from s2a_bench.options import option
+from s2a_bench.transport.listening import ListeningOptions
 from s2a_bench.transport.observation import DEFAULT, TemplateName
-from s2a_bench.transport.options import SERVER, SERVING, Options
-from s2a_bench.transport.urls import checked_url
-
-SCHEMES = ("ws", "wss")
 
 
-class WebsocketOptions(Options):
+class WebsocketOptions(ListeningOptions):
     """How our policy server is reached, or somebody else's is asked."""
 
-    host: str = option("127.0.0.1", "address that our server binds; others than this machine need a key", side=SERVING)
-    port: int = option(0, "port of the server; 0: any free one", ge=0, le=65535, side=SERVER)
-    url: str = option("", "a policy server that runs already (a black box)", side=SERVER)
+    SCHEMES: ClassVar[tuple[str, ...]] = ("ws", "wss")
+
     template: TemplateName = option(DEFAULT, "what the policy is told: a template's name, or a TOML or JSON file")
-    api_key_env: str = option(
-        "", "NAME of the environment variable with the API key: of the url, or that our server wants", side=SERVER
-    )
-    no_auth: bool = option(False, "let everybody in who reaches the host, without a key", side=SERVING)
-
-    @field_validator("url")
-    @classmethod
-    def _names_a_server(cls, url: str) -> str:
-        return checked_url(url, SCHEMES)
-
-    def check(self) -> None:
-        """Refuse a key that nobody needs."""
-        if self.no_auth and self.api_key_env:
-            raise UsageError("`no_auth` lets everybody in without the key of `api_key_env`; give one of them")

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import errno
-import socket
 from contextlib import suppress
 
 import uvloop
 import websockets.version
 
-from s2a_bench.errors import PortInUse, UsageError
 from s2a_bench.transport import Handler, Wiring
-from s2a_bench.transport.credentials import key_for
+from s2a_bench.transport.listening import bound_socket
 from s2a_bench.transport.turns import Queued
 from s2a_bench.transport.websocket.call import Office, metadata_of
 from s2a_bench.transport.websocket.codec import packb
@@ -32,22 +29,7 @@ class WebsocketServer:
 
         Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
         """
-        host, _, port = (wiring.address.removeprefix("ws://") or "127.0.0.1:0").rpartition(":")
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        options = wiring.options
-        try:
-            self._socket.bind((host or "127.0.0.1", int(port)))
-            key = key_for(self._socket.getsockname()[0], options.api_key_env, everybody=options.no_auth)
-            self._socket.listen()  # only now is the port ours
-        except UsageError:
-            self._socket.close()
-            raise
-        except OSError as error:
-            self._socket.close()
-            if error.errno == errno.EADDRINUSE:
-                raise PortInUse(f"`port`: {port} is in use on {host}; choose another, or 0 for any free one") from error
-            raise PortInUse(f"`port`: cannot bind {host}:{port}: {error.strerror}") from error
+        self._socket, key = bound_socket(wiring.address, "ws", wiring.options)
         self.address = "ws://{}:{}".format(*self._socket.getsockname())
         queued = Queued.around(handler, wiring.limits)
         self._house = House(Office(queued, wiring.limits), key, packb(metadata_of(queued)))

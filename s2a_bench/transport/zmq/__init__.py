@@ -7,26 +7,27 @@ code in it: nothing here does, and whoever still serves it should not let others
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from s2a_bench import extras
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
-from s2a_bench.transport import ACTIONS, Client, Handler, Server, Transport, Wiring
-from s2a_bench.transport.zmq.options import SCHEMES, ZmqOptions
+from s2a_bench.transport import ACTIONS, Client, Handler, Server, Wiring
+from s2a_bench.transport.listening import Listening
+from s2a_bench.transport.zmq.options import ZmqOptions
 
 GR00T = "gr00t"
 PACKAGES = ("msgpack", "zmq")
 """What the extra of its name brings, by the names under which they are imported."""
 
 
-class Zmq(Transport[ZmqOptions]):
+class Zmq(Listening[ZmqOptions]):
     """Policies over ZeroMQ."""
 
     name = "zmq"
     options = ZmqOptions
     variants = (GR00T,)
     payloads = ("raw", "jpeg", "jpeg-preencoded", "png")
-    schemes = SCHEMES
+    schemes = ZmqOptions.SCHEMES
     examines = "s2a_bench.transport.zmq.dangers:examine"
     stages = {"msgpack_pack": "pack", "msgpack_parse": "parse"}
     tells = (PAYLOAD_BYTES, RECONNECTS)
@@ -75,15 +76,6 @@ class Zmq(Transport[ZmqOptions]):
 
         self._need()
         read_key(options.api_key_env)
-
-    def foreign(self, options: ZmqOptions) -> str:
-        """Return the URL that a user gave."""
-        return options.url
-
-    def bind(self, options: ZmqOptions, taken: Sequence[str]) -> str:
-        """Return ``host:port``, with any free port where another server of ours has this one."""
-        wanted = f"{options.host}:{options.port}"
-        return f"{options.host}:0" if wanted in taken else wanted
 
     def ready(self, wiring: Wiring[ZmqOptions], address: str) -> str:
         """Return where policies are asked, and by whom."""

@@ -7,7 +7,6 @@ threads. So the waiting thread must not ask the socket, and waits for its descri
 
 from __future__ import annotations
 
-import errno
 import select
 import socket
 from contextlib import suppress
@@ -17,11 +16,12 @@ from typing import Any, Final
 import zmq
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import Busy, PortInUse, TransportError
+from s2a_bench.errors import Busy, TransportError
 from s2a_bench.machine.tuning import give_back_memory
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.credentials import key_for
+from s2a_bench.transport.listening import cannot_bind, split
 from s2a_bench.transport.turns import Queued
 from s2a_bench.transport.zmq.call import Call, Office
 from s2a_bench.transport.zmq.options import ZmqOptions
@@ -47,9 +47,9 @@ class ZmqServer:
 
         Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
         """
-        told, _, port = (wiring.address.removeprefix("tcp://") or "127.0.0.1:0").rpartition(":")
+        told, port = split(wiring.address, "tcp")
         options, self._limits = wiring.options, wiring.limits
-        host = _resolved(told or "127.0.0.1")
+        host = _resolved(told)
         key = key_for(host, options.api_key_env, everybody=options.no_auth)
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
@@ -66,9 +66,7 @@ class ZmqServer:
             self._router.bind(f"tcp://{host}:{'*' if port == '0' else port}")
         except zmq.ZMQError as error:
             self._close()
-            if error.errno == errno.EADDRINUSE:
-                raise PortInUse(f"`port`: {port} is in use on {host}; choose another, or 0 for any free one") from error
-            raise PortInUse(f"`port`: cannot bind {host}:{port}: {error.strerror}") from error
+            raise cannot_bind(host, port, error.errno, error.strerror) from error
         self.address: str = self._router.get_string(zmq.LAST_ENDPOINT)
         self._office = Office(Queued.around(handler, wiring.limits), wiring.limits, key, options.layout, self._send)
         self._stopped = False
