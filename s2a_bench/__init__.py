@@ -1,7 +1,7 @@
 """s2a-bench: what wiring a vision-language model to a robot costs, and when the robot may act on what it streams.
 
-The library's face: every experiment is a function (`latency`, `throughput`, `timeline`, `boundary`, `study`, `ccrb`),
-`load` opens a run folder, `compare` compares two. See docs/library.md.
+The library's face: every experiment is a function (`latency`, `throughput`, `timeline`, `chunks`, `boundary`, `study`,
+`ccrb`), `load` opens a run folder, `compare` compares two. See docs/library.md.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     boundary = command("boundary")
     ccrb = command("ccrb")
+    chunks = command("chunks")
     latency = command("latency")
     study = command("study")
     throughput = command("throughput")
@@ -25,6 +26,7 @@ __all__ = [
     "Run",
     "boundary",
     "ccrb",
+    "chunks",
     "compare",
     "latency",
     "load",

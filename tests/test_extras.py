@@ -104,11 +104,15 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("timeline", "--profile", "rtx-4080", "--tokens-per-skill", "6"),
         ("boundary", "--data-only"),
         ("ccrb", "--data-only"),
+        ("chunks", "--cycles", "100", "--data-only"),
         ("doctor",),
         ("report", "RUN"),
         ("compare", "RUN", "RUN"),
         ("profile", "list"),
-        *((command, "--help") for command in ("latency", "throughput", "timeline", "boundary", "study", "ccrb")),
+        *(
+            (command, "--help")
+            for command in ("latency", "throughput", "timeline", "boundary", "study", "ccrb", "chunks")
+        ),
         *((command, "--help") for command in ("sweep", "compare", "report", "doctor", "model", "profile", "serve")),
         ("--help",),
     ],

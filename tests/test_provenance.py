@@ -100,10 +100,11 @@ RUNS: dict[str, dict[str, Any]] = {
     "timeline": {"profiles": ["rtx-4080"], "tokens_per_skill": [6]},
     "boundary": {"profiles": ["rtx-4080"], "tokens_per_skill": [6], "rates": (1.0, 10.0)},
     "ccrb": {},
+    "chunks": {"cycles": 100, "latency": ["40", "lognormal:mean_ms=80,cv=.5"]},
 }
 
 
-@pytest.mark.parametrize("name", ["latency", "timeline", "boundary", "ccrb"])
+@pytest.mark.parametrize("name", ["latency", "timeline", "boundary", "ccrb", "chunks"])
 def test_every_table_csv_figure_page_and_json_of_every_experiment_has_it(name: str, tmp_path: Path) -> None:
     run = getattr(s2a, name)(output=tmp_path, **RUNS[name])
     stored = read_run(run.path)

@@ -1,4 +1,4 @@
-"""Draw the figures of docs/policies.md, docs/timeline.md, docs/boundary.md: `.venv/bin/python tools/docs_figures.py`.
+"""Draw the figures of docs/{policies,timeline,boundary,chunks}.md: `.venv/bin/python tools/docs_figures.py`.
 
 They come from runs in virtual time with fixed seeds, so that running this again changes no figure. Those of
 docs/studies.md take minutes and are drawn where they are named: `... study-targets study-frontier`.
@@ -18,6 +18,10 @@ import numpy as np
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
 from s2a_bench.experiments.boundary.view.figure import build_boundary
+from s2a_bench.experiments.chunks.config import ChunksConfig
+from s2a_bench.experiments.chunks.run import run_chunks
+from s2a_bench.experiments.chunks.view.figures import build_reactions, build_stability, build_triggers
+from s2a_bench.experiments.chunks.view.lanes import build_lanes
 from s2a_bench.experiments.study.config import StudyConfig
 from s2a_bench.experiments.study.run import run_study
 from s2a_bench.experiments.study.view.figures import build_frontier, build_targets
@@ -38,6 +42,10 @@ if TYPE_CHECKING:
 FOLDER = Path(__file__).parent.parent / "docs" / "figures"
 DPI = 150
 ORIN = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
+
+
+SPREAD = "lognormal:mean_ms=80,cv=.5"
+SLOW_ONES = "bimodal:mean_ms=80,cv=.2,pause_share=.05,pause_ratio=3"
 
 
 class Quiet:
@@ -65,6 +73,11 @@ def timelines(config: TimelineConfig) -> Figure:
 def boundary(config: BoundaryConfig) -> Figure:
     """Draw a boundary run."""
     return build_boundary(_run(lambda output: run_boundary(config, output, Quiet())))
+
+
+def chunks(latency: str) -> Run:
+    """Make a run of chunks, four modes and the rules."""
+    return _run(lambda output: run_chunks(ChunksConfig(latency=latency, shown_ticks=90), output, Quiet()))
 
 
 def study(config: StudyConfig) -> Run:
@@ -124,6 +137,11 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "timeline": lambda: timelines(TimelineConfig()),
     "boundary": lambda: boundary(BoundaryConfig()),
     "boundary-jitter": lambda: boundary(BoundaryConfig(jitter="lognormal:cv=0.2")),
+    "chunks-lanes": lambda: build_lanes(chunks(SPREAD)),
+    "chunks-stability": lambda: build_stability(chunks("80")),
+    "chunks-stability-spread": lambda: build_stability(chunks(SPREAD)),
+    "chunks-triggers": lambda: build_triggers(chunks(f"{SPREAD},{SLOW_ONES}")),
+    "chunks-reactions": lambda: build_reactions(chunks("80")),
 }
 
 SLOW: dict[str, Callable[[], Figure]] = {

@@ -188,6 +188,7 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
     {
         "boundary": "s2a_bench.experiments.boundary:EXPERIMENT",
         "ccrb": "s2a_bench.experiments.ccrb:EXPERIMENT",
+        "chunks": "s2a_bench.experiments.chunks:EXPERIMENT",
         "latency": "s2a_bench.experiments.latency:EXPERIMENT",
         "throughput": "s2a_bench.experiments.throughput:EXPERIMENT",
         "timeline": "s2a_bench.experiments.timeline:EXPERIMENT",

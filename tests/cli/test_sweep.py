@@ -297,7 +297,7 @@ def test_wrong_use_is_one_line(arguments: list[str], message: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('command = "fly"', "command: 'fly' is none of boundary, ccrb, latency"),
+        ('command = "fly"', "command: 'fly' is none of boundary, ccrb, chunks, latency"),
         (
             'command = "timeline"\n[settings]\npolicies = "naive"',
             "'policies' is no flag of s2a-bench timeline; did you mean policy?",

@@ -33,12 +33,12 @@ class Queue(Laid):
 
     def stepper(self, setting: Setting) -> ChunkStepper:
         """Follow one robot."""
-        return QueueStepper(self.trigger, _length(self.execute, setting))
+        return QueueStepper(self.trigger, length_of(self.execute, setting))
 
     def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
         """Say what becomes of requests with latencies of shape (R,), in ns."""
         delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
-        return _append(delay, known, delay, self.trigger, _length(self.execute, setting), setting.horizon)
+        return _append(delay, known, delay, self.trigger, length_of(self.execute, setting), setting.horizon)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,17 +84,17 @@ class Streamed(Laid):
     def hold_ticks(self, setting: Setting) -> int:
         """Return for how many ticks the first action is held back, S0 - L rounded up."""
         slower_ns = max(0, self.gap_ns - setting.period_ns) if self.start == "safe" else 0
-        return -(-(_length(self.execute, setting) - 1) * slower_ns // setting.period_ns)
+        return -(-(length_of(self.execute, setting) - 1) * slower_ns // setting.period_ns)
 
     def stepper(self, setting: Setting) -> ChunkStepper:
         """Follow one robot."""
-        return QueueStepper(self.trigger, _length(self.execute, setting), self.hold_ticks(setting))
+        return QueueStepper(self.trigger, length_of(self.execute, setting), self.hold_ticks(setting))
 
     def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
         """Say what becomes of requests whose first actions have latencies of shape (R,), in ns."""
         if self.start == "naive" and self.gap_ns > setting.period_ns:
             return step(self, latency_ns, setting)[0]
-        length = _length(self.execute, setting)
+        length = length_of(self.execute, setting)
         known = setting.known_ticks(latency_ns + (length - 1) * self.gap_ns)
         whole = setting.delay_ticks(latency_ns + (setting.horizon - 1) * self.gap_ns)
         ready = setting.delay_ticks(latency_ns) + self.hold_ticks(setting)
@@ -144,7 +144,7 @@ class QueueStepper:
         return self.waiting.popleft()[0]
 
 
-def _length(execute: int, setting: Setting) -> int:
+def length_of(execute: int, setting: Setting) -> int:
     """Return s; raises ValueError where a chunk has fewer actions."""
     if execute > setting.horizon:
         raise ValueError(f"execute = {execute} of a chunk of {setting.horizon} actions")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from s2a_bench.experiments.chunks.view.lanes import Lane
     from s2a_bench.experiments.timeline.view.cells import Timelines
     from s2a_bench.store.run import Run
     from s2a_bench.writers.csv_text import CsvTable
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What a command's run shows: sentences, tables and figures by their files' names, and timelines to look into.
+    """What a command's run shows: sentences, tables and figures by their files' names, and what to look into.
 
     ``csvs`` are tables for programs by file name. ``main`` are the tables that stand open on the page, in that order.
     """
@@ -27,7 +28,7 @@ class Content:
     main: Sequence[str] = ()
     csvs: Mapping[str, CsvTable] = field(default_factory=dict)
     figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
-    timelines: Sequence[Timelines] = ()
+    timelines: Sequence[Timelines] | Sequence[Lane] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,23 +16,24 @@ TICKS = 6
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """One skill or stall; ``text`` says all about it."""
+    """One skill, chunk or stall; ``text`` says all about it, ``colour`` is its own where lanes have several."""
 
     kind: str
     start_s: float
     width_s: float
     text: str
+    colour: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Lane:
-    """One policy's plan: where it waits, acts and stalls; S0 and the tokens when they arrived, if they are its own."""
+    """One policy's plan: where it waits, acts and stalls; S0 if it has one, and the tokens if they are its own."""
 
     name: str
     colour: str
     bars: tuple[Bar, ...]
     start_s: float
-    safe_start_s: float
+    safe_start_s: float | None
     tokens_s: tuple[float, ...]
     complete_s: tuple[float, ...]
     words: str

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench import __version__
+from s2a_bench.experiments.chunks.view.lanes import Lane as ChunkLane
 from s2a_bench.report.claims.verdicts import Judged
 from s2a_bench.report.page.chapters import when
+from s2a_bench.report.page.chunk_lanes import panels_of_chunks
 from s2a_bench.report.page.contents import labels_of
 from s2a_bench.report.page.lanes import MOST_PANELS, panels_of
 from s2a_bench.store.manifest import utc_now
@@ -93,8 +95,7 @@ def _view(chapter: Chapter, figures: dict[str, Drawn]) -> dict[str, Any]:
         "warnings": manifest.get("warnings", []),
         "tables": main,
         "more": [table for name, table in content.tables.items() if name not in content.main],
-        "panels": panels_of(content.timelines),
-        "left_out": max(0, len({cell.setting for cell in content.timelines}) - MOST_PANELS),
+        **_panels(content.timelines),
         "figures": figures,
         "command": chapter.command,
         "attached": chapter.attached,
@@ -104,6 +105,16 @@ def _view(chapter: Chapter, figures: dict[str, Drawn]) -> dict[str, Any]:
         "facts": [(name, fact["about"]) for name, fact in chapter.run.facts.items()],
         "seeds": list(_facts(manifest.get("seeds", {}))),
     }
+
+
+def _panels(shown: Sequence[Any]) -> dict[str, Any]:
+    """Return the panels of timelines or of control ticks, what their bars are, and how many are left out."""
+    if any(isinstance(each, ChunkLane) for each in shown):
+        bars = "Bars are actions, a colour a chunk; dashed boxes are stalls. Time counts from the first request."
+        return {"panels": panels_of_chunks(shown), "bars": bars, "left_out": 0}
+    bars = "Bars are skills, dashed boxes stalls, the dashed line is S0, long ticks are complete skills."
+    left_out = max(0, len({cell.setting for cell in shown}) - MOST_PANELS)
+    return {"panels": panels_of(shown), "bars": bars, "left_out": left_out}
 
 
 def _facts(facts: Any, prefix: str = "") -> list[tuple[str, str]]:

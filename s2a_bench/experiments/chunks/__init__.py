@@ -1,0 +1,13 @@
+"""When to act on actions in chunks: modes and triggers under given latencies, in virtual time."""
+
+from s2a_bench.experiments import Experiment
+
+EXPERIMENT = Experiment(
+    name="chunks",
+    about="Act on chunks of actions in virtual time: how often each mode and trigger stalls, and on how old a picture.",
+    config="s2a_bench.experiments.chunks.config:ChunksConfig",
+    run="s2a_bench.experiments.chunks.run:run_chunks",
+    view="s2a_bench.experiments.chunks.view:show",
+    cell="s2a_bench.experiments.chunks.view.cell:ChunkCell",
+    unit="cells",
+)

@@ -1,0 +1,115 @@
+"""What is tried: each mode as it is given, and the first queue again with its trigger chosen by each rule."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from s2a_bench.experiments.chunks.closed import execution_horizon
+from s2a_bench.experiments.study.worlds import generator
+from s2a_bench.policy.chunks.append import Queue
+from s2a_bench.policy.chunks.trigger import Maximum, Mean, Rule, Tracked, calibrate, follow, trigger
+from s2a_bench.policy.chunks.varied import Varied
+
+if TYPE_CHECKING:
+    from s2a_bench.experiments.chunks.config import ChunksConfig
+    from s2a_bench.experiments.chunks.latencies import Source
+    from s2a_bench.policy.chunks import Ints, Mode, Setting
+
+GIVEN: Final = "given"
+"""The rule of a mode that is tried as it was asked for."""
+_ORACLE_DRAWS: Final = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """The latencies of one source, in ns: those that are judged, and others that rules learn from."""
+
+    source: Source
+    judged: Ints
+    learnt: Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cell:
+    """One mode under one source; ``triggers`` are those that a rule chose request by request."""
+
+    mode: Mode
+    name: str
+    """The mode with its parameters; of one with a rule without the trigger."""
+    rule: str
+    drawn: Drawn
+    triggers: tuple[int, ...] = ()
+
+    @property
+    def cell(self) -> str:
+        """Return its name."""
+        rule = "" if self.rule == GIVEN else f", {self.rule}"
+        return f"{self.name}{rule} @ {self.drawn.source.name}"
+
+
+def draw(config: ChunksConfig, source: Source) -> Drawn:
+    """Draw the latencies of a source; a recording is played in its order, its first half for the rules if any."""
+    if source.recorded_ns is not None:
+        count = min(config.calibration_cycles, source.recorded_ns.size // 2) if config.with_rules else 0
+        judged = source.recorded_ns[count:]
+        return Drawn(source, judged[: config.cycles], source.recorded_ns[:count])
+    from s2a_bench.experiments.chunks.config import CYCLES
+
+    judged = source.draw(generator(config.seed, "chunks", source.name), config.cycles or CYCLES)
+    count = config.calibration_cycles if config.with_rules else 0
+    return Drawn(source, judged, source.draw(generator(config.seed, "chunks rules", source.name), count))
+
+
+def cells(config: ChunksConfig, drawn: Drawn) -> Iterator[Cell]:
+    """Yield the cells of one source."""
+    for name, mode in config.made.items():
+        yield Cell(mode, name, GIVEN, drawn)
+    queue = next((mode for mode in config.made.values() if isinstance(mode, Queue)), None)
+    if queue is None:
+        return
+    name = f"queue?execute={queue.execute}" if queue.execute else "queue"
+    for rule in config.rules:
+        triggers = _triggers(config, rule, queue, drawn)
+        if len(triggers) == 1:
+            yield Cell(replace(queue, trigger=triggers[0]), name, rule, drawn, triggers)
+        else:
+            yield Cell(Varied(triggers, queue.execute), name, rule, drawn, triggers)
+
+
+def _triggers(config: ChunksConfig, rule: str, queue: Queue, drawn: Drawn) -> tuple[int, ...]:
+    """Return the triggers that a rule chooses, one for all requests where it never changes its mind."""
+    setting = config.setting
+    most = max(1, execution_horizon(queue, setting) - 1)
+    if rule == "oracle":
+        return (min(most, _oracle(config, drawn, setting)),)
+    if rule == "calibrated":
+        caution_ns = calibrate(drawn.learnt, config.epsilon).caution
+        return (trigger(caution_ns, setting, most).ticks,)
+    return tuple(follow(_made(config, rule, drawn), drawn.judged, setting, most).trigger.tolist())
+
+
+def _made(config: ChunksConfig, rule: str, drawn: Drawn) -> Rule:
+    """Return a rule that has seen what the calibration has."""
+    if rule == "tracked":
+        return Tracked.begin(drawn.learnt.tolist(), config.epsilon)
+    made: Rule = Maximum() if rule == "maximum" else Mean()
+    for latency_ns in drawn.learnt.tolist():
+        made.learn(latency_ns, stalled=False)
+    return made
+
+
+def _oracle(config: ChunksConfig, drawn: Drawn, setting: Setting) -> int:
+    """Return the least trigger that stalls in no more than a share epsilon of the cycles, of the distribution itself.
+
+    That is a million other draws; of a recording all that was recorded.
+    """
+    import numpy as np
+
+    source = drawn.source
+    latency_ns = source.recorded_ns
+    if latency_ns is None:
+        latency_ns = source.draw(generator(config.seed, "chunks oracle", source.name), _ORACLE_DRAWS)
+    delay = np.sort(setting.delay_ticks(latency_ns))
+    return int(delay[-1 - int(config.epsilon * delay.size)])

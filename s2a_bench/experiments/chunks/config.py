@@ -1,0 +1,144 @@
+"""What a run of chunks tries, and what it refuses."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from pydantic import BeforeValidator
+
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.chunks.latencies import EXAMPLE, split
+from s2a_bench.options import Names, Options, one_of, option
+from s2a_bench.policy.chunks import Rounding
+
+if TYPE_CHECKING:
+    from s2a_bench.experiments.chunks.latencies import Source
+    from s2a_bench.policy.chunks import Mode, Setting
+
+RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
+"""What may choose the trigger of queue."""
+CYCLES: Final = 10_000
+CALIBRATION: Final = 8_000
+
+Sources = Annotated[tuple[str, ...], BeforeValidator(split)]
+"""Several sources of latencies; as text with commas between them, which may hold the parameters of a family too."""
+
+
+class ChunksConfig(Options):
+    """Modes and rules under latencies."""
+
+    modes: Names = option(
+        ("sync", "queue?trigger=6", "replace?execute=8", "aggregate?trigger=6"),
+        "sync, queue, streamed, replace, aggregate, each with ?parameter=value&...; several with commas",
+    )
+    latency: Sources = option(
+        (EXAMPLE,),
+        "observation to usable chunk (with streamed: to its first action): ms, FAMILY:mean_ms=...,key=value, FILE.csv, "
+        "a run folder, or a profile; several with commas",
+    )
+    control_hz: float = option(50.0, "control ticks a second", gt=0, le=1e6, allow_inf_nan=False)
+    horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096)
+    rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
+    rules: Annotated[Names, one_of(lambda: RULES)] = option(
+        RULES, "further rows for the first queue, its trigger chosen by each; empty text for none"
+    )
+    epsilon: float = option(0.01, "share of cycles that may stall, for the rules", flag="eps", gt=0, lt=1)
+    cycles: int | None = option(
+        None, f"requests of each row [default: {CYCLES}; replayed: as many as there are]", ge=2, le=1_000_000
+    )
+    calibration_cycles: int = option(
+        CALIBRATION, "further requests that the rules learn from; of a recording its first half at most", ge=1
+    )
+    tokens_per_action: int = option(7, "tokens of an action, where a profile answers", ge=1, le=1000)
+    shown_ticks: int = option(120, "control ticks of each row that are kept", ge=0, le=100_000)
+    stability: int = option(
+        33, "mean latencies of the stability diagram of the first replace, from 0 to H ticks; 0 for none", ge=0, le=1000
+    )
+    export_delays: Path | None = option(
+        None, "also write each request's times, L and d as CSV, for other simulators; of one source of latencies"
+    )
+    seed: int = option(0, "seed of everything that is drawn", ge=0)
+
+    @property
+    def virtual(self) -> bool:
+        """Return True: nothing is measured."""
+        return True
+
+    @property
+    def setting(self) -> Setting:
+        """Return what all modes are told."""
+        from s2a_bench.policy.chunks import Setting
+
+        return Setting(round(1e9 / self.control_hz), self.horizon, self.rounding)
+
+    @cached_property
+    def made(self) -> dict[str, Mode]:
+        """Return the modes by their names with parameters; raises UsageError naming the field."""
+        from s2a_bench.policy.chunks import MODES
+        from s2a_bench.policy.parameters import build, canonical
+
+        known = {written: written.partition("?")[0] for written in self.modes}
+        if unknown := [name for name in known.values() if name not in MODES]:
+            raise UsageError(f"`modes`: '{unknown[0]}' is none of {', '.join(MODES)}")
+        made = [build(MODES[name], written, "modes") for written, name in known.items()]
+        found = {canonical(each.name, each): each for each in made}
+        for name, each in found.items():
+            if getattr(each, "execute", 0) > self.horizon:
+                raise UsageError(f"`modes`: {name}: a chunk has {self.horizon} actions (`horizon`)")
+        return found
+
+    @cached_property
+    def sources(self) -> tuple[Source, ...]:
+        """Return the latencies' sources; raises S2AError naming the field."""
+        from s2a_bench.experiments.chunks.latencies import sources
+
+        return tuple(
+            each for written in self.latency for each in sources(written, self.horizon * self.tokens_per_action)
+        )
+
+    @property
+    def with_rules(self) -> bool:
+        """Return whether rules choose the trigger of a queue."""
+        return bool(self.rules) and any(each.name == "queue" for each in self.made.values())
+
+    def check(self) -> None:
+        """Refuse what makes no sense together; raises UsageError naming the fields."""
+        from s2a_bench.policy.conformal import check
+
+        for field in ("modes", "latency"):
+            if not getattr(self, field):
+                raise UsageError(f"`{field}`: name at least one")
+        self._check_export()
+        for source in self.sources:
+            recorded = source.recorded_ns
+            learnt = self.calibration_cycles if recorded is None else min(self.calibration_cycles, recorded.size // 2)
+            if self.with_rules:
+                _promised(source.name, learnt, self.epsilon, check)
+            if recorded is not None and recorded.size - learnt * self.with_rules < 2:  # noqa: PLR2004 - a boundary
+                raise UsageError(f"`latency`: {source.name} has {recorded.size} latencies; two or more are needed")
+
+    def _check_export(self) -> None:
+        file = self.export_delays
+        if file is None:
+            return
+        if len(self.sources) != 1:
+            names = ", ".join(source.name for source in self.sources)
+            raise UsageError(f"`export_delays`: {len(self.sources)} sources of `latency`, {names}; name one of them")
+        if file.suffix != ".csv" or not file.parent.is_dir():
+            raise UsageError(f"`export_delays`: {file} should be a .csv file in a folder that there is")
+
+    def to_manifest(self) -> dict[str, Any]:
+        """Return the options as plain data, with the numbers that follow from others."""
+        file = None if self.export_delays is None else str(self.export_delays)
+        more = {"modes": list(self.made), "period_ns": self.setting.period_ns, "export_delays": file}
+        return {**self.model_dump(), **more}
+
+
+def _promised(name: str, learnt: int, epsilon: float, check: Any) -> None:
+    """Refuse rules that have too little to learn from."""
+    try:
+        check(learnt, epsilon)
+    except UsageError as error:
+        raise UsageError(f"{error}; or leave the `rules` out ({name})") from error

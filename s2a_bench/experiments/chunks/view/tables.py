@@ -1,0 +1,190 @@
+"""The tables of a run of chunks, and its ``--json`` object."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Final
+
+from s2a_bench.experiments.chunks.rows import CHUNKS
+from s2a_bench.experiments.chunks.view.cell import ChunkCell
+from s2a_bench.store.manifest import present
+from s2a_bench.store.schema import PROVENANCE
+from s2a_bench.writers.as_json import frame
+from s2a_bench.writers.csv_text import CsvTable
+from s2a_bench.writers.tables import ABSENT, EMULATED, Note, TextTable, number
+
+if TYPE_CHECKING:
+    from s2a_bench.store.run import Run
+
+Row = dict[str, Any]
+
+_LEFT: Final = ("mode", "rule")
+_CONVENTION: Final = {
+    "floor": "d = floor(L / Delta t): an action leaves at the end of its tick, as real-time chunking counts.",
+    "ceil": "d = ceil(L / Delta t): an action leaves at the start of its tick, as lerobot counts.",
+}
+
+
+def rows_of(run: Run) -> list[Row]:
+    """Return the rows of a run; what a row lacks is None."""
+    table = run.table(CHUNKS).drop(columns=PROVENANCE)
+    whole = table.astype(object).where(table.notna(), None)
+    return [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
+
+
+def sources_of(rows: list[Row]) -> list[tuple[str, list[Row]]]:
+    """Return the rows of each source of latencies, in the order asked for."""
+    names = dict.fromkeys(row["latency"] for row in rows)
+    return [(name, [row for row in rows if row["latency"] == name]) for name in names]
+
+
+def stall_table(run: Run) -> TextTable:
+    """Lay out how often each mode stalls, and what would have been safe."""
+    header = ("s", "m", "stalls/s", "P(stall), %", "form", "longest", "margin")
+    return _table(run, "Stalls", header, _stalls)
+
+
+def action_table(run: Run) -> TextTable:
+    """Lay out how old the actions are, how soon the robot reacts, and what is lost at boundaries."""
+    header = ("age", "max", "react (ms)", "form", "p99", "Hz", "unused, %", "jump")
+    return _table(run, "Actions: ages in ticks", header, _actions)
+
+
+def chunk_tables(run: Run) -> dict[str, TextTable]:
+    """Return every table of a run by its file's name."""
+    return {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
+
+
+def delay_table(run: Run) -> TextTable:
+    """Lay out the realised delays of each source."""
+    rows = []
+    for place, (name, group) in enumerate(sources_of(rows_of(run)), 1):
+        one = next((row for row in group if not row["mode"].startswith("streamed")), group[0])
+        delays = (one[f"delay_ticks_{part}"] for part in ("mean", "p99", "max"))
+        rows.append(
+            (
+                str(place),
+                name,
+                str(one["requests"]),
+                number(one["latency_s"] * 1e3),
+                number(one["latency_s_p99"] * 1e3),
+                *map(_number, delays),
+            )
+        )
+    header = ("L", "latency", "requests", "ms", "p99", "d", "p99", "max")
+    return TextTable(f"Delays, d = {_rounding(run)} of L over Delta t", header, rows, 2, notes=(_convention(run),))
+
+
+def chunk_csv(run: Run) -> dict[str, CsvTable]:
+    """Return file name -> CSV table: every metric of every row."""
+    return {"chunks.csv": CsvTable.of_frame(run.table(CHUNKS))}
+
+
+def chunk_json(run: Run) -> dict[str, Any]:
+    """Return the object that ``--json`` prints."""
+    return frame(run, [present(ChunkCell(**row, emulated=True)) for row in rows_of(run)], [])
+
+
+def chunk_sentences(run: Run) -> list[str]:
+    """Return what calibration costs over the oracle, and what the other rules do, a sentence a source."""
+    said = []
+    epsilon = float(run.manifest["configuration"]["epsilon"])
+    for name, rows in sources_of(rows_of(run)):
+        by_rule = {row["rule"]: row for row in rows if row["p_stall_cycle"] is not None}
+        parts = [
+            f"{rule} {row['p_stall_cycle']:.2%} at age {_number(row['age_ticks_mean'])}"
+            for rule, row in by_rule.items()
+            if rule != "given"
+        ]
+        if parts:
+            said.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(parts)} ticks.")
+        slower = max((row["slow_down"] or 1 for row in rows if row["mode"].startswith("queue")), default=1)
+        if slower > 1:
+            said.append(f"@ {name} no trigger of queue is enough: actions would have to be {slower:.2f} times slower.")
+    return said
+
+
+def _table(run: Run, title: str, header: tuple[str, ...], cells: Any) -> TextTable:
+    """Lay out a line a row; of several sources the first column has the number that the table of delays names."""
+    rows: list[tuple[str, ...]] = []
+    rules = []
+    found = sources_of(rows_of(run))
+    several = len(found) > 1
+    for place, (_, group) in enumerate(found, 1):
+        rules.append(len(rows))
+        rows += [((str(place),) * several + (row["mode"], row["rule"], *cells(row))) for row in group]
+    asked = run.manifest["configuration"]
+    of = "" if several else f" @ {found[0][0]}" if found else ""
+    what = f"{title}{of}, H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {_rounding(run)}"
+    left = ("L",) * several + _LEFT
+    return TextTable(what, (*left, *header), rows, len(left), frozenset(rules[1:]), tuple(_notes(run)))
+
+
+def _stalls(row: Row) -> Iterator[str]:
+    yield str(row["execution_horizon"])
+    yield _number(row["trigger"])
+    yield _number(row["stall_ticks_per_s"])
+    yield _interval(row)
+    yield _percent(row["p_stall_closed"])
+    yield _number(row["longest_stall_ticks"])
+    yield _number(row["margin_ticks"])
+
+
+def _actions(row: Row) -> Iterator[str]:
+    for name in ("age_ticks_mean", "age_ticks_max"):
+        yield _number(row[name])
+    for name in ("reaction_s_mean", "reaction_s_closed", "reaction_s_p99"):
+        yield ABSENT if row[name] is None else number(row[name] * 1e3)
+    yield _number(row["control_rate_hz"])
+    yield _percent(row["thrown_away_share"])
+    yield _number(row["jump_mean"])
+
+
+def _interval(row: Row) -> str:
+    if row["p_stall_cycle"] is None:
+        return ABSENT
+    share, low, high = (_percent(row[f"p_stall_{part}"]) for part in ("cycle", "low", "high"))
+    return f"{share} [{low}, {high}]"
+
+
+def _percent(value: float | None) -> str:
+    """Write a share in percent, without the sign."""
+    return ABSENT if value is None else _number(round(value * 100, 6))
+
+
+def _number(value: float | None) -> str:
+    """Write a number, a whole one without decimals."""
+    if value is None:
+        return ABSENT
+    return str(int(value)) if float(value).is_integer() else number(value)
+
+
+def _rounding(run: Run) -> str:
+    return str(run.manifest["configuration"]["rounding"])
+
+
+def _convention(run: Run) -> str:
+    return _CONVENTION[_rounding(run)]
+
+
+def _notes(run: Run) -> Iterator[str]:
+    """Yield what a reader must know besides the numbers."""
+    yield _convention(run)
+    yield (
+        "P(stall): share of the cycles, with its 95 % interval; form: what the closed form says, where it holds; "
+        "margin: ticks that all latencies may be longer without a stall. Ages and stalls are in control ticks."
+    )
+    rows = rows_of(run)
+    if any(row["mode"].startswith("streamed") for row in rows):
+        yield "streamed: the latency is that of the first action, d that of the last."
+    if any(row["slow_down"] is not None and row["slow_down"] > 1 for row in rows):
+        yield "Where no trigger is enough, actions have to be slower by beta (chunks.csv: slow_down)."
+    if any(row["rule"] != "given" for row in rows):
+        asked = run.manifest["configuration"]
+        yield (
+            f"Rules choose m of queue: calibrated for P(stall) <= {asked['epsilon']:.2%}, tracked from there, "
+            "lerobot's maximum, the mean, an oracle that knows the distribution. All others saw the same cycles before."
+        )
+    yield Note(
+        "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
+    )

@@ -1,0 +1,174 @@
+"""Runs of chunks: rows against closed forms and the modes themselves, rules against each other, repeatability."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.chunks.cells import cells, draw
+from s2a_bench.experiments.chunks.config import ChunksConfig
+from s2a_bench.experiments.chunks.metrics import METRICS
+from s2a_bench.experiments.chunks.rows import CHUNKS, REQUESTS, TICKS
+from s2a_bench.experiments.chunks.run import run_chunks
+from s2a_bench.store.run import Run, read_run
+from s2a_bench.testing import NullProgress
+
+LATENCIES = "40,lognormal:mean_ms=80,cv=.5"
+
+
+def ran(folder: Path, **asked: Any) -> Run:
+    return read_run(run_chunks(ChunksConfig(**asked), folder, NullProgress()))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return ran(tmp_path_factory.mktemp("chunks"), latency=LATENCIES, cycles=4000)
+
+
+def row(run: Run, mode: str, latency: str, rule: str = "given") -> dict[str, Any]:
+    table = run.table(CHUNKS)
+    (found,) = table[(table["mode"] == mode) & (table["latency"] == latency) & (table["rule"] == rule)].to_dict(
+        "records"
+    )
+    return {str(name): value for name, value in found.items()}
+
+
+def test_every_mode_and_rule_has_a_row_under_every_latency_with_every_metric(run: Run) -> None:
+    table = run.table(CHUNKS)
+    assert len(table) == 2 * (4 + 5)
+    assert table["cell"].is_unique
+    assert {*METRICS} <= {*table.columns}
+    assert set(table["rounding"]) == {"floor"}
+    assert set(table["provenance"]) == {"none/none/emulated/clock-virtual"}
+
+
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_at_a_constant_latency_rows_are_what_the_closed_forms_say(rounding: str, tmp_path: Path) -> None:
+    run = ran(tmp_path, latency="90", rounding=rounding, cycles=2000, rules="")
+    delay = 4 if rounding == "floor" else 5
+    sync = row(run, "sync", "90")
+    assert sync["longest_stall_ticks"] == delay
+    assert sync["stall_share"] == pytest.approx(delay / (16 + delay), rel=0.01)
+    assert sync["control_rate_hz"] == pytest.approx(50 * 16 / (16 + delay), rel=0.01)
+    assert sync["p_stall_cycle"] == 1
+    assert sync["blocked_ticks"] == sync["stall_ticks"] + delay
+    queue = row(run, "queue?trigger=6", "90")
+    assert queue["stall_ticks"] == 0
+    assert queue["margin_ticks"] == 6 - delay
+    assert queue["jump_mean"] == 6
+    replace = row(run, "replace", "90")
+    assert replace["execution_horizon"] == 8
+    assert replace["age_ticks_mean"] == pytest.approx(delay + 3.5, rel=0.01)
+    assert replace["age_ticks_max"] == 2 * delay + 8 - 1  # the very first chunk, which began at its first action
+    assert replace["thrown_away_share"] == pytest.approx(0.5, abs=0.01)
+    for name in ("sync", "queue?trigger=6", "replace", "aggregate?trigger=6"):
+        found = row(run, name, "90")
+        assert found["reaction_s_mean"] == pytest.approx(found["reaction_s_closed"], rel=0.02)
+        assert found["p_stall_cycle"] == found["p_stall_closed"]
+        assert found["delay_ticks_mean"] == found["delay_ticks_max"] == delay
+
+
+def test_with_random_latencies_closed_forms_lie_within_the_interval(run: Run) -> None:
+    table = run.table(CHUNKS)
+    told = table[table["p_stall_closed"].notna()]
+    assert {"sync", "queue", "queue?trigger=6", "replace", "aggregate?trigger=6"} <= set(told["mode"])
+    assert (told["p_stall_low"] <= told["p_stall_closed"] + 1e-9).all()
+    assert (told["p_stall_closed"] <= told["p_stall_high"] + 1e-9).all()
+
+
+def test_blended_actions_are_older_than_the_newest_observation_in_them(tmp_path: Path) -> None:
+    kinds = ("latest_only", "weighted_average", "average", "conservative")
+    modes = [f"aggregate?trigger=6&kind={kind}" for kind in kinds]
+    table = ran(tmp_path, modes=modes, latency="60", cycles=500).table(CHUNKS)
+    assert len(set(table["age_ticks_mean"])) == 1
+    assert table["age_ticks_blended"].iloc[0] == pytest.approx(table["age_ticks_mean"].iloc[0])
+    assert table["age_ticks_blended"].is_monotonic_increasing
+    assert table["age_ticks_blended"].is_unique
+
+
+def test_rules_choose_between_the_mean_that_stalls_and_the_maximum_that_is_old(run: Run) -> None:
+    found = {rule: row(run, "queue", "lognormal:mean_ms=80,cv=.5", rule) for rule in ChunksConfig().rules}
+    assert found["mean"]["p_stall_cycle"] > 0.2
+    assert found["calibrated"]["p_stall_cycle"] <= 0.015
+    assert found["tracked"]["p_stall_cycle"] <= 0.015
+    assert found["maximum"]["age_ticks_mean"] > 1.15 * found["oracle"]["age_ticks_mean"]
+    assert found["calibrated"]["age_ticks_mean"] == pytest.approx(found["oracle"]["age_ticks_mean"], rel=0.1)
+    assert found["calibrated"]["slow_down"] == 1
+
+
+def test_where_no_trigger_is_enough_beta_says_how_much_slower(tmp_path: Path) -> None:
+    run = ran(tmp_path, modes="queue?trigger=6,sync", latency="600", cycles=100)
+    assert row(run, "queue", "600", "calibrated")["slow_down"] == pytest.approx(600 / (15 * 20))
+    assert pd.isna(row(run, "sync", "600")["slow_down"])
+
+
+def test_the_first_ticks_and_requests_are_kept(run: Run) -> None:
+    ticks, requests = run.table(TICKS), run.table(REQUESTS)
+    assert set(ticks.groupby("cell").size()) == {120}
+    mine = ticks[ticks["cell"] == "queue?trigger=6 @ 40"]
+    assert mine["chunk"].isna().sum() == 2
+    assert not mine["stalled"].any()
+    first = requests[requests["cell"] == "queue?trigger=6 @ 40"].to_dict("records")
+    assert [each["request_tick"] for each in first[:3]] == [0, 12, 28]
+    assert first[1]["start_tick"] == 18
+    assert first[1]["jump"] == -6
+
+
+def test_a_seed_repeats_a_run_and_another_one_does_not(tmp_path: Path) -> None:
+    one, same, other = (ran(tmp_path, cycles=300, seed=seed).table(CHUNKS) for seed in (1, 1, 2))
+    assert one.equals(same)
+    assert not one.equals(other)
+
+
+def test_a_mode_has_the_same_row_whatever_else_is_tried(tmp_path: Path) -> None:
+    alone = ran(tmp_path, modes="sync", latency=LATENCIES, cycles=300)
+    among = ran(tmp_path, latency=f"{LATENCIES},20", cycles=300)
+    assert row(alone, "sync", "lognormal:mean_ms=80,cv=.5") == row(among, "sync", "lognormal:mean_ms=80,cv=.5")
+
+
+def test_a_recording_is_played_in_order_and_its_first_half_is_what_rules_learn_from(tmp_path: Path) -> None:
+    file = tmp_path / "delays.csv"
+    file.write_text("latency_ms\n" + "".join(f"{20 + place % 40}\n" for place in range(400)))
+    config = ChunksConfig(latency=str(file), epsilon=0.05)
+    (source,) = config.sources
+    drawn = draw(config, source)
+    assert (drawn.learnt.size, drawn.judged.size) == (200, 200)
+    assert drawn.judged[:3].tolist() == [20_000_000, 21_000_000, 22_000_000]
+    assert {cell.rule for cell in cells(config, drawn)} == {"given", *config.rules}
+    without = ChunksConfig(latency=str(file), rules="", cycles=150)
+    assert draw(without, without.sources[0]).judged.size == 150
+
+
+def test_a_mode_that_never_acts_has_no_numbers_instead_of_wrong_ones(tmp_path: Path) -> None:
+    found = row(ran(tmp_path, modes="replace?assumed=16", latency="40", cycles=50), "replace?assumed=16", "40")
+    assert found["requests"] == 50
+    assert all(pd.isna(found[name]) for name in ("p_stall_cycle", "p_stall_high", "jump_mean"))
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"modes": "walk"}, "walk"),
+        ({"modes": "queue?execute=20"}, "`modes`: queue?execute=20: a chunk has 16 actions (`horizon`)"),
+        ({"modes": ""}, "`modes`: name at least one"),
+        ({"latency": ""}, "`latency`: name at least one"),
+        ({"rules": "guessed"}, "`rules`: 'guessed' is none of calibrated, tracked"),
+        ({"calibration_cycles": 50}, "`epsilon`: 50 calibration plans promise"),
+        ({"rounding": "nearest"}, "`rounding`"),
+        ({"control_hz": 0}, "`control_hz`"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_its_field(asked: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError) as error:
+        ChunksConfig(**asked)
+    assert message in str(error.value)
+
+
+def test_what_would_not_fit_into_memory_is_refused_before_a_folder_is_made(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"`cycles`: 1000000 chunks @ 3\.6e6 make"):
+        run_chunks(ChunksConfig(latency="3.6e6", cycles=1_000_000, rules=""), tmp_path / "none", NullProgress())
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,124 @@
+"""Runs of chunks as they are shown: tables, sentences, CSV, figures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.collections import QuadMesh
+from matplotlib.figure import Figure
+
+from s2a_bench.experiments.chunks import EXPERIMENT
+from s2a_bench.experiments.chunks.config import ChunksConfig
+from s2a_bench.experiments.chunks.run import run_chunks
+from s2a_bench.experiments.chunks.view.figures import build_reactions, build_stability, build_triggers
+from s2a_bench.experiments.chunks.view.lanes import build_lanes, lanes_of, short
+from s2a_bench.experiments.chunks.view.tables import action_table, chunk_sentences, delay_table, stall_table
+from s2a_bench.store.run import Run, read_run
+from s2a_bench.testing import NullProgress
+from s2a_bench.writers.figures import save
+from s2a_bench.writers.style import paper_column
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    config = ChunksConfig(latency="60,lognormal:mean_ms=80,cv=.5", cycles=1500)
+    return read_run(run_chunks(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
+
+
+def drawn(run: Run, build: object) -> Figure:
+    with paper_column():
+        figure: Figure = build(run)  # type: ignore[operator]
+        return figure
+
+
+def test_tables_number_the_sources_and_name_the_convention(run: Run) -> None:
+    stalls, actions, delays = stall_table(run), action_table(run), delay_table(run)
+    assert stalls.header[:3] == ("L", "mode", "rule")
+    assert [row[0] for row in stalls.rows] == ["1"] * 9 + ["2"] * 9
+    assert stalls.rules == {9}
+    assert [row[:2] for row in delays.rows] == [("1", "60"), ("2", "lognormal:mean_ms=80,cv=.5")]
+    for table in (stalls, actions, delays):
+        assert "floor" in table.title
+        assert any(note.startswith("d = floor(L / Delta t)") for note in table.notes)
+    sync = dict(zip(stalls.header, stalls.rows[0], strict=True))
+    assert (sync["s"], sync["m"], sync["longest"], sync["form"], sync["margin"]) == (
+        "16",
+        "\N{EN DASH}",
+        "3",
+        "100",
+        "-1",
+    )
+
+
+def test_sentences_say_what_each_rule_costs(run: Run) -> None:
+    constant, random = chunk_sentences(run)
+    assert constant.startswith("Stalled cycles of queue @ 60, for at most 1.00%: calibrated 0.00% at age 10.5")
+    assert "mean 3" in random
+
+
+def test_csv_has_every_row_with_its_provenance(run: Run) -> None:
+    lines = EXPERIMENT.show(run).csvs["chunks.csv"].text(run.origins).splitlines()
+    assert len(lines) == 1 + 18
+    assert all(line.endswith("none/none/emulated/clock-virtual") for line in lines[1:])
+
+
+def test_lanes_show_the_modes_and_the_calibrated_trigger(run: Run) -> None:
+    assert [(lane.name, lane.rule) for lane in lanes_of(run)[:5]] == [
+        ("sync", "given"),
+        ("queue?trigger=6", "given"),
+        ("replace", "given"),
+        ("aggregate?trigger=6", "given"),
+        ("queue", "calibrated"),
+    ]
+    axes = drawn(run, build_lanes).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()][:2] == ["sync\n60", "queue?trigger=6\n60"]
+    stalls = [found for found in axes.collections if getattr(found, "get_hatch", lambda: None)()]
+    assert len(stalls) >= 6
+    assert any(text.get_text() == "\N{MINUS SIGN}8" for text in axes.texts)
+
+
+def test_the_diagram_has_the_line_and_a_shade_a_point(run: Run) -> None:
+    axes = drawn(run, build_stability).axes[0]
+    (mesh,) = [found for found in axes.collections if isinstance(found, QuadMesh)]
+    assert mesh.get_array().size == 16 * 33
+    line = next(line for line in axes.lines if line.get_label() == "$s = H - d$")
+    ms, execute = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
+    assert execute == pytest.approx(16 - ms / 20)
+
+
+def test_triggers_are_a_line_a_source_with_a_mark_a_rule(run: Run) -> None:
+    axes = drawn(run, build_triggers).axes[0]
+    assert axes.get_yscale() == "log"
+    labels = {str(line.get_label()) for line in axes.lines}
+    assert {"60", "lognormal:mean_ms=80,cv=.5", "calibrated", "oracle"} <= labels
+    assert [text.get_text() for text in axes.texts] == ["epsilon = 0.01"]
+
+
+def test_reactions_have_the_closed_form_drawn_over_them(run: Run) -> None:
+    upper, lower = drawn(run, build_reactions).axes
+    dotted = [line for line in upper.lines if line.get_linestyle() == ":"]
+    assert len(dotted) == 5
+    ms = np.asarray(dotted[0].get_xdata())
+    assert (ms[0], ms[-1]) == (pytest.approx(60), pytest.approx(2 * 60 + 320))
+    assert lower.get_title(loc="left") == "lognormal:mean_ms=80,cv=.5"
+
+
+def test_every_figure_is_written_and_says_where_its_numbers_come_from(run: Run) -> None:
+    written = save(run.path / "figures", EXPERIMENT.show(run).figures)
+    assert [path.name for path in written if path.suffix == ".png"] == [
+        "lanes.png",
+        "stability.png",
+        "triggers.png",
+        "reactions.png",
+    ]
+
+
+def test_a_long_name_is_cut_and_a_short_one_is_not() -> None:
+    assert short("bimodal:mean_ms=80", 30) == "bimodal:mean_ms=80"
+    assert short("bimodal:mean_ms=80", 10) == "bimodal..."
+
+
+def test_what_a_run_has_no_rows_for_is_not_drawn(tmp_path_factory: pytest.TempPathFactory) -> None:
+    config = ChunksConfig(modes="sync", cycles=20, shown_ticks=0)
+    run = read_run(run_chunks(config, tmp_path_factory.mktemp("one"), NullProgress()))
+    assert list(EXPERIMENT.show(run).figures) == ["reactions"]

@@ -1,0 +1,45 @@
+"""A queue whose trigger varies: its arrays against its stepper, and against queue where it does not vary."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from s2a_bench.policy.chunks import Setting
+from s2a_bench.policy.chunks.append import Queue
+from s2a_bench.policy.chunks.stepping import step
+from s2a_bench.policy.chunks.varied import Varied
+from tests.policy.chunks.drawn import latencies, settings_of_chunks
+
+
+@st.composite
+def varied(draw: st.DrawFn) -> tuple[Varied, Any, Setting]:
+    setting = draw(settings_of_chunks())
+    triggers = draw(st.lists(st.integers(0, setting.horizon), min_size=1, max_size=14))
+    execute = draw(st.integers(0, setting.horizon))
+    return Varied(tuple(triggers), execute), draw(latencies(setting)), setting
+
+
+def agree(one: tuple[Any, ...], other: tuple[Any, ...]) -> None:
+    for mine, yours in zip(one, other, strict=True):
+        for field in fields(mine):
+            np.testing.assert_array_equal(getattr(mine, field.name), getattr(yours, field.name), field.name)
+
+
+@settings(max_examples=300)
+@given(case=varied())
+def test_its_arrays_and_its_stepper_agree(case: tuple[Varied, Any, Setting]) -> None:
+    mode, latency_ns, setting = case
+    agree((mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)), step(mode, latency_ns, setting))
+
+
+@given(case=varied())
+def test_with_one_trigger_it_is_queue(case: tuple[Varied, Any, Setting]) -> None:
+    mode, latency_ns, setting = case
+    queue = Queue(mode.triggers[0], mode.execute)
+    same = Varied(mode.triggers[:1], mode.execute)
+    agree((same.cycles(latency_ns, setting),), (queue.cycles(latency_ns, setting),))
