@@ -63,15 +63,8 @@ def generic(data: Any, dtype: Any) -> bytes:
     return msgpack.packb({b"__npgeneric__": True, b"data": data, b"dtype": dtype})
 
 
-def deep() -> bytes:
-    return b"\x91" * 400 + b"\xdd\x00\x00\x0f\xff" * 100
-
-
 HOSTILE = {
-    "nothing": b"",
     "half a message": packb({"a": np.zeros(9)})[:-5],
-    "two messages": packb(1) * 2,
-    "no message": b"\xc1",
     "objects": ndarray(dtype="|O", shape=(1,)),
     "records": ndarray(dtype="|V8", shape=(1,)),
     "records by a comma": ndarray(dtype="f4,f4", shape=(1,)),
@@ -95,16 +88,6 @@ HOSTILE = {
     "a number that is a list": generic([1, 2], "<f4"),
     "a number beyond its type": generic(1 << 40, "|i1"),
     "bytes of a number": generic(1 << 30, "|S5"),
-    "an extension": msgpack.packb(msgpack.ExtType(5, b"abc")),
-    "no UTF-8": b"\xa2\xff\xfe",
-    "a list of 2^32 elements": b"\xdd\xff\xff\xff\xff",
-    "a map of 2^32 keys": b"\xdf\xff\xff\xff\xff",
-    "bytes of 2^32": b"\xc6\xff\xff\xff\xff",
-    "deep lists": b"\x91" * 100_000,
-    "deep lists with room": deep(),
-    "very many lists": (b"\xdc\x0f\xff" + b"\x90" * 4095) * 64,
-    "very many maps": b"\xdc\x0f\xff" + (b"\xdc\x0f\xff" + b"\x80" * 4095) * 4095,
-    "a key that is a number": b"\x81\x01\x01",
     "a key that is an array": b"\x81" + ndarray() + b"\x01",
 }
 

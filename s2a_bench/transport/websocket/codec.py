@@ -1,9 +1,8 @@
-"""MessagePack with NumPy's arrays as openpi writes them, byte for byte, and bounds on what is read.
+"""MessagePack with NumPy's arrays as openpi writes them, byte for byte.
 
 An array is the map ``{b"__ndarray__": True, b"data": bytes, b"dtype": text, b"shape": [...]}``, one of NumPy's numbers
-``{b"__npgeneric__": True, b"data": its value, b"dtype": text}``. No other hook is called, so bytes become nothing but
-numbers, texts, bytes, lists, dictionaries and arrays of numbers and texts: no objects (dtype kind O), no records (V),
-no complex numbers (c), which openpi refuses too.
+``{b"__npgeneric__": True, b"data": its value, b"dtype": text}``. Arrays are of numbers and texts: no objects (dtype
+kind O), no records (V), no complex numbers (c), which openpi refuses too.
 """
 
 from __future__ import annotations
@@ -16,10 +15,9 @@ import msgpack
 import numpy as np
 
 from s2a_bench.errors import RequestFailed
+from s2a_bench.transport.messagepack import unpacked
 
 ARRAY, GENERIC = b"__ndarray__", b"__npgeneric__"
-LIST, MAP, VALUES = 4096, 1024, 1 << 16
-"""The most elements of a list, keys of a map, and elements and keys of a whole message; arrays are one each."""
 DIMENSIONS: Final = 8
 UNSAFE: Final = "VOc"
 """Kinds of dtypes that do not travel."""
@@ -55,40 +53,13 @@ def _packable(value: Any) -> Any:
 
 def unpackb(data: bytes | bytearray | memoryview) -> Any:
     """Read a message, whose arrays are read-only views of their bytes; raises RequestFailed for any other bytes."""
-    reader = _Reader()
-    try:
-        return msgpack.unpackb(
-            data,
-            object_hook=reader.map,
-            list_hook=reader.list,
-            ext_hook=_no_extension,
-            max_array_len=LIST,
-            max_map_len=MAP,
-        )
-    except (ValueError, TypeError, OverflowError, RecursionError) as error:  # msgpack's own are ValueErrors
-        raise RequestFailed(f"{len(data)} bytes that are no message: {_why(error)}") from error
+    return unpacked(data, _of_map)
 
 
-class _Reader:
-    """The hooks of one message, which count what it has."""
-
-    def __init__(self) -> None:
-        self._left = VALUES
-
-    def list(self, value: list[Any]) -> list[Any]:
-        self._count(len(value))
-        return value
-
-    def map(self, value: dict[Any, Any]) -> Any:
-        self._count(len(value))
-        if ARRAY in value:
-            return _array(value)
-        return _generic(value) if GENERIC in value else value
-
-    def _count(self, number: int) -> None:
-        self._left -= number + 1
-        if self._left < 0:
-            raise ValueError(f"it has more than {VALUES} values")
+def _of_map(value: dict[Any, Any]) -> Any:
+    if ARRAY in value:
+        return _array(value)
+    return _generic(value) if GENERIC in value else value
 
 
 def _array(told: dict[Any, Any]) -> Any:
@@ -119,11 +90,3 @@ def _dtype(told: dict[Any, Any]) -> np.dtype[Any]:
     if dtype.kind in UNSAFE or not dtype.itemsize:
         raise ValueError(f"an array of type {dtype}, which does not travel")
     return dtype
-
-
-def _no_extension(code: int, _: bytes) -> Any:
-    raise ValueError(f"an extension of type {code}, which nobody knows")
-
-
-def _why(error: Exception) -> str:
-    return f"{error}" or type(error).__name__

@@ -1,7 +1,4 @@
-"""Messages as GR00T packs them: MessagePack in which an array is a map with a NumPy file; bounded on reading.
-
-No other hook is called, so bytes become nothing but numbers, texts, bytes, lists, dictionaries and arrays of numbers.
-"""
+"""Messages as GR00T packs them: MessagePack in which an array of numbers is a map with a NumPy file."""
 
 from __future__ import annotations
 
@@ -12,11 +9,10 @@ import msgpack
 import numpy as np
 
 from s2a_bench.errors import RequestFailed
+from s2a_bench.transport.messagepack import unpacked
 from s2a_bench.transport.zmq.npy import Room, array_of, file_of
 
 ARRAY, FILE = "__ndarray_class__", "as_npy"
-LIST, MAP, VALUES = 4096, 1024, 1 << 16
-"""The most elements of a list, keys of a map, and elements and keys of a whole message; arrays are one each."""
 SMALL: Final = 1 << 16
 """Bytes that a message without large pictures takes, or fewer."""
 NO_ROOMS: Final[Mapping[int, Room]] = {}
@@ -45,35 +41,4 @@ def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS) -> memoryview:
 
 def unpack(data: Any) -> Any:
     """Return the message in a buffer, its arrays read-only; raises RequestFailed for any other bytes."""
-    reader = _Reader()
-    try:
-        return msgpack.unpackb(
-            data,
-            object_hook=reader.map,
-            list_hook=reader.list,
-            max_array_len=LIST,
-            max_map_len=MAP,
-            max_ext_len=0,
-        )
-    except (ValueError, TypeError, OverflowError, RecursionError) as error:  # msgpack's own are ValueErrors
-        raise RequestFailed(f"{len(data)} bytes that are no message: {error or type(error).__name__}") from error
-
-
-class _Reader:
-    """The hooks of one message, which count what it has."""
-
-    def __init__(self) -> None:
-        self._left = VALUES
-
-    def list(self, value: list[Any]) -> list[Any]:
-        self._count(len(value))
-        return value
-
-    def map(self, value: dict[Any, Any]) -> Any:
-        self._count(len(value))
-        return array_of(value.get(FILE)) if ARRAY in value else value
-
-    def _count(self, number: int) -> None:
-        self._left -= number + 1
-        if self._left < 0:
-            raise ValueError(f"it has more than {VALUES} values")
+    return unpacked(data, lambda value: array_of(value.get(FILE)) if ARRAY in value else value)
