@@ -11,7 +11,7 @@ first token seen by the client is the mark `return`. Everything is in integer na
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Final, TypeAlias
 
 from s2a_bench.clock import clock_id, now_ns
@@ -106,6 +106,10 @@ class Remote:
             facts=value["facts"],
             provenance=value.get("provenance", {}),
         ).check()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what `of_json` reads."""
+        return asdict(self)
 
     def check(self) -> Remote:
         """Return it; raises ValueError for what came from outside and can be no server's marks."""

@@ -37,6 +37,7 @@ from s2a_bench.store.requests import EARLIER_STAGES, TOKENS, TokenRow, samples_t
 from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.trace import Remote, Trace
+from s2a_bench.transport import ours
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
@@ -49,9 +50,7 @@ from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.pipeline import pipelines
 from s2a_bench.transport.ros import wire
 from s2a_bench.transport.websocket.codec import packb, unpackb
-from s2a_bench.transport.websocket.own import remote_message, remote_of, request_of
 from s2a_bench.transport.zmq import layouts
-from s2a_bench.transport.zmq import own as gr00t_own
 from s2a_bench.transport.zmq import wire as gr00t
 from s2a_bench.types import Action, Frame, Request, Token
 from tests.plan.test_parser import FORMATS
@@ -251,7 +250,7 @@ METADATA = b"""rosbag2_bagfile_information:
 def read_observation(data: bytes) -> None:
     """Read what a policy server is asked, and what its client is answered."""
     message = unpackb(data)
-    request_of(message, Trace(), LIMITS, ours=True)
+    ours.request_of(message, ours.told_in(message), Trace(), LIMITS)
     actions_of(message.get("actions") if isinstance(message, dict) else message)
 
 
@@ -266,12 +265,12 @@ def observations() -> list[bytes]:
 def read_gr00t(data: bytes) -> None:
     """Read what a GR00T server is asked, and what its client is answered."""
     message = gr00t.unpack(data)
+    with suppress(RequestFailed):
+        ours.remote_of(message)
     if isinstance(message, dict):
         observation, layout = layouts.observation_in(message.get("data"))
-        gr00t_own.request_of(observation, gr00t_own.told_in(message) or {}, Trace(), LIMITS)
+        ours.request_of(observation, ours.told_in(message), Trace(), LIMITS)
         layouts.answer_of(observation, layout, [Action(0, np.zeros(2, np.float32))])
-    with suppress(RequestFailed):
-        gr00t_own.remote_of(message)
     layouts.actions_in(message)
 
 
@@ -286,7 +285,7 @@ def gr00ts() -> list[bytes]:
         {"endpoint": "get_action", "data": {"observation": nested, "options": None}},
         [{"a": np.zeros((1, 4, 2)), "b": np.zeros((1, 4, 1))}, {}],
         {"action.a": np.zeros((4, 2), np.float32)},
-        gr00t_own.remote_message(Trace().to_remote()),
+        ours.remote_message(Trace().to_remote()),
     ]
     return [bytes(gr00t.pack(message)) for message in messages]
 
@@ -315,7 +314,9 @@ TARGETS = {
     "pipeline": Target(lambda data: pipelines([data.decode("utf-8", "replace")]), lambda: NAMES),
     "yaml": Target(read_yaml, lambda: [METADATA]),
     "observation": Target(read_observation, observations),
-    "marks": Target(lambda data: remote_of(unpackb(data)), lambda: [packb(remote_message(Trace().to_remote()))]),
+    "marks": Target(
+        lambda data: ours.remote_of(unpackb(data)), lambda: [packb(ours.remote_message(Trace().to_remote()))]
+    ),
     "gr00t": Target(read_gr00t, gr00ts),
     "template": Target(
         lambda data: template_of(str(as_file("t.toml", data))), tomls("s2a_bench/transport/templates/*.toml")

@@ -21,7 +21,6 @@ from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import open_client
 from s2a_bench.transport.http.detect import cache_hits
 from s2a_bench.transport.http.dialects import open_dialect
-from s2a_bench.transport.http.own import remote_of_json
 from s2a_bench.transport.ros.wire import remote_of
 from s2a_bench.types import Request
 from tests.servers.hostile import delta
@@ -129,7 +128,7 @@ def test_marks_that_can_be_none_fail_their_sample(odd: dict[str, Any]) -> None:
         with pytest.raises(RequestFailed, match="this is not the dialect 's2a'"):
             list(client.request(Request("a", "plan"), Trace()))
         client.close()
-    assert remote_of_json(MARKS).token_ns == [2]
+    assert Remote.of_json(MARKS).token_ns == [2]
 
 
 def test_facts_of_marks_are_checked_in_name_and_value() -> None:

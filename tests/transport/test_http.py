@@ -17,7 +17,7 @@ import pytest
 
 from s2a_bench.errors import PortInUse
 from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
-from s2a_bench.trace import Trace, budget
+from s2a_bench.trace import Remote, Trace, budget
 from s2a_bench.transport import Handler, open_client, open_server
 from s2a_bench.transport.http import own as dialect
 from s2a_bench.types import Request, Token
@@ -89,7 +89,7 @@ def test_our_own_server_is_known_by_its_url_and_keeps_its_marks(url: str) -> Non
 def test_marks_of_another_hosts_clock_are_not_mixed_with_ours(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("s2a_bench.transport.http.client.clock_id", lambda: "another boot")
     monkeypatch.setattr("s2a_bench.trace.clock_id", lambda: "another boot")
-    monkeypatch.setattr(dialect, "remote_json", lambda remote: {**asdict(remote), "clock": "this boot"})
+    monkeypatch.setattr(Remote, "to_json", lambda remote: {**asdict(remote), "clock": "this boot"})
     client = open_client(wiring("http/as-deployed", url))
     _, trace = ask(client, Request("a", "plan"))
     client.close()
@@ -258,4 +258,4 @@ def test_marks_survive_the_wire() -> None:
     trace.facts["prompt_n"] = 5.0
     trace.token_ns.append(17)
     remote = trace.to_remote()
-    assert dialect.remote_of_json(json.loads(json.dumps(dialect.remote_json(remote)))) == remote
+    assert Remote.of_json(json.loads(json.dumps(remote.to_json()))) == remote

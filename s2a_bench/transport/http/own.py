@@ -10,14 +10,13 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import orjson
 import pybase64
 
 from s2a_bench.errors import BadRequest, Busy, EngineError, Overdue, S2AError
-from s2a_bench.trace import Remote
 from s2a_bench.transport.http import VARIANTS
 from s2a_bench.transport.http.dialects.common import TEMPERATURE, TOP_P
 from s2a_bench.types import Request
@@ -122,13 +121,3 @@ def chunk(request_id: str, delta: dict[str, str], finish_reason: str | None = No
     """Return one streamed event; with ``usage`` in ``extra`` it is the last and has no choices."""
     choices = [] if "usage" in extra else [{"index": 0, "delta": delta, "finish_reason": finish_reason}]
     return {"id": request_id, "object": "chat.completion.chunk", "model": "s2a", "choices": choices, **extra}
-
-
-def remote_json(remote: Remote) -> dict[str, Any]:
-    """Turn a server's marks into what the last event carries."""
-    return asdict(remote)
-
-
-def remote_of_json(value: dict[str, Any]) -> Remote:
-    """Read a server's marks from the last event; raises ValueError for what can be none."""
-    return Remote.of_json(value)

@@ -56,7 +56,7 @@ class Reply:
             "model": "s2a",
             "choices": [{"index": 0, "message": message, "finish_reason": self._finish_reason(len(tokens))}],
             "usage": self._usage(len(tokens)),
-            "s2a": own.remote_json(self.trace.to_remote()),
+            "s2a": self.trace.to_remote().to_json(),
         }
 
     def events(self) -> Generator[bytes, None, None]:
@@ -76,7 +76,7 @@ class Reply:
             yield b"data: " + dumps({"error": {"message": str(error), "type": type(error).__name__}}) + b"\n\n"
             return
         yield b"data: " + dumps(own.chunk(request_id, {}, self._finish_reason(count))) + b"\n\n"
-        last = own.chunk(request_id, {}, usage=self._usage(count), s2a=own.remote_json(self.trace.to_remote()))
+        last = own.chunk(request_id, {}, usage=self._usage(count), s2a=self.trace.to_remote().to_json())
         yield b"data: " + dumps(last) + b"\n\ndata: [DONE]\n\n"
 
     @property
@@ -95,7 +95,7 @@ class Reply:
         except S2AError as error:
             yield blocks.of_json({"error": {"message": str(error), "type": type(error).__name__}})
             return
-        last = own.chunk(self._request.id, {}, self._finish_reason(count), s2a=own.remote_json(self.trace.to_remote()))
+        last = own.chunk(self._request.id, {}, self._finish_reason(count), s2a=self.trace.to_remote().to_json())
         yield blocks.of_json(last)
 
     def _wanted(self) -> Iterator[Piece]:

@@ -20,6 +20,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, S2AError
 from s2a_bench.facts import INFER_MS
 from s2a_bench.trace import RESIDUAL, Trace
+from s2a_bench.transport import ours
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.turns import Queued, Turn, whole
 from s2a_bench.transport.websocket import PREV_TOTAL_MS, own
@@ -110,7 +111,8 @@ class Call:
             raise _Gone
         observation = unpackb(message)
         trace.mark("msgpack_parse")
-        request = own.request_of(observation, trace, self._office.limits, ours=self._peer.ours)
+        told = ours.told_in(observation) if self._peer.ours else None
+        request = ours.request_of(observation, told, trace, self._office.limits)
         trace.mark("msgpack_parse")
         turn = self._turn = self._office.queued.turns.join()
         if turn.come is None:
@@ -172,7 +174,7 @@ class Call:
         self._peer.write(packb({**kind, own.ACTIONS: np.stack(actions), own.TIMING: timing}))
         self._peer.previous_ms = (now_ns() - self._began_ns) / 1e6
         if self._peer.ours:
-            self._peer.write(packb(own.remote_message(trace.to_remote())))
+            self._peer.write(packb(ours.remote_message(trace.to_remote())))
         self._peer.answered("")
 
     def _wanted(self, pieces: Generator[Piece, None, None]) -> Generator[Piece, None, None]:

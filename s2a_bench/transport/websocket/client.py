@@ -17,7 +17,7 @@ from s2a_bench.errors import RequestFailed, ServerDied
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring
+from s2a_bench.transport import Wiring, ours
 from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.credentials import read_key
@@ -75,7 +75,7 @@ class WebsocketClient:
         pictures = [told(frame, self._wiring.options.payload, trace) for frame in request.images]
         observation = self._template.fill(pictures, request.state, request.prompt)
         if self._ours:
-            observation[own.OWN] = own.parameters(request)
+            observation[ours.OWN] = ours.parameters(request)
         body = packb(observation)
         trace.mark("msgpack_pack")
         trace.facts[PAYLOAD_BYTES] = len(body)
@@ -145,7 +145,7 @@ class WebsocketClient:
             message = self._message(self._link)
         self._learn(answer.get(own.TIMING), trace)
         if self._ours:
-            trace.receive(own.remote_of(unpackb(self._message(self._link))))
+            trace.receive(ours.remote_of(unpackb(self._message(self._link))))
         self._mark(trace, packed_ns, first_ns)
 
     def _learn(self, timing: Any, trace: Trace) -> None:

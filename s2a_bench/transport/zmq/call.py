@@ -18,6 +18,7 @@ from typing import Any, Final
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, RequestFailed, S2AError
 from s2a_bench.trace import RESIDUAL, Trace
+from s2a_bench.transport import ours
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.turns import RETRY_AFTER_S, STUCK_S, Queued, Turn, whole
 from s2a_bench.transport.zmq import layouts, own
@@ -205,7 +206,7 @@ class Call:
             raise RequestFailed(f"a request is a map, not {type(message).__name__}")
         office = self._office
         office.check_key(message)
-        endpoint, told = message.get(own.ENDPOINT, own.GET_ACTION), own.told_in(message)
+        endpoint, told = message.get(own.ENDPOINT, own.GET_ACTION), ours.told_in(message)
         if endpoint == own.MARKS and told is not None:
             office.ask(self._envelope[0], str(told.get("id")), self)
             return
@@ -213,7 +214,7 @@ class Call:
             self.say(pack(office.told(endpoint)))
             return
         observation, layout = layouts.observation_in(message.get(own.DATA))
-        request = own.request_of(observation, told or {}, trace, office.limits)
+        request = ours.request_of(observation, told, trace, office.limits)
         trace.mark("msgpack_parse")
         turn = self._turn = office.queued.turns.join()
 
@@ -253,7 +254,7 @@ class Call:
         self.say(answer)
         if promised is not None:
             promised.asked.wait(ASKED_S)  # or the answer's way would be slower for what is computed now
-            marks = bytes(pack(own.remote_message(trace.to_remote())))
+            marks = bytes(pack(ours.remote_message(trace.to_remote())))
             self._office.keep(who, request.id, promised, marks)
 
     def _wanted(self, pieces: Generator[Piece, None, None]) -> Generator[Piece, None, None]:

@@ -18,7 +18,7 @@ from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring
+from s2a_bench.transport import Wiring, ours
 from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.credentials import read_key
 from s2a_bench.transport.observation import template_of
@@ -74,8 +74,8 @@ class ZmqClient:
                 yield action
             if self._ours:
                 whole = False
-                asked = {own.ENDPOINT: own.MARKS, own.OWN: {"id": request.id}, **self._token()}
-                trace.receive(own.remote_of(self._said(link.asked(pack(asked), bounds))))
+                asked = {own.ENDPOINT: own.MARKS, ours.OWN: {"id": request.id}, **self._token()}
+                trace.receive(ours.remote_of(self._said(link.asked(pack(asked), bounds))))
                 whole = True
             here = trace.remote is not None and trace.remote.clock == clock_id()
             trace.marks.append(("return" if here else "server", seen_ns))
@@ -103,7 +103,7 @@ class ZmqClient:
         data = layouts.data_of(self._wiring.options.layout, observation)
         message: dict[str, Any] = {own.ENDPOINT: own.GET_ACTION, own.DATA: data, **self._token()}
         if self._ours:
-            message[own.OWN] = own.parameters(request)
+            message[ours.OWN] = ours.parameters(request)
         body = pack(message, {room.address: room for room in self._rooms.values()})
         trace.mark("msgpack_pack")
         trace.facts[PAYLOAD_BYTES] = len(body)

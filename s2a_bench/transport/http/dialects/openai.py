@@ -25,6 +25,7 @@ from s2a_bench.facts import (
     USAGE_ZERO,
     Fact,
 )
+from s2a_bench.trace import Remote
 from s2a_bench.transport.chunks import NUMBERS as TICKS
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http import own as dialect
@@ -175,5 +176,5 @@ class Own(OpenAI):
             text = text_of(delta["content"]) if "content" in delta else None
             token = token_id(choice.get("token"))
             finish = text_of(choice.get("finish_reason") or "")
-        remote = dialect.remote_of_json(message["s2a"]) if "s2a" in message else None
+        remote = Remote.of_json(message["s2a"]) if "s2a" in message else None
         return Event(text, token, finish=finish, remote=remote, actions=actions)
