@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any, Final, Protocol
 
 from s2a_bench.clock import now_ns
@@ -15,43 +15,12 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import Accepted, ActionEvent, CancelResponse, Feedback, Rejected, Result
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import CancelCode
-from s2a_bench.ros.waiting import appeared
+from s2a_bench.ros.service import Asker
+from s2a_bench.ros.waiting import Waits, appeared
 
 AT_ONCE: Final = 1000
 """More than that is not taken before what has come is looked at."""
 FEEDBACK_ID: Final = slice(4, 20)
-
-
-class Asker(Protocol):
-    """The client's side of one service."""
-
-    request_type: str
-    hashed_type: str
-    """The type whose hash a server announces."""
-
-    def pack(self, body: Any, /) -> bytearray:
-        """Serialise a request."""
-        ...
-
-    def call(self, packed: bytearray, goal_id: bytes, /) -> None:
-        """Send a request that concerns a goal."""
-        ...
-
-    def replies(self) -> Iterator[tuple[bytes, memoryview]]:
-        """Take what has arrived, a bounded number, as (goal id, CDR)."""
-        ...
-
-    def unpack(self, packed: memoryview, /) -> Any:
-        """Deserialise a reply; raises TransportError."""
-        ...
-
-    def matched(self) -> bool:
-        """Return whether a server is there."""
-        ...
-
-    def peer_type_hash(self) -> str:
-        """Return the type hash that a server announces; empty without one."""
-        ...
 
 
 class Arrivals(Protocol):
@@ -59,20 +28,6 @@ class Arrivals(Protocol):
 
     def arrived(self) -> Iterable[memoryview]:
         """Take what has arrived, `AT_ONCE` at most."""
-        ...
-
-
-class Waits(Protocol):
-    """Waits for anything to arrive."""
-
-    interrupted: bool
-
-    def wait_until(self, deadline_ns: int, /) -> bool:
-        """Return after data, a time slice or an interrupt; False once the deadline or an interrupt has come."""
-        ...
-
-    def interrupt(self) -> None:
-        """End a wait under way and every later one; callable from any thread."""
         ...
 
 

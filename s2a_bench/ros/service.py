@@ -1,13 +1,15 @@
-"""Plain ROS 2 services on any middleware: one end of a service, and how a request of a stranger is answered."""
+"""Plain ROS 2 services on any middleware: both ends of one, how a stranger's request is answered, how one waits."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Generic, Protocol, TypeVar
 
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import REQUEST_BYTES
+from s2a_bench.ros.waiting import Waits, appeared
 
 _log = logging.getLogger(__name__)
 Caller = TypeVar("Caller")
@@ -38,6 +40,38 @@ class Service(Protocol[Caller_contra]):
         ...
 
 
+class Asker(Protocol):
+    """The client's side of one service."""
+
+    request_type: str
+    hashed_type: str
+    """The type whose hash a server announces."""
+
+    def pack(self, body: Any, /) -> bytearray:
+        """Serialise a request."""
+        ...
+
+    def call(self, packed: bytearray, goal_id: bytes, /) -> None:
+        """Send a request that concerns ``goal_id``."""
+        ...
+
+    def replies(self) -> Iterator[tuple[bytes, memoryview]]:
+        """Take what has arrived, a bounded number, as (goal id, CDR)."""
+        ...
+
+    def unpack(self, packed: memoryview, /) -> Any:
+        """Deserialise a reply; raises TransportError."""
+        ...
+
+    def matched(self) -> bool:
+        """Return whether a server is there."""
+        ...
+
+    def peer_type_hash(self) -> str:
+        """Return the type hash that a server announces; empty without one."""
+        ...
+
+
 class Offered(Generic[Caller]):
     """One service of a node and what answers it."""
 
@@ -60,3 +94,32 @@ class Offered(Generic[Caller]):
             if said != self._said:
                 self._said = said
                 _log.warning("%s: dropped a request: %s", self._name, str(error)[:200])
+
+
+class Calling:
+    """Calls one service and waits for the answer."""
+
+    def __init__(
+        self, name: str, asker: Asker, ended: Callable[[], Iterator[tuple[bytes, memoryview | None]]], waiter: Waits
+    ) -> None:
+        """Call the service ``/name``; ``ended`` yields the replies, without CDR those of requests that were dropped."""
+        self._name, self._asker, self._ended, self._waiter = name, asker, ended, waiter
+        self._asked = 0
+
+    def call(self, request: Any, timeout_s: float) -> Any:
+        """Wait for the server, send, wait for the reply that is ours."""
+        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        if not appeared(self._asker.matched, timeout_s):
+            raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
+        self._asked += 1
+        key = self._asked.to_bytes(8, "big")
+        self._asker.call(self._asker.pack(request), key)
+        silent = f"the service {self._name} did not answer in {timeout_s:g} s"
+        while True:
+            for answered, packed in self._ended():
+                if answered == key:
+                    if packed is None:
+                        raise TransportError(f"{silent}: it has dropped the request")
+                    return self._asker.unpack(packed)
+            if not self._waiter.wait_until(deadline_ns):
+                raise TransportError(silent)

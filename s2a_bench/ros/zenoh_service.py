@@ -17,8 +17,8 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, QoS
 from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
-from s2a_bench.ros.service import Offered
-from s2a_bench.ros.waiting import WAIT_SLICE_NS, appeared
+from s2a_bench.ros.service import Calling, Offered
+from s2a_bench.ros.waiting import WAIT_SLICE_NS
 from s2a_bench.ros.zenoh_inbox import Bell, Inbox
 from s2a_bench.ros.zenoh_node import Node, direct, give_way, refusals
 from s2a_bench.ros.zenoh_topic import Stamps, plain_cdr
@@ -229,30 +229,10 @@ class ZenohServices:
             self._bell.wait_until(now_ns() + WAIT_SLICE_NS)
 
 
-class ZenohServiceClient:
-    """Calls one service and waits for the answer."""
+class ZenohServiceClient(Calling):
+    """Calls one service with queries."""
 
     def __init__(self, node: Node, name: str, type_name: str) -> None:
         """Create the client's side of the service ``/name``."""
-        self._name, self._bell = name, Bell()
-        self._client = ServiceClient(node, name, type_name, DEFAULT_VERSION, self._bell)
-        self._asked = 0
-
-    def call(self, request: Any, timeout_s: float) -> Any:
-        """Wait for the server, send, wait for the reply."""
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
-        if not appeared(self._client.matched, timeout_s):
-            raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
-        self._asked += 1
-        key = self._asked.to_bytes(8, "big")
-        self._client.call(self._client.pack(request), key)
-        while True:
-            for answered, packed in self._client.ended():
-                if answered == key:
-                    if packed is None:
-                        raise TransportError(
-                            f"the service {self._name} did not answer in {timeout_s:g} s: it has dropped the request"
-                        )
-                    return self._client.unpack(packed)
-            if not self._bell.wait_until(deadline_ns):
-                raise TransportError(f"the service {self._name} did not answer in {timeout_s:g} s")
+        client = ServiceClient(node, name, type_name, DEFAULT_VERSION, bell := Bell())
+        super().__init__(name, client, client.ended, bell)
