@@ -36,15 +36,15 @@ def installed(module: str) -> bool:
     return sys.modules[module] is not None if module in sys.modules else find_spec(module) is not None
 
 
-def need(module: str, extra: str) -> None:
-    """Raise MissingExtra where a top-level module is not installed, without importing it."""
-    if not installed(module):
-        raise MissingExtra(f"{EXTRAS[extra]}: the package {module} is not installed; {how_to_install(extra)}")
+def need(extra: str, *modules: str) -> None:
+    """Raise MissingExtra where a top-level module that an extra brings is not installed, without importing it."""
+    if missing := [module for module in modules if not installed(module)]:
+        raise MissingExtra(f"{EXTRAS[extra]}: the package {missing[0]} is not installed; {how_to_install(extra)}")
 
 
 def require(module: str, extra: str) -> Any:
     """Import and return a module, as ``gguf.constants``; raises MissingExtra where it is missing or does not load."""
-    need(module.partition(".")[0], extra)
+    need(extra, module.partition(".")[0])
     try:
         return import_module(module)
     except (ImportError, OSError, RuntimeError) as error:

@@ -39,8 +39,7 @@ def _fetch(config: FetchConfig, *, json_: Json = False) -> None:
     from s2a_bench.inference.fetch import wanted
     from s2a_bench.inference.gguf_file import read_header
 
-    for module in ("huggingface_hub", "gguf"):
-        extras.need(module, "model")
+    extras.need("model", "huggingface_hub", "gguf")
     want = wanted(config.what, config.quant, config.mmproj)
     with _bytes_bar() as bar:
         tasks: dict[str, TaskID] = {}

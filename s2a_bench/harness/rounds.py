@@ -64,7 +64,7 @@ def run_requests(task: Task, config: RequestsConfig, output: Path, progress: Pro
     if config.own_engine:
         need_engine(config.engine.name)
     if config.starts_program:
-        extras.need("gguf", "model")
+        extras.need("model", "gguf")
     limit_threads()
     malloc_tuned = config.tuned and keep_large_blocks()
     with ExitStack() as stack:

@@ -141,8 +141,7 @@ def default_engine(say: Callable[[str], None]) -> str:
 def need_engine(name: str) -> None:
     """Raise MissingExtra where what an engine needs is not installed."""
     if name == "llama":
-        extras.need("llama_cpp", "llama")
-        extras.need("gguf", "llama")
+        extras.need("llama", "llama_cpp", "gguf")
 
 
 def open_engine(config: EngineConfig) -> Engine:

@@ -25,7 +25,7 @@ class Embedded:
     most: ClassVar[int | None] = 1
 
     def __init__(self, step_s: float = STEP_S) -> None:
-        extras.need("highway_env", "ccrb")
+        extras.need("ccrb", "highway_env")
         self.step_s = step_s
         self._cars: dict[int, Any] = {}
 

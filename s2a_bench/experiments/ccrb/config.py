@@ -150,4 +150,4 @@ class CcrbView(Options):
     def check(self) -> None:
         """Raise MissingExtra, before anything is driven, where an animation cannot be drawn."""
         if self.animation:
-            extras.need("highway_env", "ccrb")
+            extras.need("ccrb", "highway_env")

@@ -49,14 +49,14 @@ class Websocket(Listening[WebsocketOptions]):
 
     def client(self, wiring: Wiring[WebsocketOptions], alive: Callable[[], bool]) -> Client:
         """Prepare to ask the server at ``wiring.address``, a URL."""
-        self._need()
+        extras.need(self.name, *PACKAGES)
         from s2a_bench.transport.websocket.client import WebsocketClient
 
         return WebsocketClient(wiring, alive)
 
     def server(self, wiring: Wiring[WebsocketOptions], handler: Handler) -> Server:
         """Bind ``host:port``; raises PortInUse."""
-        self._need()
+        extras.need(self.name, *PACKAGES)
         from s2a_bench.transport.websocket.server import WebsocketServer
 
         return WebsocketServer(wiring, handler)
@@ -83,7 +83,7 @@ class Websocket(Listening[WebsocketOptions]):
         """Refuse a key that is not there; raises MissingExtra too."""
         from s2a_bench.transport.credentials import read_key
 
-        self._need()
+        extras.need(self.name, *PACKAGES)
         read_key(options.api_key_env)
 
     def ready(self, wiring: Wiring[WebsocketOptions], address: str) -> str:
@@ -91,11 +91,6 @@ class Websocket(Listening[WebsocketOptions]):
         key, everybody = wiring.options.api_key_env, wiring.options.no_auth
         whom = f" for who has the key in ${key}, /healthz for all" if key else " for all who reach it" * everybody
         return f"serving openpi's protocol at {address}, streamed at {address}{STREAM_PATH}{whom}"
-
-    def _need(self) -> None:
-        """Raise MissingExtra where its libraries are not installed."""
-        for module in PACKAGES:
-            extras.need(module, self.name)
 
 
 STREAM_PATH = "/stream"

@@ -18,8 +18,7 @@ PAGE = "https://example.org"
 
 def examine(parts: SplitResult) -> Iterator[Finding]:
     """Shake hands without a key, and once more as a page in somebody's browser would."""
-    for module in PACKAGES:
-        extras.need(module, "websocket")
+    extras.need("websocket", *PACKAGES)
     url = urlunsplit(parts)
     try:
         said = _greeting(url, {})

@@ -40,14 +40,14 @@ class Zmq(Listening[ZmqOptions]):
 
     def client(self, wiring: Wiring[ZmqOptions], alive: Callable[[], bool]) -> Client:
         """Prepare to ask the server at ``wiring.address``, a URL."""
-        self._need()
+        extras.need(self.name, *PACKAGES)
         from s2a_bench.transport.zmq.client import ZmqClient
 
         return ZmqClient(wiring, alive)
 
     def server(self, wiring: Wiring[ZmqOptions], handler: Handler) -> Server:
         """Bind ``host:port``; raises PortInUse."""
-        self._need()
+        extras.need(self.name, *PACKAGES)
         from s2a_bench.transport.zmq.server import ZmqServer
 
         return ZmqServer(wiring, handler)
@@ -74,7 +74,7 @@ class Zmq(Listening[ZmqOptions]):
         """Refuse a key that is not there; raises MissingExtra too."""
         from s2a_bench.transport.credentials import read_key
 
-        self._need()
+        extras.need(self.name, *PACKAGES)
         read_key(options.api_key_env)
 
     def ready(self, wiring: Wiring[ZmqOptions], address: str) -> str:
@@ -82,11 +82,6 @@ class Zmq(Listening[ZmqOptions]):
         key, everybody = wiring.options.api_key_env, wiring.options.no_auth
         whom = f" for who sends the key in ${key}" if key else " for all who reach it" * everybody
         return f"serving GR00T's protocol at {address}{whom}"
-
-    def _need(self) -> None:
-        """Raise MissingExtra where its libraries are not installed."""
-        for module in PACKAGES:
-            extras.need(module, self.name)
 
 
 ZMQ = Zmq()

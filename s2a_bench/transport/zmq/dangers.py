@@ -19,8 +19,7 @@ PORT = 5555
 
 def examine(parts: SplitResult) -> Iterator[Finding]:
     """Ping it without a key."""
-    for module in PACKAGES:
-        extras.need(module, "zmq")
+    extras.need("zmq", *PACKAGES)
     place = f"{parts.hostname}:{parts.port or PORT}"
     try:
         said = _pinged(urlunsplit((parts.scheme, place, "", "", "")))
