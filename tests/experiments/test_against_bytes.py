@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.experiments.latency.view.against_bytes import against_bytes, build_lines, crossings, shown
+from s2a_bench.experiments.latency.view.against_bytes import against_bytes, crossings, shown
+from s2a_bench.experiments.latency.view.cells import split
 from s2a_bench.store.run import Run
 from s2a_bench.transport import TRANSPORTS
 from s2a_bench.writers.style import _OTHER_LOOKS
@@ -37,7 +38,7 @@ def runs(make_run: MakeRun) -> list[Run]:
 
 
 def test_lines_are_what_made_the_times(runs: list[Run]) -> None:
-    found = {each.name: each for each in against_bytes(runs)}
+    found = {each.name: each for each in against_bytes(split(runs))}
     assert list(found) == ["http/binary", "ros/topic", "loopback"]
     for name, each in found.items():
         assert each.line is not None
@@ -52,19 +53,19 @@ def test_scaled_pictures_count_as_scaled(make_run: MakeRun) -> None:
     cells = {"ros/topic": {"capture": 1.0, "inference": 1.0, "return": 0.0}}
     sizes = [asked(640, 480, 1, resize=[224, 224]), asked(640, 480, 1)]
     made = [make_run(cells, n=5, spread=0, manifest=each, payloads={"ros": "raw"}) for each in sizes]
-    ((pipeline),) = against_bytes(made)
+    ((pipeline),) = against_bytes(split(made))
     assert [size for size, _ in pipeline.groups] == [224 * 224 * 3 / 1e6, 640 * 480 * 3 / 1e6]
 
 
 def test_runs_of_one_size_show_nothing(make_run: MakeRun) -> None:
     same = [make_run(n=5, manifest=asked(640, 480, 1)) for _ in range(2)]
-    assert against_bytes(same) == []
-    assert shown(same) == ({}, {})
-    assert against_bytes([make_run(n=5)]) == []  # a folder that says no size
+    assert against_bytes(split(same)) == []
+    assert shown(split(same)) == ({}, {})
+    assert against_bytes(split([make_run(n=5)])) == []  # a folder that says no size
 
 
 def test_tables_and_figure_say_what_answered(runs: list[Run]) -> None:
-    tables, figures = shown(runs)
+    tables, figures = shown(split(runs))
     assert set(tables) == {"bytes", "crossings"}
     assert tables["bytes"].rows[0] == (
         *("http/binary", "raw", "1.00 [1.00, 1.00]", "0.300 [0.300, 0.300]", "2.00", "0%"),
@@ -76,7 +77,6 @@ def test_tables_and_figure_say_what_answered(runs: list[Run]) -> None:
     (axes,) = figure.axes
     assert [line.get_label() for line in axes.lines] == ["http/binary", "ros/topic", "loopback"]
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-    assert build_lines(runs, against_bytes(runs)).axes
 
 
 def test_every_transport_looks_like_no_other() -> None:

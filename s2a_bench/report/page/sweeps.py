@@ -12,7 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.latency.view import against_bytes
-from s2a_bench.experiments.latency.view.cells import cells_of, engine_note
+from s2a_bench.experiments.latency.view.cells import split, stand_ins
 from s2a_bench.experiments.latency.view.tables import TITLES
 from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
 from s2a_bench.provenance import Origins
@@ -27,7 +27,7 @@ from s2a_bench.writers.tables import ABSENT, TextTable, mean_sd, number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.latency.view.cells import Cell, Floats
+    from s2a_bench.experiments.latency.view.cells import Cell, Floats, Split
     from s2a_bench.store.sweep import Sweep
 
 Runs = Sequence[tuple[dict[str, Any], Run]]
@@ -45,9 +45,10 @@ def overview(sweep: Sweep, runs: Runs) -> Content:
     if failed := int(states.get("failed", 0)):
         said.append(f"{failed} failed; the table of cells says why, and --resume --retry-failed runs them again.")
     tables = {"cells": cell_table(sweep)}
-    if measured := measured_table(runs):
+    cells = split(run for _, run in runs)
+    if measured := measured_table([settings for settings, _ in runs], cells):
         tables = {"overview": measured, **tables}
-    lines, figures = against_bytes.shown([run for _, run in runs])
+    lines, figures = against_bytes.shown(cells)
     line = sweep.origins.line
     tables = {name: replace(table, provenance=line) for name, table in (lines | tables).items()}
     csvs = {"cells.csv": CsvTable.of_frame(sweep.cells)}
@@ -76,14 +77,15 @@ def cell_table(sweep: Sweep) -> TextTable:
     return TextTable("Cells", ("cell", "settings", "host", "state", "repeat", "attempt", "took s"), rows, 4)
 
 
-def measured_table(runs: Runs) -> TextTable | None:
+def measured_table(settings: Sequence[Mapping[str, Any]], runs: Split) -> TextTable | None:
     """Lay out the numbers of latency and throughput cells side by side; None where there are none."""
-    rows = [row for settings, run in runs for row in _measured(words_of(settings), run)]
+    rows = [
+        row for each, (run, cells) in zip(settings, runs, strict=True) for row in _measured(words_of(each), run, cells)
+    ]
     if not rows:
         return None
     header = ("settings", "cell", "what", "host", "n", "errors", "mean ± sd", "median", "p99")
-    notes = sorted({note.sentence() for _, run in runs if (note := engine_note(run, cells_of(run)))})
-    return TextTable("Measured cells side by side", header, rows, 4, notes=tuple(notes))
+    return TextTable("Measured cells side by side", header, rows, 4, notes=tuple(stand_ins(runs)))
 
 
 def words_of(settings: Mapping[str, Any]) -> str:
@@ -139,11 +141,11 @@ def _joined(sweep: Sweep, runs: Sequence[Run]) -> Run:
     return Run(sweep.path, manifest, tables)
 
 
-def _measured(words: str, run: Run) -> Iterator[tuple[str, ...]]:
+def _measured(words: str, run: Run, cells: Sequence[Cell]) -> Iterator[tuple[str, ...]]:
     """Yield a row a cell of a measured run."""
     if run.samples.empty:
         return
-    for cell in cells_of(run):
+    for cell in cells:
         what, values = _quantity(cell, run)
         found = summary_of(values)
         numbers = [mean_sd(found), number(found.median), number(found.p99)] if found else [ABSENT] * 3

@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note
+from s2a_bench.experiments.latency.view.cells import Cell, stand_ins
 from s2a_bench.stats.line import Estimate, Line, crossing, fit_line
 from s2a_bench.transport import declared
 from s2a_bench.writers.figures import new_figure
-from s2a_bench.writers.style import WIDTH_IN, cell_looks
+from s2a_bench.writers.style import cell_looks
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.latency.view.cells import Floats
+    from s2a_bench.experiments.latency.view.cells import Floats, Split
     from s2a_bench.store.run import Run
 
 METRIC = "e2e_without_inference"
@@ -36,10 +36,6 @@ FITTED = (
 FIT = (
     "Travels: bytes on the wire for each of the pixels. Off: root mean square of the medians' distances from the line; "
     "launches differ, and what costs a call rather than a byte lies off it."
-)
-CROSSED = (
-    "Pipelines with one payload, or one pipeline with two; where at least 95 % of the bootstrap's lines cross, between "
-    "the smallest and the largest picture."
 )
 
 
@@ -57,18 +53,18 @@ class Pipeline:
     """Bytes on the wire for each of the pixels; None where nothing travels, or nobody tells."""
 
 
-def against_bytes(runs: Sequence[Run]) -> list[Pipeline]:
+def against_bytes(runs: Split) -> list[Pipeline]:
     """Return the pipelines of latency runs that differ in how many bytes their pictures have; nothing of others."""
     found: dict[tuple[str, str], list[tuple[float, Cell]]] = {}
-    for run in runs:
+    for run, cells in runs:
         if run.manifest["command"] != "latency" or run.samples.empty or not (pixels := _pixels(run)):
             continue
-        payloads = {cell.about["payload"] for cell in cells_of(run)} - {"", "none"}
-        for cell in cells_of(run):
+        payloads = {cell.about["payload"] for cell in cells} - {"", "none"}
+        for cell in cells:
             payload = cell.about["payload"] if cell.about["payload"] in payloads else "/".join(sorted(payloads))
             if cell.values_ms(METRIC).size:
                 found.setdefault((cell.name, payload), []).append((pixels, cell))
-    lines = [_pipeline(name, payload, cells) for (name, payload), cells in found.items()]
+    lines = [_pipeline(name, payload, sized) for (name, payload), sized in found.items()]
     order = sorted(
         lines, key=lambda each: (each.payload != "raw", each.payload, declared(each.path[0]).order, each.name)
     )
@@ -105,7 +101,7 @@ def crossings(pipelines: Sequence[Pipeline]) -> list[tuple[Pipeline, Pipeline, E
     return found
 
 
-def line_table(runs: Sequence[Run], pipelines: Sequence[Pipeline]) -> TextTable:
+def line_table(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> TextTable:
     """Lay out each line: the fixed cost, the cost a megabyte, what of the pixels travels, how well a line fits."""
     rows: list[tuple[str, ...]] = [
         (
@@ -120,15 +116,11 @@ def line_table(runs: Sequence[Run], pipelines: Sequence[Pipeline]) -> TextTable:
         if each.line
     ]
     header = ("pipeline", "payload", "fixed ms", "ms a MB", "travels", "off")
-    notes: list[str] = [
-        FITTED,
-        FIT,
-        *_answered(runs),
-    ]
-    return TextTable("Time against bytes: a line for each pipeline", header, rows, 2, notes=tuple(notes))
+    notes = (FITTED, FIT, *answered)
+    return TextTable("Time against bytes: a line for each pipeline", header, rows, 2, notes=notes)
 
 
-def crossing_table(runs: Sequence[Run], pipelines: Sequence[Pipeline]) -> TextTable | None:
+def crossing_table(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> TextTable | None:
     """Lay out where lines cross, with loopback, which no picture travels over, left out; None where none do."""
     wired = [each for each in pipelines if not declared(each.path[0]).in_process]
     rows: list[tuple[str, ...]] = [
@@ -139,7 +131,7 @@ def crossing_table(runs: Sequence[Run], pipelines: Sequence[Pipeline]) -> TextTa
         return None
     notes = (
         "Where 95 % of the bootstrap's lines cross, between the smallest and the largest picture.",
-        *_answered(runs),
+        *answered,
     )
     header = ("faster below", "faster above", "at MB of pixels")
     return TextTable("Where one becomes faster than another", header, rows, 2, notes=notes)
@@ -153,22 +145,17 @@ def _estimate(found: Estimate) -> str:
     return f"{number(found.value)} [{number(found.low)}, {number(found.high)}]"
 
 
-def _answered(runs: Sequence[Run]) -> list[str]:
-    notes = {note.sentence(): note for run in runs if (note := engine_note(run, cells_of(run)))}
-    return [notes[said].sentence() for said in sorted(notes)]
-
-
-def build_lines(runs: Sequence[Run], pipelines: Sequence[Pipeline]) -> Figure:
+def build_lines(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> Figure:
     """Draw medians and lines, a panel a payload, both axes logarithmic."""
     drawn = [each for each in pipelines if each.line]
     payloads = list(dict.fromkeys(each.payload for each in drawn))
     names = {each.name: each.path for each in drawn}
     looks = cell_looks(names)
     title = "Time against bytes: medians and fitted lines"
-    if answered := _answered(runs):
+    if answered:
         title += f"\n{' '.join(answered)}"
     height = 0.6 + 2.3 * len(payloads) + 0.14 * -(-len(names) // 2)
-    figure = new_figure(height, title, WIDTH_IN)
+    figure = new_figure(height, title)
     panels = figure.subplots(len(payloads), 1, squeeze=False, sharex=True)[:, 0]
     for axes, payload in zip(panels, payloads, strict=True):
         _draw(axes, [each for each in drawn if each.payload == payload], looks)
@@ -200,12 +187,13 @@ def _draw(axes: Axes, pipelines: Sequence[Pipeline], looks: Mapping[str, tuple[s
     axes.grid(visible=True, linewidth=0.3, color="#DDDDDD")
 
 
-def shown(runs: Sequence[Run]) -> tuple[dict[str, TextTable], dict[str, Callable[[], Figure]]]:
+def shown(runs: Split) -> tuple[dict[str, TextTable], dict[str, Callable[[], Figure]]]:
     """Return the tables and the figure of runs that differ in bytes, by their files' names."""
     pipelines = against_bytes(runs)
     if not pipelines:
         return {}, {}
-    tables = {"bytes": line_table(runs, pipelines)}
-    if crossed := crossing_table(runs, pipelines):
+    answered = stand_ins(runs)
+    tables = {"bytes": line_table(pipelines, answered)}
+    if crossed := crossing_table(pipelines, answered):
         tables["crossings"] = crossed
-    return tables, {"time_against_bytes": lambda: build_lines(runs, pipelines)}
+    return tables, {"time_against_bytes": lambda: build_lines(pipelines, answered)}

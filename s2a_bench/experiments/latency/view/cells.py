@@ -5,7 +5,7 @@ Warm-ups and failed samples are counted and take part in no summary.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
     Floats: TypeAlias = NDArray[np.float64]
+    Split: TypeAlias = Sequence[tuple[Run, list["Cell"]]]
 
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
 """What cells are compared by: columns of the samples, less the unit."""
@@ -142,6 +143,11 @@ def cells_of(run: Run) -> list[Cell]:
     return _cells(run, with_launch(run.samples))
 
 
+def split(runs: Iterable[Run]) -> Split:
+    """Return runs, each with its cells."""
+    return [(run, cells_of(run)) for run in runs]
+
+
 def launches_of(run: Run) -> list[tuple[int, list[Cell]]]:
     """Return launch and cells for every launch of a run."""
     samples = with_launch(run.samples)
@@ -216,6 +222,11 @@ def engine_note(run: Run, cells: list[Cell]) -> Note:
     if UNKNOWN in engines:
         notes.append(Note("engine unknown, as the server does not tell", "engine unknown"))
     return Note(", ".join(notes), *(label for note in notes for label in note.labels))
+
+
+def stand_ins(runs: Split) -> list[str]:
+    """Return what did not really answer runs, a sentence each."""
+    return sorted({note.sentence() for run, cells in runs if (note := engine_note(run, cells))})
 
 
 def _replayed(run: Run, cells: list[Cell]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from s2a_bench.experiments import Compared, Metric, Subject, by_name
-from s2a_bench.experiments.latency.view.cells import Cell, cells_of, engine_note, launches_of, numbers_ms
+from s2a_bench.experiments.latency.view.cells import Cell, launches_of, numbers_ms, split, stand_ins
 from s2a_bench.trace import GROUPS
 
 if TYPE_CHECKING:
@@ -28,8 +28,7 @@ def subject_of(cell: Cell, rows: Callable[[str], Rows], launch: int) -> Subject:
 
 def origin_of(run: Run) -> list[str]:
     """Return what did not really answer the requests of a run."""
-    note = engine_note(run, cells_of(run))
-    return [note.sentence()] if note else []
+    return stand_ins(split([run]))
 
 
 def token_rows(cell: Cell, name: str) -> Rows | None:
