@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median
-from time import perf_counter
 
 import numpy as np
 
+from benchmarks.timing import turns_s
 from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.policy.chunks import Mode, Setting, mode
 from s2a_bench.policy.chunks.stepping import step
@@ -58,21 +57,10 @@ def _speed(written: str, made: Mode, latency_ns: np.ndarray, seconds: float) -> 
     ticks, stepped = made.cycles(latency_ns, SETTING).ticks, made.cycles(few, SETTING).ticks
     return Speed(
         written,
-        ticks / _time(seconds, lambda: made.cycles(latency_ns, SETTING)),
-        ticks / _time(seconds, lambda: made.ticks(latency_ns, SETTING)),
-        stepped / _time(seconds, lambda: step(made, few, SETTING)),
+        ticks / median(turns_s(seconds, lambda: made.cycles(latency_ns, SETTING))),
+        ticks / median(turns_s(seconds, lambda: made.ticks(latency_ns, SETTING))),
+        stepped / median(turns_s(seconds, lambda: step(made, few, SETTING))),
     )
-
-
-def _time(seconds: float, run: Callable[[], object]) -> float:
-    """Repeat for a while and return the median turn; the first turn warms up and does not count."""
-    run()
-    turns: list[float] = []
-    while not turns or sum(turns) < seconds:
-        before = perf_counter()
-        run()
-        turns.append(perf_counter() - before)
-    return median(turns)
 
 
 def main() -> None:

@@ -13,10 +13,10 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median
-from time import perf_counter
 
 import numpy as np
 
+from benchmarks.timing import turns_s
 from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.arrivals import fragments, tokens
@@ -66,13 +66,7 @@ def measure(seconds: float = SECONDS) -> list[Speed]:
 
 
 def _time(what: str, plans: int, seconds: float, run: Callable[[], object]) -> Speed:
-    """Repeat for a while; the first turn warms up and does not count."""
-    run()
-    turns: list[float] = []
-    while not turns or sum(turns) < seconds:
-        before = perf_counter()
-        run()
-        turns.append(perf_counter() - before)
+    turns = turns_s(seconds, run)
     return Speed(what, plans / median(turns), plans / min(turns))
 
 
