@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -16,8 +14,9 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import Accepted, Feedback, Rejected, Result, llama, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.testing.action import NAME, WAIT_S, Action, ActionSuite, event, offer, receive, send, start, text_of
+from s2a_bench.testing.action import NAME, WAIT_S, Action, ActionSuite, event, offer, receive, send, start
 from s2a_bench.testing.middleware import Join
+from tests.ros.words import hears_them, served
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
@@ -199,33 +198,10 @@ def test_malformed_requests_leave_the_server_up(join: Join, caplog: pytest.LogCa
     assert [record.getMessage()[: len(NAME) + 10] for record in caplog.records] == [NAME + ": dropped "] * 3
 
 
-SERVER_PROCESS = """
-import sys
-from s2a_bench.ros import llama, open_middleware
-middleware = open_middleware(domain_id=int(sys.argv[1]))
-server = middleware.action_server(sys.argv[2], llama.GENERATE_RESPONSE)
-goal = server.next_goal(60)
-goal.accept()
-words = goal.unpack().prompt.split()
-goal.executing()
-for number, word in enumerate(words):
-    goal.feedback(llama.token_feedback(word, number))
-goal.succeed(llama.text_result(" ".join(words)))
-sys.stdin.read()
-middleware.close()
-"""
-
-
 def test_client_and_server_are_two_processes(join: Join, dds_domain: int) -> None:
     client = join().action_client(NAME, llama.GENERATE_RESPONSE)
-    command = [sys.executable, "-c", SERVER_PROCESS, str(dds_domain), NAME]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
-        assert client.wait_for_server(30)
-        words = [f"word{number}" for number in range(200)]
-        sent = send(client, " ".join(words))
-        assert event(client, Accepted).goal_id == sent
-        assert [text_of(client, event(client, Feedback)) for _ in words] == words
-        assert client.unpack_result(event(client, Result).packed).response.text == " ".join(words)
+    with served("cyclonedds", dds_domain) as process:
+        hears_them(client, 30)
         assert process.stdin is not None
         process.stdin.close()
     assert process.returncode == 0

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
@@ -18,9 +16,6 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import (
     MIDDLEWARES,
     REQUEST_BYTES,
-    Accepted,
-    ActionClient,
-    Feedback,
     Middleware,
     QoS,
     Rejected,
@@ -31,8 +26,9 @@ from s2a_bench.ros import (
 )
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.router import Router, endpoint_of, free_endpoint, listens
-from s2a_bench.testing.action import NAME, ActionSuite, event, offer, receive, send, start, text_of
+from s2a_bench.testing.action import NAME, ActionSuite, event, offer, receive, start
 from s2a_bench.testing.middleware import GET_TYPES, STRING, WAIT_S, Join, MiddlewareSuite, text, wait_matched
+from tests.ros.words import hears_them, served
 
 zenoh = pytest.importorskip("zenoh", reason="the extra zenoh is not installed")
 
@@ -371,46 +367,16 @@ def test_a_message_that_is_too_large_is_dropped_and_the_next_arrives(
         assert subscription.unpack(subscription.take(WAIT_S)).data == "whole"
 
 
-SERVER_PROCESS = """
-import sys
-from s2a_bench.ros import llama, open_middleware
-from s2a_bench.ros.router import Router
-middleware = open_middleware("zenoh", domain_id=int(sys.argv[1]), router=Router(sys.argv[2], host=True))
-server = middleware.action_server(sys.argv[3], llama.GENERATE_RESPONSE)
-goal = server.next_goal(60)
-goal.accept()
-words = goal.unpack().prompt.split()
-goal.executing()
-for number, word in enumerate(words):
-    goal.feedback(llama.token_feedback(word, number))
-goal.succeed(llama.text_result(" ".join(words)))
-sys.stdin.read()
-"""
-
-
 def test_a_server_that_was_the_router_may_die_and_come_back(endpoint: str, dds_domain: int) -> None:
-    words = [f"word{number}" for number in range(200)]
-
-    def served() -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-c", SERVER_PROCESS, str(dds_domain), endpoint, NAME]
-        return subprocess.Popen(command, stdin=subprocess.PIPE)
-
-    def answers(client: ActionClient) -> None:
-        assert client.wait_for_server(WAIT_S)
-        sent = send(client, " ".join(words))
-        assert event(client, Accepted).goal_id == sent
-        assert [text_of(client, event(client, Feedback)) for _ in words] == words
-        assert client.unpack_result(event(client, Result).packed).response.text == " ".join(words)
-
-    with served() as server:
+    with served("zenoh", dds_domain, endpoint) as server:
         until(lambda: listens(endpoint))
         middleware = open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint))
         client = middleware.action_client(NAME, llama.GENERATE_RESPONSE)
-        answers(client)
+        hears_them(client, WAIT_S)
         server.kill()
     until(lambda: not client.server_present())
-    with served() as server:
-        answers(client)
+    with served("zenoh", dds_domain, endpoint) as server:
+        hears_them(client, WAIT_S)
         server.kill()
     middleware.close()
 
