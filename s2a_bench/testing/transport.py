@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from threading import Thread
 from typing import Any, ClassVar
@@ -33,6 +33,7 @@ from s2a_bench.transport import (
     TRANSPORTS,
     Client,
     Handler,
+    Server,
     Transport,
     Wiring,
     open_client,
@@ -97,16 +98,25 @@ def wiring(
     return pipeline.wiring(address, timeout_s=timeout_s, deadline_s=deadline_s, max_tokens=max_tokens)
 
 
+@contextmanager
+def served(told: Wiring[Any], handler: Handler) -> Iterator[tuple[Server, Thread]]:
+    """Serve on a thread of its own for as long as the context lasts."""
+    server = open_server(told, handler)
+    thread = Thread(target=server.serve)
+    thread.start()
+    try:
+        yield server, thread
+    finally:
+        server.stop()
+        thread.join()
+
+
 def connector(told: Wiring[Any]) -> Iterator[Connect]:
     """Connect through a server on a thread of its own; everything is stopped afterwards."""
     with ExitStack() as stack:
 
         def connect(handler: Handler) -> Client:
-            server = open_server(told, handler)
-            thread = Thread(target=server.serve)
-            thread.start()
-            stack.callback(thread.join)
-            stack.callback(server.stop)
+            server, thread = stack.enter_context(served(told, handler))
             client = open_client(replace(told, address=server.address), thread.is_alive)
             stack.callback(client.close)
             return client

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from threading import Thread
+from contextlib import contextmanager
 from typing import Any
 
 import httpx
@@ -14,7 +13,7 @@ import pytest
 from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.testing.transport import ask, wiring
+from s2a_bench.testing.transport import ask, served, wiring
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.http.own import PATHS
 from s2a_bench.types import Request
@@ -34,12 +33,7 @@ def key_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 def serving(address: str = "", **options: Any) -> Iterator[str]:
     """Serve echo; return the address on loopback."""
     handler = engine_handler(open_engine(EngineConfig(name="echo")))
-    with ExitStack() as stack:
-        server = open_server(wiring("http", address, **options), handler)
-        thread = Thread(target=server.serve)
-        thread.start()
-        stack.callback(thread.join)
-        stack.callback(server.stop)
+    with served(wiring("http", address, **options), handler) as (server, _):
         yield server.address.replace(ALL[:-2], "127.0.0.1")
 
 

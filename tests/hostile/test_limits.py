@@ -14,10 +14,9 @@ import sys
 import time
 import zlib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from threading import Thread
 
 import cv2
 import httpx
@@ -27,8 +26,8 @@ import pytest
 from s2a_bench.errors import RequestFailed
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.testing.transport import ask, wiring
-from s2a_bench.transport import open_client, open_server
+from s2a_bench.testing.transport import ask, served, wiring
+from s2a_bench.transport import open_client
 from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS
 from s2a_bench.transport.limits import LIMITS, MIB, Limits, check_encoded
 from s2a_bench.types import Request
@@ -41,13 +40,8 @@ HEAD = b"POST /v1/chat/completions HTTP/1.1\r\nHost: a\r\nContent-Type: applicat
 @contextmanager
 def serving(limits: Limits = LIMITS) -> Iterator[str]:
     """Serve echo for as long as the context lasts."""
-    with ExitStack() as stack:
-        handler = engine_handler(open_engine(EngineConfig(name="echo")), limits=limits)
-        server = open_server(replace(wiring("http"), limits=limits), handler)
-        thread = Thread(target=server.serve)
-        thread.start()
-        stack.callback(thread.join)
-        stack.callback(server.stop)
+    handler = engine_handler(open_engine(EngineConfig(name="echo")), limits=limits)
+    with served(replace(wiring("http"), limits=limits), handler) as (server, _):
         yield server.address
 
 
@@ -280,18 +274,13 @@ class TestDoor:
 
 @pytest.mark.parametrize("max_tokens", [0, LIMITS.answer_tokens + 1, 2**32 - 1])
 def test_a_ros_request_for_too_many_tokens_is_refused(max_tokens: int) -> None:
-    server = open_server(wiring("ros/topic"), engine_handler(open_engine(EngineConfig(name="echo"))))
-    thread = Thread(target=server.serve)
-    thread.start()
-    client = open_client(wiring("ros/topic", server.address))
-    try:
+    with (
+        served(wiring("ros/topic"), engine_handler(open_engine(EngineConfig(name="echo")))) as (server, _),
+        closing(open_client(wiring("ros/topic", server.address))) as client,
+    ):
         with pytest.raises(RequestFailed, match="max_tokens should be"):
             ask(client, Request("a", "a", max_tokens=max_tokens))
         assert len(ask(client, Request("b", "a", max_tokens=2))[0]) == 2
-    finally:
-        client.close()
-        server.stop()
-        thread.join()
 
 
 STUCK = """

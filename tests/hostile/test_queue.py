@@ -7,7 +7,7 @@ import random
 import socket
 import time
 from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from threading import Event, Lock, Thread
 from typing import Any
@@ -19,9 +19,9 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, EngineError, RequestFailed
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.testing.transport import ask, wiring
+from s2a_bench.testing.transport import ask, served, wiring
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Handler, open_client, open_server
+from s2a_bench.transport import Handler, open_client
 from s2a_bench.transport.http.own import PATHS
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.turns import Queued, Turn, Turns
@@ -34,12 +34,7 @@ paths = pytest.mark.parametrize("path", [CHAT, BEST_EFFORT])
 @contextmanager
 def serving(handler: Handler, name: str = "http", limits: Limits = LIMITS) -> Iterator[str]:
     """Serve for as long as the context lasts."""
-    with ExitStack() as stack:
-        server = open_server(replace(wiring(name), limits=limits), handler)
-        thread = Thread(target=server.serve)
-        thread.start()
-        stack.callback(thread.join)
-        stack.callback(server.stop)
+    with served(replace(wiring(name), limits=limits), handler) as (server, _):
         yield server.address
 
 

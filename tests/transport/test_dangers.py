@@ -11,8 +11,8 @@ import pytest
 
 from s2a_bench.errors import UsageError
 from s2a_bench.machine.doctor import Finding
-from s2a_bench.testing.transport import Recorder, wiring
-from s2a_bench.transport import dangers, open_server
+from s2a_bench.testing.transport import Recorder, served, wiring
+from s2a_bench.transport import dangers
 from s2a_bench.transport.dangers import PREFACE, examine, shown
 
 SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
@@ -55,15 +55,8 @@ def test_what_speaks_no_grpc_is_an_error(reply: bytes) -> None:
 
 
 def test_a_server_of_models_without_a_key_is_told_of() -> None:
-    told = wiring("http")
-    server = open_server(told, Recorder(["x"]))
-    thread = Thread(target=server.serve)
-    thread.start()
-    try:
+    with served(wiring("http"), Recorder(["x"])) as (server, _):
         findings = found(server.address)
-    finally:
-        server.stop()
-        thread.join()
     assert findings["plain-text"].level == "state"
     assert findings["no-key"].level == "advice"
     assert "(s2a of s2a-bench)" in findings["no-key"].message

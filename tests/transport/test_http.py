@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Generator, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from itertools import count
 from threading import Event, Thread, get_ident
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import PortInUse
-from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Remote, Trace, budget
 from s2a_bench.transport import Handler, open_client, open_server
 from s2a_bench.transport.http import own as dialect
@@ -31,12 +31,7 @@ def handler() -> Recorder:
 @contextmanager
 def serving(handler: Handler) -> Iterator[str]:
     """Serve for as long as the context lasts."""
-    with ExitStack() as stack:
-        server = open_server(wiring("http"), handler)
-        thread = Thread(target=server.serve)
-        thread.start()
-        stack.callback(thread.join)
-        stack.callback(server.stop)
+    with served(wiring("http"), handler) as (server, _):
         yield server.address
 
 
@@ -105,17 +100,12 @@ def test_connections_are_kept_or_not(
     opened = []
     connect = socket.create_connection
     monkeypatch.setattr(socket, "create_connection", lambda *a, **k: opened.append(1) or connect(*a, **k))
-    server = open_server(wiring("http"), handler)
-    thread = Thread(target=server.serve)
-    thread.start()
-    client = open_client(wiring("http/as-deployed", server.address, connection=connection))
-    try:
+    with (
+        serving(handler) as url,
+        closing(open_client(wiring("http/as-deployed", url, connection=connection))) as client,
+    ):
         for _ in range(3):
             ask(client, Request("a", "plan"))
-    finally:
-        client.close()
-        server.stop()
-        thread.join()
     assert len(opened) == connections
 
 

@@ -13,7 +13,7 @@ from threading import Event, Thread
 
 import pytest
 
-from s2a_bench.testing.transport import Recorder, wiring
+from s2a_bench.testing.transport import Recorder, served, wiring
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, open_server
 from s2a_bench.transport.http.own import PATHS
@@ -27,11 +27,8 @@ PATH = PATHS["best-effort"]
 def connected(handler: Handler | None = None, limits: Limits = LIMITS) -> Iterator[socket.socket]:
     """Serve, and connect, for as long as the context lasts."""
     with ExitStack() as stack:
-        server = open_server(replace(wiring("http"), limits=limits), handler or Recorder(["go", "_to"]))
-        thread = Thread(target=server.serve)
-        thread.start()
-        stack.callback(thread.join)
-        stack.callback(server.stop)
+        told = replace(wiring("http"), limits=limits)
+        server, _ = stack.enter_context(served(told, handler or Recorder(["go", "_to"])))
         host, port = server.address.removeprefix("http://").split(":")
         yield stack.enter_context(socket.create_connection((host, int(port)), timeout=20))
 

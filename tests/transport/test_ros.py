@@ -16,7 +16,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, TransportError
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client, open_server
 from s2a_bench.transport.ros.camera import CAMERA
@@ -31,12 +31,7 @@ def stack() -> Iterator[ExitStack]:
 
 
 def serve(stack: ExitStack, told: Wiring[Any], handler: Handler) -> Any:
-    server = open_server(told, handler)
-    thread = Thread(target=server.serve)
-    thread.start()
-    stack.callback(thread.join)
-    stack.callback(server.stop)
-    return server
+    return stack.enter_context(served(told, handler))[0]
 
 
 def until(met: Callable[[], bool]) -> None:

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from threading import Thread
 from typing import Any
 
 import pytest
@@ -19,9 +18,9 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.diagnostics import ARRAY, Finding, Level, diagnostic_array
 from s2a_bench.ros.parameters import PARAMETER, SERVICE, value_message, value_of
 from s2a_bench.ros.rosout import LOG, LONGEST, log_message
-from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring, open_client, open_server
+from s2a_bench.transport import Wiring, open_client
 from s2a_bench.transport.ros.joining import join
 from s2a_bench.transport.ros.node import EVENT, Activity, snake
 from s2a_bench.transport.ros.server import RosServer
@@ -58,12 +57,8 @@ def server(stack: ExitStack, told: Wiring[Any]) -> RosServer:
     """A server as `serve ros` starts it."""
     handler = Queued.around(Recorder(["a", "b"]))
     handler.settings = EngineConfig(name="echo")
-    server = open_server(told, handler)
+    server, _ = stack.enter_context(served(told, handler))
     assert isinstance(server, RosServer)
-    thread = Thread(target=server.serve)
-    thread.start()
-    stack.callback(thread.join)
-    stack.callback(server.stop)
     return server
 
 

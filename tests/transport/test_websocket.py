@@ -26,7 +26,7 @@ from websockets.sync.server import serve as plain_serve
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageError
 from s2a_bench.inference import EngineConfig
-from s2a_bench.testing.transport import Connect, Recorder, ask, connector, wiring, yuyv_frame
+from s2a_bench.testing.transport import Connect, Recorder, ask, connector, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client, open_server
 from s2a_bench.transport.dangers import examine
@@ -42,14 +42,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:connect.. must be used as a cont
 @contextmanager
 def serving(handler: Handler, address: str = "", limits: Limits | None = None, **options: Any) -> Iterator[Server]:
     told = wiring("websocket", address, **options)
-    server = open_server(replace(told, limits=limits or told.limits), handler)
-    thread = Thread(target=server.serve)
-    thread.start()
-    try:
+    with served(replace(told, limits=limits or told.limits), handler) as (server, _):
         yield server
-    finally:
-        server.stop()
-        thread.join()
 
 
 @pytest.fixture
@@ -306,10 +300,17 @@ def test_a_message_that_does_not_end_is_given_up() -> None:
     assert code == 1008
 
 
-def test_one_too_many_that_waits_is_told_so() -> None:
+@pytest.mark.parametrize(
+    ("limits", "says"),
+    [
+        (Limits(waiting=0), "requests are waiting for the engine already"),
+        (Limits(answer_s=0.3), "still waiting for the engine"),
+    ],
+)
+def test_one_too_many_that_waits_and_one_at_its_deadline_are_told_so(limits: Limits, says: str) -> None:
     handler = Slow()
     with (
-        serving(handler, limits=Limits(waiting=0)) as server,
+        serving(handler, limits=limits) as server,
         robot(server.address) as (first, _),
         robot(server.address) as (other, _),
     ):
@@ -318,7 +319,7 @@ def test_one_too_many_that_waits_is_told_so() -> None:
         other.send(packb({"prompt": "go"}))
         said, _ = closed_with(other)
         handler.go.set()
-    assert "requests are waiting for the engine already" in said
+    assert says in said
 
 
 def test_those_that_wait_are_answered_in_turn_and_one_that_goes_gives_its_place_up() -> None:
@@ -332,21 +333,6 @@ def test_those_that_wait_are_answered_in_turn_and_one_that_goes_gives_its_place_
         handler.go.set()
         for socket in (sockets[0], sockets[2]):
             assert unpackb(socket.recv(timeout=20))["actions"].shape == (4, 3)
-
-
-def test_a_wait_ends_at_the_deadline() -> None:
-    handler = Slow()
-    with (
-        serving(handler, limits=Limits(answer_s=0.3)) as server,
-        robot(server.address) as (first, _),
-        robot(server.address) as (other, _),
-    ):
-        first.send(packb({"prompt": "go"}))
-        assert handler.began.wait(20)
-        other.send(packb({"prompt": "go"}))
-        said, _ = closed_with(other)
-        handler.go.set()
-    assert "still waiting for the engine" in said
 
 
 def test_an_answer_that_nobody_wants_any_more_ends() -> None:

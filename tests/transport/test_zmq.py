@@ -20,7 +20,7 @@ import zmq
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import PortInUse, RequestFailed, ServerDied, UsageError
 from s2a_bench.frames.convert import yuyv_to_rgb
-from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client, open_server
 from s2a_bench.transport.dangers import examine
@@ -37,14 +37,8 @@ TASK = "annotation.human.task_description"
 @contextmanager
 def serving(handler: Handler, limits: Limits | None = None, **options: Any) -> Iterator[Server]:
     told = wiring("zmq/gr00t", **options)
-    server = open_server(replace(told, limits=limits or told.limits), handler)
-    thread = Thread(target=server.serve)
-    thread.start()
-    try:
+    with served(replace(told, limits=limits or told.limits), handler) as (server, _):
         yield server
-    finally:
-        server.stop()
-        thread.join()
 
 
 @contextmanager
