@@ -57,6 +57,8 @@ HONEST = {
 }
 """What the honest clients speak; "whole" is an answer that is not streamed."""
 ATTACKERS = 3
+BLOCKS = 15
+"""Of idle latencies, before the load and after it."""
 BLOCK = {"echo": 20}
 """Requests of a block of idle latencies; of an engine that computes a quarter."""
 GROWTH_MIB, PEAK_MIB, SLOWER = 20.0, 1024.0, 1.2
@@ -300,7 +302,7 @@ def settled(pid: int, before: Usage, client: Client) -> Usage:
         time.sleep(0.5)
 
 
-def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = 15) -> Result:
+def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = BLOCKS) -> Result:
     """Load a server for so long and return what came of it."""
     result = Result(transport, engine, minutes)
     with ExitStack() as stack:
@@ -352,10 +354,12 @@ def main() -> None:
     parser.add_argument("transport", choices=[*HOSTILE])
     parser.add_argument("--engine", default="echo", help="echo, llama (the tiny dummy), ...")
     parser.add_argument("--minutes", type=float, default=10)
+    parser.add_argument("--blocks", type=int, default=BLOCKS, help="of idle latencies, before the load and after it")
     parser.add_argument("--output", type=Path, help="[default: soak-TRANSPORT-ENGINE.json]")
     given = parser.parse_args()
     output = given.output or Path(f"soak-{given.transport}-{given.engine}.json")
-    whole = result_json(soak(given.transport, given.engine, given.minutes, output.with_suffix(".log")))
+    log = output.with_suffix(".log")
+    whole = result_json(soak(given.transport, given.engine, given.minutes, log, given.blocks))
     text = json.dumps(whole, indent=1)
     output.write_text(text + "\n")
     print(text)

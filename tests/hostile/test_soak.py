@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from benchmarks.soak import HOSTILE, SLOWER, result_json, served, soak, told
+from benchmarks.soak import HOSTILE, served, told
 from s2a_bench.testing.hostile.usage import usage
+
+MINUTES = float(os.environ.get("S2A_SOAK_MINUTES", "0.5"))
+Soaks = dict[str, dict[str, Any]]
 
 
 def test_bodies_that_no_framework_lets_go_are_not_kept(tmp_path: Path) -> None:
@@ -25,13 +33,24 @@ def test_bodies_that_no_framework_lets_go_are_not_kept(tmp_path: Path) -> None:
         assert usage(server.process.pid).rss_mib < before.rss_mib + 100
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("transport", [*HOSTILE])
-def test_no_promise_is_broken_within_a_minute(transport: str, tmp_path: Path) -> None:
-    log = tmp_path / "log"
-    result = soak(transport, "echo", float(os.environ.get("S2A_SOAK_MINUTES", "0.5")), log, blocks=5)
-    result.slower_low = min(result.slower_low or 0.0, SLOWER)  # whatever the machine does beside this
-    whole = result_json(result)
-    assert whole["broken"] == [], log.read_text()[-3000:]
+@pytest.fixture(scope="module")
+def came(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Soaks:
+    """What came of the soaks of all tests that were chosen, which happen at once, each in a process of its own."""
+    specs = [item.callspec.params for item in request.session.items if hasattr(item, "callspec")]
+    folder = tmp_path_factory.mktemp("soaks")
+    paths = {name: folder / f"{name}.json" for name in HOSTILE if {"soaked": name} in specs}
+    with ExitStack() as stack:
+        for name, path in paths.items():
+            line = [sys.executable, "-m", "benchmarks.soak", name, "--minutes", str(MINUTES), "--blocks", "5"]
+            process = subprocess.Popen([*line, "--output", str(path)], stdout=subprocess.DEVNULL)
+            stack.callback(process.wait)
+    return {name: json.loads(path.read_text()) for name, path in paths.items()}
+
+
+@pytest.mark.parametrize("soaked", [*HOSTILE])
+def test_no_promise_is_broken_within_a_minute(soaked: str, came: Soaks) -> None:
+    """But for the idle latency, which tells of whatever the machine does beside this."""
+    whole = came[soaked]
+    assert [said for said in whole["broken"] if not said.startswith("the idle latency")] == []
     assert whole["asked"] > 50
     assert whole["attacks"] > 50
