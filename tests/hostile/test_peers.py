@@ -36,6 +36,7 @@ class TestHttpBinary(HostileSuite):
 class TestRosTopic(HostileSuite):
     name = "ros/topic"
     clients = ros.CLIENTS
+    targets = 1  # a case is for the first participants of the domain
     servers = ros_servers.TOKENS
 
 
@@ -57,6 +58,7 @@ needs_zenoh = pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh
 class TestRosTopicOverZenoh(HostileSuite):
     name = "ros/topic?middleware=zenoh"
     clients = ros.CLIENTS
+    targets = 1
     servers = ros_servers.TOKENS
 
 

@@ -1,4 +1,4 @@
-"""One hostile peer after the other against both ends of a transport, from tables: subclass `HostileSuite`.
+"""Hostile peers against both ends of a transport, from tables: subclass `HostileSuite`.
 
 A package that offers a transport over TCP tests it like this, and adds cases that know its messages::
 
@@ -10,6 +10,8 @@ A package that offers a transport over TCP tests it like this, and adds cases th
         servers = tcp.SERVERS
 
 Each case has bounds: on the time until the other side has told its error in one line, and on its memory, both measured.
+Most peers are silent most of the time. So several are met at once, each by a process of ours that has nothing else to
+do: what is measured of that is one case's.
 """
 
 from __future__ import annotations
@@ -19,9 +21,11 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from queue import SimpleQueue
 from selectors import EVENT_READ, DefaultSelector
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
@@ -43,11 +47,15 @@ Attack: TypeAlias = "Callable[[Wiring[Any]], str]"
 Trap: TypeAlias = "Callable[[Wiring[Any]], AbstractContextManager[str]]"
 """A hostile server: its address, for as long as the context lasts."""
 Does = TypeVar("Does")
+End = TypeVar("End")
+Came = TypeVar("Came")
 FAILED = "^(RequestFailed|MessagesLost|ServerDied|TransportError): ."
 """What a client says, where the words are its own affair."""
 PATIENCE_S = 2.0
 """The longest silence that the client bears, its ``timeout_s``."""
 SETTLES_S = 10.0
+AT_ONCE = 6
+"""Hostile peers that are met at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +105,42 @@ class Asker:
                 self._process.kill()
 
 
+@dataclass(frozen=True, slots=True)
+class Attacked:
+    """What came of a hostile client: what our server said to it, and what an honest client was answered afterwards."""
+
+    said: str
+    seconds: float
+    peak_mib: float
+    answer: list[str]
+    expected: list[str]
+    """What the honest client was answered before all of them."""
+    alive: bool
+    tidy: bool
+    """Whether no descriptors are left."""
+
+
+class Target:
+    """Our server in a process of its own, and a client that means well, connected all the while."""
+
+    def __init__(self, told: Wiring[Any], server: OwnServer, honest: Client) -> None:
+        """Ask a first time: the connection is there from now on."""
+        self._told, self._server, self._honest = told, server, honest
+        self._expected = _answer(honest)
+
+    def attacked(self, case: Case[Attack]) -> Attacked:
+        """Return what comes of one hostile client."""
+        pid = self._server.pid
+        before = usage(pid)
+        forget_peak(pid)
+        began = now_ns()
+        said = case.does(self._told)
+        seconds = (now_ns() - began) / 1e9
+        answer, peak_mib = _answer(self._honest), usage(pid).peak_mib
+        tidy = _settled(lambda: usage(pid).descriptors <= before.descriptors)
+        return Attacked(said, seconds, peak_mib, answer, self._expected, self._server.alive(), tidy)
+
+
 class HostileSuite:
     """Name the pipeline, and the cases; override `told` for options that a name cannot say."""
 
@@ -104,8 +148,8 @@ class HostileSuite:
     """As in ``--transport``."""
     clients: ClassVar[Sequence[Case[Attack]]] = ()
     servers: ClassVar[Sequence[Case[Trap]]] = ()
-    expected: ClassVar[list[str]]
-    """What an honest client is answered."""
+    targets: ClassVar[int] = AT_ONCE
+    """Servers of ours that hostile clients meet, each one after the other."""
 
     @classmethod
     def told(cls) -> Wiring[Any]:
@@ -120,54 +164,55 @@ class HostileSuite:
 
     @pytest.fixture(scope="class")
     @classmethod
-    def server(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[OwnServer]:
-        """Our server in a process of its own, one for all hostile clients."""
-        with own_server(cls.told(), tmp_path_factory.mktemp("server") / "log") as process:
-            yield process
+    def attacked(
+        cls, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+    ) -> Iterator[dict[Case[Attack], Future[Attacked]]]:
+        """What comes of the hostile clients of all tests that were chosen."""
+        told, folder = cls.told(), tmp_path_factory.mktemp("servers")
+        with ExitStack() as stack:
+            targets: list[Target] = []
+            for number in range(cls.targets):
+                server = stack.enter_context(own_server(told, folder / f"log-{number}"))
+                here = replace(told, address=server.address)
+                honest = stack.enter_context(closing(open_client(replace(here, timeout_s=60.0))))
+                targets.append(Target(here, server, honest))
+            yield stack.enter_context(_at_once(targets, Target.attacked, _chosen(request, "hostile_client")))
 
     @pytest.fixture(scope="class")
     @classmethod
-    def honest(cls, server: OwnServer) -> Iterator[Client]:
-        """A client that means well."""
-        with closing(open_client(replace(cls.told(), address=server.address, timeout_s=60.0))) as client:
-            cls.expected = _answer(client)  # its connection is there from now on
-            assert cls.expected
-            yield client
+    def asked(cls, request: pytest.FixtureRequest) -> Iterator[dict[Case[Trap], Future[dict[str, Any]]]]:
+        """What comes of asking the hostile servers of all tests that were chosen."""
 
-    @pytest.fixture(scope="class")
-    @classmethod
-    def asker(cls) -> Iterator[Asker]:
-        """The process that asks hostile servers."""
-        with closing(Asker()) as process:
-            yield process
+        def ask_it(asker: Asker, case: Case[Trap]) -> dict[str, Any]:
+            with case.does(told := cls.told()) as address:
+                return asker.ask(replace(told, address=address), case.seconds)
+
+        with ExitStack() as stack:
+            askers = [stack.enter_context(closing(Asker())) for _ in range(AT_ONCE)]
+            yield stack.enter_context(_at_once(askers, ask_it, _chosen(request, "hostile_server")))
 
     def test_the_server_outlives_a_hostile_client(
         self,
         hostile_client: Case[Attack],
-        server: OwnServer,
-        honest: Client,
+        attacked: dict[Case[Attack], Future[Attacked]],
         record_property: Callable[[str, object], None],
     ) -> None:
-        before = usage(server.pid)
-        forget_peak(server.pid)
-        began = now_ns()
-        said = hostile_client.does(replace(self.told(), address=server.address))
-        seconds = (now_ns() - began) / 1e9
-        answer = _answer(honest)
-        peak = usage(server.pid).peak_mib
-        record_property("cost", f"{self.name}, server: {seconds:.2f} s, {peak:.0f} MiB")
-        assert answer == self.expected
-        assert server.alive()
-        assert re.search(hostile_client.says, said, re.DOTALL), said[:1000]
-        assert seconds < hostile_client.seconds
-        assert peak < hostile_client.mib
-        assert _settled(lambda: usage(server.pid).descriptors <= before.descriptors), "descriptors are left"
+        came = attacked[hostile_client].result()
+        record_property("cost", f"{self.name}, server: {came.seconds:.2f} s, {came.peak_mib:.0f} MiB")
+        assert came.answer == came.expected != []
+        assert came.alive
+        assert re.search(hostile_client.says, came.said, re.DOTALL), came.said[:1000]
+        assert came.seconds < hostile_client.seconds
+        assert came.peak_mib < hostile_client.mib
+        assert came.tidy, "descriptors are left"
 
     def test_the_client_outlives_a_hostile_server(
-        self, hostile_server: Case[Trap], asker: Asker, record_property: Callable[[str, object], None]
+        self,
+        hostile_server: Case[Trap],
+        asked: dict[Case[Trap], Future[dict[str, Any]]],
+        record_property: Callable[[str, object], None],
     ) -> None:
-        with hostile_server.does(self.told()) as address:
-            got = asker.ask(replace(self.told(), address=address), hostile_server.seconds)
+        got = asked[hostile_server].result()
         record_property("cost", f"{self.name}, client: {got['seconds']:.2f} s, {got['peak_mib']:.0f} MiB")
         error = got["error"]
         assert re.search(hostile_server.says, error) if hostile_server.says else not error, error
@@ -175,6 +220,36 @@ class HostileSuite:
         assert got["tokens"] <= PIECES + PIECES_A_TOKEN * TOKENS
         assert got["seconds"] < hostile_server.seconds
         assert got["peak_mib"] < hostile_server.mib
+
+
+def _chosen(request: pytest.FixtureRequest, name: str) -> list[Case[Any]]:
+    """Return the cases of the tests of a class that were chosen."""
+    items: list[Any] = request.session.items
+    ours = [item for item in items if getattr(item, "cls", None) is request.cls and hasattr(item, "callspec")]
+    return [item.callspec.params[name] for item in ours if name in item.callspec.params]
+
+
+@contextmanager
+def _at_once(
+    ends: Sequence[End], meets: Callable[[End, Case[Any]], Came], cases: Sequence[Case[Any]]
+) -> Iterator[dict[Case[Any], Future[Came]]]:
+    """Let ends of ours meet cases on threads, each one at a time; what comes of each is kept for its test."""
+    free: SimpleQueue[End] = SimpleQueue()
+    for end in ends:
+        free.put(end)
+
+    def meet(case: Case[Any]) -> Came:
+        end = free.get()
+        try:
+            return meets(end, case)
+        finally:
+            free.put(end)
+
+    with ThreadPoolExecutor(len(ends)) as pool:
+        try:
+            yield {case: pool.submit(meet, case) for case in cases}
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 @contextmanager
