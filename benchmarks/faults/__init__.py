@@ -79,16 +79,16 @@ FAULTS = [
 ]
 
 
-def outcomes(faults: Collection[Fault]) -> dict[Fault, str]:
-    """Let all faults happen, those of a transport one after the other, and return what came of each."""
-    transports = {fault.transport for fault in faults}
-    with ThreadPoolExecutor(max(1, len(transports))) as pool:
-        runs = [pool.submit(_over, [fault for fault in faults if fault.transport == each]) for each in transports]
-        return {fault: outcome for run in runs for fault, outcome in run.result().items()}
+def outcomes(faults: Collection[Fault], lanes: int = 1) -> dict[Fault, str]:
+    """Let all faults happen, those of a transport one after the other in so many lanes; return what came of each."""
+    of_each = [[fault for fault in faults if fault.transport == each] for each in {fault.transport for fault in faults}]
+    parts = [part for of_one in of_each for lane in range(lanes) if (part := of_one[lane::lanes])]
+    with ThreadPoolExecutor(max(1, len(parts))) as pool:
+        return {fault: outcome for came in pool.map(_over, parts) for fault, outcome in came.items()}
 
 
 def _over(faults: Sequence[Fault]) -> dict[Fault, str]:
-    """Return what came of the faults of one transport; one server has to outlive all that do not end it."""
+    """Return what came of the faults of one lane; one server has to outlive all that do not end it."""
     came: dict[Fault, str] = {}
     with serving(faults[0].transport) as lasting:
         for fault in faults:
