@@ -24,9 +24,11 @@ CHAT = PATHS["as-deployed"]
 BODY = {"messages": [{"role": "user", "content": "go on"}], "max_tokens": 2}
 
 
-@pytest.fixture(autouse=True)
-def key_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MY_KEY", KEY)
+@pytest.fixture(scope="module", autouse=True)
+def key_in_the_environment() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MY_KEY", KEY)
+        yield
 
 
 @contextmanager
@@ -35,6 +37,12 @@ def serving(address: str = "", **options: Any) -> Iterator[str]:
     handler = engine_handler(open_engine(EngineConfig(name="echo")))
     with served(wiring("http", address, **options), handler) as (server, _):
         yield server.address.replace(ALL[:-2], "127.0.0.1")
+
+
+@pytest.fixture(scope="module")
+def documented(key_in_the_environment: None) -> Iterator[str]:  # noqa: ARG001 - it is read there
+    with serving(api_key_env="MY_KEY", api_docs=True) as url:
+        yield url
 
 
 def test_off_loopback_a_key_is_needed_or_none_is_asked_for() -> None:
@@ -71,15 +79,14 @@ def test_a_key_that_is_not_there_is_told_before_anything_is_served() -> None:
     ],
 )
 @pytest.mark.parametrize("path", [*PATHS.values(), "/v1/models", "/openapi.json", "/nowhere"])
-def test_without_the_key_only_health_is_open(path: str, headers: list[tuple[str, str]]) -> None:
+def test_without_the_key_only_health_is_open(path: str, headers: list[tuple[str, str]], documented: str) -> None:
     encoded = [(name, value.encode()) for name, value in headers]
-    with serving(api_key_env="MY_KEY", api_docs=True) as url:
-        answer = httpx.post(url + path, json=BODY, headers=encoded)
-        assert answer.status_code == 401
-        assert answer.headers["www-authenticate"] == "Bearer"
-        assert "Bearer KEY" in answer.json()["error"]["message"]
-        assert KEY not in answer.text
-        assert httpx.get(url + "/health").status_code == 200
+    answer = httpx.post(documented + path, json=BODY, headers=encoded)
+    assert answer.status_code == 401
+    assert answer.headers["www-authenticate"] == "Bearer"
+    assert "Bearer KEY" in answer.json()["error"]["message"]
+    assert KEY not in answer.text
+    assert httpx.get(documented + "/health").status_code == 200
 
 
 def test_a_large_body_without_the_key_is_told_so_too() -> None:
