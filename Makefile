@@ -42,8 +42,11 @@ test: setup
 fuzz: setup
 	S2A_FUZZ_S=600 $(BIN)/python -m pytest tests/fuzz
 
+# Hostile peers mostly wait: they are met beside all else, and what came of them is shown at the end.
 test-all: setup
-	$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest tests/hostile > hostile.log 2>&1 & hostile=$$!; \
+	$(BIN)/python -m pytest --ignore=tests/hostile; rest=$$?; \
+	wait $$hostile; hostile=$$?; cat hostile.log; exit $$((rest + hostile))
 
 # Everything that is tested against hostile peers, faults and load; `make test-all` has it with two transports' faults.
 hostile: setup
