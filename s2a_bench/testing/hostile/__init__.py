@@ -149,7 +149,7 @@ class HostileSuite:
     clients: ClassVar[Sequence[Case[Attack]]] = ()
     servers: ClassVar[Sequence[Case[Trap]]] = ()
     targets: ClassVar[int] = AT_ONCE
-    """Servers of ours that hostile clients meet, each one after the other."""
+    """Servers of ours that hostile clients meet, each one after the other; 1 where their address is told."""
 
     @classmethod
     def told(cls) -> Wiring[Any]:
