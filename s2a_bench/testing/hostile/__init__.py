@@ -81,7 +81,7 @@ class Asker:
         """Return what came of one request; fails the test after ``seconds``."""
         process = self._process
         if process is None or process.poll() is not None:
-            line = [sys.executable, "-m", "s2a_bench.testing.hostile.asker"]
+            line = [sys.executable, "-c", "from s2a_bench.testing.hostile.asker import main; main()"]
             process = self._process = subprocess.Popen(line, stdin=-1, stdout=-1, text=True)  # noqa: S603 - ours
         assert process.stdin
         assert process.stdout

@@ -47,7 +47,3 @@ def main() -> None:
     for line in sys.stdin:
         sys.stdout.write(json.dumps(asked(Wiring.from_json(json.loads(line)))) + "\n")
         sys.stdout.flush()
-
-
-if __name__ == "__main__":
-    main()
