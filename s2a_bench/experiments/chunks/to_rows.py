@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
@@ -30,12 +30,23 @@ _SIDE: Final = 0.975
 
 
 def chunk_row(
-    cell: Cell, setting: Setting, cycles: Cycles, ticks: Ticks, *, epsilon: float, reaction_s: Floats
+    cell: Cell,
+    setting: Setting,
+    cycles: Cycles,
+    ticks: Ticks,
+    *,
+    epsilon: float,
+    reaction_s: Floats,
+    smooth: Mapping[str, float],
 ) -> AboutCell:
-    """Describe a cell's run; ``reaction_s`` are its reaction times, ``epsilon`` is the share that may stall."""
+    """Describe a cell's run.
+
+    ``reaction_s`` are its reaction times, ``smooth`` its metrics of smoothness if any, and ``epsilon`` is the share
+    that may stall.
+    """
     latency_s = cell.drawn.judged / 1e9
     triggers = cell.triggers or ((cell.mode.trigger,) if hasattr(cell.mode, "trigger") else ())
-    values = metrics_of(cell, setting, cycles, ticks, reaction_s)
+    values = {**metrics_of(cell, setting, cycles, ticks, reaction_s), **smooth}
     values["slow_down"] = beta(cell.mode, cell.drawn.judged, setting, epsilon)
     row: AboutCell = ChunkRow(
         cell=cell.cell,
@@ -50,7 +61,7 @@ def chunk_row(
         execution_horizon=execution_horizon(cell.mode, setting),
         requests=int(latency_s.size),
         trigger=float(np.mean(triggers)) if triggers else None,
-        **{name: _plain(values[name], whole=metric.whole) for name, metric in METRICS.items()},
+        **{name: _plain(values.get(name), whole=metric.whole) for name, metric in METRICS.items()},
     )
     return row
 

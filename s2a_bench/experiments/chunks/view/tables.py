@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.chunks.rows import CHUNKS
@@ -23,6 +24,10 @@ _CONVENTION: Final = {
     "floor": "d = floor(L / Delta t): an action leaves at the end of its tick, as real-time chunking counts.",
     "ceil": "d = ceil(L / Delta t): an action leaves at the start of its tick, as lerobot counts.",
 }
+
+_EMULATED: Final = Note(
+    "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
+)
 
 
 def rows_of(run: Run) -> list[Row]:
@@ -50,9 +55,23 @@ def action_table(run: Run) -> TextTable:
     return _table(run, "Actions: ages in ticks", header, _actions)
 
 
+def smoothness_table(run: Run) -> TextTable:
+    """Lay out how well a plant follows a target under each mode, and how smoothly."""
+    header = ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
+    table = _table(run, "Smoothness", header, _smoothness)
+    note = (
+        f"Tracking error and jerk (root mean squares) of {run.manifest['configuration']['robot']}, in the target's "
+        "standard deviation and s; ideal: asked in every tick and answered at once. jump: from one action to the next "
+        "across a boundary, step: within a chunk."
+    )
+    return replace(table, notes=(_convention(run), note, _EMULATED))
+
+
 def chunk_tables(run: Run) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
-    return {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
+    found = {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
+    smooth = any(row.get("tracking_rms") is not None for row in rows_of(run))
+    return found | ({"smoothness": smoothness_table(run)} if smooth else {})
 
 
 def delay_table(run: Run) -> TextTable:
@@ -140,6 +159,13 @@ def _actions(row: Row) -> Iterator[str]:
     yield _number(row["jump_mean"])
 
 
+def _smoothness(row: Row) -> Iterator[str]:
+    for name in ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal"):
+        yield _number(row[name])
+    for name in ("boundary_jump_mean", "boundary_jump_p99", "action_step_mean"):
+        yield _number(row[name])
+
+
 def _interval(row: Row) -> str:
     if row["p_stall_cycle"] is None:
         return ABSENT
@@ -185,6 +211,4 @@ def _notes(run: Run) -> Iterator[str]:
             f"Rules choose m of queue: calibrated for P(stall) <= {asked['epsilon']:.2%}, tracked from there, "
             "lerobot's maximum, the mean, an oracle that knows the distribution. All others saw the same cycles before."
         )
-    yield Note(
-        "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
-    )
+    yield _EMULATED
