@@ -25,7 +25,11 @@ MOST_TICKS = 100_000_000
 
 
 def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
-    """Simulate every cell and return the run folder; raises S2AError for what a user can mend."""
+    """Simulate every cell, or act live, and return the run folder; raises S2AError for what a user can mend."""
+    if config.live:
+        from s2a_bench.experiments.chunks.live.run import run_live
+
+        return run_live(config, output, progress)
     drawn = [draw(config, source) for source in config.sources]
     for each in drawn:
         _check(config, each)
