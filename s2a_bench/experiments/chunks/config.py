@@ -39,6 +39,10 @@ class ChunksConfig(Options):
         "observation to usable chunk (with streamed: to its first action): ms, FAMILY:mean_ms=...,key=value, FILE.csv, "
         "a run folder, or a profile; several with commas",
     )
+    slow_down: float = option(1.0, "all actions so many times slower (time-scaling)", ge=1, le=1000)
+    slowest: float = option(
+        1.0, "so many times slower calibrated and oracle may make actions where no trigger is enough", ge=1, le=1000
+    )
     control_hz: float = option(50.0, "control ticks a second", gt=0, le=1e6, allow_inf_nan=False)
     horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096)
     rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
@@ -76,7 +80,7 @@ class ChunksConfig(Options):
     @property
     def ticks(self) -> int:
         """Return the control ticks of a mode, live."""
-        return max(2, round(self.seconds * self.control_hz))
+        return max(2, round(self.seconds * 1e9 / self.setting.period_ns))
 
     @cached_property
     def asked(self) -> LiveRequests:
@@ -94,7 +98,7 @@ class ChunksConfig(Options):
         """Return what all modes are told."""
         from s2a_bench.policy.chunks import Setting
 
-        return Setting(round(1e9 / self.control_hz), self.horizon, self.rounding)
+        return Setting(round(1e9 / self.control_hz), self.horizon, self.rounding).slowed(self.slow_down)
 
     @cached_property
     def made(self) -> dict[str, Mode]:

@@ -87,6 +87,7 @@ METRICS: Final[Mapping[str, ChunkMetric]] = {
             "So many times slower actions stall in a share epsilon of the cycles at most, at the greatest trigger.",
             least=1,
         ),
+        _number("slower", "", "slower", "So many times slower than it was asked for actions were executed.", least=1),
         _share("thrown_away_share", "thrown away", "Actions never executed, of all."),
         _number("jump_mean", "actions", "jump", "By how many actions the robot is thrown at a boundary."),
         _number("jump_max", "actions", "max", "The greatest."),

@@ -58,7 +58,7 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
 
 
 def _simulate(config: ChunksConfig, cell: Cell, writer: RunWriter) -> None:
-    setting, latency_ns = config.setting, cell.drawn.judged
+    setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
     cycles, ticks = cell.mode.cycles(latency_ns, setting), cell.mode.ticks(latency_ns, setting)
     reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
     row = chunk_row(cell, setting, cycles, ticks, epsilon=config.epsilon, reaction_s=reaction_s)

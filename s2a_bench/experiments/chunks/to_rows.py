@@ -37,7 +37,7 @@ def chunk_row(
     latency_s = cell.drawn.judged / 1e9
     triggers = cell.triggers or ((cell.mode.trigger,) if hasattr(cell.mode, "trigger") else ())
     values = metrics_of(cell, setting, cycles, ticks, reaction_s)
-    values["slow_down"] = beta(cell.mode, cell.drawn.judged, setting, epsilon)
+    values |= {"slow_down": beta(cell.mode, cell.drawn.judged, setting, epsilon), "slower": cell.slower}
     row: AboutCell = ChunkRow(
         cell=cell.cell,
         mode=cell.name,

@@ -130,12 +130,19 @@ def _table(run: Run, title: str, header: tuple[str, ...], cells: Any) -> TextTab
     named = ("mode",) if live(run) else ("mode", "rule")
     for place, (_, group) in enumerate(found, 1):
         rules.append(len(rows))
-        rows += [((str(place),) * several + (*(row[name] for name in named), *cells(row))) for row in group]
+        rows += [((str(place),) * several + (*(_named(row, name) for name in named), *cells(row))) for row in group]
     asked = run.manifest["configuration"]
     of = "" if several else f" @ {found[0][0]}" if found else ""
-    what = f"{title}{of}, H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {_rounding(run)}"
+    slower = f" / {asked['slow_down']:g}" if asked.get("slow_down", 1) > 1 else ""
+    what = f"{title}{of}, H = {asked['horizon']}, {asked['control_hz']:g}{slower} Hz, d by {_rounding(run)}"
     left = ("L",) * several + named
     return TextTable(what, (*left, *header), rows, len(left), frozenset(rules[1:]), tuple(_notes(run)))
+
+
+def _named(row: Row, column: str) -> str:
+    """Return a row's mode or rule, and by how much the rule slowed actions down."""
+    slower = row.get("slower") or 1
+    return f"{row[column]}, {slower:.3g}x slower" if column == "rule" and slower > 1 else str(row[column])
 
 
 def _stalls(row: Row) -> Iterator[str]:
