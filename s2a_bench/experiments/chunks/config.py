@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import BeforeValidator
 
+from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.latencies import EXAMPLE, split
+from s2a_bench.experiments.chunks.latencies import split
 from s2a_bench.options import Names, Options, one_of, option
 from s2a_bench.policy.chunks import Rounding
 
