@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, cycle, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -25,10 +26,13 @@ if TYPE_CHECKING:
     Ints: TypeAlias = NDArray[np.int64]
 
 EXAMPLE: Final = "lognormal:mean_ms=80,cv=0.5"
-KINDS: Final = "a number of ms, a family, a .csv file"
 UNITS_NS: Final = {"latency_ns": 1, "latency_ms": 1_000_000, "latency_s": 1_000_000_000}
 """Column -> ns in its unit."""
 LONGEST_MS: Final = 3_600_000.0
+SEED: Final = 0
+"""Of every sequence of latencies, so that whoever knows what was written knows all of them."""
+STRETCH: Final = 65_536
+"""Latencies that are drawn together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +44,7 @@ class Latencies:
 
 
 def read_latency(written: str) -> Latencies | None:
-    """Read latencies as people write them, None if that is none of `KINDS`; raises UsageError naming the field."""
+    """Read latencies as people write them, None for what it does not know; raises UsageError naming the field."""
     if (constant := _number(written)) is not None:
         if not 0 <= constant <= LONGEST_MS:
             raise UsageError(f"`latency`: {written} should be between 0 and {LONGEST_MS:g} ms")
@@ -55,6 +59,23 @@ def read_latency(written: str) -> Latencies | None:
 def draw_ns(gaps: Gaps, rng: np.random.Generator, count: int) -> Ints:
     """Draw successive latencies of shape (count,), in ns."""
     return whole_ns(gaps.sample(rng, count, 1)[:, 0])
+
+
+def sequence_ns(latencies: Latencies) -> Iterator[int]:
+    """Return an iterator over the latencies of requests 0, 1, ... in ns, without end and each time the same.
+
+    A recording is played in its order and starts over at its end. A family that remembers does so for `STRETCH`
+    latencies, and starts afresh then.
+    """
+    import numpy as np
+
+    if latencies.recorded_ns is not None:
+        return cycle(latencies.recorded_ns.tolist())
+    if latencies.gaps is None:
+        raise TypeError("no latencies")
+    rng = np.random.default_rng(SEED)
+    stretches = (draw_ns(gaps, rng, STRETCH).tolist() for gaps in repeat(latencies.gaps))
+    return chain(next(stretches), chain.from_iterable(stretches))  # the first is drawn before anybody waits for it
 
 
 def whole_ns(latency_s: NDArray[np.float64]) -> Ints:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from s2a_bench.boards.gaps import Lognormal, Markov
-from s2a_bench.boards.latency import Latencies, draw_ns, read_delays, read_latency
+from s2a_bench.boards.latency import STRETCH, Latencies, draw_ns, read_delays, read_latency, sequence_ns
 from s2a_bench.errors import UsageError
 
 MS = 1_000_000
+BURSTS = "bursty:mean_ms=10,cv=0,burst_tokens=4,within=.1"
 
 
 def read(written: str) -> Latencies:
@@ -105,3 +107,21 @@ def test_what_is_no_latency_is_one_line_that_names_it(written: str, message: str
 def test_anything_else_is_left_to_others() -> None:
     assert read_latency("rtx-4080") is None
     assert read_latency("runs/a:b") is None
+
+
+@pytest.mark.parametrize("written", ["80", "lognormal:mean_ms=80,cv=.5", BURSTS])
+def test_the_sequence_is_the_same_each_time_whoever_asks_for_how_much(written: str) -> None:
+    one, other = sequence_ns(read(written)), sequence_ns(read(written))
+    assert list(islice(one, 5)) + list(islice(one, STRETCH)) == list(islice(other, STRETCH + 5))
+
+
+def test_successive_values_of_a_family_that_remembers_follow_one_another() -> None:
+    spans = list(islice(sequence_ns(read(BURSTS)), 40))
+    first = next(place for place, span in enumerate(spans) if span > 20 * MS)
+    assert [span > 20 * MS for span in spans[first : first + 12]] == [True, False, False, False] * 3
+
+
+def test_a_recording_starts_over_at_its_end(tmp_path: Path) -> None:
+    file = tmp_path / "delays.csv"
+    file.write_text("latency_ms\n1\n2\n3\n")
+    assert list(islice(sequence_ns(read(str(file))), 7)) == [MS, 2 * MS, 3 * MS, MS, 2 * MS, 3 * MS, MS]

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.boards.gaps import Gaps
-from s2a_bench.boards.latency import KINDS, draw_ns, read_latency, whole_ns
+from s2a_bench.boards.latency import draw_ns, read_latency, whole_ns
 from s2a_bench.errors import UsageError
 from s2a_bench.provenance import NONE, Provenance
 
@@ -84,5 +84,6 @@ def _of_profile(written: str, tokens: int) -> Source:
     from s2a_bench.boards.search import load_profile, profile_files
 
     if written not in profile_files() and not (written.endswith(".toml") and Path(written).is_file()):
-        raise UsageError(f"`latency`: '{written}' should be {KINDS}, a run folder, or a profile of 'profile list'")
+        kinds = "a number of ms, a family, a .csv file, a run folder, or a profile of 'profile list'"
+        raise UsageError(f"`latency`: '{written}' should be {kinds}")
     return Source(written, profile=written, tokens=tokens, weights=load_profile(written).weights)
