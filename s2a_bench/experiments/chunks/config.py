@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import BeforeValidator
 
+from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.latencies import EXAMPLE, split
+from s2a_bench.experiments.chunks.latencies import split
 from s2a_bench.experiments.chunks.live.config import SHOWN, LiveRequests
 from s2a_bench.options import Names, Options, group, one_of, option
 from s2a_bench.policy.chunks import Rounding
@@ -85,13 +86,19 @@ class ChunksConfig(Options):
     @cached_property
     def asked(self) -> LiveRequests:
         """Return what the control loop asks for, live; raises UsageError naming the field."""
-        given = self.requests.engine
-        engine = given.but(answer="actions", horizon=self.horizon)
-        return self.requests.but(engine=engine, seed=self.seed, runs=1)
+        told: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
+        if self.known:
+            told |= {"latency": self.known} | ({"name": "echo"} if not self.requests.engine.model_fields_set else {})
+        return self.requests.but(engine=self.requests.engine.but(**told), seed=self.seed, runs=1)
+
+    @property
+    def known(self) -> str:
+        """Return the latencies that our own server keeps, live; nothing where it answers at its own speed."""
+        return self.latency[0] if "latency" in self.model_fields_set else ""
 
     def named(self, pipeline: str) -> str:
         """Return what a row says of where latencies come from, live."""
-        return f"{pipeline}, {self.latency[0]}" if "latency" in self.model_fields_set else pipeline
+        return f"{pipeline}, {self.known}" if self.known else pipeline
 
     @property
     def setting(self) -> Setting:
@@ -156,6 +163,8 @@ class ChunksConfig(Options):
         said = self.model_fields_set
         if alone := next((field for field in ("rules", "cycles", "calibration_cycles") if field in said), ""):
             raise UsageError(f"`{alone}` is for virtual time; live, name a trigger: queue?trigger=6")
+        if self.known and len(self.latency) > 1:
+            raise UsageError(f"`latency`: live a server keeps one, not {len(self.latency)}; run once for each")
         if len(self.asked.pipelines) > 1 and self.export_delays is not None:
             raise UsageError("`export_delays`: of one `transport` at a time")
         self._check_file()
