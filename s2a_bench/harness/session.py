@@ -145,10 +145,9 @@ class Session:
         except KeyboardInterrupt as interrupt:
             error, fatal = INTERRUPTED, interrupt
         self._sampler.edge()
-        texts = struck_pieces([piece.text for piece, _ in seen])
+        texts = iter(struck_pieces([piece.text for piece, _ in seen if isinstance(piece, Token)]))
         seen = [
-            (replace(piece, text=text) if isinstance(piece, Token) else piece, at_ns)
-            for (piece, at_ns), text in zip(seen, texts, strict=True)
+            (replace(piece, text=next(texts)) if isinstance(piece, Token) else piece, at_ns) for piece, at_ns in seen
         ]
         trace.facts.update(self._sampler.window(started_ns, now_ns()))
         if not error and not seen:
