@@ -25,10 +25,12 @@ _CONVENTION: Final = {
 
 
 def rows_of(run: Run) -> list[Row]:
-    """Return the rows of a run; what a row lacks is None."""
+    """Return the rows of a run; what a row lacks is None. Live they are made in random order, which is put right."""
     table = run.table(CHUNKS).drop(columns=PROVENANCE)
     whole = table.astype(object).where(table.notna(), None)
-    return [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
+    rows = [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
+    asked = run.manifest["configuration"]
+    return sorted(rows, key=lambda row: (row["latency"], asked["modes"].index(row["mode"]))) if live(run) else rows
 
 
 def sources_of(rows: list[Row]) -> list[tuple[str, list[Row]]]:
