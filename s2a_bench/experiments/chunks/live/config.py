@@ -9,7 +9,7 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Names, group, option
 
 SHOWN: Final = (
-    *("transports", "variants", "options", "url", "engine", "payload", "source", "size", "cameras", "resize"),
+    *("transports", "variants", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
     *("prompt", "warmup", "timeout_s", "deadline_s", "sample_resources_hz", "nonce"),
 )
 """The options that are flags of `chunks`."""
