@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import BeforeValidator
 
+from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.latencies import EXAMPLE, split
-from s2a_bench.options import Names, Options, one_of, option
+from s2a_bench.experiments.chunks.latencies import split
+from s2a_bench.experiments.chunks.live.config import SHOWN, LiveRequests
+from s2a_bench.options import Names, Options, group, one_of, option
 from s2a_bench.policy.chunks import Rounding
 
 if TYPE_CHECKING:
@@ -39,6 +41,10 @@ class ChunksConfig(Options):
         "observation to usable chunk (with streamed: to its first action): ms, FAMILY:mean_ms=...,key=value, FILE.csv, "
         "a run folder, or a profile; several with commas",
     )
+    slow_down: float = option(1.0, "all actions so many times slower (time-scaling)", ge=1, le=1000)
+    slowest: float = option(
+        1.0, "so many times slower calibrated and oracle may make actions where no trigger is enough", ge=1, le=1000
+    )
     control_hz: float = option(50.0, "control ticks a second", gt=0, le=1e6, allow_inf_nan=False)
     horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096)
     rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
@@ -66,17 +72,45 @@ class ChunksConfig(Options):
     )
     seed: int = option(0, "seed of everything that is drawn", ge=0)
 
+    live: bool = option(
+        False, "act in real time on what a server answers; with `engine` echo, `latency` is how long its answers take"
+    )
+    seconds: float = option(20.0, "live: how long each mode acts", gt=0, le=86_400)
+    requests: LiveRequests = group(LiveRequests, only=SHOWN, about="live: ")
+
     @property
     def virtual(self) -> bool:
-        """Return True: nothing is measured."""
-        return True
+        """Return whether nothing is measured."""
+        return not self.live
+
+    @property
+    def ticks(self) -> int:
+        """Return the control ticks of a mode, live."""
+        return max(2, round(self.seconds * 1e9 / self.setting.period_ns))
+
+    @cached_property
+    def asked(self) -> LiveRequests:
+        """Return what the control loop asks for, live; raises UsageError naming the field."""
+        told: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
+        if self.known:
+            told |= {"latency": self.known} | ({"name": "echo"} if not self.requests.engine.model_fields_set else {})
+        return self.requests.but(engine=self.requests.engine.but(**told), seed=self.seed, runs=1)
+
+    @property
+    def known(self) -> str:
+        """Return the latencies that our own server keeps, live; nothing where it answers at its own speed."""
+        return self.latency[0] if "latency" in self.model_fields_set else ""
+
+    def named(self, pipeline: str) -> str:
+        """Return what a row says of where latencies come from, live."""
+        return f"{pipeline}, {self.known}" if self.known else pipeline
 
     @property
     def setting(self) -> Setting:
         """Return what all modes are told."""
         from s2a_bench.policy.chunks import Setting
 
-        return Setting(round(1e9 / self.control_hz), self.horizon, self.rounding)
+        return Setting(round(1e9 / self.control_hz), self.horizon, self.rounding).slowed(self.slow_down)
 
     @cached_property
     def made(self) -> dict[str, Mode]:
@@ -128,6 +162,11 @@ class ChunksConfig(Options):
         for field in ("modes", "latency"):
             if not getattr(self, field):
                 raise UsageError(f"`{field}`: name at least one")
+        if self.live:
+            self._check_live()
+            return
+        if alone := next(self.requests.given(), ""):
+            raise UsageError(f"`{alone}` is for a control loop that runs; it needs `live`")
         self._check_export()
         _ = self.plant
         for source in self.sources:
@@ -138,21 +177,35 @@ class ChunksConfig(Options):
             if recorded is not None and recorded.size - learnt * self.with_rules < 2:  # noqa: PLR2004 - a boundary
                 raise UsageError(f"`latency`: {source.name} has {recorded.size} latencies; two or more are needed")
 
+    def _check_live(self) -> None:
+        """Refuse what only virtual time has, and what no server could be told."""
+        said = self.model_fields_set
+        if alone := next((field for field in ("rules", "cycles", "calibration_cycles") if field in said), ""):
+            raise UsageError(f"`{alone}` is for virtual time; live, name a trigger: queue?trigger=6")
+        if self.known and len(self.latency) > 1:
+            raise UsageError(f"`latency`: live a server keeps one, not {len(self.latency)}; run once for each")
+        if len(self.asked.pipelines) > 1 and self.export_delays is not None:
+            raise UsageError("`export_delays`: of one `transport` at a time")
+        self._check_file()
+
     def _check_export(self) -> None:
-        file = self.export_delays
-        if file is None:
+        if self.export_delays is None:
             return
         if len(self.sources) != 1:
             names = ", ".join(source.name for source in self.sources)
             raise UsageError(f"`export_delays`: {len(self.sources)} sources of `latency`, {names}; name one of them")
-        if file.suffix != ".csv" or not file.parent.is_dir():
+        self._check_file()
+
+    def _check_file(self) -> None:
+        file = self.export_delays
+        if file is not None and (file.suffix != ".csv" or not file.parent.is_dir()):
             raise UsageError(f"`export_delays`: {file} should be a .csv file in a folder that there is")
 
     def to_manifest(self) -> dict[str, Any]:
         """Return the options as plain data, with the numbers that follow from others."""
         file = None if self.export_delays is None else str(self.export_delays)
         more = {"modes": list(self.made), "period_ns": self.setting.period_ns, "export_delays": file}
-        return {**self.model_dump(), **more}
+        return {**self.model_dump(exclude={"requests"}), **more}
 
 
 def _promised(name: str, learnt: int, epsilon: float, check: Any) -> None:

@@ -57,6 +57,8 @@ class TickRow:
     index: int | None
     age_ticks: int | None
     stalled: bool
+    late_ns: int | None = None
+    """How long after it was due the action left; null in virtual time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,8 @@ class RequestRow:
     thrown_away: int
     stall_ticks: int
     jump: int | None
+    request_id: str | None = None
+    """Of its sample; null in virtual time."""
 
 
 @dataclass(frozen=True, slots=True)

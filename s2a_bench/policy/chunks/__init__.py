@@ -165,6 +165,11 @@ class Mode(Protocol):
         return 0
 
     @property
+    def streams(self) -> bool:
+        """Return whether it acts on a chunk that has not arrived whole."""
+        return False
+
+    @property
     def blocks(self) -> bool:
         """Return whether the control loop waits for the answer."""
         return False

@@ -20,7 +20,7 @@ def show(run: Run, **_: Any) -> Shown:
     return Shown(
         sentences=chunk_sentences(run),
         tables=tables,
-        main=["chunks"],
+        main=["chunks", "loop"] if "loop" in tables else ["chunks"],
         notes=tables["chunks"].notes,
         csvs=chunk_csv(run),
         figures=chunk_figures(run),

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 
-_LEFT: Final = ("mode", "rule")
 _CONVENTION: Final = {
     "floor": "d = floor(L / Delta t): an action leaves at the end of its tick, as real-time chunking counts.",
     "ceil": "d = ceil(L / Delta t): an action leaves at the start of its tick, as lerobot counts.",
@@ -31,10 +30,12 @@ _EMULATED: Final = Note(
 
 
 def rows_of(run: Run) -> list[Row]:
-    """Return the rows of a run; what a row lacks is None."""
+    """Return the rows of a run; what a row lacks is None. Live they are made in random order, which is put right."""
     table = run.table(CHUNKS).drop(columns=PROVENANCE)
     whole = table.astype(object).where(table.notna(), None)
-    return [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
+    rows = [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
+    asked = run.manifest["configuration"]
+    return sorted(rows, key=lambda row: (row["latency"], asked["modes"].index(row["mode"]))) if live(run) else rows
 
 
 def sources_of(rows: list[Row]) -> list[tuple[str, list[Row]]]:
@@ -67,31 +68,40 @@ def smoothness_table(run: Run) -> TextTable:
     return replace(table, notes=(_convention(run), note, _EMULATED))
 
 
+def loop_table(run: Run) -> TextTable:
+    """Lay out how well the control loop of a live run kept time."""
+    header = ("alike, %", "jitter (ms)", "p99", "max", "late", "busy (ms)", "max", "MB/s up")
+    return _table(run, "Control loop", header, _loop)
+
+
+def live(run: Run) -> bool:
+    """Whether a run acted in real time."""
+    return bool(run.manifest["configuration"].get("live"))
+
+
 def chunk_tables(run: Run) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
-    found = {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
-    smooth = any(row.get("tracking_rms") is not None for row in rows_of(run))
-    return found | ({"smoothness": smoothness_table(run)} if smooth else {})
+    tables = {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
+    if any(row.get("jerk_rms") is not None for row in rows_of(run)):
+        tables["smoothness"] = smoothness_table(run)
+    return tables | ({"loop": loop_table(run)} if live(run) else {})
 
 
 def delay_table(run: Run) -> TextTable:
-    """Lay out the realised delays of each source."""
+    """Lay out the realised delays of each source, live of each mode beside the d that it is ready for."""
     rows = []
     for place, (name, group) in enumerate(sources_of(rows_of(run)), 1):
-        one = next((row for row in group if not row["mode"].startswith("streamed")), group[0])
-        delays = (one[f"delay_ticks_{part}"] for part in ("mean", "p99", "max"))
-        rows.append(
-            (
-                str(place),
-                name,
-                str(one["requests"]),
-                number(one["latency_s"] * 1e3),
-                number(one["latency_s_p99"] * 1e3),
-                *map(_number, delays),
-            )
-        )
-    header = ("L", "latency", "requests", "ms", "p99", "d", "p99", "max")
-    return TextTable(f"Delays, d = {_rounding(run)} of L over Delta t", header, rows, 2, notes=(_convention(run),))
+        shared = next((row for row in group if not row["mode"].startswith("streamed")), group[0])
+        for one in group if live(run) else [shared]:
+            delays = (_number(one[f"delay_ticks_{part}"]) for part in ("mean", "p99", "max"))
+            latency = (number(one[part] * 1e3) for part in ("latency_s", "latency_s_p99"))
+            told = (_number(one["delay_assumed_ticks"]), _percent(one["p_delay_above"])) if live(run) else ()
+            who = (one["mode"],) if live(run) else (name, str(one["requests"]))
+            rows.append((str(place), *who, *latency, *delays, *told))
+    left, more = (("L", "mode"), ("assumed", "above, %")) if live(run) else (("L", "latency", "requests"), ())
+    header = (*left, "ms", "p99", "d", "p99", "max", *more)
+    title = f"Delays, d = {_rounding(run)} of L over Delta t"
+    return TextTable(title, header, rows, 2, notes=(_convention(run),))
 
 
 def chunk_csv(run: Run) -> dict[str, CsvTable]:
@@ -101,11 +111,14 @@ def chunk_csv(run: Run) -> dict[str, CsvTable]:
 
 def chunk_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints."""
-    return frame(run, [present(ChunkCell(**row, emulated=True)) for row in rows_of(run)], [])
+    origins = run.origins
+    return frame(
+        run, [present(ChunkCell(**row, emulated=origins.of(row["cell"]).emulated)) for row in rows_of(run)], []
+    )
 
 
 def chunk_sentences(run: Run) -> list[str]:
-    """Return what calibration costs over the oracle, and what the other rules do, a sentence a source."""
+    """Return what calibration costs over the oracle, what the other rules do, and how a control loop kept time."""
     said = []
     epsilon = float(run.manifest["configuration"]["epsilon"])
     for name, rows in sources_of(rows_of(run)):
@@ -117,6 +130,12 @@ def chunk_sentences(run: Run) -> list[str]:
         ]
         if parts:
             said.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(parts)} ticks.")
+        if live(run):
+            least, worst = min(row["agreement"] for row in rows), max(row["jitter_s_p99"] for row in rows)
+            said.append(
+                f"Control loop @ {name}: {least:.2%} of the ticks and more are as virtual time has them; "
+                f"p99 of the jitter {number(worst * 1e3)} ms at most."
+            )
         slower = max((row["slow_down"] or 1 for row in rows if row["mode"].startswith("queue")), default=1)
         if slower > 1:
             said.append(f"@ {name} no trigger of queue is enough: actions would have to be {slower:.2f} times slower.")
@@ -129,14 +148,22 @@ def _table(run: Run, title: str, header: tuple[str, ...], cells: Any) -> TextTab
     rules = []
     found = sources_of(rows_of(run))
     several = len(found) > 1
+    named = ("mode",) if live(run) else ("mode", "rule")
     for place, (_, group) in enumerate(found, 1):
         rules.append(len(rows))
-        rows += [((str(place),) * several + (row["mode"], row["rule"], *cells(row))) for row in group]
+        rows += [((str(place),) * several + (*(_named(row, name) for name in named), *cells(row))) for row in group]
     asked = run.manifest["configuration"]
     of = "" if several else f" @ {found[0][0]}" if found else ""
-    what = f"{title}{of}, H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {_rounding(run)}"
-    left = ("L",) * several + _LEFT
+    slower = f" / {asked['slow_down']:g}" if asked.get("slow_down", 1) > 1 else ""
+    what = f"{title}{of}, H = {asked['horizon']}, {asked['control_hz']:g}{slower} Hz, d by {_rounding(run)}"
+    left = ("L",) * several + named
     return TextTable(what, (*left, *header), rows, len(left), frozenset(rules[1:]), tuple(_notes(run)))
+
+
+def _named(row: Row, column: str) -> str:
+    """Return a row's mode or rule, and by how much the rule slowed actions down."""
+    slower = row.get("slower") or 1
+    return f"{row[column]}, {slower:.3g}x slower" if column == "rule" and slower > 1 else str(row[column])
 
 
 def _stalls(row: Row) -> Iterator[str]:
@@ -164,6 +191,16 @@ def _smoothness(row: Row) -> Iterator[str]:
         yield _number(row[name])
     for name in ("boundary_jump_mean", "boundary_jump_p99", "action_step_mean"):
         yield _number(row[name])
+
+
+def _loop(row: Row) -> Iterator[str]:
+    yield _percent(row["agreement"])
+    for name in ("jitter_s_p50", "jitter_s_p99", "jitter_s_max"):
+        yield number(row[name] * 1e3)
+    yield str(row["late_ticks"])
+    for name in ("blocked_s_p99", "blocked_s_max"):
+        yield number(row[name] * 1e3)
+    yield number(row["bytes_up_per_s"] / 1e6)
 
 
 def _interval(row: Row) -> str:
@@ -211,4 +248,14 @@ def _notes(run: Run) -> Iterator[str]:
             f"Rules choose m of queue: calibrated for P(stall) <= {asked['epsilon']:.2%}, tracked from there, "
             "lerobot's maximum, the mean, an oracle that knows the distribution. All others saw the same cycles before."
         )
+    if live(run):
+        sources = [name for name, _ in sources_of(rows)]
+        if len(sources) > 1:
+            yield "; ".join(f"{place}: {name}" for place, name in enumerate(sources, 1)) + "."
+        yield (
+            "alike: share of the ticks that virtual time has the same way, on the latencies that were measured; "
+            "jitter: how long after it was due an action left; late: by a tick or more; busy: for how long asking and "
+            "sending kept the loop in a tick, p99."
+        )
+        return
     yield _EMULATED

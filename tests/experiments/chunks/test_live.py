@@ -1,0 +1,127 @@
+"""Chunks live: what the loop did is what virtual time says of the same latencies, over transports that labs use."""
+
+import json
+from itertools import islice
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from s2a_bench.errors import RequestFailed, UsageError
+from s2a_bench.experiments.chunks.config import ChunksConfig
+from s2a_bench.experiments.chunks.run import run_chunks
+from s2a_bench.experiments.chunks.view import show
+from s2a_bench.inference.chunk import chunk
+from s2a_bench.library import Run
+from s2a_bench.progress import NullProgress
+from s2a_bench.store.run import read_run
+from s2a_bench.types import Token
+
+ECHO = {"name": "echo"}
+
+
+def act(tmp_path: Path, *, transport: str = "loopback", **asked: object) -> pd.DataFrame:
+    """Act for a moment and return a row a mode."""
+    requests = {"transports": transport, "engine": ECHO, "size": "64x48", "warmup": 1}
+    config = ChunksConfig(**{"live": True, "seconds": 1.5, "requests": requests, **asked})
+    folder = run_chunks(config, tmp_path, NullProgress())
+    return pd.read_csv(folder / "chunks.csv")
+
+
+def folder_of(tmp_path: Path) -> Path:
+    """Return the one run folder."""
+    return next(path for path in tmp_path.iterdir() if path.is_dir())
+
+
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_every_mode_acts_as_computed(tmp_path: Path, rounding: str) -> None:
+    modes = "sync,queue?trigger=4,replace?execute=5,aggregate?trigger=4,streamed?trigger=3"
+    rows = act(tmp_path, modes=modes, rounding=rounding)
+    assert len(rows) == 5
+    assert (rows["agreement"] >= 0.99).all()
+    assert (rows["latency_s"] > 0).all()
+    assert (rows["jitter_s_max"] >= rows["jitter_s_p50"]).all()
+    assert (rows["blocked_s_max"] > 0).all()
+    assert rows.loc[rows["mode"].str.startswith("sync"), "jump_max"].item() == 0
+    ticks = pd.read_csv(folder_of(tmp_path) / "chunk_ticks.csv")
+    assert (ticks["late_ns"] >= 0).all()
+
+
+def test_requests_are_kept_as_samples_with_their_marks_and_ids(tmp_path: Path) -> None:
+    rows = act(tmp_path, modes="replace?execute=8")
+    run = read_run(folder_of(tmp_path))
+    samples, requests = run.samples, pd.read_csv(run.path / "chunk_requests.csv")
+    assert samples["warmup"].sum() == 1
+    assert len(samples) - 1 >= rows["requests"].item()
+    assert set(requests["request_id"]) <= set(samples["request_id"])
+    assert set(rows["cell"]) <= set(run.origins.cells)
+
+
+def test_several_requests_are_under_way_over_clients_of_their_own(tmp_path: Path) -> None:
+    act(tmp_path, modes="replace?execute=2&under_way=many")
+    assert read_run(folder_of(tmp_path)).samples["warmup"].sum() == 4  # of each client
+
+
+def test_a_live_run_is_shown_and_its_latencies_are_a_source(tmp_path: Path) -> None:
+    act(tmp_path, modes="queue?trigger=3,sync")
+    folder = folder_of(tmp_path)
+    shown = show(read_run(folder))
+    assert "loop" in shown.tables
+    assert {"lanes", "reactions"} <= set(shown.figures)
+    assert not any("EMULATED" in str(note) for note in shown.notes)
+    assert shown.json()["cells"][0]["emulated"] is False
+    assert "as virtual time has them" in " ".join(shown.sentences)
+    assert Run(folder).table("loop").shape[0] == 2
+    again = ChunksConfig(latency=f"{folder}#loopback", modes="queue?trigger=3", rules="")
+    assert again.sources[0].recorded_ns is not None
+
+
+def test_delays_of_a_live_run_are_exported(tmp_path: Path) -> None:
+    act(tmp_path, modes="queue", export_delays=tmp_path / "delays.csv")
+    delays = pd.read_csv(tmp_path / "delays.csv")
+    assert len(delays) >= 2
+    assert (delays["received_ns"] > delays["observation_ns"]).all()
+    assert (delays["rounding"] == "floor").all()
+
+
+@pytest.mark.parametrize("transport", ["websocket/openpi", "ros/topic"])
+def test_over_what_labs_use(tmp_path: Path, transport: str) -> None:
+    rows = act(tmp_path, transport=transport, modes="queue?trigger=4,replace?execute=8")
+    assert (rows["agreement"] >= 0.99).all()
+    assert (rows["bytes_up_per_s"] > 0).all()
+
+
+def test_a_chunk_of_another_length_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *asked: islice(chunk(*asked), 5))
+    with pytest.raises(UsageError, match=r"`horizon`: loopback answers with chunks of 5 actions, not 16"):
+        act(tmp_path, modes="sync")
+
+
+def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *_: [Token(0, "go")])
+    with pytest.raises(RequestFailed, match="chunks of actions"):
+        act(tmp_path, modes="sync")
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"live": True, "rules": "mean"}, "`rules` is for virtual time"),
+        ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
+        ({"requests": {"transports": "http"}}, "`transports` is for a control loop"),
+        ({"live": True, "requests": {"transports": "nothing"}}, "nothing"),
+        ({"live": True, "requests": {"engine": {"name": "llama"}}}, "echo or replay"),
+        ({"live": True, "export_delays": "delays.txt"}, "`export_delays`: delays.txt should be"),
+        ({"live": True, "export_delays": "d.csv", "requests": {"transports": "http,ros"}}, "one `transport` at a time"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(asked: dict[str, object], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        ChunksConfig(**asked)
+
+
+def test_json_has_what_is_measured(tmp_path: Path) -> None:
+    act(tmp_path, modes="sync")
+    cell = show(read_run(folder_of(tmp_path))).json()["cells"][0]
+    json.dumps(cell)
+    assert {"agreement", "jitter_s_p99", "blocked_s_max", "late_ticks", "bytes_up_per_s"} <= set(cell)
