@@ -22,6 +22,7 @@ from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.chunks.view.figures import build_reactions, build_stability, build_triggers
 from s2a_bench.experiments.chunks.view.lanes import build_lanes
+from s2a_bench.experiments.chunks.view.smoothness import build_smoothness
 from s2a_bench.experiments.study.config import StudyConfig
 from s2a_bench.experiments.study.run import run_study
 from s2a_bench.experiments.study.view.figures import build_frontier, build_targets
@@ -142,6 +143,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "chunks-stability-spread": lambda: build_stability(chunks(SPREAD)),
     "chunks-triggers": lambda: build_triggers(chunks(f"{SPREAD},{SLOW_ONES}")),
     "chunks-reactions": lambda: build_reactions(chunks("80")),
+    "chunks-smoothness": lambda: build_smoothness(chunks(SPREAD)),
 }
 
 SLOW: dict[str, Callable[[], Figure]] = {

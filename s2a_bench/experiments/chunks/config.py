@@ -18,6 +18,7 @@ from s2a_bench.policy.chunks import Rounding
 if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.latencies import Source
     from s2a_bench.policy.chunks import Mode, Setting
+    from s2a_bench.robots.plant import Plant
 
 RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
 """What may choose the trigger of queue."""
@@ -60,7 +61,15 @@ class ChunksConfig(Options):
     tokens_per_action: int = option(7, "tokens of an action, where a profile answers", ge=1, le=1000)
     shown_ticks: int = option(120, "control ticks of each row that are kept", ge=0, le=100_000)
     stability: int = option(
-        33, "mean latencies of the stability diagram of the first replace, from 0 to H ticks; 0 for none", ge=0, le=1000
+        33,
+        "mean latencies of the diagrams of stability (first replace) and smoothness, from 0 to H ticks; 0 for none",
+        ge=0,
+        le=1000,
+    )
+    robot: str = option(
+        "plant",
+        "what takes the actions: plant?frequency_hz=5&damping=1, live also ros?topic=/NAME, call?function=MODULE:NAME; "
+        "empty text for none",
     )
     export_delays: Path | None = option(
         None, "also write each request's times, L and d as CSV, for other simulators; of one source of latencies"
@@ -132,6 +141,19 @@ class ChunksConfig(Options):
             each for written in self.latency for each in sources(written, self.horizon * self.tokens_per_action)
         )
 
+    @cached_property
+    def plant(self) -> Plant | None:
+        """Return what takes actions in virtual time; raises UsageError naming the field."""
+        from s2a_bench.robots import kind
+        from s2a_bench.robots.plant import Plant
+
+        if not self.robot:
+            return None
+        found = kind(self.robot)
+        if not isinstance(found, Plant):
+            raise UsageError(f"`robot`: {found.name}: virtual time has no actions to send; name a plant, or nothing")
+        return found
+
     @property
     def with_rules(self) -> bool:
         """Return whether rules choose the trigger of a queue."""
@@ -150,6 +172,7 @@ class ChunksConfig(Options):
         if alone := next(self.requests.given(), ""):
             raise UsageError(f"`{alone}` is for a control loop that runs; it needs `live`")
         self._check_export()
+        _ = self.plant
         for source in self.sources:
             recorded = source.recorded_ns
             learnt = self.calibration_cycles if recorded is None else min(self.calibration_cycles, recorded.size // 2)
@@ -160,6 +183,10 @@ class ChunksConfig(Options):
 
     def _check_live(self) -> None:
         """Refuse what only virtual time has, and what no server could be told."""
+        from s2a_bench.robots import kind
+
+        if self.robot:
+            kind(self.robot)
         said = self.model_fields_set
         if alone := next((field for field in ("rules", "cycles", "calibration_cycles") if field in said), ""):
             raise UsageError(f"`{alone}` is for virtual time; live, name a trigger: queue?trigger=6")

@@ -31,12 +31,23 @@ _SIDE: Final = 0.975
 
 
 def chunk_row(
-    cell: Cell, setting: Setting, cycles: Cycles, ticks: Ticks, *, epsilon: float, reaction_s: Floats
+    cell: Cell,
+    setting: Setting,
+    cycles: Cycles,
+    ticks: Ticks,
+    *,
+    epsilon: float,
+    reaction_s: Floats,
+    smooth: Mapping[str, float],
 ) -> AboutCell:
-    """Describe a cell's run; ``reaction_s`` are its reaction times, ``epsilon`` is the share that may stall."""
+    """Describe a cell's run.
+
+    ``reaction_s`` are its reaction times, ``smooth`` its metrics of smoothness if any, and ``epsilon`` is the share
+    that may stall.
+    """
     latency_s = cell.drawn.judged / 1e9
     triggers = cell.triggers or ((cell.mode.trigger,) if hasattr(cell.mode, "trigger") else ())
-    values = metrics_of(cell, setting, cycles, ticks, reaction_s)
+    values = {**metrics_of(cell, setting, cycles, ticks, reaction_s), **smooth}
     values |= {"slow_down": beta(cell.mode, cell.drawn.judged, setting, epsilon), "slower": cell.slower}
     row: AboutCell = ChunkRow(
         cell=cell.cell,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.chunks.rows import CHUNKS
@@ -22,6 +23,10 @@ _CONVENTION: Final = {
     "floor": "d = floor(L / Delta t): an action leaves at the end of its tick, as real-time chunking counts.",
     "ceil": "d = ceil(L / Delta t): an action leaves at the start of its tick, as lerobot counts.",
 }
+
+_EMULATED: Final = Note(
+    "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
+)
 
 
 def rows_of(run: Run) -> list[Row]:
@@ -62,10 +67,28 @@ def live(run: Run) -> bool:
     return bool(run.manifest["configuration"].get("live"))
 
 
+def smoothness_table(run: Run) -> TextTable:
+    """Lay out how well a plant follows a target under each mode, and how smoothly."""
+    header = ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
+    table = _table(run, "Smoothness", header, _smoothness)
+    robot = run.manifest["configuration"]["robot"]
+    jump = "jump: from one action to the next across a boundary, step: within a chunk."
+    if live(run):
+        note = f"Jerk (root mean square) of {robot}, in the actions' unit and s. {jump}"
+        return replace(table, notes=(_convention(run), note))
+    note = (
+        f"Tracking error and jerk (root mean squares) of {robot}, in the target's standard deviation and s; ideal: "
+        f"asked in every tick and answered at once. {jump}"
+    )
+    return replace(table, notes=(_convention(run), note, _EMULATED))
+
+
 def chunk_tables(run: Run) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
-    tables = {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
-    return tables | ({"loop": loop_table(run)} if live(run) else {})
+    found = {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
+    found |= {"loop": loop_table(run)} if live(run) else {}
+    smooth = any(row.get("jerk_rms") is not None for row in rows_of(run))
+    return found | ({"smoothness": smoothness_table(run)} if smooth else {})
 
 
 def delay_table(run: Run) -> TextTable:
@@ -177,6 +200,13 @@ def _loop(row: Row) -> Iterator[str]:
     yield number(row["bytes_up_per_s"] / 1e6)
 
 
+def _smoothness(row: Row) -> Iterator[str]:
+    for name in ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal"):
+        yield _number(row[name])
+    for name in ("boundary_jump_mean", "boundary_jump_p99", "action_step_mean"):
+        yield _number(row[name])
+
+
 def _interval(row: Row) -> str:
     if row["p_stall_cycle"] is None:
         return ABSENT
@@ -232,6 +262,4 @@ def _notes(run: Run) -> Iterator[str]:
             "sending kept the loop in a tick, p99."
         )
         return
-    yield Note(
-        "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
-    )
+    yield _EMULATED

@@ -1,0 +1,48 @@
+"""Tracking error and jerk against mean latency, a line a mode; PNG and PDF."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from s2a_bench.experiments.chunks.rows import SMOOTHNESS
+from s2a_bench.experiments.chunks.view.figures import LOOKS, title_of
+from s2a_bench.writers.figures import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from s2a_bench.store.run import Run
+
+MOST_LINES = len(LOOKS)
+
+
+def build_smoothness(run: Run) -> Figure:
+    """Draw both, and dashed what the plant alone does, asked in every tick and answered at once."""
+    rows = run.table(SMOOTHNESS)
+    modes = list(rows["mode"].unique())[:MOST_LINES]
+    what = "Following a target"
+    foot_in = 0.17 * -(-(len(modes) + 1) // 2)
+    figure = new_figure(3.5 + foot_in, title_of(run, what, f"shape of {rows['latency'].iloc[0]}"))
+    panels = figure.subplots(2, 1, sharex=True)
+    latency_ms = rows["latency_s"].to_numpy(dtype="float64") * 1e3
+    for axes, name, label in zip(
+        panels, ("tracking_rms", "jerk_rms"), ("tracking error (sd)", "jerk (sd/s$^3$)"), strict=True
+    ):
+        for mode, (colour, line, _) in zip(modes, LOOKS, strict=False):
+            mine = (rows["mode"] == mode).to_numpy()
+            axes.plot(latency_ms[mine], rows[name].to_numpy(dtype="float64")[mine], line, color=colour, label=str(mode))
+        ideal = rows.groupby("latency_s")[f"{name}_ideal"].mean()
+        axes.plot(
+            ideal.index.to_numpy(dtype="float64") * 1e3,
+            ideal.to_numpy(dtype="float64"),
+            "--",
+            color="black",
+            label="asked in every tick, answered at once",
+        )
+        axes.set_ylim(bottom=0)
+        axes.set_ylabel(label)
+    panels[-1].set_xlim(0, float(latency_ms.max()))
+    panels[-1].set_xlabel("mean latency, L (ms)")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, columnspacing=1.0)
+    return figure
