@@ -1,6 +1,6 @@
 """Acting on chunks of actions: a loop at control rate, on a thread of its own, that nothing blocks.
 
-    loop = ControlLoop(mode("queue?trigger=6").stepper(setting), setting, robot.send, ask, ticks=1000)
+    loop = ControlLoop(mode("queue?trigger=6"), setting, robot.send, ask, ticks=1000)
     loop.start()                         # ask(request, tick) is called from the loop, and should only pass it on
     loop.arrived(request, actions, now_ns())    # from any thread, with what has come of that request's chunk so far
     acted = loop.join()
@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from s2a_bench.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
-    from s2a_bench.policy.chunks import ChunkStepper, Ints, Setting
+    from s2a_bench.policy.chunks import Ints, Mode, Setting
     from s2a_bench.types import Vector
 
 Send: TypeAlias = "Callable[[Vector | None, int], None]"
@@ -73,10 +73,12 @@ class ControlLoop:
     """One robot that acts on chunks for so many control ticks."""
 
     def __init__(
-        self, stepper: ChunkStepper, setting: Setting, send: Send, ask: Ask, ticks: int, clock: Clock | None = None
+        self, mode: Mode, setting: Setting, send: Send, ask: Ask, ticks: int, clock: Clock | None = None
     ) -> None:
         """Prepare; `start` starts."""
-        self._stepper, self._setting = stepper, setting
+        self._stepper, self._setting = mode.stepper(setting), setting
+        self._weight = mode.weight
+        self._blended: deque[Vector] = deque()
         self._send, self._ask = send, ask
         self._ticks = ticks
         self._clock = clock or SystemClock()
@@ -177,12 +179,25 @@ class ControlLoop:
             arrival = self._inbox.popleft()
             if arrival[0] < before_ns:
                 self._stepper.arrived(arrival[1], arrival[2], tick)
+                if self._weight < 1:
+                    self._blend(self._actions[arrival[1]])
             else:
                 self._inbox.append(arrival)
 
+    def _blend(self, actions: Sequence[Vector]) -> None:
+        """Blend a chunk, from the action on that is due next, into what is left."""
+        due = actions[self._stepper.past :]  # type: ignore[attr-defined]  # every mode that blends counts
+        weight, left = self._weight, self._blended
+        self._blended = deque(
+            weight * new + (1 - weight) * left[place] if place < len(left) else new for place, new in enumerate(due)
+        )
+
     def _act(self, tick: int, due_ns: int) -> None:
         action = self._stepper.act(tick)
-        self._send(None if action is None else self._actions[action.request][action.index], due_ns)
+        value = None
+        if action is not None:
+            value = self._blended.popleft() if self._weight < 1 else self._actions[action.request][action.index]
+        self._send(value, due_ns)
         self._late.append(self._clock.now_ns() - due_ns)
         self._chunk.append(-1 if action is None else action.request)
         self._index.append(-1 if action is None else action.index)

@@ -60,7 +60,7 @@ def act(written: str, setting: Setting, latency_ns: list[int], clock: VirtualClo
             else:
                 loop.arrived(request, actions, began_ns)
 
-    loop = ControlLoop(chosen.stepper(setting), setting, lambda *_: None, ask, ticks, clock)
+    loop = ControlLoop(chosen, setting, lambda *_: None, ask, ticks, clock)
     loop.run()
     return loop.acted()
 
@@ -103,7 +103,7 @@ def test_robot_is_sent_each_action_and_each_stall() -> None:
     setting, sent = Setting(2_000_000, 3), []
     chunk = [np.full(2, place, np.float32) for place in range(3)]
     loop = ControlLoop(
-        mode("sync").stepper(setting),
+        mode("sync"),
         setting,
         lambda action, due_ns: sent.append((None if action is None else float(action[0]), due_ns)),
         lambda request, _: loop.arrived(request, chunk, now_ns() + 3_000_000),
@@ -117,6 +117,28 @@ def test_robot_is_sent_each_action_and_each_stall() -> None:
     assert {late - early for (_, early), (_, late) in pairwise(sent)} == {2_000_000}
 
 
+def test_overlapping_actions_are_blended_as_virtual_time_says() -> None:
+    setting, sent = Setting(PERIOD_NS, HORIZON), []
+    chosen = mode("aggregate?trigger=3")
+    rng = np.random.default_rng(0)
+    chunks = rng.normal(size=(12, HORIZON, 2)).astype(np.float32)
+    latency_ns = rng.integers(0, 4 * PERIOD_NS, 12)
+
+    def ask(request: int, tick: int) -> None:
+        if request < len(chunks):
+            began_ns = tick * PERIOD_NS
+            loop.arrived(request, list(chunks[request]), began_ns + int(latency_ns[request]))
+
+    loop = ControlLoop(chosen, setting, lambda action, _: sent.append(action), ask, 80, VirtualClock())
+    loop.run()
+    cycles, _ = follow(chosen, np.repeat(latency_ns[:, np.newaxis], HORIZON, axis=1), setting)
+    said = np.full((cycles.ticks, 2), np.nan)
+    for tick, chunk, index, share in chosen.blend(cycles):  # type: ignore[attr-defined]
+        said[tick] = np.nan_to_num(said[tick]) + share[:, np.newaxis] * chunks[chunk, index]
+    done = np.array([[np.nan] * 2 if action is None else action for action in sent[: cycles.ticks]])
+    np.testing.assert_allclose(done, said, rtol=1e-5)
+
+
 def test_failure_of_a_robot_reaches_who_waits_and_the_interpreter_is_as_before() -> None:
     before_s = sys.getswitchinterval()
     seen: list[float] = []
@@ -126,7 +148,7 @@ def test_failure_of_a_robot_reaches_who_waits_and_the_interpreter_is_as_before()
         raise ValueError("the arm fell off")
 
     setting = Setting(1_000_000, 3)
-    loop = ControlLoop(mode("sync").stepper(setting), setting, broken, lambda *_: None, 10)
+    loop = ControlLoop(mode("sync"), setting, broken, lambda *_: None, 10)
     loop.start()
     with pytest.raises(ValueError, match="fell off"):
         loop.join(10)
@@ -137,9 +159,7 @@ def test_failure_of_a_robot_reaches_who_waits_and_the_interpreter_is_as_before()
 def test_stop_ends_it_before_its_time() -> None:
     asked = Event()
     setting = Setting(1_000_000, 3)
-    loop = ControlLoop(
-        mode("sync").stepper(setting), setting, lambda *_: None, lambda *_: asked.set(), 10**9, SystemClock()
-    )
+    loop = ControlLoop(mode("sync"), setting, lambda *_: None, lambda *_: asked.set(), 10**9, SystemClock())
     loop.start()
     assert asked.wait(10)
     assert loop.join(0.001) is None

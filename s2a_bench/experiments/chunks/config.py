@@ -66,7 +66,11 @@ class ChunksConfig(Options):
         ge=0,
         le=1000,
     )
-    robot: str = option("plant", "what takes the actions: plant?frequency_hz=5&damping=1; empty text for none")
+    robot: str = option(
+        "plant",
+        "what takes the actions: plant?frequency_hz=5&damping=1, live also ros?topic=/NAME, call?function=MODULE:NAME; "
+        "empty text for none",
+    )
     export_delays: Path | None = option(
         None, "also write each request's times, L and d as CSV, for other simulators; of one source of latencies"
     )
@@ -179,6 +183,10 @@ class ChunksConfig(Options):
 
     def _check_live(self) -> None:
         """Refuse what only virtual time has, and what no server could be told."""
+        from s2a_bench.robots import kind
+
+        if self.robot:
+            kind(self.robot)
         said = self.model_fields_set
         if alone := next((field for field in ("rules", "cycles", "calibration_cycles") if field in said), ""):
             raise UsageError(f"`{alone}` is for virtual time; live, name a trigger: queue?trigger=6")

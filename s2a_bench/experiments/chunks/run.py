@@ -10,7 +10,7 @@ from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells, draw
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
 from s2a_bench.experiments.chunks.rows import CHUNKS, REACTIONS, REQUESTS, SMOOTHNESS, STABILITY, TICKS, TRIGGERS
-from s2a_bench.experiments.chunks.smooth import follower, smoothness_rows
+from s2a_bench.experiments.chunks.smooth import Follower, follower, smoothness_rows
 from s2a_bench.experiments.chunks.to_rows import chunk_row, reaction_rows, reactions_s, request_rows, tick_rows
 from s2a_bench.experiments.chunks.varying import stability_rows, trigger_rows
 from s2a_bench.experiments.study.worlds import generator
@@ -47,24 +47,24 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
         progress.opened(writer.path)
         progress.stage("acting in virtual time")
         progress.expect(len(tried))
+        follows = follower(config)
         for cell in tried:
-            _simulate(config, cell, writer)
+            _simulate(config, cell, follows, writer)
             progress.advance()
         for each in drawn:
             writer.append(TRIGGERS, trigger_rows(config, each))
         writer.append(STABILITY, stability_rows(config, drawn[0]))
-        writer.append(SMOOTHNESS, smoothness_rows(config, drawn[0]))
+        writer.append(SMOOTHNESS, smoothness_rows(config, drawn[0], follows))
         if config.export_delays is not None:
             write_delays(config.export_delays, delay_rows(drawn[0], tried[0].mode, config.setting))
         return writer.path
 
 
-def _simulate(config: ChunksConfig, cell: Cell, writer: RunWriter) -> None:
+def _simulate(config: ChunksConfig, cell: Cell, follows: Follower | None, writer: RunWriter) -> None:
     setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
     cycles, ticks = cell.mode.cycles(latency_ns, setting), cell.mode.ticks(latency_ns, setting)
     reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
-    follows = follower(config, setting)
-    smooth = follows.measure(cell.mode, cycles, ticks) if follows else {}
+    smooth = follows.measure(cell.mode, cycles, ticks) if follows and cell.slower == 1 else {}
     row = chunk_row(cell, setting, cycles, ticks, epsilon=config.epsilon, reaction_s=reaction_s, smooth=smooth)
     writer.append(CHUNKS, [row])
     writer.append(REACTIONS, reaction_rows(cell, latency_ns, setting, reaction_s))

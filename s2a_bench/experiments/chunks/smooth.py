@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.cells import Drawn
     from s2a_bench.experiments.chunks.config import ChunksConfig
     from s2a_bench.policy import Floats
-    from s2a_bench.policy.chunks import Cycles, Mode, Setting, Ticks
+    from s2a_bench.policy.chunks import Cycles, Mode, Ticks
     from s2a_bench.robots.plant import Plant
 
 MOST_TICKS: Final = 50_000
@@ -63,12 +63,15 @@ class Follower:
         }
 
 
-def follower(config: ChunksConfig, setting: Setting) -> Follower | None:
-    """Return what follows, the same target for all cells of a seed; None where no robot is asked for."""
-    if config.plant is None:
+def follower(config: ChunksConfig) -> Follower | None:
+    """Return what follows, the same target for all cells of a seed; None where no robot is asked for.
+
+    Nor where all actions are slowed down: no target waits for them.
+    """
+    if config.plant is None or config.slow_down > 1:
         return None
     rng = generator(config.seed, "chunks target")
-    return Follower(config.plant, draw_target(rng, MOST_TICKS, setting.period_ns / 1e9))
+    return Follower(config.plant, draw_target(rng, MOST_TICKS, config.setting.period_ns / 1e9))
 
 
 def executed(mode: Mode, cycles: Cycles, ticks: Ticks, target: Target) -> Floats:
@@ -86,13 +89,11 @@ def executed(mode: Mode, cycles: Cycles, ticks: Ticks, target: Target) -> Floats
     return found
 
 
-def smoothness_rows(config: ChunksConfig, drawn: Drawn) -> Iterator[SmoothnessRow]:
+def smoothness_rows(config: ChunksConfig, drawn: Drawn, follows: Follower | None) -> Iterator[SmoothnessRow]:
     """Try each mode as given over mean latency; none where no robot is asked for, or no diagram."""
-    setting = config.setting
-    follows = follower(config, setting)
     if follows is None or not config.stability:
         return
-    shape = drawn.judged[:REQUESTS] / max(float(drawn.judged[:REQUESTS].mean()), 1.0)
+    setting, shape = config.setting, drawn.judged[:REQUESTS] / max(float(drawn.judged[:REQUESTS].mean()), 1.0)
     for mean_ns in np.linspace(0, setting.horizon * setting.period_ns, config.stability):
         latency_ns = np.rint(shape * mean_ns).astype(np.int64)
         for name, mode in config.made.items():

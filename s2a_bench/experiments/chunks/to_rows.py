@@ -38,7 +38,7 @@ def chunk_row(
     *,
     epsilon: float,
     reaction_s: Floats,
-    smooth: Mapping[str, float] | None = None,
+    smooth: Mapping[str, float],
 ) -> AboutCell:
     """Describe a cell's run.
 
@@ -47,7 +47,7 @@ def chunk_row(
     """
     latency_s = cell.drawn.judged / 1e9
     triggers = cell.triggers or ((cell.mode.trigger,) if hasattr(cell.mode, "trigger") else ())
-    values = {**metrics_of(cell, setting, cycles, ticks, reaction_s), **(smooth or {})}
+    values = {**metrics_of(cell, setting, cycles, ticks, reaction_s), **smooth}
     values |= {"slow_down": beta(cell.mode, cell.drawn.judged, setting, epsilon), "slower": cell.slower}
     row: AboutCell = ChunkRow(
         cell=cell.cell,

@@ -170,6 +170,11 @@ class Mode(Protocol):
         return False
 
     @property
+    def weight(self) -> float:
+        """Return the share of a new action where it meets one that is due at the same time; 1: it takes its place."""
+        return 1.0
+
+    @property
     def blocks(self) -> bool:
         """Return whether the control loop waits for the answer."""
         return False

@@ -39,6 +39,11 @@ class Aggregate(Laid):
     trigger: Annotated[int, Field(ge=0)] = 0
     kind: Kind = "weighted_average"
 
+    @property
+    def weight(self) -> float:
+        """Return the new action's weight."""
+        return WEIGHTS[self.kind]
+
     def stepper(self, setting: Setting) -> ChunkStepper:
         """Follow one robot."""
         return AggregateStepper(self.trigger, setting.horizon)

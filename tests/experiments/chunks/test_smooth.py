@@ -16,7 +16,7 @@ from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.metrics import METRICS
 from s2a_bench.experiments.chunks.rows import CHUNKS, SMOOTHNESS
 from s2a_bench.experiments.chunks.run import run_chunks
-from s2a_bench.experiments.chunks.smooth import Follower, executed, smoothness_rows
+from s2a_bench.experiments.chunks.smooth import Follower, executed, follower, smoothness_rows
 from s2a_bench.experiments.chunks.target import RATE, Target, draw_target
 from s2a_bench.policy.chunks import Setting, Ticks, mode
 from s2a_bench.policy.chunks.aggregate import WEIGHTS, Aggregate
@@ -188,7 +188,7 @@ class TestRuns:
 
     def test_without_diagrams_there_is_none(self) -> None:
         config = ChunksConfig(stability=0)
-        assert not list(smoothness_rows(config, draw(config, config.sources[0])))
+        assert not list(smoothness_rows(config, draw(config, config.sources[0]), follower(config)))
 
     @pytest.mark.parametrize(
         ("robot", "message"),

@@ -107,13 +107,18 @@ class Asking:
                 return
 
 
-def warm_up(session: Session, place: Place, horizon: int) -> Measured:
-    """Ask once before the loop starts; raises as `check` does."""
-    actions: list[Piece] = []
-    measured = session.measure(place, Asked(heard=lambda piece, _: actions.append(piece)))
+def warm_up(session: Session, place: Place, horizon: int) -> tuple[Measured, int]:
+    """Ask once before the loop starts, and return of how many numbers an action is; raises as `check` does."""
+    actions: list[Vector] = []
+
+    def heard(piece: Piece, _at_ns: int) -> None:
+        if isinstance(piece, Action):
+            actions.append(piece.values)
+
+    measured = session.measure(place, Asked(heard=heard))
     if not measured.sample.error:
-        check(session, sum(isinstance(piece, Action) for piece in actions), horizon)
-    return measured
+        check(session, len(actions), horizon)
+    return measured, actions[0].size if actions else 0
 
 
 def check(session: Session, actions: int, horizon: int) -> None:

@@ -7,6 +7,7 @@ tick in which a request left until its chunk was there.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.errors import TransportError
+from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.chunks.cells import GIVEN, Cell, Drawn
 from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
 from s2a_bench.experiments.chunks.latencies import Source
@@ -29,15 +30,22 @@ from s2a_bench.harness.rounds import Launch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.policy.chunks.cycles import gather
 from s2a_bench.policy.chunks.stepping import follow
+from s2a_bench.robots import open_robot
+from s2a_bench.robots.plant import PlantRobot
+from s2a_bench.robots.smoothness import smoothness
 from s2a_bench.runtime.control import Acted, ControlLoop
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.config import ChunksConfig
     from s2a_bench.policy.chunks import Cycles, Ints, Mode, Setting, Ticks
     from s2a_bench.progress import Progress
+    from s2a_bench.robots import Robot
+    from s2a_bench.types import Vector
 
 CLIENTS: Final = 4
 """Of a cell, where a mode has several requests under way."""
+SMOOTH: Final = ("jerk_rms", "boundary_jump_mean", "boundary_jump_p99", "action_step_mean")
+"""What is told of how a plant moved."""
 LOOK_S: Final = 0.05
 """How often who waits for a loop writes down what was measured."""
 
@@ -62,16 +70,19 @@ def _drive(config: ChunksConfig, launch: Launch) -> None:
     blocks = count()
     groups = _groups(launch.sessions)
     launch.progress.stage("warming up")
+    dims: dict[str, int] = {}
     for session in launch.sessions:
         for _ in range(launch.config.warmup):
-            launch.keep(session, warm_up(session, Place(next(blocks), 0, warmup=True), config.horizon))
+            warm, dims[session.cell.name] = warm_up(session, Place(next(blocks), 0, warmup=True), config.horizon)
+            launch.keep(session, warm)
     cells = [(name, mode, group) for group in groups for name, mode in config.made.items()]
     launch.progress.expect(len(cells))
     for name, mode, sessions in Random(config.seed).sample(cells, len(cells)):  # noqa: S311 - an order, not a secret
         where = sessions[0].cell.name
         launch.progress.stage(f"acting for {config.seconds:g} s: {name} @ {where}")
-        asking, acted = _act(config, mode, sessions, launch, blocks)
-        _write(config, launch, Live(name, mode, sessions[0], acted, asking))
+        with robot_of(config, dims[where]) as robot:
+            asking, acted = _act(config, mode, sessions, launch, blocks, robot)
+            _write(config, launch, Live(name, mode, sessions[0], acted, asking, robot))
         launch.progress.advance()
 
 
@@ -83,11 +94,30 @@ def _groups(sessions: Sequence[Session]) -> list[list[Session]]:
     return list(found.values())
 
 
+@contextmanager
+def robot_of(config: ChunksConfig, dims: int) -> Iterator[Robot | None]:
+    """Open the robot for a mode, if there is one; raises S2AError."""
+    if not config.robot:
+        yield None
+        return
+    robot = open_robot(config.robot, dims, config.setting.period_ns)
+    try:
+        yield robot
+    finally:
+        robot.close()
+
+
 def _act(
-    config: ChunksConfig, mode: Mode, sessions: Sequence[Session], launch: Launch, blocks: Iterator[int]
+    config: ChunksConfig,
+    mode: Mode,
+    sessions: Sequence[Session],
+    launch: Launch,
+    blocks: Iterator[int],
+    robot: Robot | None,
 ) -> tuple[Asking, Acted]:
     """Act in one mode, and write down every request as it is measured."""
     setting = config.setting
+    told = robot is not None and _takes_state(config, sessions[0], robot)
 
     def heard(request: int, actions: Sequence[Any], at_ns: int) -> None:
         loop.arrived(request, actions, at_ns)
@@ -95,9 +125,10 @@ def _act(
     asking = Asking(sessions, config.horizon, config.seed, mode.streams, heard, blocks)
 
     def ask(request: int, tick: int) -> None:
-        asking.jobs.put(Job(request, tick, ()))
+        asking.jobs.put(Job(request, tick, robot.state() if robot is not None and told else ()))
 
-    loop = ControlLoop(mode.stepper(setting), setting, lambda *_: None, ask, config.ticks)
+    send = _nowhere if robot is None else robot.send
+    loop = ControlLoop(mode, setting, send, ask, config.ticks)
     acted: Acted | None = None
     with asking.running():
         try:
@@ -109,6 +140,18 @@ def _act(
             loop.stop()
     _keep(asking, launch)
     return asking, acted
+
+
+def _nowhere(action: Vector | None, at_ns: int) -> None:
+    """Take actions that nobody executes."""
+
+
+def _takes_state(config: ChunksConfig, session: Session, robot: Robot) -> bool:
+    """Return whether requests tell the policy of the robot; raises UsageError for another state than was asked for."""
+    cell, numbers, wanted = session.cell, len(robot.state()), config.requests.state
+    if numbers and wanted and numbers != wanted:
+        raise UsageError(f"`state`: `robot` {config.robot} has {numbers} numbers, not {wanted}; leave it out")
+    return bool(numbers) and cell.transport.takes_state(cell.variant, cell.options)
 
 
 def _keep(asking: Asking, launch: Launch) -> None:
@@ -127,6 +170,7 @@ class Live:
     session: Session
     acted: Acted
     asking: Asking
+    robot: Robot | None
 
     @property
     def arrival_ns(self) -> Ints:
@@ -139,6 +183,13 @@ class Live:
         asked = acted.asked_tick[:whole]
         usable = asked + setting.delay_ticks(self.arrival_ns[:, -1])
         return gather(asked, usable, acted.chunk[:ticks], acted.index[:ticks], setting.horizon)
+
+    def smooth(self) -> dict[str, float]:
+        """Return how smoothly a plant moved, in the actions' own unit and s; nothing of other robots."""
+        if not isinstance(self.robot, PlantRobot) or (motion := self.robot.motion()) is None:
+            return {}
+        found = smoothness(motion, self.robot.actions, self.acted.chunk[-len(motion.position) :])
+        return {name: getattr(found, name) for name in SMOOTH}
 
     def agreement(self, setting: Setting) -> float:
         """Return the share of the ticks in which it did what virtual time says of the same arrivals."""
@@ -159,7 +210,7 @@ def _write(config: ChunksConfig, launch: Launch, live: Live) -> None:
     keep_origin(writer, cell.cell, live.session.origin)
     cycles, ticks = live.counted(setting)
     reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
-    row = chunk_row(cell, setting, cycles, ticks, epsilon=config.epsilon, reaction_s=reaction_s)
+    row = chunk_row(cell, setting, cycles, ticks, epsilon=config.epsilon, reaction_s=reaction_s, smooth=live.smooth())
     if live.mode.streams:  # the closed forms are about a given gap between actions
         row = replace(row, p_stall_closed=None, reaction_s_closed=None, margin_ticks=None)  # type: ignore[call-arg]
     writer.append(CHUNKS, [replace(row, **_measured(config, live))])  # type: ignore[arg-type]

@@ -56,18 +56,6 @@ def action_table(run: Run) -> TextTable:
     return _table(run, "Actions: ages in ticks", header, _actions)
 
 
-def smoothness_table(run: Run) -> TextTable:
-    """Lay out how well a plant follows a target under each mode, and how smoothly."""
-    header = ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
-    table = _table(run, "Smoothness", header, _smoothness)
-    note = (
-        f"Tracking error and jerk (root mean squares) of {run.manifest['configuration']['robot']}, in the target's "
-        "standard deviation and s; ideal: asked in every tick and answered at once. jump: from one action to the next "
-        "across a boundary, step: within a chunk."
-    )
-    return replace(table, notes=(_convention(run), note, _EMULATED))
-
-
 def loop_table(run: Run) -> TextTable:
     """Lay out how well the control loop of a live run kept time."""
     header = ("alike, %", "jitter (ms)", "p99", "max", "late", "busy (ms)", "max", "MB/s up")
@@ -79,12 +67,28 @@ def live(run: Run) -> bool:
     return bool(run.manifest["configuration"].get("live"))
 
 
+def smoothness_table(run: Run) -> TextTable:
+    """Lay out how well a plant follows a target under each mode, and how smoothly."""
+    header = ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
+    table = _table(run, "Smoothness", header, _smoothness)
+    robot = run.manifest["configuration"]["robot"]
+    jump = "jump: from one action to the next across a boundary, step: within a chunk."
+    if live(run):
+        note = f"Jerk (root mean square) of {robot}, in the actions' unit and s. {jump}"
+        return replace(table, notes=(_convention(run), note))
+    note = (
+        f"Tracking error and jerk (root mean squares) of {robot}, in the target's standard deviation and s; ideal: "
+        f"asked in every tick and answered at once. {jump}"
+    )
+    return replace(table, notes=(_convention(run), note, _EMULATED))
+
+
 def chunk_tables(run: Run) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
-    tables = {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
-    if any(row.get("jerk_rms") is not None for row in rows_of(run)):
-        tables["smoothness"] = smoothness_table(run)
-    return tables | ({"loop": loop_table(run)} if live(run) else {})
+    found = {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
+    found |= {"loop": loop_table(run)} if live(run) else {}
+    smooth = any(row.get("jerk_rms") is not None for row in rows_of(run))
+    return found | ({"smoothness": smoothness_table(run)} if smooth else {})
 
 
 def delay_table(run: Run) -> TextTable:
@@ -186,13 +190,6 @@ def _actions(row: Row) -> Iterator[str]:
     yield _number(row["jump_mean"])
 
 
-def _smoothness(row: Row) -> Iterator[str]:
-    for name in ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal"):
-        yield _number(row[name])
-    for name in ("boundary_jump_mean", "boundary_jump_p99", "action_step_mean"):
-        yield _number(row[name])
-
-
 def _loop(row: Row) -> Iterator[str]:
     yield _percent(row["agreement"])
     for name in ("jitter_s_p50", "jitter_s_p99", "jitter_s_max"):
@@ -201,6 +198,13 @@ def _loop(row: Row) -> Iterator[str]:
     for name in ("blocked_s_p99", "blocked_s_max"):
         yield number(row[name] * 1e3)
     yield number(row["bytes_up_per_s"] / 1e6)
+
+
+def _smoothness(row: Row) -> Iterator[str]:
+    for name in ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal"):
+        yield _number(row[name])
+    for name in ("boundary_jump_mean", "boundary_jump_p99", "action_step_mean"):
+        yield _number(row[name])
 
 
 def _interval(row: Row) -> str:
