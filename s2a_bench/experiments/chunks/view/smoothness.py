@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.chunks.rows import SMOOTHNESS
 from s2a_bench.experiments.chunks.view.figures import LOOKS, title_of
+from s2a_bench.experiments.chunks.view.lanes import short
 from s2a_bench.writers.figures import LINE_CHARS, new_figure
 
 if TYPE_CHECKING:
@@ -29,7 +30,13 @@ def build_smoothness(run: Run) -> Figure:
     ):
         for mode, (colour, line, _) in zip(modes, LOOKS, strict=False):
             mine = (rows["mode"] == mode).to_numpy()
-            axes.plot(latency_ms[mine], rows[name].to_numpy(dtype="float64")[mine], line, color=colour, label=str(mode))
+            axes.plot(
+                latency_ms[mine],
+                rows[name].to_numpy(dtype="float64")[mine],
+                line,
+                color=colour,
+                label=short(mode, LINE_CHARS - 8),
+            )
         ideal = rows.groupby("latency_s")[f"{name}_ideal"].mean()
         axes.plot(
             ideal.index.to_numpy(dtype="float64") * 1e3,
