@@ -73,14 +73,16 @@ def _drive(config: ChunksConfig, launch: Launch) -> None:
     dims: dict[str, int] = {}
     for session in launch.sessions:
         for _ in range(launch.config.warmup):
-            warm, dims[session.cell.name] = warm_up(session, Place(next(blocks), 0, warmup=True), config.horizon)
+            warm, numbers = warm_up(session, Place(next(blocks), 0, warmup=True), config.horizon)
+            dims[session.cell.name] = numbers or dims.get(session.cell.name, 0)  # one may fail, and be made up for
             launch.keep(session, warm)
     cells = [(name, mode, group) for group in groups for name, mode in config.made.items()]
     launch.progress.expect(len(cells))
     for name, mode, sessions in Random(config.seed).sample(cells, len(cells)):  # noqa: S311 - an order, not a secret
         where = sessions[0].cell.name
         launch.progress.stage(f"acting for {config.seconds:g} s: {name} @ {where}")
-        with robot_of(config, dims[where]) as robot:
+        with robot_of(config, dims[where] or launch.config.engine.action_dim) as robot:
+            launch.writer.update(robot={} if robot is None else robot.describe())
             asking, acted = _act(config, mode, sessions, launch, blocks, robot)
             _write(config, launch, Live(name, mode, sessions[0], acted, asking, robot))
         launch.progress.advance()

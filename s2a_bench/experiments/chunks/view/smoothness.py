@@ -28,15 +28,11 @@ def build_smoothness(run: Run) -> Figure:
     for axes, name, label in zip(
         panels, ("tracking_rms", "jerk_rms"), ("tracking error (sd)", "jerk (sd/s$^3$)"), strict=True
     ):
+        values = rows[name].to_numpy(dtype="float64")
         for mode, (colour, line, _) in zip(modes, LOOKS, strict=False):
             mine = (rows["mode"] == mode).to_numpy()
-            axes.plot(
-                latency_ms[mine],
-                rows[name].to_numpy(dtype="float64")[mine],
-                line,
-                color=colour,
-                label=short(mode, LINE_CHARS - 8),
-            )
+            label_of = short(mode, LINE_CHARS - 8)
+            axes.plot(latency_ms[mine], values[mine], line, color=colour, label=label_of)
         ideal = rows.groupby("latency_s")[f"{name}_ideal"].mean()
         axes.plot(
             ideal.index.to_numpy(dtype="float64") * 1e3,
