@@ -121,7 +121,7 @@ class RosRobot:
         """Return the topic, and what carries its messages."""
         told = {**asdict(self._asked), "joints": ":".join(self._joints)}
         carried = self._middleware.describe()
-        return {"robot": "ros"} | {name: str(value) for name, value in (told | carried).items()}
+        return {"robot": self._asked.name} | {name: str(value) for name, value in (told | carried).items()}
 
     def close(self) -> None:
         """Leave the domain."""

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import RobotError, UsageError
-from s2a_bench.robots import ROBOTS, Robot, kind, open_robot
+from s2a_bench.robots import ROBOTS, Kind, Robot, kind, open_robot
+from s2a_bench.robots.call import Call
 from s2a_bench.robots.plant import Plant
+from s2a_bench.robots.ros import Ros
 
 
 @pytest.fixture
@@ -64,6 +66,11 @@ def test_what_is_no_function_is_refused(arm: ModuleType, written: str, message: 
     with pytest.raises(UsageError) as error:
         open_robot(written, 1, 1)
     assert message in str(error.value)
+
+
+def test_each_kind_has_its_name_in_the_table() -> None:
+    kinds: list[Kind] = [Plant(), Ros(), Call("arm:move")]
+    assert {each.name: type(each) for each in kinds} == {name: ROBOTS[name] for name in ROBOTS.built_in()}
 
 
 def test_a_robot_of_another_package_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch, arm: ModuleType) -> None:
