@@ -190,6 +190,13 @@ class TestRuns:
         config = ChunksConfig(stability=0)
         assert not list(smoothness_rows(config, draw(config, config.sources[0]), follower(config)))
 
+    def test_no_target_waits_for_actions_that_are_slowed_down(self, tmp_path: Path) -> None:
+        assert follower(ChunksConfig(slow_down=2)) is None
+        run = ran(tmp_path, latency="400", modes="queue", rules="calibrated", slowest=4.0, cycles=100, stability=0)
+        table = run.table(CHUNKS).set_index("rule")
+        assert table.loc["given", NAMES].notna().all()
+        assert table.loc["calibrated", NAMES].isna().all()
+
     @pytest.mark.parametrize(
         ("robot", "message"),
         [
