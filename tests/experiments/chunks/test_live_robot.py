@@ -22,9 +22,10 @@ def test_a_plant_moves_and_is_measured(tmp_path: Path) -> None:
     assert rows["tracking_rms"].isna().all()
     run = read_run(folder_of(tmp_path))
     assert run.manifest["robot"] == {"robot": "plant", "frequency_hz": "3", "damping": "1"}
-    notes = show(run).tables["smoothness"].notes
-    assert any("Jerk (root mean square) of plant?frequency_hz=3" in note for note in notes)
-    assert not any("EMULATED" in note for note in notes)
+    table = show(run).tables["smoothness"]
+    assert table.header == ("mode", "jerk", "jump", "p99", "step")
+    assert any("Jerk (root mean square) of plant?frequency_hz=3" in note for note in table.notes)
+    assert not any("EMULATED" in note for note in table.notes)
 
 
 def test_a_robot_s_state_goes_with_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

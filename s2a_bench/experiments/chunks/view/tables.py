@@ -24,6 +24,16 @@ _CONVENTION: Final = {
     "ceil": "d = ceil(L / Delta t): an action leaves at the start of its tick, as lerobot counts.",
 }
 
+_SMOOTHNESS: Final = {
+    "tracking_rms": "tracking",
+    "tracking_rms_ideal": "ideal",
+    "jerk_rms": "jerk",
+    "jerk_rms_ideal": "ideal",
+    "boundary_jump_mean": "jump",
+    "boundary_jump_p99": "p99",
+    "action_step_mean": "step",
+}
+_OF_A_TARGET: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms_ideal")
 _EMULATED: Final = Note(
     "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
 )
@@ -68,9 +78,9 @@ def live(run: Run) -> bool:
 
 
 def smoothness_table(run: Run) -> TextTable:
-    """Lay out how well a plant follows a target under each mode, and how smoothly."""
-    header = ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
-    table = _table(run, "Smoothness", header, _smoothness)
+    """Lay out how smoothly a plant moves under each mode; in virtual time, how well it follows a target besides."""
+    names = {name: title for name, title in _SMOOTHNESS.items() if not live(run) or name not in _OF_A_TARGET}
+    table = _table(run, "Smoothness", tuple(names.values()), lambda row: (_number(row[name]) for name in names))
     robot = run.manifest["configuration"]["robot"]
     jump = "jump: from one action to the next across a boundary, step: within a chunk."
     if live(run):
@@ -198,13 +208,6 @@ def _loop(row: Row) -> Iterator[str]:
     for name in ("blocked_s_p99", "blocked_s_max"):
         yield number(row[name] * 1e3)
     yield number(row["bytes_up_per_s"] / 1e6)
-
-
-def _smoothness(row: Row) -> Iterator[str]:
-    for name in ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal"):
-        yield _number(row[name])
-    for name in ("boundary_jump_mean", "boundary_jump_p99", "action_step_mean"):
-        yield _number(row[name])
 
 
 def _interval(row: Row) -> str:
