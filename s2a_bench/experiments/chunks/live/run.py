@@ -81,6 +81,7 @@ def _drive(config: ChunksConfig, launch: Launch) -> None:
         where = sessions[0].cell.name
         launch.progress.stage(f"acting for {config.seconds:g} s: {name} @ {where}")
         with robot_of(config, dims[where]) as robot:
+            launch.writer.update(robot={} if robot is None else robot.describe())
             asking, acted = _act(config, mode, sessions, launch, blocks, robot)
             _write(config, launch, Live(name, mode, sessions[0], acted, asking, robot))
         launch.progress.advance()
