@@ -1,21 +1,23 @@
 """Chunks live: what the loop did is what virtual time says of the same latencies, over transports that labs use."""
 
 import json
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from s2a_bench.errors import RequestFailed, UsageError
+from s2a_bench.errors import RequestFailed, RobotError, UsageError
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.chunks.view import show
+from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.chunk import chunk
 from s2a_bench.library import Run
 from s2a_bench.progress import NullProgress
 from s2a_bench.store.run import read_run
-from s2a_bench.types import Token
+from s2a_bench.types import Action, Request, Token, Vector
 
 ECHO = {"name": "echo"}
 
@@ -82,6 +84,64 @@ def test_delays_of_a_live_run_are_exported(tmp_path: Path) -> None:
     assert len(delays) >= 2
     assert (delays["received_ns"] > delays["observation_ns"]).all()
     assert (delays["rounding"] == "floor").all()
+
+
+moved: list[float] = []
+
+
+def move(action: Vector) -> None:
+    """Stand in for somebody's robot."""
+    moved.append(float(action[0]))
+
+
+def drop(action: Vector) -> None:
+    """Stand in for a robot that breaks."""
+    raise ValueError(f"no grip on {action.size}")
+
+
+def test_a_plant_moves_and_the_policy_is_told_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[float, ...]] = []
+
+    def chunk_of(config: EngineConfig, request: Request) -> Iterator[Action]:
+        told.append(request.state)
+        return chunk(config, request)
+
+    monkeypatch.setattr("s2a_bench.inference.echo.chunk", chunk_of)
+    rows = act(tmp_path, modes="replace?execute=8")
+    assert rows["jerk_rms"].item() > 0
+    assert rows["boundary_jump_p99"].item() >= rows["boundary_jump_mean"].item()
+    assert rows["action_step_mean"].item() > 0
+    assert rows["tracking_rms"].isna().item()  # nobody knows what the policy follows
+    table = show(read_run(folder_of(tmp_path))).tables["smoothness"]
+    assert table.header == ("mode", "jerk", "jump", "p99", "step")
+    assert not any("EMULATED" in note for note in table.notes)
+    assert {len(state) for state in told[2:]} == {7}
+    assert len(set(told[2:])) > 1
+
+
+def test_without_jumps_in_timing_echos_chunks_are_one_trajectory(tmp_path: Path) -> None:
+    rows = act(tmp_path, modes="replace?execute=8")
+    assert rows["jump_max"].item() == 0
+    assert rows["boundary_jump_mean"].item() == pytest.approx(rows["action_step_mean"].item(), rel=0.2)
+
+
+def test_a_function_is_called_with_every_action(tmp_path: Path) -> None:
+    moved.clear()
+    rows = act(tmp_path, modes="queue?trigger=4", robot=f"call?function={__name__}:move")
+    assert len(moved) >= rows["ticks"].item() - rows["stall_ticks"].item()
+    assert rows["jerk_rms"].isna().item()
+    assert read_run(folder_of(tmp_path)).manifest["robot"]["function"].endswith(":move")
+
+
+def test_a_robot_that_breaks_ends_the_run_with_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="drop: ValueError: no grip on 7"):
+        act(tmp_path, modes="sync", robot=f"call?function={__name__}:drop")
+    assert read_run(folder_of(tmp_path)).manifest["state"] == "failed"
+
+
+def test_another_state_than_the_robot_has_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="`state`: `robot` plant has 7 numbers, not 3"):
+        act(tmp_path, modes="sync", requests={"transports": "loopback", "engine": ECHO, "size": "64x48", "state": 3})
 
 
 @pytest.mark.parametrize("transport", ["websocket/openpi", "ros/topic"])
