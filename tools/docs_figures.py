@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -133,7 +132,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "policies": lambda: timelines(ORIN),
     "safe-start": safe_start_figure,
     "online": lambda: timelines(
-        replace(ORIN, policies=("naive", "s2a-clairvoyant", "s2a-mean", "stream-to-act"), jitter="profile")
+        ORIN.but(policies=("naive", "s2a-clairvoyant", "s2a-mean", "stream-to-act"), jitter="profile")
     ),
     "timeline": lambda: timelines(TimelineConfig()),
     "boundary": lambda: boundary(BoundaryConfig()),

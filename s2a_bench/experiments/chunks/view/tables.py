@@ -69,7 +69,12 @@ def action_table(run: Run) -> TextTable:
 def loop_table(run: Run) -> TextTable:
     """Lay out how well the control loop of a live run kept time."""
     header = ("alike, %", "jitter (ms)", "p99", "max", "late", "busy (ms)", "max", "MB/s up")
-    return _table(run, "Control loop", header, _loop)
+    note = (
+        "alike: share of the ticks that virtual time has the same way, on the latencies that were measured; jitter: "
+        "how long after it was due an action left; late: by a tick or more; busy: for how long asking and sending kept "
+        "the loop in a tick, p99."
+    )
+    return replace(_table(run, "Control loop", header, _loop), notes=(_convention(run), note))
 
 
 def live(run: Run) -> bool:
@@ -259,10 +264,5 @@ def _notes(run: Run) -> Iterator[str]:
         sources = [name for name, _ in sources_of(rows)]
         if len(sources) > 1:
             yield "; ".join(f"{place}: {name}" for place, name in enumerate(sources, 1)) + "."
-        yield (
-            "alike: share of the ticks that virtual time has the same way, on the latencies that were measured; "
-            "jitter: how long after it was due an action left; late: by a tick or more; busy: for how long asking and "
-            "sending kept the loop in a tick, p99."
-        )
         return
     yield _EMULATED
