@@ -76,7 +76,7 @@ class ControlLoop:
         self, mode: Mode, setting: Setting, send: Send, ask: Ask, ticks: int, clock: Clock | None = None
     ) -> None:
         """Prepare; `start` starts."""
-        self._stepper, self._setting = mode.stepper(setting), setting
+        self.stepper, self._setting = mode.stepper(setting), setting
         self._weight = mode.weight
         self._blended: deque[Vector] = deque()
         self._send, self._ask = send, ask
@@ -134,7 +134,7 @@ class ControlLoop:
                 self._act(tick - 1, begins_ns)
             if tick < self._ticks:
                 self._deliver(begins_ns + 1, tick)
-                if self._stepper.ask(tick):
+                if self.stepper.ask(tick):
                     self._asked.append(tick)
                     self._ask(len(self._asked) - 1, tick)
                 if not floor:
@@ -178,7 +178,7 @@ class ControlLoop:
         for _ in range(len(self._inbox)):
             arrival = self._inbox.popleft()
             if arrival[0] < before_ns:
-                self._stepper.arrived(arrival[1], arrival[2], tick)
+                self.stepper.arrived(arrival[1], arrival[2], tick)
                 if self._weight < 1:
                     self._blend(self._actions[arrival[1]])
             else:
@@ -186,14 +186,14 @@ class ControlLoop:
 
     def _blend(self, actions: Sequence[Vector]) -> None:
         """Blend a chunk, from the action on that is due next, into what is left."""
-        due = actions[self._stepper.past :]  # type: ignore[attr-defined]  # every mode that blends counts
+        due = actions[self.stepper.past :]  # type: ignore[attr-defined]  # every mode that blends counts
         weight, left = self._weight, self._blended
         self._blended = deque(
             weight * new + (1 - weight) * left[place] if place < len(left) else new for place, new in enumerate(due)
         )
 
     def _act(self, tick: int, due_ns: int) -> None:
-        action = self._stepper.act(tick)
+        action = self.stepper.act(tick)
         value = None
         if action is not None:
             value = self._blended.popleft() if self._weight < 1 else self._actions[action.request][action.index]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.experiments.chunks.closed import execution_horizon
 from s2a_bench.experiments.study.worlds import generator
 from s2a_bench.policy.chunks.append import Queue
+from s2a_bench.policy.chunks.learning import Learning
 from s2a_bench.policy.chunks.trigger import Maximum, Mean, Rule, Tracked, calibrate, follow, trigger
 from s2a_bench.policy.chunks.varied import Varied
 
@@ -67,14 +69,14 @@ def draw(config: ChunksConfig, source: Source) -> Drawn:
 
 
 def cells(config: ChunksConfig, drawn: Drawn) -> Iterator[Cell]:
-    """Yield the cells of one source."""
+    """Yield the cells of one source; live, nothing has been judged yet."""
     for name, mode in config.made.items():
         yield Cell(mode, name, GIVEN, drawn)
     queue = next((mode for mode in config.made.values() if isinstance(mode, Queue)), None)
     if queue is None:
         return
     name = f"queue?execute={queue.execute}" if queue.execute else "queue"
-    for rule in config.rules:
+    for rule in config.rules_tried:
         most = max(1, execution_horizon(queue, config.setting) - 1)
         if rule in FIXED:
             ready_ns = (
@@ -83,6 +85,8 @@ def cells(config: ChunksConfig, drawn: Drawn) -> Iterator[Cell]:
             chosen = trigger(ready_ns, config.setting, most)
             mode = replace(queue, trigger=chosen.ticks)
             yield Cell(mode, name, rule, drawn, (chosen.ticks,), min(chosen.beta, config.slowest))
+        elif config.live:
+            yield Cell(Learning(partial(_made, config, rule, drawn), queue.execute), name, rule, drawn)
         else:
             triggers = follow(_made(config, rule, drawn), drawn.judged, config.setting, most).trigger.tolist()
             yield Cell(Varied(tuple(triggers), queue.execute), name, rule, drawn, tuple(triggers))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -49,7 +51,9 @@ class ChunksConfig(Options):
     horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096)
     rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
     rules: Annotated[Names, one_of(lambda: RULES)] = option(
-        RULES, "further rows for the first queue, its trigger chosen by each; empty text for none"
+        RULES,
+        "further rows for the first queue, its trigger chosen by each; empty text for none "
+        f"[default: {','.join(RULES)}; live: none]",
     )
     epsilon: float = option(0.01, "share of cycles that may stall, for the rules", flag="eps", gt=0, lt=1)
     cycles: int | None = option(
@@ -86,11 +90,6 @@ class ChunksConfig(Options):
     def virtual(self) -> bool:
         """Return whether nothing is measured."""
         return not self.live
-
-    @property
-    def ticks(self) -> int:
-        """Return the control ticks of a mode, live."""
-        return max(2, round(self.seconds * 1e9 / self.setting.period_ns))
 
     @cached_property
     def asked(self) -> LiveRequests:
@@ -155,9 +154,14 @@ class ChunksConfig(Options):
         return found
 
     @property
+    def rules_tried(self) -> Sequence[str]:
+        """Return what chooses triggers; live nothing unless it is asked for."""
+        return self.rules if not self.live or "rules" in self.model_fields_set else ()
+
+    @property
     def with_rules(self) -> bool:
         """Return whether rules choose the trigger of a queue."""
-        return bool(self.rules) and any(each.name == "queue" for each in self.made.values())
+        return bool(self.rules_tried) and any(each.name == "queue" for each in self.made.values())
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
@@ -188,8 +192,17 @@ class ChunksConfig(Options):
         if self.robot:
             kind(self.robot)
         said = self.model_fields_set
-        if alone := next((field for field in ("rules", "cycles", "calibration_cycles") if field in said), ""):
-            raise UsageError(f"`{alone}` is for virtual time; live, name a trigger: queue?trigger=6")
+        if alone := next((field for field in ("cycles", "calibration_cycles") if field in said), ""):
+            raise UsageError(f"`{alone}` is for virtual time; live there are `seconds` and `warmup`")
+        if "oracle" in self.rules_tried:
+            raise UsageError("`rules`: nobody is an oracle live; take calibrated, tracked, maximum or mean")
+        if {"calibrated", "tracked"} & {*self.rules_tried} and self.with_rules:
+            needed = math.ceil(1 / self.epsilon) - 1
+            if self.requests.warmup < needed:
+                raise UsageError(
+                    f"`warmup`: {self.requests.warmup} requests are too few to learn from for `epsilon` "
+                    f"{self.epsilon:g}; take {needed} or more, or other `rules`"
+                )
         if self.known and len(self.latency) > 1:
             raise UsageError(f"`latency`: live a server keeps one, not {len(self.latency)}; run once for each")
         if len(self.asked.pipelines) > 1 and self.export_delays is not None:

@@ -86,6 +86,34 @@ def test_delays_of_a_live_run_are_exported(tmp_path: Path) -> None:
     assert (delays["rounding"] == "floor").all()
 
 
+def test_rules_choose_triggers_as_they_go(tmp_path: Path) -> None:
+    requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
+    asked = {"rules": "calibrated,tracked,maximum,mean", "epsilon": 0.05, "latency": "lognormal:mean_ms=50,cv=.5"}
+    rows = act(tmp_path, modes="queue,sync", requests=requests, seconds=2.5, **asked)
+    assert rows["rule"].value_counts().to_dict() == {"given": 2, "calibrated": 1, "tracked": 1, "maximum": 1, "mean": 1}
+    assert (rows["agreement"] >= 0.99).all()
+    trigger = rows.set_index("rule")["trigger"]
+    assert 0 < trigger["mean"] < trigger["maximum"]
+    assert trigger["calibrated"] > trigger["mean"]
+    shown = show(read_run(folder_of(tmp_path)))
+    assert [row[:2] for row in shown.tables["chunks"].rows][:3] == [
+        ("queue", "given"),
+        ("sync", "given"),
+        ("queue", "calibrated"),
+    ]
+
+
+def test_a_slow_server_slows_actions_down(tmp_path: Path) -> None:
+    requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
+    asked = {"rules": "calibrated", "epsilon": 0.05, "latency": "150", "slowest": 4.0, "horizon": 4}
+    rows = act(tmp_path, modes="queue", requests=requests, seconds=4, **asked).set_index("rule")
+    assert rows.loc["given", "p_stall_cycle"] == 1
+    assert rows.loc["calibrated", "slower"] > 150 / 60
+    assert rows.loc["calibrated", "delta_t_s"] == pytest.approx(0.02 * rows.loc["calibrated", "slower"], rel=1e-3)
+    assert rows.loc["calibrated", "stall_share"] < rows.loc["given", "stall_share"]
+    assert rows.loc["calibrated", "agreement"] >= 0.99
+
+
 moved: list[float] = []
 
 
@@ -166,7 +194,11 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ({"live": True, "rules": "mean"}, "`rules` is for virtual time"),
+        ({"live": True, "rules": "mean,oracle"}, "`rules`: nobody is an oracle live"),
+        (
+            {"live": True, "rules": "tracked"},
+            "`warmup`: 5 requests are too few to learn from for `epsilon` 0.01; take 99",
+        ),
         ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
         ({"requests": {"transports": "http"}}, "`transports` is for a control loop"),
         ({"live": True, "requests": {"transports": "nothing"}}, "nothing"),

@@ -1,51 +1,38 @@
-"""The live run: every mode acts at control rate on what a server answers, and virtual time says what it should do.
-
-What a mode did is judged with the formulas of virtual time, on the latencies that were measured: from the start of the
-tick in which a request left until its chunk was there.
-"""
+"""The live run: every mode acts at control rate on what a server answers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from functools import partial
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.experiments.chunks.cells import GIVEN, Cell, Drawn
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells
 from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
 from s2a_bench.experiments.chunks.latencies import Source
 from s2a_bench.experiments.chunks.live.asking import Asking, Job, warm_up
+from s2a_bench.experiments.chunks.live.to_rows import Live, write
 from s2a_bench.experiments.chunks.measured import measured
-from s2a_bench.experiments.chunks.rows import CHUNKS, REACTIONS, REQUESTS, TICKS
-from s2a_bench.experiments.chunks.to_rows import chunk_row, reaction_rows, reactions_s, request_rows, tick_rows
-from s2a_bench.experiments.study.worlds import generator
-from s2a_bench.harness.rounds import Launch, Task, keep_origin, run_requests
+from s2a_bench.harness.rounds import Launch, Task, run_requests
 from s2a_bench.harness.session import Place, Session
-from s2a_bench.policy.chunks.cycles import gather
-from s2a_bench.policy.chunks.stepping import follow
 from s2a_bench.robots import open_robot
-from s2a_bench.robots.plant import PlantRobot
-from s2a_bench.robots.smoothness import smoothness
 from s2a_bench.runtime.control import Acted, ControlLoop
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.config import ChunksConfig
-    from s2a_bench.policy.chunks import Cycles, Ints, Mode, Setting, Ticks
+    from s2a_bench.policy.chunks import Ints
     from s2a_bench.progress import Progress
     from s2a_bench.robots import Robot
     from s2a_bench.types import Vector
 
 CLIENTS: Final = 4
 """Of a cell, where a mode has several requests under way."""
-SMOOTH: Final = ("jerk_rms", "boundary_jump_mean", "boundary_jump_p99", "action_step_mean")
-"""What is told of how a plant moved."""
 LOOK_S: Final = 0.05
 """How often who waits for a loop writes down what was measured."""
 
@@ -68,23 +55,18 @@ def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
 def _drive(config: ChunksConfig, launch: Launch) -> None:
     """Let every mode act over every pipeline, in random order."""
     blocks = count()
-    groups = _groups(launch.sessions)
+    tried: list[tuple[Cell, list[Session], int]] = []
     launch.progress.stage("warming up")
-    dims: dict[str, int] = {}
-    for session in launch.sessions:
-        for _ in range(launch.config.warmup):
-            warm, numbers = warm_up(session, Place(next(blocks), 0, warmup=True), config.horizon)
-            dims[session.cell.name] = numbers or dims.get(session.cell.name, 0)  # one may fail, and be made up for
-            launch.keep(session, warm)
-    cells = [(name, mode, group) for group in groups for name, mode in config.made.items()]
-    launch.progress.expect(len(cells))
-    for name, mode, sessions in Random(config.seed).sample(cells, len(cells)):  # noqa: S311 - an order, not a secret
-        where = sessions[0].cell.name
-        launch.progress.stage(f"acting for {config.seconds:g} s: {name} @ {where}")
-        with robot_of(config, dims[where] or launch.config.engine.action_dim) as robot:
+    for sessions in _groups(launch.sessions):
+        learnt, dims = _warm_up(config, launch, sessions, blocks)
+        source = Source(config.named(sessions[0].cell.name))
+        tried += [(cell, sessions, dims) for cell in cells(config, Drawn(source, learnt[:0], learnt))]
+    launch.progress.expect(len(tried))
+    for cell, sessions, dims in Random(config.seed).sample(tried, len(tried)):  # noqa: S311 - an order, not a secret
+        launch.progress.stage(f"acting for {config.seconds:g} s: {cell.cell}")
+        with robot_of(config, cell, dims) as robot:
             launch.writer.update(robot={} if robot is None else robot.describe())
-            asking, acted = _act(config, mode, sessions, launch, blocks, robot)
-            _write(config, launch, Live(name, mode, sessions[0], acted, asking, robot))
+            write(config, launch.writer, _act(config, cell, sessions, launch, blocks, robot))
         launch.progress.advance()
 
 
@@ -96,13 +78,28 @@ def _groups(sessions: Sequence[Session]) -> list[list[Session]]:
     return list(found.values())
 
 
+def _warm_up(
+    config: ChunksConfig, launch: Launch, sessions: Sequence[Session], blocks: Iterator[int]
+) -> tuple[Ints, int]:
+    """Return the latencies of requests before any loop starts, in ns, and of how many numbers an action is."""
+    latency_ns: list[int] = []
+    dims = 0
+    for session, _ in product(sessions, range(launch.config.warmup)):
+        warm, numbers = warm_up(session, Place(next(blocks), 0, warmup=True), config.horizon)
+        launch.keep(session, warm)
+        dims = dims or numbers
+        if not warm.sample.error and warm.sample.last_token_ns is not None:
+            latency_ns.append(warm.sample.last_token_ns - warm.sample.marks[0][1])
+    return np.array(latency_ns, np.int64), dims
+
+
 @contextmanager
-def robot_of(config: ChunksConfig, dims: int) -> Iterator[Robot | None]:
-    """Open the robot for a mode, if there is one; raises S2AError."""
+def robot_of(config: ChunksConfig, cell: Cell, dims: int) -> Iterator[Robot | None]:
+    """Open the robot for a cell, if there is one; raises S2AError."""
     if not config.robot:
         yield None
         return
-    robot = open_robot(config.robot, dims, config.setting.period_ns)
+    robot = open_robot(config.robot, dims, config.setting.slowed(cell.slower).period_ns)
     try:
         yield robot
     finally:
@@ -111,26 +108,26 @@ def robot_of(config: ChunksConfig, dims: int) -> Iterator[Robot | None]:
 
 def _act(
     config: ChunksConfig,
-    mode: Mode,
+    cell: Cell,
     sessions: Sequence[Session],
     launch: Launch,
     blocks: Iterator[int],
     robot: Robot | None,
-) -> tuple[Asking, Acted]:
+) -> Live:
     """Act in one mode, and write down every request as it is measured."""
-    setting = config.setting
+    setting = config.setting.slowed(cell.slower)
     told = robot is not None and _takes_state(config, sessions[0], robot)
 
     def heard(request: int, actions: Sequence[Any], at_ns: int) -> None:
         loop.arrived(request, actions, at_ns)
 
-    asking = Asking(sessions, config.horizon, config.seed, mode.streams, heard, blocks)
+    asking = Asking(sessions, config.horizon, config.seed, cell.mode.streams, heard, blocks)
 
     def ask(request: int, tick: int) -> None:
         asking.jobs.put(Job(request, tick, robot.state() if robot is not None and told else ()))
 
     send = _nowhere if robot is None else robot.send
-    loop = ControlLoop(mode, setting, send, ask, config.ticks)
+    loop = ControlLoop(cell.mode, setting, send, ask, max(2, round(config.seconds * 1e9 / setting.period_ns)))
     acted: Acted | None = None
     with asking.running():
         try:
@@ -141,7 +138,7 @@ def _act(
         finally:
             loop.stop()
     _keep(asking, launch)
-    return asking, acted
+    return Live(cell, setting, sessions[0], acted, asking, robot, tuple(getattr(loop.stepper, "triggers", ())))
 
 
 def _nowhere(action: Vector | None, at_ns: int) -> None:
@@ -161,77 +158,3 @@ def _keep(asking: Asking, launch: Launch) -> None:
         launch.keep(*asking.done.get())
     if asking.failure is not None:
         raise asking.failure
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Live:
-    """What a mode did over a pipeline."""
-
-    name: str
-    mode: Mode
-    session: Session
-    acted: Acted
-    asking: Asking
-    robot: Robot | None
-
-    @property
-    def arrival_ns(self) -> Ints:
-        """Return the arrivals of the actions of whole answers, after the request's tick began: shape (R, H)."""
-        return self.acted.arrival_ns[: self.acted.whole]
-
-    def counted(self, setting: Setting) -> tuple[Cycles, Ticks]:
-        """Return what it did as virtual time would have it, as far as whole answers decide."""
-        acted, whole, ticks = self.acted, self.acted.whole, self.acted.ticks
-        asked = acted.asked_tick[:whole]
-        usable = asked + setting.delay_ticks(self.arrival_ns[:, -1])
-        return gather(asked, usable, acted.chunk[:ticks], acted.index[:ticks], setting.horizon)
-
-    def smooth(self) -> dict[str, float]:
-        """Return how smoothly a plant moved, in the actions' own unit and s; nothing of other robots."""
-        if not isinstance(self.robot, PlantRobot) or (motion := self.robot.motion()) is None:
-            return {}
-        found = smoothness(motion, self.robot.actions, self.acted.chunk[-len(motion.position) :])
-        return {name: getattr(found, name) for name in SMOOTH}
-
-    def agreement(self, setting: Setting) -> float:
-        """Return the share of the ticks in which it did what virtual time says of the same arrivals."""
-        _, said = follow(self.mode, self.arrival_ns, setting)
-        both = min(said.chunk.size, self.acted.chunk.size)
-        chunk, index = self.acted.chunk[:both], self.acted.index[:both]
-        return float(np.mean((chunk == said.chunk[:both]) & (index == said.index[:both])))
-
-
-def _write(config: ChunksConfig, launch: Launch, live: Live) -> None:
-    """Write the rows of one mode over one pipeline; raises TransportError where too little was answered."""
-    setting, acted, writer = config.setting, live.acted, launch.writer
-    where = live.session.cell.name
-    if acted.whole < 2:  # noqa: PLR2004 - a boundary lies between two chunks
-        raise TransportError(f"{live.name} @ {where}: {acted.whole} chunks in {config.seconds:g} s; act for longer")
-    latency_ns = live.arrival_ns[:, 0 if live.mode.streams else -1]
-    cell = Cell(live.mode, live.name, GIVEN, Drawn(Source(config.named(where)), latency_ns, latency_ns[:0]))
-    keep_origin(writer, cell.cell, live.session.origin)
-    cycles, ticks = live.counted(setting)
-    reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
-    row = chunk_row(cell, setting, cycles, ticks, epsilon=config.epsilon, reaction_s=reaction_s, smooth=live.smooth())
-    if live.mode.streams:  # the closed forms are about a given gap between actions
-        row = replace(row, p_stall_closed=None, reaction_s_closed=None, margin_ticks=None)  # type: ignore[call-arg]
-    writer.append(CHUNKS, [replace(row, **_measured(config, live))])  # type: ignore[arg-type]
-    writer.append(REACTIONS, reaction_rows(cell, latency_ns, setting, reaction_s))
-    writer.append(TICKS, tick_rows(cell.cell, ticks, config.shown_ticks, acted.late_ns))
-    writer.append(REQUESTS, request_rows(cell.cell, latency_ns, cycles, config.shown_ticks, live.asking.names))
-
-
-def _measured(config: ChunksConfig, live: Live) -> dict[str, float | int]:
-    """Return the metrics that only a live run has."""
-    acted, period_ns = live.acted, config.setting.period_ns
-    late_s, busy_s = acted.late_ns / 1e9, acted.busy_ns / 1e9
-    return {
-        "agreement": live.agreement(config.setting),
-        "jitter_s_p50": float(np.quantile(late_s, 0.5)),
-        "jitter_s_p99": float(np.quantile(late_s, 0.99)),
-        "jitter_s_max": float(late_s.max()),
-        "late_ticks": int((acted.late_ns >= period_ns).sum()),
-        "blocked_s_p99": float(np.quantile(busy_s, 0.99)),
-        "blocked_s_max": float(busy_s.max()),
-        "bytes_up_per_s": live.asking.sent_bytes / (acted.chunk.size * period_ns / 1e9),
-    }

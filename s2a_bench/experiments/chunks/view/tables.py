@@ -45,7 +45,12 @@ def rows_of(run: Run) -> list[Row]:
     whole = table.astype(object).where(table.notna(), None)
     rows = [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
     asked = run.manifest["configuration"]
-    return sorted(rows, key=lambda row: (row["latency"], asked["modes"].index(row["mode"]))) if live(run) else rows
+    order = [*((name, "given") for name in asked["modes"]), *((None, rule) for rule in asked["rules"])]
+
+    def place(row: Row) -> tuple[str, int]:
+        return row["latency"], order.index((row["mode"] if row["rule"] == "given" else None, row["rule"]))
+
+    return sorted(rows, key=place) if live(run) else rows
 
 
 def sources_of(rows: list[Row]) -> list[tuple[str, list[Row]]]:
@@ -167,7 +172,8 @@ def _table(run: Run, title: str, header: tuple[str, ...], cells: Any) -> TextTab
     rules = []
     found = sources_of(rows_of(run))
     several = len(found) > 1
-    named = ("mode",) if live(run) else ("mode", "rule")
+    ruled = any(row["rule"] != "given" for row in rows_of(run))
+    named = ("mode", "rule") if ruled or not live(run) else ("mode",)
     for place, (_, group) in enumerate(found, 1):
         rules.append(len(rows))
         rows += [((str(place),) * several + (*(_named(row, name) for name in named), *cells(row))) for row in group]
@@ -256,9 +262,10 @@ def _notes(run: Run) -> Iterator[str]:
         yield "Where no trigger is enough, actions have to be slower by beta (chunks.csv: slow_down)."
     if any(row["rule"] != "given" for row in rows):
         asked = run.manifest["configuration"]
+        seen = "an oracle that knows the distribution. All others saw the same cycles before."
         yield (
             f"Rules choose m of queue: calibrated for P(stall) <= {asked['epsilon']:.2%}, tracked from there, "
-            "lerobot's maximum, the mean, an oracle that knows the distribution. All others saw the same cycles before."
+            f"lerobot's maximum, the mean, {'each after the same warm-up.' if live(run) else seen}"
         )
     if live(run):
         sources = [name for name, _ in sources_of(rows)]
