@@ -26,6 +26,7 @@ RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
 """What may choose the trigger of queue."""
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
+MOST_LIVE_TICKS: Final = 20_000_000
 
 Sources = Annotated[tuple[str, ...], BeforeValidator(split)]
 """Several sources of latencies; as text with commas between them, which may hold the parameters of a family too."""
@@ -194,6 +195,11 @@ class ChunksConfig(Options):
         said = self.model_fields_set
         if alone := next((field for field in ("cycles", "calibration_cycles") if field in said), ""):
             raise UsageError(f"`{alone}` is for virtual time; live there are `seconds` and `warmup`")
+        if self.seconds * self.control_hz > MOST_LIVE_TICKS:
+            raise UsageError(
+                f"`seconds`: {self.seconds:g} s at `control_hz` {self.control_hz:g} are more than {MOST_LIVE_TICKS:.0e} "
+                "control ticks, which are held in memory; act for a shorter time"
+            )
         if "oracle" in self.rules_tried:
             raise UsageError("`rules`: nobody is an oracle live; take calibrated, tracked, maximum or mean")
         if {"calibrated", "tracked"} & {*self.rules_tried} and self.with_rules:

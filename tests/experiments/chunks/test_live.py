@@ -199,6 +199,10 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             {"live": True, "rules": "tracked"},
             "`warmup`: 5 requests are too few to learn from for `epsilon` 0.01; take 99",
         ),
+        (
+            {"live": True, "seconds": 80_000, "control_hz": 1000},
+            "`seconds`: 80000 s at `control_hz` 1000 are more than",
+        ),
         ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
         ({"requests": {"transports": "http"}}, "`transports` is for a control loop"),
         ({"live": True, "requests": {"transports": "nothing"}}, "nothing"),
