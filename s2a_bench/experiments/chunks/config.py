@@ -197,7 +197,7 @@ class ChunksConfig(Options):
             raise UsageError(f"`{alone}` is for virtual time; live there are `seconds` and `warmup`")
         if self.seconds * self.control_hz > MOST_LIVE_TICKS:
             raise UsageError(
-                f"`seconds`: {self.seconds:g} s at `control_hz` {self.control_hz:g} are more than {MOST_LIVE_TICKS:.0e} "
+                f"`seconds`: {self.seconds:g} s at `control_hz` {self.control_hz:g} are over {MOST_LIVE_TICKS:.0e} "
                 "control ticks, which are held in memory; act for a shorter time"
             )
         if "oracle" in self.rules_tried:
