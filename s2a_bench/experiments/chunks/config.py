@@ -54,7 +54,7 @@ class ChunksConfig(Options):
     rules: Annotated[Names, one_of(lambda: RULES)] = option(
         RULES,
         "further rows for the first queue, its trigger chosen by each; empty text for none "
-        f"[default: {','.join(RULES)}; live: none]",
+        f"[default: {','.join(RULES)}; --live: none]",
     )
     epsilon: float = option(0.01, "share of cycles that may stall, for the rules", flag="eps", gt=0, lt=1)
     cycles: int | None = option(
@@ -84,8 +84,8 @@ class ChunksConfig(Options):
     live: bool = option(
         False, "act in real time on what a server answers; with `engine` echo, `latency` is how long its answers take"
     )
-    seconds: float = option(20.0, "live: how long each mode acts", gt=0, le=86_400)
-    requests: LiveRequests = group(LiveRequests, only=SHOWN, about="live: ")
+    seconds: float = option(20.0, "--live: how long each mode acts", gt=0, le=86_400)
+    requests: LiveRequests = group(LiveRequests, only=SHOWN, about="--live: ")
 
     @property
     def virtual(self) -> bool:

@@ -201,7 +201,7 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         ),
         (
             {"live": True, "seconds": 80_000, "control_hz": 1000},
-            "`seconds`: 80000 s at `control_hz` 1000 are more than",
+            "`seconds`: 80000 s at `control_hz` 1000 are over",
         ),
         ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
         ({"requests": {"transports": "http"}}, "`transports` is for a control loop"),
