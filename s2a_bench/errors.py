@@ -18,6 +18,7 @@ S2AError
 │   ├── PortInUse        a server cannot bind its address
 │   └── ServerDied       the server's process is gone
 ├── SimulatorError       a simulator cannot start, or goes away
+├── RobotError           a robot cannot be reached, or fails at an action
 ├── StoreError           a run folder cannot be written or read
 └── UnlikeRuns           runs of other machines, models or settings, which are not to be compared
 """
@@ -103,6 +104,10 @@ class ServerDied(TransportError):
 
 class SimulatorError(S2AError):
     """A simulator cannot start, or goes away."""
+
+
+class RobotError(S2AError):
+    """A robot cannot be reached, or fails at an action."""
 
 
 class StoreError(S2AError):

@@ -33,7 +33,7 @@ class Provenance:
 
     ``weights`` are real, dummy, or none where no model takes part; ``tokens`` measured, emulated (their times come from
     a profile, a rate or a distribution) or paced (held back); ``link`` real, emulated, or none; ``clock`` monotonic or
-    virtual. ``profile`` names what was emulated. Each is "unknown" where nobody told.
+    virtual. ``profile`` names what was emulated: a profile, or latencies. Each is "unknown" where nobody told.
     """
 
     engine: str = UNKNOWN
@@ -61,7 +61,7 @@ class Provenance:
             quantisation=_text(told.get("quantisation")),
             weights=NONE if no_model else weights,
             tokens="emulated" if emulated else "paced" if paced else "measured",
-            profile=_text(told.get("profile")),
+            profile=_text(told.get("profile")) or _latencies(_text(told.get("latency"))),
             link=link,
         )
 
@@ -181,6 +181,11 @@ def joined(origins: Iterable[Origins]) -> Origins:
     every = dict.fromkeys(each for one in origins for each in one.every)
     cells = {str(place): each for place, each in enumerate(every)}
     return Origins(next(iter(every), Provenance()), cells)
+
+
+def _latencies(written: str) -> str:
+    """Return in words which latencies somebody waits for: a number is ms."""
+    return f"latencies {written}{' ms' if written[-1].isdigit() and ':' not in written else ''}" if written else ""
 
 
 def _text(value: Any) -> str:

@@ -63,6 +63,16 @@ def test_a_replay_and_an_echo_say_what_they_are() -> None:
     assert (echo.weights, echo.tokens, echo.labels) == ("none", "measured", ("echo engine",))
 
 
+@pytest.mark.parametrize(
+    ("written", "said"),
+    [("80", "latencies 80 ms"), ("lognormal:mean_ms=80,cv=5", "latencies lognormal:mean_ms=80,cv=5")],
+)
+def test_an_echo_whose_latencies_are_given_is_emulated(written: str, said: str) -> None:
+    echo = Provenance.of_engine(open_engine(EngineConfig(name="echo", latency=written)).describe())
+    assert (echo.emulated, echo.profile, echo.labels) == (True, said, ("emulated", "echo engine"))
+    assert echo.line == f"echo (no model), tokens EMULATED after {said}"
+
+
 def test_a_run_knows_its_cells_and_what_is_made_of_all() -> None:
     known, unknown = Provenance.of_engine(LLAMA), Provenance()
     origins = Origins(known, {"a": known, "b": unknown})

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -22,6 +21,7 @@ from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.chunks.view.figures import build_reactions, build_stability, build_triggers
 from s2a_bench.experiments.chunks.view.lanes import build_lanes
+from s2a_bench.experiments.chunks.view.smoothness import build_smoothness
 from s2a_bench.experiments.study.config import StudyConfig
 from s2a_bench.experiments.study.run import run_study
 from s2a_bench.experiments.study.view.figures import build_frontier, build_targets
@@ -132,7 +132,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "policies": lambda: timelines(ORIN),
     "safe-start": safe_start_figure,
     "online": lambda: timelines(
-        replace(ORIN, policies=("naive", "s2a-clairvoyant", "s2a-mean", "stream-to-act"), jitter="profile")
+        ORIN.but(policies=("naive", "s2a-clairvoyant", "s2a-mean", "stream-to-act"), jitter="profile")
     ),
     "timeline": lambda: timelines(TimelineConfig()),
     "boundary": lambda: boundary(BoundaryConfig()),
@@ -142,6 +142,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "chunks-stability-spread": lambda: build_stability(chunks(SPREAD)),
     "chunks-triggers": lambda: build_triggers(chunks(f"{SPREAD},{SLOW_ONES}")),
     "chunks-reactions": lambda: build_reactions(chunks("80")),
+    "chunks-smoothness": lambda: build_smoothness(chunks(SPREAD)),
 }
 
 SLOW: dict[str, Callable[[], Figure]] = {

@@ -15,6 +15,7 @@ from s2a_bench.cli.ros_args import read as read_ros_args
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import ACTING, ANSWERS, EngineConfig, acts
 from s2a_bench.options import Options, group, option, placed, places
+from s2a_bench.provenance import Provenance
 from s2a_bench.toml_file import loads
 from s2a_bench.transport import ACTIONS, TRANSPORTS, Transport, Wiring
 from s2a_bench.transport.limits import Limits
@@ -24,7 +25,7 @@ from s2a_bench.transport.pipeline import Pipeline, answer_over, one_pipeline
 if TYPE_CHECKING:
     from s2a_bench.harness.processes import ServerProcess
 
-ENGINE = ("name", "model", "mmproj", "threads", "gpu_layers", "context", "profile", "gaps", *ANSWERS)
+ENGINE = ("name", "model", "mmproj", "threads", "gpu_layers", "context", "profile", "gaps", "latency", *ANSWERS)
 """The engine's options that a server has flags for."""
 Sorted: TypeAlias = "tuple[dict[str, Any], dict[str, Any], dict[str, Any]]"
 _NUMBER = EngineConfig.model_fields["threads"]
@@ -157,14 +158,17 @@ def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
     """Serve until SIGINT or SIGTERM, then end cleanly with exit code 0; a server that died is started again once."""
     from s2a_bench.harness.serving import ServerJob
     from s2a_bench.harness.supervisor import keep_serving
+    from s2a_bench.inference.echo import check_latency
     from s2a_bench.inference.replay import check_replay
 
     check_replay(config)
+    check_latency(config)
     transport = TRANSPORTS[wiring.transport]
 
     def ready(server: ServerProcess) -> None:
-        facts = server.facts["engine"]
-        name = f"replay of {facts['profile']} (EMULATED)" if facts.get("emulated") else facts["engine"]
+        origin = Provenance.of_engine(server.facts["engine"])
+        played = f" of {origin.profile}" if origin.engine == "replay" else f", {origin.profile}"
+        name = f"{origin.engine}{played} (EMULATED)" if origin.emulated else origin.engine
         typer.echo(f"{transport.ready(wiring, server.address)}; engine {name}; Ctrl-C ends it")
 
     job = ServerJob(wiring, config, tuned=transport.tuned(wiring.options), pixels=False)

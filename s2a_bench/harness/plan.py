@@ -13,7 +13,7 @@ from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
 from s2a_bench.frames import SOURCES
-from s2a_bench.inference import ACTING, EngineConfig, acts, default_engine, told_by
+from s2a_bench.inference import ACTING, EngineConfig, acts, default_engine
 from s2a_bench.machine.resources.rows import SPENT
 from s2a_bench.options import Grammar, Names, Options, Size, Square, TextOrFile, group, option
 from s2a_bench.trace import path_of
@@ -206,7 +206,7 @@ class RequestsConfig(Options):
     def facts(self) -> dict[str, dict[str, str]]:
         """Return fact -> unit and meaning, of all that may be told of a request."""
         told = [fact for each in self.pipelines for fact in each.transport.told(each.options)]
-        told += told_by(self.engine.name) if self.own_engine else ()
+        told += self.engine.told if self.own_engine else ()
         told += (FRAMES_PUBLISHED, FRAMES_LOST) if self.mode == "stream" else ()
         return facts_json([*told, *(SPENT if self.sample_resources_hz else ())])
 
@@ -249,6 +249,7 @@ class RequestsConfig(Options):
 
     def check(self) -> None:
         """Raise UsageError, naming the field, for a combination that makes no sense."""
+        from s2a_bench.inference.echo import check_latency
         from s2a_bench.inference.replay import check_replay
 
         if not self.transports:
@@ -258,6 +259,7 @@ class RequestsConfig(Options):
                 f"`size`: {self.width}x{self.height} should be 16x16 to {LARGEST}x{LARGEST}, of even width"
             )
         check_replay(self.engine)
+        check_latency(self.engine)
         self._check_answer()
         self._check_observation()
         if self.record is not None and self.record.exists():
@@ -270,6 +272,8 @@ class RequestsConfig(Options):
             )
         if self.engine.name == "replay" and self.foreign:
             raise UsageError(f"`engine` replay needs our own servers; leave out `{self.foreign}`")
+        if self.engine.latency and self.foreign:
+            raise UsageError(f"`latency` is about our own servers; leave out `{self.foreign}`")
         self._check_unused()
 
     def _check(self, pipeline: Pipeline) -> None:

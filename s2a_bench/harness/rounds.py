@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from random import Random
 from typing import Any, TypeAlias
@@ -20,7 +21,7 @@ from s2a_bench.harness.flash_attention import decided
 from s2a_bench.harness.plan import RequestsConfig
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet
-from s2a_bench.harness.session import Place, Session
+from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.harness.warnings import Counters, SampleGuard, before_run
 from s2a_bench.inference import need_engine
 from s2a_bench.inference.models import resolve
@@ -44,6 +45,27 @@ Slot: TypeAlias = Callable[[Place], None]
 
 
 @dataclass(frozen=True, slots=True)
+class Launch:
+    """One set of servers that runs, and what asks them."""
+
+    number: int
+    config: RequestsConfig
+    """With the model files that were found."""
+    writer: RunWriter
+    sessions: Sequence[Session]
+    """One a cell, in the order of the cells; of a `Task` with more clients so many of each, one after the other."""
+    keep: Callable[[Session, Measured], None]
+    """Writes down a request, and raises what makes the next one useless; not thread-safe."""
+    progress: Progress
+
+
+def in_blocks(launch: Launch, others: Sequence[Slot] = ()) -> None:
+    """Measure every cell in turn; ``others`` is what else has a turn in every block."""
+    slots = [_slot(session, launch.keep) for session in launch.sessions]
+    run_blocks(slots, others, launch.config, launch.progress, launch.number)
+
+
+@dataclass(frozen=True, slots=True)
 class Task:
     """What a measuring command asks for besides the requests themselves."""
 
@@ -52,8 +74,12 @@ class Task:
     """What the command calls a cell whose server is in this process; empty: its own name."""
     needs_model: bool = False
     """Whether the command itself reads the model's files, whoever answers the requests."""
-    others: Callable[[RequestsConfig, RunWriter, Sequence[Session]], Sequence[Slot]] = lambda *_: ()
-    """Makes what else has a turn in every block; the config has the model files that were found."""
+    drive: Callable[[Launch], None] = in_blocks
+    """Asks the servers of a launch."""
+    clients: int = 1
+    """How many clients a cell has."""
+    told: Mapping[str, Any] = field(default_factory=dict)
+    """What the manifest says besides."""
 
 
 def run_requests(task: Task, config: RequestsConfig, output: Path, progress: Progress) -> Path:
@@ -72,6 +98,7 @@ def run_requests(task: Task, config: RequestsConfig, output: Path, progress: Pro
         sources = _Sources(config, stack)
         manifest = _manifest(config, malloc_tuned=malloc_tuned)
         writer = stack.enter_context(RunWriter.create(output, task.command, manifest))
+        writer.update(**task.told)
         progress.opened(writer.path)
         needed = config.own_engine or config.starts_program or task.needs_model
         if needed and config.engine.name == "llama" and extras.installed("gguf"):  # else nobody here reads the files
@@ -187,9 +214,9 @@ def _launch(
         )
         hits = servers.cache_hits()
         backoff = Backoff(SystemClock(), progress.stage)
-        slots = [_slot(session, servers, writer, guard, backoff, sampler) for session in sessions]
+        keep = _keeper(servers, writer, guard, backoff, sampler)
         try:
-            run_blocks(slots, task.others(config, writer, sessions), config, progress, launch)
+            task.drive(Launch(launch, config, writer, sessions, keep, progress))
             guard.see_hits(hits, servers.cache_hits())
             for session in sessions:
                 _write_frames(writer, session.frames(keep=0))
@@ -217,7 +244,7 @@ def _sessions(
         camera = Camera(sources.of("camera", "camera"), config.fps, on_frame=recorder.frame if recorder else None)
         camera.start()
         stack.callback(camera.stop)
-    for cell in config.pipelines:
+    for cell, place in product(config.pipelines, range(task.clients)):
         with servers.death_explained(cell):
             client = open_client(servers.wiring(cell), servers.alive(cell))
         clients.callback(client.close)
@@ -226,7 +253,8 @@ def _sessions(
             random = Random(config.seed)  # noqa: S311 - phases, not secrets
             feed = StreamFeed(camera, client.camera, int(1e9 / config.fps), random)
         else:
-            source = sources.of(cell.name, cell.name if cell.black_box else "")
+            who = f"{cell.name} {place}" if place else cell.name
+            source = sources.of(who, who if cell.black_box or place else "")
             preencoded = cell.payload == "jpeg-preencoded"
             feed = RequestFeed(source, preencoded=preencoded, cameras=config.cameras, size=config.resize)
         name = task.in_process if cell.transport.in_process and task.in_process else cell.name
@@ -253,18 +281,17 @@ def run_blocks(
             progress.advance()
 
 
-def _slot(
-    session: Session,
-    servers: ServerSet,
-    writer: RunWriter,
-    guard: SampleGuard,
-    backoff: Backoff,
-    sampler: Sampler,
-) -> Slot:
-    """Return a session's slot: one request, kept at once, and a look at whether the run can go on."""
+def _slot(session: Session, keep: Callable[[Session, Measured], None]) -> Slot:
+    """Return a session's slot: one request, kept at once."""
+    return lambda place: keep(session, session.measure(place))
 
-    def measure(place: Place) -> None:
-        measured = session.measure(place)
+
+def _keeper(
+    servers: ServerSet, writer: RunWriter, guard: SampleGuard, backoff: Backoff, sampler: Sampler
+) -> Callable[[Session, Measured], None]:
+    """Return what keeps a request, and looks whether the run can go on."""
+
+    def keep(session: Session, measured: Measured) -> None:
         keep_origin(writer, session.cell.name, session.origin)
         writer.sample(measured.sample)
         writer.tokens(measured.tokens)
@@ -282,7 +309,7 @@ def _slot(
             raise TransportError(f"{name} failed {GIVE_UP_AFTER} times in a row, at last with {error}")
         backoff.wait(session.cell.name, measured.retry_after_s)
 
-    return measure
+    return keep
 
 
 def keep_origin(writer: RunWriter, cell: str, origin: Provenance) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -66,6 +66,23 @@ class Measured:
     """What the server said of itself that can be no fact."""
 
 
+def _nobody(piece: Piece, at_ns: int) -> None:
+    """Listen to no piece."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What one request is told that others of the run are not, and who hears of its pieces as they arrive."""
+
+    state: tuple[float, ...] | None = None
+    """Of the robot; None: of a robot that nobody has."""
+    seed: int | None = None
+    """None: the run's."""
+    heard: Callable[[Piece, int], None] = _nobody
+    """Called on the thread that measures, with each piece and the time, in ns, at which it was there."""
+
+
+PLAIN = Asked()
 UNKNOWN_ORIGIN = Provenance()
 KEPT_FRAMES = 90
 """Frames kept until an answer may name them: three seconds at 30 Hz."""
@@ -100,7 +117,7 @@ class Session:
         self.prompt_n = 0
         """Tokens of the last prompt, pictures included; 0 where nobody says."""
 
-    def measure(self, place: Place) -> Measured:
+    def measure(self, place: Place, asked: Asked = PLAIN) -> Measured:
         """Make one request; a failure becomes a row with its error, and says whether it is the run's end."""
         self.feed.get_ready()
         request_id = f"{self.cell.name}-{place.block}"
@@ -108,15 +125,18 @@ class Session:
         trace = Trace()
         error, retry_after_s = "", 0.0
         fatal: S2AError | KeyboardInterrupt | None = None
-        state = state_at(place.block, self._config.state)
+        state = state_at(place.block, self._config.state) if asked.state is None else asked.state
         started_ns = now_ns()
         self._sampler.edge()
         frames = self.feed.capture(trace)
         config = self._config
-        said = config.prompt, frames, config.most_pieces, config.grammar, config.seed
-        request = Request(request_id, *said, state=state)
+        said = config.prompt, frames, config.most_pieces, config.grammar
+        request = Request(request_id, *said, config.seed if asked.seed is None else asked.seed, state=state)
         try:
-            seen.extend((piece, now_ns()) for piece in self.client.request(request, trace))
+            for piece in self.client.request(request, trace):
+                at_ns = now_ns()
+                seen.append((piece, at_ns))
+                asked.heard(piece, at_ns)
         except S2AError as failure:
             error = f"{type(failure).__name__}: {failure}"
             fatal = failure if isinstance(failure, FATAL) else None
@@ -125,10 +145,9 @@ class Session:
         except KeyboardInterrupt as interrupt:
             error, fatal = INTERRUPTED, interrupt
         self._sampler.edge()
-        texts = struck_pieces([piece.text for piece, _ in seen])
+        texts = iter(struck_pieces([piece.text for piece, _ in seen if isinstance(piece, Token)]))
         seen = [
-            (replace(piece, text=text) if isinstance(piece, Token) else piece, at_ns)
-            for (piece, at_ns), text in zip(seen, texts, strict=True)
+            (replace(piece, text=next(texts)) if isinstance(piece, Token) else piece, at_ns) for piece, at_ns in seen
         ]
         trace.facts.update(self._sampler.window(started_ns, now_ns()))
         if not error and not seen:

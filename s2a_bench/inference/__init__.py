@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Final, Literal, Protocol
+from typing import Annotated, Any, Final, Literal, Protocol
+
+from pydantic import BeforeValidator
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
@@ -62,6 +64,10 @@ ACTING: Final = "echo or replay"
 """The engines that answer with actions, for errors."""
 
 
+def _written(value: Any) -> Any:
+    return str(value) if isinstance(value, (int, float)) else value
+
+
 class EngineConfig(Options):
     """Which engine, on which files, with which settings; plain data, so that a server process can be told."""
 
@@ -72,6 +78,10 @@ class EngineConfig(Options):
     )
     profile: str = option("", "what --engine replay plays: a name of 'profile list', or a path")
     gaps: str = option("", "replay: trace, parametric, constant [default: trace if recorded]")
+    latency: Annotated[str, BeforeValidator(_written)] = option(
+        "",
+        "echo: how long until an answer is there, whole: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]",
+    )
     model: Path | None = option(None, "GGUF model [default: the tiny dummy]")
     mmproj: Path | None = option(None, "GGUF vision tower that goes with --model")
     threads: int = option(0, "CPU threads of the model; 0: all", ge=0, le=LARGEST)
@@ -110,6 +120,12 @@ class EngineConfig(Options):
         return self.answer == "actions"
 
     @property
+    def told(self) -> Sequence[Fact]:
+        """Return the facts that the engine tells, set like this."""
+        told: Callable[[EngineConfig], Sequence[Fact]] | None = getattr(ENGINES[self.name], "told", None)
+        return told(self) if told else told_by(self.name)
+
+    @property
     def pieces(self) -> str:
         """Return what an answer of actions is, in words."""
         return f"{self.horizon} actions of {self.action_dim}"
@@ -121,7 +137,7 @@ def acts(name: str) -> bool:
 
 
 def told_by(name: str) -> Sequence[Fact]:
-    """Return the facts that an engine tells."""
+    """Return the facts that an engine may tell."""
     return getattr(ENGINES[name], "tells", ())
 
 

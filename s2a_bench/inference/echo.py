@@ -1,31 +1,73 @@
-"""An engine without a model: answers at once, so that a run shows what the transport alone costs."""
+"""An engine without a model: answers at once, so that a run shows what the transport alone costs.
+
+With ``latency`` it answers after latencies that are known beforehand (`boards.latency.sequence_ns`). Such times are
+emulated, never measured.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import cycle, islice
 
-from s2a_bench.errors import EngineError
+from s2a_bench.boards.latency import read_latency, sequence_ns
+from s2a_bench.clock import Clock, SystemClock
+from s2a_bench.errors import EngineError, UsageError
+from s2a_bench.facts import LATENCY_DRAWN_MS, Fact
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.chunk import chunk
 from s2a_bench.types import Piece, Request, Token
 
 
+def check_latency(config: EngineConfig) -> None:
+    """Raise UsageError where ``latency`` is none, or goes with no echo."""
+    if not config.latency:
+        return
+    if config.name != "echo":
+        raise UsageError(f"`latency` needs `engine` echo; `engine` {config.name} answers at its own speed")
+    if config.pace:
+        raise UsageError("`pace`: with `latency` the whole answer comes at once; leave out one of them")
+    _sequence_ns(config)
+
+
+def _sequence_ns(config: EngineConfig) -> Iterator[int]:
+    latencies = read_latency(config.latency)
+    if latencies is None:
+        raise UsageError(f"`latency`: '{config.latency}' should be a number of ms, a family, or a .csv file")
+    return sequence_ns(latencies)
+
+
 class EchoEngine:
-    """Says the prompt's words again and again until ``max_tokens``, or a chunk of actions; the rest is ignored."""
+    """Says the prompt's words again and again until ``max_tokens``, or a chunk of actions; the rest is ignored.
+
+    With ``latency`` request k, counted from 0 since the engine was opened, is answered with the k-th latency: all
+    pieces come at that time after the request, the first no sooner than the last.
+    """
 
     acts = True
+    tells = (LATENCY_DRAWN_MS,)
 
-    def __init__(self, config: EngineConfig) -> None:
-        """Take the settings for their name only."""
+    @staticmethod
+    def told(config: EngineConfig) -> tuple[Fact, ...]:
+        """Return the facts that it tells, set like this."""
+        return EchoEngine.tells if config.latency else ()
+
+    def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
+        """Read the latencies, if any; raises UsageError for what `check_latency` refuses."""
+        check_latency(config)
         self.facts: dict[str, float] = {}
         self._config = config
+        self._clock = clock or SystemClock()
+        self._latencies_ns = _sequence_ns(config) if config.latency else None
         self._closed = False
 
     def generate(self, request: Request) -> Iterator[Piece]:
         """Yield the prompt's words as tokens, where there are none "echo"; or the actions of a chunk."""
         if self._closed:
             raise EngineError("echo: the engine is closed; open a new one")
+        if self._latencies_ns is not None:
+            asked_ns, latency_ns = self._clock.now_ns(), next(self._latencies_ns)
+            self.facts = {LATENCY_DRAWN_MS: latency_ns / 1e6}
+            self._clock.sleep_until_ns(asked_ns + latency_ns)
         if self._config.chunks:
             yield from chunk(self._config, request)
             return
@@ -34,9 +76,10 @@ class EchoEngine:
             yield Token(index, word if index == 0 else f" {word}")
 
     def describe(self) -> dict[str, str | int | float | bool]:
-        """Say that nothing but an echo answers."""
-        chunks = {"answer": self._config.pieces} if self._config.chunks else {}
-        return {"engine": self._config.name, "model": "none", "dummy": True, **chunks}
+        """Say that nothing but an echo answers, and after which latencies."""
+        told: dict[str, str | int | float | bool] = {"engine": self._config.name, "model": "none", "dummy": True}
+        told |= {"emulated": True, "latency": self._config.latency} if self._config.latency else {}
+        return told | ({"answer": self._config.pieces} if self._config.chunks else {})
 
     def close(self) -> None:
         """Refuse further requests."""

@@ -109,16 +109,23 @@ class ReplayEngine:
         rng = np.random.default_rng((request.seed % 2**32, self._requests))
         self._requests += 1
         prompt_s = self._prompt_s(rng)
-        pieces = list(self._pieces(request))
-        gaps_s = [prompt_s + self._profile.gaps.mean_s, *self._draw(rng, len(pieces) - 1, self._played)]
-        due_ns = accumulate(round(gap * 1e9) for gap in gaps_s)
+        due_ns = accumulate(round(gap * 1e9) for gap in self._gaps_s(rng, prompt_s, self._count(request)))
         self.facts = {PROMPT_MS: prompt_s * 1e3, PREDICTED_N: 0.0, PREDICTED_MS: 0.0}
-        for index, (piece, due) in enumerate(zip(pieces, due_ns, strict=True)):
+        for index, (piece, due) in enumerate(zip(self._pieces(request), due_ns, strict=True)):
             self._clock.sleep_until_ns(started_ns + due)
             self._played += index > 0
             self.facts[PREDICTED_N] = float(index + 1)
             self.facts[PREDICTED_MS] = (self._clock.now_ns() - started_ns) / 1e6 - self.facts[PROMPT_MS]
             yield piece
+
+    def _gaps_s(self, rng: np.random.Generator, prompt_s: float, pieces: int) -> Iterator[float]:
+        """Yield the time to the first piece, and the gaps, all drawn together when the second is asked for."""
+        yield prompt_s + self._profile.gaps.mean_s
+        yield from self._draw(rng, pieces - 1, self._played)
+
+    def _count(self, request: Request) -> int:
+        """Return how many pieces an answer has."""
+        return min(request.max_tokens, self._config.horizon) if self._config.chunks else request.max_tokens
 
     def _pieces(self, request: Request) -> Iterator[Piece]:
         """Yield the answer, without its times."""

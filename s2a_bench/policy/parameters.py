@@ -19,7 +19,10 @@ def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
     """Build ``name?parameter=value&...``; raises UsageError naming ``field``, the parameter, and those there are."""
     name, _, given = written.partition("?")
     if not given:
-        return made_by()
+        try:
+            return made_by()
+        except UsageError as error:
+            raise UsageError(f"`{field}`: {name}: {error}") from error
     types = _types(made_by)
     known = f"its parameters are {', '.join(types)}" if types else "it has no parameters"
     values: dict[str, Any] = {}

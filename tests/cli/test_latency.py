@@ -72,6 +72,19 @@ def test_two_servers_of_a_run_are_each_the_zenoh_router_of_their_clients(tmp_pat
     assert len({server["router"] for server in servers}) == 2
 
 
+def test_a_server_whose_latencies_are_known_answers_after_them_and_is_emulated_in_every_place(tmp_path: Path) -> None:
+    done = run(*SMALL, "--latency", "20", "--transport", "http/binary,ros,loopback", "--json", output=tmp_path)
+    kept = only_run(tmp_path)
+    assert (kept.samples["error"] == "").all()
+    assert (kept.samples["inference_ns"] >= 20_000_000).all()
+    assert {json.loads(facts)["latency_drawn_ms"] for facts in kept.samples["facts"]} == {20}
+    assert set(kept.samples["provenance"]) == {"echo/none/emulated"}
+    cells = json.loads(done.stdout)["cells"]
+    assert {(cell["emulated"], cell["profile"]) for cell in cells} == {(True, "latencies 20 ms")}
+    for path in (kept.path / "tables").glob("*.md"):
+        assert "Echo engine, EMULATED: latencies 20 ms" in path.read_text(), path
+
+
 def test_blocks_hold_every_cell_once_in_changing_order(tmp_path: Path) -> None:
     run(*SMALL, "--transport", "http,loopback", "--runs", "8", output=tmp_path)
     samples = only_run(tmp_path).samples

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -293,6 +294,24 @@ def test_ros_args_that_are_none_are_one_line(arguments: list[str], message: str)
     assert done.returncode == 2
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_server_whose_latencies_are_known_says_so_and_is_recognised_from_afar(start: Start, tmp_path: Path) -> None:
+    process, line = start(
+        "http", "--engine", "echo", "--port", "0", "--latency", "bursty:mean_ms=5,cv=0,burst_tokens=2,within=.2"
+    )
+    assert "engine echo, latencies bursty:mean_ms=5,cv=0,burst_tokens=2,within=.2 (EMULATED); " in line
+    url = line.split()[2].partition("/v1")[0]
+    command = [sys.executable, "-m", "s2a_bench", "latency", "--transport", "http/as-deployed", "--url", url]
+    small = ["--size", "64x48", "--runs", "3", "--warmup", "1", "--max-tokens", "3", "--data-only"]
+    subprocess.run([*command, *small, "--output", str(tmp_path)], check=True, capture_output=True)
+    (folder,) = tmp_path.iterdir()
+    found = read_run(folder)
+    assert {round(json.loads(facts)["latency_drawn_ms"], 6) for facts in found.samples["facts"]} == {1, 9}
+    assert "latency_drawn_ms" in found.manifest["facts"]
+    assert found.origins.every[0].profile.startswith("latencies bursty")
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) in {0, -signal.SIGTERM}
 
 
 def test_zmq_says_where_a_policy_is_asked_and_ends_with_a_signal(start: Start) -> None:

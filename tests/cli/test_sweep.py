@@ -242,6 +242,15 @@ def test_a_setting_that_makes_no_sense_is_told_before_anything_runs(tmp_path: Pa
     assert not (tmp_path / "results").exists()
 
 
+def test_latencies_are_an_axis_as_numbers_and_as_families(tmp_path: Path) -> None:
+    file = tmp_path / "f.toml"
+    axis = 'latency = [20, "lognormal:mean_ms=20,cv=.5"]'
+    file.write_text(f'command = "latency"\n[settings]\nengine = "echo"\n[grid]\n{axis}\n')
+    lines = sweep(file, "--dry-run", "--output", tmp_path / "results").stdout.splitlines()
+    asked = {line.partition("--latency=")[2].split()[0] for line in lines if "--latency" in line}
+    assert asked == {"20", "lognormal:mean_ms=20,cv=.5"}
+
+
 def test_dry_run_prints_cells_and_time_and_leaves_nothing(many: Path) -> None:
     output = many.parent / "results"
     done = sweep(many, "--dry-run", "--output", output)

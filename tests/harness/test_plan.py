@@ -138,6 +138,9 @@ def test_the_stages_are_those_of_the_transports_in_the_order_of_the_path() -> No
 def test_the_facts_are_those_that_transport_dialect_engine_and_harness_may_tell() -> None:
     few: dict[str, Any] = {"engine": EngineConfig(name="echo"), "sample_resources_hz": 0}
     assert RequestsConfig(transports=("loopback",), **few).facts == {}
+    few["engine"] = EngineConfig(name="echo", latency="80")
+    assert [*RequestsConfig(transports=("loopback",), **few).facts] == ["latency_drawn_ms"]
+    few["engine"] = EngineConfig(name="echo")
     over_ros = RequestsConfig(transports=("ros",), mode="stream", **few).facts
     assert {*over_ros} == {
         *("payload_bytes", "camera_frames", "camera_age_ms", "camera_stamp_age_ms", "stale_frames"),

@@ -33,5 +33,5 @@ def test_settings_that_make_no_sense_are_named(fields: dict[str, Any], message: 
 
 
 def test_a_server_is_told_as_json() -> None:
-    config = EngineConfig(model=Path("m.gguf"), threads=2, pace=4.8)
+    config = EngineConfig(model=Path("m.gguf"), threads=2, pace=4.8, latency="80")
     assert EngineConfig(**config.model_dump(mode="json")) == config

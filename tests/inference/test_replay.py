@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 from s2a_bench.boards.file import to_toml
+from s2a_bench.boards.gaps import Lognormal
+from s2a_bench.boards.search import load_profile
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import EngineError, UsageError
 from s2a_bench.inference import Engine, EngineConfig, open_engine
@@ -94,6 +97,23 @@ def test_a_parametric_run_has_the_rate_the_first_token_and_the_spread_of_its_pro
     expected = {"rtx-4080": 0.05, "jetson-agx-orin": 0.5, "jetson-orin-nano": 3.0}[name]
     assert prompt.mean() == pytest.approx(expected, rel=0.03)
     assert prompt.std() / prompt.mean() == pytest.approx(0.15, rel=0.15)
+
+
+def test_the_gaps_of_an_answer_are_drawn_together_after_the_prompt() -> None:
+    profile = load_profile("rtx-4080")
+    rng = np.random.default_rng((7, 0))
+    prompt_s = Lognormal(profile.prompt_s, profile.prompt_cv).sample(rng, 1, 1)[0, 0]
+    gaps_s = [prompt_s + profile.gaps.mean_s, *profile.gaps.sample(rng, 39, 1)[:, 0]]
+    came = times_ns(*replay("rtx-4080", "parametric"), 40, seed=7)
+    assert came == np.cumsum([round(gap * 1e9) for gap in gaps_s]).tolist()
+
+
+def test_the_first_token_waits_for_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine, _ = replay("rtx-4080")
+    made = []
+    monkeypatch.setattr("s2a_bench.inference.replay._plan", lambda _seed: (made.append(n) or str(n) for n in count()))
+    assert next(iter(engine.generate(Request("r", "go", max_tokens=2**40)))).text == "0"
+    assert made == [0]
 
 
 def test_times_differ_from_request_to_request_and_are_the_same_in_the_next_run() -> None:

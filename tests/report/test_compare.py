@@ -186,6 +186,13 @@ def test_another_machine_or_model_is_refused_unless_told(
     assert told.message == f"the runs are unlike: {said}"
 
 
+def test_other_latencies_of_an_echo_are_refused_unless_told(launch: Launch) -> None:
+    echo = {"engine": "echo", "emulated": True}
+    sides = [launch(1, n=2, manifest=with_(MANIFEST, "model", **echo, latency=each)) for each in ("40", "80")]
+    with pytest.raises(UnlikeRuns, match="model latency: 40 against 80"):
+        opened(*sides)
+
+
 def test_another_gpu_is_refused_and_another_driver_is_told(launch: Launch) -> None:
     def with_gpu(name: str, driver: str) -> Run:
         return launch(1, n=2, manifest=with_(MANIFEST, "environment", gpus=[{"name": name, "driver": driver}]))

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.experiments.chunks.closed import execution_horizon
 from s2a_bench.experiments.study.worlds import generator
 from s2a_bench.policy.chunks.append import Queue
+from s2a_bench.policy.chunks.learning import Learning
 from s2a_bench.policy.chunks.trigger import Maximum, Mean, Rule, Tracked, calibrate, follow, trigger
 from s2a_bench.policy.chunks.varied import Varied
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.config import ChunksConfig
     from s2a_bench.experiments.chunks.latencies import Source
-    from s2a_bench.policy.chunks import Ints, Mode, Setting
+    from s2a_bench.policy.chunks import Ints, Mode
 
+FIXED: Final = ("calibrated", "oracle")
+"""The rules that choose one trigger for all requests, and may slow actions down."""
 GIVEN: Final = "given"
 """The rule of a mode that is tried as it was asked for."""
 _ORACLE_DRAWS: Final = 1_000_000
@@ -41,6 +45,8 @@ class Cell:
     rule: str
     drawn: Drawn
     triggers: tuple[int, ...] = ()
+    slower: float = 1.0
+    """So many times slower than the others it executes its actions (time-scaling)."""
 
     @property
     def cell(self) -> str:
@@ -63,31 +69,27 @@ def draw(config: ChunksConfig, source: Source) -> Drawn:
 
 
 def cells(config: ChunksConfig, drawn: Drawn) -> Iterator[Cell]:
-    """Yield the cells of one source."""
+    """Yield the cells of one source; live, nothing has been judged yet."""
     for name, mode in config.made.items():
         yield Cell(mode, name, GIVEN, drawn)
     queue = next((mode for mode in config.made.values() if isinstance(mode, Queue)), None)
     if queue is None:
         return
     name = f"queue?execute={queue.execute}" if queue.execute else "queue"
-    for rule in config.rules:
-        triggers = _triggers(config, rule, queue, drawn)
-        if len(triggers) == 1:
-            yield Cell(replace(queue, trigger=triggers[0]), name, rule, drawn, triggers)
+    for rule in config.rules_tried:
+        most = max(1, execution_horizon(queue, config.setting) - 1)
+        if rule in FIXED:
+            ready_ns = (
+                calibrate(drawn.learnt, config.epsilon).caution if rule == "calibrated" else _oracle_ns(config, drawn)
+            )
+            chosen = trigger(ready_ns, config.setting, most)
+            mode = replace(queue, trigger=chosen.ticks)
+            yield Cell(mode, name, rule, drawn, (chosen.ticks,), min(chosen.beta, config.slowest))
+        elif config.live:
+            yield Cell(Learning(partial(_made, config, rule, drawn), queue.execute), name, rule, drawn)
         else:
-            yield Cell(Varied(triggers, queue.execute), name, rule, drawn, triggers)
-
-
-def _triggers(config: ChunksConfig, rule: str, queue: Queue, drawn: Drawn) -> tuple[int, ...]:
-    """Return the triggers that a rule chooses, one for all requests where it never changes its mind."""
-    setting = config.setting
-    most = max(1, execution_horizon(queue, setting) - 1)
-    if rule == "oracle":
-        return (min(most, _oracle(config, drawn, setting)),)
-    if rule == "calibrated":
-        caution_ns = calibrate(drawn.learnt, config.epsilon).caution
-        return (trigger(caution_ns, setting, most).ticks,)
-    return tuple(follow(_made(config, rule, drawn), drawn.judged, setting, most).trigger.tolist())
+            triggers = follow(_made(config, rule, drawn), drawn.judged, config.setting, most).trigger.tolist()
+            yield Cell(Varied(tuple(triggers), queue.execute), name, rule, drawn, tuple(triggers))
 
 
 def _made(config: ChunksConfig, rule: str, drawn: Drawn) -> Rule:
@@ -100,10 +102,10 @@ def _made(config: ChunksConfig, rule: str, drawn: Drawn) -> Rule:
     return made
 
 
-def _oracle(config: ChunksConfig, drawn: Drawn, setting: Setting) -> int:
-    """Return the least trigger that stalls in no more than a share epsilon of the cycles, of the distribution itself.
+def _oracle_ns(config: ChunksConfig, drawn: Drawn) -> int:
+    """Return the latency that a share epsilon of the distribution itself exceeds at most.
 
-    That is a million other draws; of a recording all that was recorded.
+    The distribution is a million other draws; of a recording all that was recorded.
     """
     import numpy as np
 
@@ -111,5 +113,4 @@ def _oracle(config: ChunksConfig, drawn: Drawn, setting: Setting) -> int:
     latency_ns = source.recorded_ns
     if latency_ns is None:
         latency_ns = source.draw(generator(config.seed, "chunks oracle", source.name), _ORACLE_DRAWS)
-    delay = np.sort(setting.delay_ticks(latency_ns))
-    return int(delay[-1 - int(config.epsilon * delay.size)])
+    return int(np.sort(latency_ns)[-1 - int(config.epsilon * latency_ns.size)])

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import BeforeValidator
 
+from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.latencies import EXAMPLE, split
-from s2a_bench.options import Names, Options, one_of, option
+from s2a_bench.experiments.chunks.latencies import split
+from s2a_bench.experiments.chunks.live.config import SHOWN, LiveRequests
+from s2a_bench.options import Names, Options, group, one_of, option
 from s2a_bench.policy.chunks import Rounding
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.latencies import Source
     from s2a_bench.policy.chunks import Mode, Setting
+    from s2a_bench.robots.plant import Plant
 
 RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
 """What may choose the trigger of queue."""
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
+MOST_LIVE_TICKS: Final = 20_000_000
 
 Sources = Annotated[tuple[str, ...], BeforeValidator(split)]
 """Several sources of latencies; as text with commas between them, which may hold the parameters of a family too."""
@@ -38,11 +44,17 @@ class ChunksConfig(Options):
         "observation to usable chunk (with streamed: to its first action): ms, FAMILY:mean_ms=...,key=value, FILE.csv, "
         "a run folder, or a profile; several with commas",
     )
+    slow_down: float = option(1.0, "all actions so many times slower (time-scaling)", ge=1, le=1000)
+    slowest: float = option(
+        1.0, "so many times slower calibrated and oracle may make actions where no trigger is enough", ge=1, le=1000
+    )
     control_hz: float = option(50.0, "control ticks a second", gt=0, le=1e6, allow_inf_nan=False)
     horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096)
     rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
     rules: Annotated[Names, one_of(lambda: RULES)] = option(
-        RULES, "further rows for the first queue, its trigger chosen by each; empty text for none"
+        RULES,
+        "further rows for the first queue, its trigger chosen by each; empty text for none "
+        f"[default: {','.join(RULES)}; --live: none]",
     )
     epsilon: float = option(0.01, "share of cycles that may stall, for the rules", flag="eps", gt=0, lt=1)
     cycles: int | None = option(
@@ -54,24 +66,55 @@ class ChunksConfig(Options):
     tokens_per_action: int = option(7, "tokens of an action, where a profile answers", ge=1, le=1000)
     shown_ticks: int = option(120, "control ticks of each row that are kept", ge=0, le=100_000)
     stability: int = option(
-        33, "mean latencies of the stability diagram of the first replace, from 0 to H ticks; 0 for none", ge=0, le=1000
+        33,
+        "mean latencies of the diagrams of stability (first replace) and smoothness, from 0 to H ticks; 0 for none",
+        ge=0,
+        le=1000,
+    )
+    robot: str = option(
+        "plant",
+        "what takes the actions: plant?frequency_hz=5&damping=1, live also ros?topic=/NAME, call?function=MODULE:NAME; "
+        "empty text for none",
     )
     export_delays: Path | None = option(
         None, "also write each request's times, L and d as CSV, for other simulators; of one source of latencies"
     )
     seed: int = option(0, "seed of everything that is drawn", ge=0)
 
+    live: bool = option(
+        False, "act in real time on what a server answers; with `engine` echo, `latency` is how long its answers take"
+    )
+    seconds: float = option(20.0, "--live: how long each mode acts", gt=0, le=86_400)
+    requests: LiveRequests = group(LiveRequests, only=SHOWN, about="--live: ")
+
     @property
     def virtual(self) -> bool:
-        """Return True: nothing is measured."""
-        return True
+        """Return whether nothing is measured."""
+        return not self.live
+
+    @cached_property
+    def asked(self) -> LiveRequests:
+        """Return what the control loop asks for, live; raises UsageError naming the field."""
+        told: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
+        if self.known:
+            told |= {"latency": self.known} | ({"name": "echo"} if not self.requests.engine.model_fields_set else {})
+        return self.requests.but(engine=self.requests.engine.but(**told), seed=self.seed, runs=1)
+
+    @property
+    def known(self) -> str:
+        """Return the latencies that our own server keeps, live; nothing where it answers at its own speed."""
+        return self.latency[0] if "latency" in self.model_fields_set else ""
+
+    def named(self, pipeline: str) -> str:
+        """Return what a row says of where latencies come from, live."""
+        return f"{pipeline}, {self.known}" if self.known else pipeline
 
     @property
     def setting(self) -> Setting:
         """Return what all modes are told."""
         from s2a_bench.policy.chunks import Setting
 
-        return Setting(round(1e9 / self.control_hz), self.horizon, self.rounding)
+        return Setting(round(1e9 / self.control_hz), self.horizon, self.rounding).slowed(self.slow_down)
 
     @cached_property
     def made(self) -> dict[str, Mode]:
@@ -98,10 +141,28 @@ class ChunksConfig(Options):
             each for written in self.latency for each in sources(written, self.horizon * self.tokens_per_action)
         )
 
+    @cached_property
+    def plant(self) -> Plant | None:
+        """Return what takes actions in virtual time; raises UsageError naming the field."""
+        from s2a_bench.robots import kind
+        from s2a_bench.robots.plant import Plant
+
+        if not self.robot:
+            return None
+        found = kind(self.robot)
+        if not isinstance(found, Plant):
+            raise UsageError(f"`robot`: {found.name}: virtual time has no actions to send; name a plant, or nothing")
+        return found
+
+    @property
+    def rules_tried(self) -> Sequence[str]:
+        """Return what chooses triggers; live nothing unless it is asked for."""
+        return self.rules if not self.live or "rules" in self.model_fields_set else ()
+
     @property
     def with_rules(self) -> bool:
         """Return whether rules choose the trigger of a queue."""
-        return bool(self.rules) and any(each.name == "queue" for each in self.made.values())
+        return bool(self.rules_tried) and any(each.name == "queue" for each in self.made.values())
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
@@ -110,7 +171,13 @@ class ChunksConfig(Options):
         for field in ("modes", "latency"):
             if not getattr(self, field):
                 raise UsageError(f"`{field}`: name at least one")
+        if self.live:
+            self._check_live()
+            return
+        if alone := next(self.requests.given(), ""):
+            raise UsageError(f"`{alone}` is for a control loop that runs; it needs `live`")
         self._check_export()
+        _ = self.plant
         for source in self.sources:
             recorded = source.recorded_ns
             learnt = self.calibration_cycles if recorded is None else min(self.calibration_cycles, recorded.size // 2)
@@ -119,21 +186,53 @@ class ChunksConfig(Options):
             if recorded is not None and recorded.size - learnt * self.with_rules < 2:  # noqa: PLR2004 - a boundary
                 raise UsageError(f"`latency`: {source.name} has {recorded.size} latencies; two or more are needed")
 
+    def _check_live(self) -> None:
+        """Refuse what only virtual time has, and what no server could be told."""
+        from s2a_bench.robots import kind
+
+        if self.robot:
+            kind(self.robot)
+        said = self.model_fields_set
+        if alone := next((field for field in ("cycles", "calibration_cycles") if field in said), ""):
+            raise UsageError(f"`{alone}` is for virtual time; live there are `seconds` and `warmup`")
+        if self.seconds * self.control_hz > MOST_LIVE_TICKS:
+            raise UsageError(
+                f"`seconds`: {self.seconds:g} s at `control_hz` {self.control_hz:g} are over {MOST_LIVE_TICKS:.0e} "
+                "control ticks, which are held in memory; act for a shorter time"
+            )
+        if "oracle" in self.rules_tried:
+            raise UsageError("`rules`: nobody is an oracle live; take calibrated, tracked, maximum or mean")
+        if {"calibrated", "tracked"} & {*self.rules_tried} and self.with_rules:
+            needed = math.ceil(1 / self.epsilon) - 1
+            if self.requests.warmup < needed:
+                raise UsageError(
+                    f"`warmup`: {self.requests.warmup} requests are too few to learn from for `epsilon` "
+                    f"{self.epsilon:g}; take {needed} or more, or other `rules`"
+                )
+        if self.known and len(self.latency) > 1:
+            raise UsageError(f"`latency`: live a server keeps one, not {len(self.latency)}; run once for each")
+        if len(self.asked.pipelines) > 1 and self.export_delays is not None:
+            raise UsageError("`export_delays`: of one `transport` at a time")
+        self._check_file()
+
     def _check_export(self) -> None:
-        file = self.export_delays
-        if file is None:
+        if self.export_delays is None:
             return
         if len(self.sources) != 1:
             names = ", ".join(source.name for source in self.sources)
             raise UsageError(f"`export_delays`: {len(self.sources)} sources of `latency`, {names}; name one of them")
-        if file.suffix != ".csv" or not file.parent.is_dir():
+        self._check_file()
+
+    def _check_file(self) -> None:
+        file = self.export_delays
+        if file is not None and (file.suffix != ".csv" or not file.parent.is_dir()):
             raise UsageError(f"`export_delays`: {file} should be a .csv file in a folder that there is")
 
     def to_manifest(self) -> dict[str, Any]:
         """Return the options as plain data, with the numbers that follow from others."""
         file = None if self.export_delays is None else str(self.export_delays)
         more = {"modes": list(self.made), "period_ns": self.setting.period_ns, "export_delays": file}
-        return {**self.model_dump(), **more}
+        return {**self.model_dump(exclude={"requests"}), **more}
 
 
 def _promised(name: str, learnt: int, epsilon: float, check: Any) -> None:

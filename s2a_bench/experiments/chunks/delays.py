@@ -1,4 +1,4 @@
-"""Delays as CSV, for simulators that assume one so far, and back: a row a request, its times and d.
+"""Delays as CSV, for simulators that assume one so far: a row a request, its times and d.
 
 | column | meaning |
 |---|---|
@@ -10,26 +10,22 @@
 | d | L in control ticks, by the convention of the column ``rounding`` (floor, ceil) |
 | delta_t_ns | the control tick that d counts in |
 
-All times are whole ns of one clock. Who reads needs ``observation_ns`` and ``received_ns``, or one of ``latency_ns``,
-``latency_ms`` and ``latency_s``; other columns are passed over.
+All times are whole ns of one clock. What a reader needs of it says `boards.latency`, which reads it back.
 """
 
 from __future__ import annotations
 
 import csv
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from s2a_bench.errors import StoreError, UsageError
+from s2a_bench.errors import StoreError
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.cells import Drawn
-    from s2a_bench.policy.chunks import Ints, Mode, Setting
+    from s2a_bench.policy.chunks import Mode, Setting
 
-LATENCY: Final = {"latency_ns": 1, "latency_ms": 1_000_000, "latency_s": 1_000_000_000}
-"""Column -> ns in its unit."""
 COLUMNS: Final = (
     "request",
     "observation_ns",
@@ -44,47 +40,6 @@ COLUMNS: Final = (
     "delta_t_ns",
     "provenance",
 )
-LONGEST_NS: Final = 3_600_000_000_000
-
-
-def read_delays(path: Path) -> Ints:
-    """Return the latencies of a CSV file in its order, in ns; raises UsageError naming file, line and column."""
-    import numpy as np
-
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file)
-            latency_of = _reader(reader.fieldnames or (), path)
-            found = [_latency(row, latency_of, f"`latency`: {path}, line {reader.line_num}") for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"`latency`: cannot read {path}: {error}") from error
-    if not found:
-        raise UsageError(f"`latency`: {path} has no rows")
-    return np.array(found, np.int64)
-
-
-def _reader(header: object, path: Path) -> Callable[[Mapping[str, str]], float]:
-    """Return what makes a latency of a row."""
-    names = list(header) if isinstance(header, (list, tuple)) else []
-    for column, unit in LATENCY.items():
-        if column in names:
-            return lambda row: float(row[column]) * unit
-    if {"observation_ns", "received_ns"} <= {*names}:
-        return lambda row: int(row["received_ns"]) - int(row["observation_ns"])
-    raise UsageError(
-        f"`latency`: {path} has the columns {', '.join(map(str, names)) or 'none'}; "
-        f"it needs observation_ns and received_ns, or one of {', '.join(LATENCY)}"
-    )
-
-
-def _latency(row: Mapping[str, str], latency_of: Callable[[Mapping[str, str]], float], where: str) -> int:
-    try:
-        latency_ns = latency_of(row)
-    except (TypeError, ValueError):
-        raise UsageError(f"{where}: the latency is no number") from None
-    if not (math.isfinite(latency_ns) and 0 <= latency_ns <= LONGEST_NS):
-        raise UsageError(f"{where}: a latency of {latency_ns:g} ns should be between 0 and an hour")
-    return round(latency_ns)
 
 
 def delay_rows(drawn: Drawn, mode: Mode, setting: Setting) -> Iterator[dict[str, object]]:

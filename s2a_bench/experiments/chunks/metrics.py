@@ -44,6 +44,11 @@ def _share(name: str, title: str, about: str, better: Better = "lower") -> Chunk
     return _number(name, "", title, about, better, most=1)
 
 
+def _plant(name: str, unit: str, title: str, about: str, better: Better = "lower") -> ChunkMetric:
+    units = "u: the actions' unit, in virtual time the target's standard deviation."
+    return _number(name, unit, title, f"{about} {units}", better)
+
+
 METRICS: Final[Mapping[str, ChunkMetric]] = {
     metric.name: metric
     for metric in (
@@ -87,10 +92,26 @@ METRICS: Final[Mapping[str, ChunkMetric]] = {
             "So many times slower actions stall in a share epsilon of the cycles at most, at the greatest trigger.",
             least=1,
         ),
+        _number("slower", "", "slower", "So many times slower than it was asked for actions were executed.", least=1),
         _share("thrown_away_share", "thrown away", "Actions never executed, of all."),
         _number("jump_mean", "actions", "jump", "By how many actions the robot is thrown at a boundary."),
         _number("jump_max", "actions", "max", "The greatest."),
+        _plant("tracking_rms", "u", "tracking", "Position of the plant less the target's, root mean square."),
+        _plant("tracking_rms_ideal", "u", "ideal", "The same, asked in every tick and answered at once.", "neither"),
+        _plant("jerk_rms", "u/s^3", "jerk", "Change of acceleration over a control period, by it; root mean square."),
+        _plant("jerk_rms_ideal", "u/s^3", "ideal", "The same, asked in every tick and answered at once.", "neither"),
+        _plant("boundary_jump_mean", "u", "jump", "From a chunk's last executed action to the next one's first."),
+        _plant("boundary_jump_p99", "u", "p99", "Its 99th percentile."),
+        _plant("action_step_mean", "u", "step", "From one action to the next within a chunk.", "neither"),
         _ticks("blocked_ticks", "blocked", "Ticks in which the control loop waits for an answer.", whole=True),
+        _share("agreement", "as computed", "Live: share of the ticks as virtual time has them.", "higher"),
+        _number("jitter_s_p50", "s", "jitter", "Live: how long after it was due an action left, the median."),
+        _number("jitter_s_p99", "s", "p99", "Its 99th percentile."),
+        _number("jitter_s_max", "s", "max", "The greatest."),
+        _ticks("late_ticks", "late", "Live: ticks whose action left a whole tick late or more.", whole=True),
+        _number("blocked_s_p99", "s", "blocked", "Live: what asking and sending took of a tick, 99th percentile."),
+        _number("blocked_s_max", "s", "max", "The greatest."),
+        _number("bytes_up_per_s", "bytes/s", "up", "Live: what the pictures weigh that leave in a second."),
     )
 }
 """The metrics by their names, in the order of their columns."""

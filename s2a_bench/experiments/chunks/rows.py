@@ -57,6 +57,8 @@ class TickRow:
     index: int | None
     age_ticks: int | None
     stalled: bool
+    late_ns: int | None = None
+    """How long after it was due the action left; null in virtual time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,8 @@ class RequestRow:
     thrown_away: int
     stall_ticks: int
     jump: int | None
+    request_id: str | None = None
+    """Of its sample; null in virtual time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +123,20 @@ class ReactionRow:
     closed_s: float | None
 
 
+@dataclass(frozen=True, slots=True)
+class SmoothnessRow:
+    """A mode at one mean latency, on a plant: the source's latencies, all longer or shorter by one factor."""
+
+    latency: str
+    mode: str
+    latency_s: float
+    tracking_rms: float | None
+    tracking_rms_ideal: float | None
+    jerk_rms: float | None
+    jerk_rms_ideal: float | None
+    boundary_jump_mean: float | None
+
+
 CHUNKS: Final[Table[AboutCell]] = Table("chunks", ChunkRow)
 """One row a mode, rule and source of latencies."""
 TICKS: Final[Table[TickRow]] = Table("chunk_ticks", TickRow)
@@ -131,3 +149,5 @@ STABILITY: Final[Table[StabilityRow]] = Table("chunk_stability", StabilityRow)
 """One row a mean latency and execution horizon."""
 REACTIONS: Final[Table[ReactionRow]] = Table("chunk_reactions", ReactionRow)
 """One row a cell and quantile."""
+SMOOTHNESS: Final[Table[SmoothnessRow]] = Table("chunk_smoothness", SmoothnessRow)
+"""One row a mode and mean latency."""

@@ -9,7 +9,8 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells, draw
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
-from s2a_bench.experiments.chunks.rows import CHUNKS, REACTIONS, REQUESTS, STABILITY, TICKS, TRIGGERS
+from s2a_bench.experiments.chunks.rows import CHUNKS, REACTIONS, REQUESTS, SMOOTHNESS, STABILITY, TICKS, TRIGGERS
+from s2a_bench.experiments.chunks.smooth import Follower, follower, smoothness_rows
 from s2a_bench.experiments.chunks.to_rows import chunk_row, reaction_rows, reactions_s, request_rows, tick_rows
 from s2a_bench.experiments.chunks.varying import stability_rows, trigger_rows
 from s2a_bench.experiments.study.worlds import generator
@@ -25,7 +26,11 @@ MOST_TICKS = 100_000_000
 
 
 def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
-    """Simulate every cell and return the run folder; raises S2AError for what a user can mend."""
+    """Simulate every cell, or act live, and return the run folder; raises S2AError for what a user can mend."""
+    if config.live:
+        from s2a_bench.experiments.chunks.live.run import run_live
+
+        return run_live(config, output, progress)
     drawn = [draw(config, source) for source in config.sources]
     for each in drawn:
         _check(config, each)
@@ -42,22 +47,25 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
         progress.opened(writer.path)
         progress.stage("acting in virtual time")
         progress.expect(len(tried))
+        follows = follower(config)
         for cell in tried:
-            _simulate(config, cell, writer)
+            _simulate(config, cell, follows, writer)
             progress.advance()
         for each in drawn:
             writer.append(TRIGGERS, trigger_rows(config, each))
         writer.append(STABILITY, stability_rows(config, drawn[0]))
+        writer.append(SMOOTHNESS, smoothness_rows(config, drawn[0], follows))
         if config.export_delays is not None:
             write_delays(config.export_delays, delay_rows(drawn[0], tried[0].mode, config.setting))
         return writer.path
 
 
-def _simulate(config: ChunksConfig, cell: Cell, writer: RunWriter) -> None:
-    setting, latency_ns = config.setting, cell.drawn.judged
+def _simulate(config: ChunksConfig, cell: Cell, follows: Follower | None, writer: RunWriter) -> None:
+    setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
     cycles, ticks = cell.mode.cycles(latency_ns, setting), cell.mode.ticks(latency_ns, setting)
     reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
-    row = chunk_row(cell, setting, cycles, ticks, epsilon=config.epsilon, reaction_s=reaction_s)
+    smooth = follows.measure(cell.mode, cycles, ticks) if follows and cell.slower == 1 else {}
+    row = chunk_row(cell, setting, cycles, ticks, epsilon=config.epsilon, reaction_s=reaction_s, smooth=smooth)
     writer.append(CHUNKS, [row])
     writer.append(REACTIONS, reaction_rows(cell, latency_ns, setting, reaction_s))
     writer.append(TICKS, tick_rows(cell.cell, ticks, config.shown_ticks))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,18 +25,30 @@ EVENTS: Final = 100_000
 """Moments of events that reactions are measured at."""
 SHARES: Final = np.linspace(0, 1, 51)
 """Of the quantiles of reaction times that are kept."""
+NO_NAMES: Final[Mapping[int, str]] = {}
 _SIDE: Final = 0.975
 """Confidence of each end of a two-sided 95 % interval."""
 
 
 def chunk_row(
-    cell: Cell, setting: Setting, cycles: Cycles, ticks: Ticks, *, epsilon: float, reaction_s: Floats
+    cell: Cell,
+    setting: Setting,
+    cycles: Cycles,
+    ticks: Ticks,
+    *,
+    epsilon: float,
+    reaction_s: Floats,
+    smooth: Mapping[str, float],
 ) -> AboutCell:
-    """Describe a cell's run; ``reaction_s`` are its reaction times, ``epsilon`` is the share that may stall."""
+    """Describe a cell's run.
+
+    ``reaction_s`` are its reaction times, ``smooth`` its metrics of smoothness if any, and ``epsilon`` is the share
+    that may stall.
+    """
     latency_s = cell.drawn.judged / 1e9
     triggers = cell.triggers or ((cell.mode.trigger,) if hasattr(cell.mode, "trigger") else ())
-    values = metrics_of(cell, setting, cycles, ticks, reaction_s)
-    values["slow_down"] = beta(cell.mode, cell.drawn.judged, setting, epsilon)
+    values = {**metrics_of(cell, setting, cycles, ticks, reaction_s), **smooth}
+    values |= {"slow_down": beta(cell.mode, cell.drawn.judged, setting, epsilon), "slower": cell.slower}
     row: AboutCell = ChunkRow(
         cell=cell.cell,
         mode=cell.name,
@@ -50,7 +62,7 @@ def chunk_row(
         execution_horizon=execution_horizon(cell.mode, setting),
         requests=int(latency_s.size),
         trigger=float(np.mean(triggers)) if triggers else None,
-        **{name: _plain(values[name], whole=metric.whole) for name, metric in METRICS.items()},
+        **{name: _plain(values.get(name), whole=metric.whole) for name, metric in METRICS.items()},
     )
     return row
 
@@ -120,18 +132,27 @@ def reaction_rows(cell: Cell, latency_ns: Ints, setting: Setting, reaction_s: Fl
         yield ReactionRow(cell.cell, share, simulated_s, expected_s)
 
 
-def tick_rows(cell: str, ticks: Ticks, most: int) -> Iterator[TickRow]:
-    """Yield the first ticks of a cell."""
+def tick_rows(cell: str, ticks: Ticks, most: int, late_ns: Ints | None = None) -> Iterator[TickRow]:
+    """Yield the first ticks of a cell; ``late_ns`` is how long after it was due each action left."""
+    late = [None] * most if late_ns is None else late_ns.tolist()
     columns = (ticks.chunk, ticks.index, ticks.age, ticks.stalled)
     for tick, (chunk, index, age, stalled) in enumerate(zip(*(each[:most].tolist() for each in columns), strict=True)):
         none = chunk < 0
         yield TickRow(
-            cell, tick, None if none else chunk, None if none else index, None if none else age, bool(stalled)
+            cell=cell,
+            tick=tick,
+            chunk=None if none else chunk,
+            index=None if none else index,
+            age_ticks=None if none else age,
+            stalled=bool(stalled),
+            late_ns=late[tick],
         )
 
 
-def request_rows(cell: str, latency_ns: Ints, cycles: Cycles, most: int) -> Iterator[RequestRow]:
-    """Yield the requests that left within the first ticks of a cell."""
+def request_rows(
+    cell: str, latency_ns: Ints, cycles: Cycles, most: int, names: Mapping[int, str] = NO_NAMES
+) -> Iterator[RequestRow]:
+    """Yield the requests that left within the first ticks of a cell; ``names`` are the ids of their samples."""
     for request in range(int(np.searchsorted(cycles.request_tick, most))):
         executed = int(cycles.executed[request])
         yield RequestRow(
@@ -146,6 +167,7 @@ def request_rows(cell: str, latency_ns: Ints, cycles: Cycles, most: int) -> Iter
             thrown_away=int(cycles.thrown_away[request]),
             stall_ticks=int(cycles.stall_ticks[request]),
             jump=int(cycles.jump[request]) if executed else None,
+            request_id=names.get(request),
         )
 
 

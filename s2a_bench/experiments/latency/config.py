@@ -22,8 +22,8 @@ class LatencyConfig(RequestsConfig):
     engine: EngineConfig = group(
         EngineConfig,
         only=(
-            *("name", "profile", "gaps", "model", "mmproj", "threads", "gpu_layers", "context", "flash_attention"),
-            *("answer", "horizon", "action_dim"),
+            *("name", "profile", "gaps", "latency", "model", "mmproj", "threads", "gpu_layers", "context"),
+            *("flash_attention", "answer", "horizon", "action_dim"),
         ),
     )
     wire: str = option("", "gone: see --payload", hidden=True)

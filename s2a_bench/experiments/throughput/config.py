@@ -45,7 +45,9 @@ class ThroughputConfig(RequestsConfig):
         (IN_PROCESS,), "in-process, http, ros, as in latency; several with commas", flag="transport"
     )
     variants: FirstVariants = group(FirstVariants)
-    engine: ThroughputEngine = group(ThroughputEngine, only=set(EngineConfig.model_fields) - {"pace", *ANSWERS})
+    engine: ThroughputEngine = group(
+        ThroughputEngine, only=set(EngineConfig.model_fields) - {"pace", "latency", *ANSWERS}
+    )
     runs: int = option(10, "requests a cell [default: 10, quick: 3]", ge=1, le=10**9)
     warmup: int = option(2, "warm-ups a cell, kept and marked [default: 2, quick: 1]", ge=0, le=10**9)
     max_tokens: int = option(128, "tokens an answer [default: 128, quick: 32]", ge=1, le=2**20)

@@ -165,6 +165,16 @@ class Mode(Protocol):
         return 0
 
     @property
+    def streams(self) -> bool:
+        """Return whether it acts on a chunk that has not arrived whole."""
+        return False
+
+    @property
+    def weight(self) -> float:
+        """Return the share of a new action where it meets one that is due at the same time; 1: it takes its place."""
+        return 1.0
+
+    @property
     def blocks(self) -> bool:
         """Return whether the control loop waits for the answer."""
         return False

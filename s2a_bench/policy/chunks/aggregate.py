@@ -7,7 +7,7 @@ newest when it is free; here one request is under way at a time, which is the sa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, TypeAlias
 
@@ -38,6 +38,11 @@ class Aggregate(Laid):
 
     trigger: Annotated[int, Field(ge=0)] = 0
     kind: Kind = "weighted_average"
+
+    @property
+    def weight(self) -> float:
+        """Return the new action's weight."""
+        return WEIGHTS[self.kind]
 
     def stepper(self, setting: Setting) -> ChunkStepper:
         """Follow one robot."""
@@ -71,10 +76,10 @@ class Aggregate(Laid):
         until = np.minimum(np.append(usable[1:], leaves[-1]), usable + horizon - first)
         return assemble(request, usable, usable, first, until, ticks=int(leaves[-1]), horizon=horizon)
 
-    def blended_age(self, cycles: Cycles) -> Floats:
-        """Return the mean age behind each executed action in ticks, shape (K,): ages weighted as actions are.
+    def blend(self, cycles: Cycles) -> Iterator[tuple[Ints, Ints, Ints, Floats]]:
+        """Yield what executed actions are made of: in which ticks, whose chunk, which action of it, with which weight.
 
-        NaN for no action. `Ticks.age` is that of the newest observation in the blend.
+        All that is newest comes first, then what is next to newest. The weights of a tick add up to 1.
         """
         import numpy as np
 
@@ -85,17 +90,26 @@ class Aggregate(Laid):
         newest, index = ticks.chunk[acted], ticks.index[acted]
         due = np.searchsorted(acted, cycles.request_tick)  # what is due first, in actions since the start
         action = due[newest] + index
-        age, rest = np.zeros(acted.size), np.ones(acted.size)
+        rest = np.ones(acted.size)
         open_, chunk = np.arange(acted.size), newest
         while open_.size:
             older = chunk - 1
             also = (older >= 0) & (action[open_] < due[np.maximum(older, 0)] + cycles.horizon)
             share = np.where(also, weight, 1.0) * rest[open_]
-            age[open_] += share * (acted[open_] - cycles.request_tick[chunk])
+            yield acted[open_], chunk, action[open_] - due[chunk], share
             rest[open_] -= share
             open_, chunk = open_[also], older[also]
+
+    def blended_age(self, cycles: Cycles) -> Floats:
+        """Return the mean age behind each executed action in ticks, shape (K,): ages weighted as actions are.
+
+        NaN for no action. `Ticks.age` is that of the newest observation in the blend.
+        """
+        import numpy as np
+
         blended = np.full(cycles.ticks, np.nan)
-        blended[acted] = age
+        for tick, chunk, _, share in self.blend(cycles):
+            blended[tick] = np.nan_to_num(blended[tick]) + share * (tick - cycles.request_tick[chunk])
         return blended
 
 

@@ -70,6 +70,7 @@ class Streamed(Laid):
     """
 
     name: ClassVar[str] = "streamed"
+    streams: ClassVar[bool] = True
 
     trigger: Annotated[int, Field(ge=0)] = 0
     execute: Execute = 0

@@ -16,11 +16,17 @@ def step(mode: Mode, latency_ns: Ints, setting: Setting) -> tuple[Cycles, Ticks]
     """Run a mode's stepper until it asks once more than there are latencies, shape (R,) in ns."""
     import numpy as np
 
+    shifts = np.arange(setting.horizon) * mode.gap_ns
+    return follow(mode, latency_ns[:, np.newaxis] + shifts, setting)
+
+
+def follow(mode: Mode, arrival_ns: Ints, setting: Setting) -> tuple[Cycles, Ticks]:
+    """Do the same with the arrival of every action after the request's tick began: shape (R, H), in ns."""
+    import numpy as np
+
     from s2a_bench.policy.chunks.cycles import gather
 
-    count, horizon = latency_ns.size, setting.horizon
-    shifts = np.arange(horizon) * mode.gap_ns
-    arrival_ns = latency_ns[:, np.newaxis] + shifts
+    count, horizon = len(arrival_ns), setting.horizon
     usable, known = setting.delay_ticks(arrival_ns), setting.known_ticks(arrival_ns)
     stepper = mode.stepper(setting)
     coming: list[_Arrival] = []

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _MACHINE: Final = ("cpu", "machine", "board", "cores", "affinity", "governor", "power_mode")
 """Facts of the environment that make it another machine, or the same one in another state."""
 
-_MODEL: Final = ("engine", "dummy", "model_sha256", "mmproj_sha256", "profile", "gaps")
+_MODEL: Final = ("engine", "dummy", "model_sha256", "mmproj_sha256", "profile", "gaps", "latency")
 """Facts that make it another model, or none: emulated is not measured, dummy weights are no model."""
 
 _ORIGIN: Final = ("engine", "weights", "tokens", "link", "clock")

@@ -172,3 +172,28 @@ def test_what_would_not_fit_into_memory_is_refused_before_a_folder_is_made(tmp_p
     with pytest.raises(UsageError, match=r"`cycles`: 1000000 chunks @ 3\.6e6 make"):
         run_chunks(ChunksConfig(latency="3.6e6", cycles=1_000_000, rules=""), tmp_path / "none", NullProgress())
     assert not (tmp_path / "none").exists()
+
+
+def test_where_no_trigger_is_enough_calibrated_and_oracle_slow_actions_down(tmp_path: Path) -> None:
+    asked = {"latency": "400,lognormal:mean_ms=200,cv=.5", "modes": "queue", "cycles": 10_000}
+    run = ran(tmp_path, **asked, slowest=4.0)
+    for latency in run.table(CHUNKS)["latency"].unique():
+        needed = row(run, "queue", latency)["slow_down"]
+        for rule in ("calibrated", "oracle"):
+            found = row(run, "queue", latency, rule)
+            assert found["slower"] == pytest.approx(needed, rel=0.06)
+            assert found["delta_t_s"] == pytest.approx(0.02 * found["slower"], rel=1e-6)
+            assert found["p_stall_cycle"] <= 0.015
+        assert row(run, "queue", latency, "tracked")["p_stall_cycle"] > 0.05
+    never = ran(tmp_path, **asked, rules="calibrated")
+    assert row(never, "queue", "400", "calibrated")["p_stall_cycle"] == 1
+    assert row(never, "queue", "400", "calibrated")["slower"] == 1
+
+
+def test_slowed_down_by_the_closed_forms_factor_no_cycle_stalls(tmp_path: Path) -> None:
+    stalls = ran(tmp_path, latency="320", modes="replace", rules="")
+    factor = row(stalls, "replace", "320")["slow_down"]
+    assert row(stalls, "replace", "320")["stall_ticks"] > 0
+    slowed = ran(tmp_path, latency="320", modes="replace", rules="", slow_down=factor)
+    assert row(slowed, "replace", "320")["stall_ticks"] == 0
+    assert row(slowed, "replace", "320")["slow_down"] == 1

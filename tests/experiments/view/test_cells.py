@@ -135,6 +135,9 @@ def test_what_did_not_really_answer_is_said(make_run: MakeRun) -> None:
         return engine_note(run, cells_of(run))
 
     assert (note(), note().labels) == ("echo engine", ("echo engine",))
+    drawn = {"model": {"engine": "echo", "model": "none", "emulated": True, "latency": "80"}}
+    assert note(manifest=drawn) == "echo engine, EMULATED: latencies 80 ms"
+    assert note(manifest=drawn).labels == ("echo engine", "emulated")
     assert note(engine="replay") == "EMULATED: replayed profile"
     played = {"profile": "agx", "gaps": "trace", "origin": "measured", "dummy": True}
     assert note(engine="replay", manifest={"model": played}) == (

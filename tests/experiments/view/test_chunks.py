@@ -12,7 +12,14 @@ from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.chunks.view.figures import build_reactions, build_stability, build_triggers
 from s2a_bench.experiments.chunks.view.lanes import build_lanes, lanes_of, short
-from s2a_bench.experiments.chunks.view.tables import action_table, chunk_sentences, delay_table, stall_table
+from s2a_bench.experiments.chunks.view.smoothness import build_smoothness
+from s2a_bench.experiments.chunks.view.tables import (
+    action_table,
+    chunk_sentences,
+    delay_table,
+    smoothness_table,
+    stall_table,
+)
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import save
@@ -103,6 +110,27 @@ def test_reactions_have_the_closed_form_drawn_over_them(run: Run) -> None:
     assert lower.get_title(loc="left") == "lognormal:mean_ms=80,cv=.5"
 
 
+def test_smoothness_stands_beside_the_ideal(run: Run) -> None:
+    table = smoothness_table(run)
+    assert table.header[3:] == ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
+    tracking, ideal = (float(text) for text in table.rows[0][3:5])
+    assert tracking > ideal > 0
+    assert any("of plant, in the target's standard deviation" in note for note in table.notes)
+    assert not any("P(stall)" in note for note in table.notes)
+    assert any(note.startswith("EMULATED") for note in table.notes)
+
+
+def test_smoothness_is_a_line_a_mode_and_the_ideal_dashed(run: Run) -> None:
+    panels = drawn(run, build_smoothness).axes
+    for axes in panels:
+        *modes, ideal = axes.lines
+        assert [line.get_label() for line in modes] == ["sync", "queue?trigger=6", "replace", "aggregate?trigger=6"]
+        assert ideal.get_linestyle() == "--"
+        assert all(len(np.asarray(line.get_xdata())) == 33 for line in axes.lines)
+    *tracking, ideal = (np.asarray(line.get_ydata()) for line in panels[0].lines)
+    assert (ideal < np.min(tracking, axis=0)).all()
+
+
 def test_every_figure_is_written_and_says_where_its_numbers_come_from(run: Run) -> None:
     written = save(run.path / "figures", EXPERIMENT.show(run).figures)
     assert [path.name for path in written if path.suffix == ".png"] == [
@@ -110,6 +138,7 @@ def test_every_figure_is_written_and_says_where_its_numbers_come_from(run: Run) 
         "stability.png",
         "triggers.png",
         "reactions.png",
+        "smoothness.png",
     ]
 
 
@@ -119,6 +148,7 @@ def test_a_long_name_is_cut_and_a_short_one_is_not() -> None:
 
 
 def test_what_a_run_has_no_rows_for_is_not_drawn(tmp_path_factory: pytest.TempPathFactory) -> None:
-    config = ChunksConfig(modes="sync", cycles=20, shown_ticks=0)
+    config = ChunksConfig(modes="sync", cycles=20, shown_ticks=0, robot="")
     run = read_run(run_chunks(config, tmp_path_factory.mktemp("one"), NullProgress()))
     assert list(EXPERIMENT.show(run).figures) == ["reactions"]
+    assert "smoothness" not in EXPERIMENT.show(run).tables

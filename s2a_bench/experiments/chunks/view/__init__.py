@@ -17,11 +17,12 @@ def show(run: Run, **_: Any) -> Shown:
     from s2a_bench.experiments.chunks.view.tables import chunk_csv, chunk_json, chunk_sentences, chunk_tables
 
     tables = chunk_tables(run)
+    main = [name for name in ("chunks", "loop") if name in tables]
     return Shown(
         sentences=chunk_sentences(run),
         tables=tables,
-        main=["chunks"],
-        notes=tables["chunks"].notes,
+        main=main,
+        notes=list(dict.fromkeys(note for name in main for note in tables[name].notes)),
         csvs=chunk_csv(run),
         figures=chunk_figures(run),
         json=lambda: chunk_json(run),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from s2a_bench.experiments.chunks.rows import ChunkRow
 from s2a_bench.store.bounds import about
@@ -13,5 +13,7 @@ ChunkCell = cell_of_row(
     "A mode of acting on chunks under one source of latencies.",
     ChunkRow,
     without=(),
-    own={"emulated": Annotated[Literal[True], about("Nothing answered: the latencies are given.")]},
+    own={
+        "emulated": Annotated[bool, about("Whether latencies were given or drawn, in virtual time or by the server.")]
+    },
 )

@@ -1,4 +1,4 @@
-"""The figures of a run of chunks: stability diagram, P(stall) against trigger, reaction times; PNG and PDF."""
+"""The figures of a run of chunks: stability diagram, P(stall) against trigger, reactions; PNG and PDF."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.chunks.rows import REACTIONS, STABILITY, TRIGGERS
+from s2a_bench.experiments.chunks.rows import REACTIONS, SMOOTHNESS, STABILITY, TRIGGERS
 from s2a_bench.experiments.chunks.view.lanes import build_lanes, lanes_of, short
 from s2a_bench.experiments.chunks.view.tables import rows_of, sources_of
 from s2a_bench.writers.figures import LINE_CHARS, new_figure
@@ -49,6 +49,10 @@ def chunk_figures(run: Run) -> dict[str, Callable[[], Figure]]:
         found["triggers"] = partial(build_triggers, run)
     if len(run.table(REACTIONS)):
         found["reactions"] = partial(build_reactions, run)
+    if len(run.table(SMOOTHNESS)):
+        from s2a_bench.experiments.chunks.view.smoothness import build_smoothness
+
+        found["smoothness"] = partial(build_smoothness, run)
     return found
 
 
@@ -62,7 +66,9 @@ def build_stability(run: Run) -> Figure:
     horizon, period_s = int(asked["horizon"]), float(asked["period_ns"]) / 1e9
     table = rows.pivot_table(index="execution_horizon", columns="latency_s", values="stall_share", dropna=False)
     mode = str(rows["mode"].iloc[0])
-    figure = new_figure(2.9, _title(run, f"Stalled share of the ticks, {mode}", f"shape of {rows['latency'].iloc[0]}"))
+    figure = new_figure(
+        2.9, title_of(run, f"Stalled share of the ticks, {mode}", f"shape of {rows['latency'].iloc[0]}")
+    )
     axes = figure.subplots()
     mesh = axes.pcolormesh(
         table.columns.to_numpy(dtype="float64") * 1e3,
@@ -93,7 +99,7 @@ def build_triggers(run: Run) -> Figure:
     epsilon = float(run.manifest["configuration"]["epsilon"])
     groups = sources_of(rows_of(run))[:_MOST_PANELS]
     more = "line: closed form; dots: simulated; 0 lies at the bottom"
-    figure = new_figure(2.6 + 0.16 * len(groups), _title(run, "P(stall) against the trigger of queue", more))
+    figure = new_figure(2.6 + 0.16 * len(groups), title_of(run, "P(stall) against the trigger of queue", more))
     axes = figure.subplots()
     sources: list[Any] = []
     rules: list[Any] = []
@@ -145,7 +151,7 @@ def build_reactions(run: Run) -> Figure:
     names = list(dict.fromkeys(_who(cell) for _, cells in groups for cell in cells if _drawn(cell)))
     what = "from an event to the first tick that knows of it"
     foot_in = 0.17 * -(-(len(names) + 1) // 2)
-    figure = new_figure(0.6 + foot_in + 1.6 * len(groups), _title(run, "Reaction time", what))
+    figure = new_figure(0.6 + foot_in + 1.6 * len(groups), title_of(run, "Reaction time", what))
     panels = figure.subplots(len(groups), 1, squeeze=False)[:, 0]
     for axes, (source, cells) in zip(panels, groups, strict=True):
         for cell in filter(_drawn, cells):
@@ -189,7 +195,7 @@ def _who(cell: dict[str, Any]) -> str:
     return str(cell["mode"]) if cell["rule"] == "given" else f"{cell['mode']}, {cell['rule']}"
 
 
-def _title(run: Run, what: str, more: str) -> str:
+def title_of(run: Run, what: str, more: str) -> str:
     """Return what is drawn, and under which setting."""
     asked = run.manifest["configuration"]
     setting = f"H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {asked['rounding']}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.chunks.rows import CHUNKS
@@ -18,18 +19,38 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 
-_LEFT: Final = ("mode", "rule")
 _CONVENTION: Final = {
     "floor": "d = floor(L / Delta t): an action leaves at the end of its tick, as real-time chunking counts.",
     "ceil": "d = ceil(L / Delta t): an action leaves at the start of its tick, as lerobot counts.",
 }
 
+_SMOOTHNESS: Final = {
+    "tracking_rms": "tracking",
+    "tracking_rms_ideal": "ideal",
+    "jerk_rms": "jerk",
+    "jerk_rms_ideal": "ideal",
+    "boundary_jump_mean": "jump",
+    "boundary_jump_p99": "p99",
+    "action_step_mean": "step",
+}
+_OF_A_TARGET: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms_ideal")
+_EMULATED: Final = Note(
+    "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
+)
+
 
 def rows_of(run: Run) -> list[Row]:
-    """Return the rows of a run; what a row lacks is None."""
+    """Return the rows of a run; what a row lacks is None. Live they are made in random order, which is put right."""
     table = run.table(CHUNKS).drop(columns=PROVENANCE)
     whole = table.astype(object).where(table.notna(), None)
-    return [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
+    rows = [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
+    asked = run.manifest["configuration"]
+    order = [*((name, "given") for name in asked["modes"]), *((None, rule) for rule in asked["rules"])]
+
+    def place(row: Row) -> tuple[str, int]:
+        return row["latency"], order.index((row["mode"] if row["rule"] == "given" else None, row["rule"]))
+
+    return sorted(rows, key=place) if live(run) else rows
 
 
 def sources_of(rows: list[Row]) -> list[tuple[str, list[Row]]]:
@@ -50,29 +71,61 @@ def action_table(run: Run) -> TextTable:
     return _table(run, "Actions: ages in ticks", header, _actions)
 
 
+def loop_table(run: Run) -> TextTable:
+    """Lay out how well the control loop of a live run kept time."""
+    header = ("alike, %", "jitter (ms)", "p99", "max", "late", "busy (ms)", "max", "MB/s up")
+    note = (
+        "alike: share of the ticks that virtual time has the same way, on the latencies that were measured; jitter: "
+        "how long after it was due an action left; late: by a tick or more; busy: for how long asking and sending kept "
+        "the loop in a tick, p99."
+    )
+    return replace(_table(run, "Control loop", header, _loop), notes=(_convention(run), note))
+
+
+def live(run: Run) -> bool:
+    """Whether a run acted in real time."""
+    return bool(run.manifest["configuration"].get("live"))
+
+
+def smoothness_table(run: Run) -> TextTable:
+    """Lay out how smoothly a plant moves under each mode; in virtual time, how well it follows a target besides."""
+    names = {name: title for name, title in _SMOOTHNESS.items() if not live(run) or name not in _OF_A_TARGET}
+    table = _table(run, "Smoothness", tuple(names.values()), lambda row: (_number(row[name]) for name in names))
+    robot = run.manifest["configuration"]["robot"]
+    jump = "jump: from one action to the next across a boundary, step: within a chunk."
+    if live(run):
+        note = f"Jerk (root mean square) of {robot}, in the actions' unit and s. {jump}"
+        return replace(table, notes=(_convention(run), note))
+    note = (
+        f"Tracking error and jerk (root mean squares) of {robot}, in the target's standard deviation and s; ideal: "
+        f"asked in every tick and answered at once. {jump}"
+    )
+    return replace(table, notes=(_convention(run), note, _EMULATED))
+
+
 def chunk_tables(run: Run) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
-    return {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
+    found = {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
+    found |= {"loop": loop_table(run)} if live(run) else {}
+    smooth = any(row.get("jerk_rms") is not None for row in rows_of(run))
+    return found | ({"smoothness": smoothness_table(run)} if smooth else {})
 
 
 def delay_table(run: Run) -> TextTable:
-    """Lay out the realised delays of each source."""
+    """Lay out the realised delays of each source, live of each mode beside the d that it is ready for."""
     rows = []
     for place, (name, group) in enumerate(sources_of(rows_of(run)), 1):
-        one = next((row for row in group if not row["mode"].startswith("streamed")), group[0])
-        delays = (one[f"delay_ticks_{part}"] for part in ("mean", "p99", "max"))
-        rows.append(
-            (
-                str(place),
-                name,
-                str(one["requests"]),
-                number(one["latency_s"] * 1e3),
-                number(one["latency_s_p99"] * 1e3),
-                *map(_number, delays),
-            )
-        )
-    header = ("L", "latency", "requests", "ms", "p99", "d", "p99", "max")
-    return TextTable(f"Delays, d = {_rounding(run)} of L over Delta t", header, rows, 2, notes=(_convention(run),))
+        shared = next((row for row in group if not row["mode"].startswith("streamed")), group[0])
+        for one in group if live(run) else [shared]:
+            delays = (_number(one[f"delay_ticks_{part}"]) for part in ("mean", "p99", "max"))
+            latency = (number(one[part] * 1e3) for part in ("latency_s", "latency_s_p99"))
+            told = (_number(one["delay_assumed_ticks"]), _percent(one["p_delay_above"])) if live(run) else ()
+            who = (one["mode"],) if live(run) else (name, str(one["requests"]))
+            rows.append((str(place), *who, *latency, *delays, *told))
+    left, more = (("L", "mode"), ("assumed", "above, %")) if live(run) else (("L", "latency", "requests"), ())
+    header = (*left, "ms", "p99", "d", "p99", "max", *more)
+    title = f"Delays, d = {_rounding(run)} of L over Delta t"
+    return TextTable(title, header, rows, 2, notes=(_convention(run),))
 
 
 def chunk_csv(run: Run) -> dict[str, CsvTable]:
@@ -82,11 +135,14 @@ def chunk_csv(run: Run) -> dict[str, CsvTable]:
 
 def chunk_json(run: Run) -> dict[str, Any]:
     """Return the object that ``--json`` prints."""
-    return frame(run, [present(ChunkCell(**row, emulated=True)) for row in rows_of(run)], [])
+    origins = run.origins
+    return frame(
+        run, [present(ChunkCell(**row, emulated=origins.of(row["cell"]).emulated)) for row in rows_of(run)], []
+    )
 
 
 def chunk_sentences(run: Run) -> list[str]:
-    """Return what calibration costs over the oracle, and what the other rules do, a sentence a source."""
+    """Return what calibration costs over the oracle, what the other rules do, and how a control loop kept time."""
     said = []
     epsilon = float(run.manifest["configuration"]["epsilon"])
     for name, rows in sources_of(rows_of(run)):
@@ -98,6 +154,12 @@ def chunk_sentences(run: Run) -> list[str]:
         ]
         if parts:
             said.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(parts)} ticks.")
+        if live(run):
+            least, worst = min(row["agreement"] for row in rows), max(row["jitter_s_p99"] for row in rows)
+            said.append(
+                f"Control loop @ {name}: {least:.2%} of the ticks and more are as virtual time has them; "
+                f"p99 of the jitter {number(worst * 1e3)} ms at most."
+            )
         slower = max((row["slow_down"] or 1 for row in rows if row["mode"].startswith("queue")), default=1)
         if slower > 1:
             said.append(f"@ {name} no trigger of queue is enough: actions would have to be {slower:.2f} times slower.")
@@ -110,14 +172,23 @@ def _table(run: Run, title: str, header: tuple[str, ...], cells: Any) -> TextTab
     rules = []
     found = sources_of(rows_of(run))
     several = len(found) > 1
+    ruled = any(row["rule"] != "given" for row in rows_of(run))
+    named = ("mode", "rule") if ruled or not live(run) else ("mode",)
     for place, (_, group) in enumerate(found, 1):
         rules.append(len(rows))
-        rows += [((str(place),) * several + (row["mode"], row["rule"], *cells(row))) for row in group]
+        rows += [((str(place),) * several + (*(_named(row, name) for name in named), *cells(row))) for row in group]
     asked = run.manifest["configuration"]
     of = "" if several else f" @ {found[0][0]}" if found else ""
-    what = f"{title}{of}, H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {_rounding(run)}"
-    left = ("L",) * several + _LEFT
+    slower = f" / {asked['slow_down']:g}" if asked.get("slow_down", 1) > 1 else ""
+    what = f"{title}{of}, H = {asked['horizon']}, {asked['control_hz']:g}{slower} Hz, d by {_rounding(run)}"
+    left = ("L",) * several + named
     return TextTable(what, (*left, *header), rows, len(left), frozenset(rules[1:]), tuple(_notes(run)))
+
+
+def _named(row: Row, column: str) -> str:
+    """Return a row's mode or rule, and by how much the rule slowed actions down."""
+    slower = row.get("slower") or 1
+    return f"{row[column]}, {slower:.3g}x slower" if column == "rule" and slower > 1 else str(row[column])
 
 
 def _stalls(row: Row) -> Iterator[str]:
@@ -138,6 +209,16 @@ def _actions(row: Row) -> Iterator[str]:
     yield _number(row["control_rate_hz"])
     yield _percent(row["thrown_away_share"])
     yield _number(row["jump_mean"])
+
+
+def _loop(row: Row) -> Iterator[str]:
+    yield _percent(row["agreement"])
+    for name in ("jitter_s_p50", "jitter_s_p99", "jitter_s_max"):
+        yield number(row[name] * 1e3)
+    yield str(row["late_ticks"])
+    for name in ("blocked_s_p99", "blocked_s_max"):
+        yield number(row[name] * 1e3)
+    yield number(row["bytes_up_per_s"] / 1e6)
 
 
 def _interval(row: Row) -> str:
@@ -181,10 +262,14 @@ def _notes(run: Run) -> Iterator[str]:
         yield "Where no trigger is enough, actions have to be slower by beta (chunks.csv: slow_down)."
     if any(row["rule"] != "given" for row in rows):
         asked = run.manifest["configuration"]
+        seen = "an oracle that knows the distribution. All others saw the same cycles before."
         yield (
             f"Rules choose m of queue: calibrated for P(stall) <= {asked['epsilon']:.2%}, tracked from there, "
-            "lerobot's maximum, the mean, an oracle that knows the distribution. All others saw the same cycles before."
+            f"lerobot's maximum, the mean, {'each after the same warm-up.' if live(run) else seen}"
         )
-    yield Note(
-        "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
-    )
+    if live(run):
+        sources = [name for name, _ in sources_of(rows)]
+        if len(sources) > 1:
+            yield "; ".join(f"{place}: {name}" for place, name in enumerate(sources, 1)) + "."
+        return
+    yield _EMULATED

@@ -27,7 +27,9 @@ class RequestsCell:
     ]
     answer: Annotated[Literal["tokens", "actions"], about("What answers are made of.")]
     profile: str | None
-    emulated: Annotated[bool, about("True where a profile was replayed: such numbers are not measured.")]
+    emulated: Annotated[
+        bool, about("True where a profile was replayed, or latencies were given: such numbers are not measured.")
+    ]
     dummy: Annotated[
         bool | None, about("Whether the model's weights are dummies, random: its times are real, its words are not.")
     ] = None

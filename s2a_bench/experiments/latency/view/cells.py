@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from s2a_bench.provenance import UNKNOWN
+from s2a_bench.provenance import UNKNOWN, Provenance
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
@@ -47,6 +47,8 @@ class Cell:
     errors: int
     stages: Mapping[str, str]
     """Stage -> group of the run, in the order of the path."""
+    emulated: bool
+    """Whether the engine's times come from a profile, or from latencies that were given."""
 
     @property
     def n(self) -> int:
@@ -66,11 +68,6 @@ class Cell:
     def is_compared_with(self, base: Cell) -> bool:
         """Whether the transport declares that its cells are divided by those of another."""
         return base.pipeline in declared(self.pipeline).compared_with
-
-    @property
-    def emulated(self) -> bool:
-        """Return whether a replayed profile answered."""
-        return self.about["engine"] == "replay"
 
     def values_ms(self, metric: str) -> Floats:
         """Return the values of a stage, or of another column less ``_ns``, in ms."""
@@ -162,7 +159,7 @@ def with_launch(rows: pd.DataFrame) -> pd.DataFrame:
 def _cells(run: Run, samples: pd.DataFrame) -> list[Cell]:
     tokens, stages = run.tokens, run.stages
     cells = [
-        _cell(str(name), samples[samples["cell"] == name], tokens[tokens["cell"] == name], stages)
+        _cell(str(name), samples[samples["cell"] == name], tokens[tokens["cell"] == name], stages, run.origins.of(name))
         for name in samples["cell"].unique()
     ]
     return sorted(cells, key=_place)
@@ -214,6 +211,9 @@ def engine_note(run: Run, cells: list[Cell]) -> Note:
     notes = []
     if "echo" in engines:
         notes.append(Note("echo engine", ECHO))
+        origins = [run.origins.of(cell.name) for cell in cells if cell.about["engine"] == "echo"]
+        drawn = dict.fromkeys(origin.profile for origin in origins if origin.emulated)
+        notes += [Note(f"EMULATED: {latencies}", EMULATED) for latencies in drawn]
     if "replay" in engines:
         notes.append(_emulated(_replayed(run, cells)))
     answered = [cell.name for cell in cells if cell.about["engine"] != "replay"]
@@ -232,9 +232,9 @@ def stand_ins(runs: Split) -> list[str]:
 def _replayed(run: Run, cells: list[Cell]) -> dict[str, Any]:
     """Return what is known of the profile that was played: by a server of ours, or by one that told in its answers."""
     model: dict[str, Any] = run.manifest.get("model") or {}
-    if model.get("emulated"):
+    if model.get("engine") == "replay":
         return model
-    told = next((origin for cell in cells if (origin := run.origins.of(cell.name)).emulated), None)
+    told = next((origin for cell in cells if (origin := run.origins.of(cell.name)).engine == "replay"), None)
     return {"profile": told.profile, "dummy": told.weights == "dummy"} if told else model
 
 
@@ -259,7 +259,9 @@ def stages_present(cells: list[Cell]) -> list[str]:
     return [stage for stage in stages if any(cell.values_ms(stage).size for cell in cells)]
 
 
-def _cell(name: str, samples: pd.DataFrame, tokens: pd.DataFrame, stages: Mapping[str, str]) -> Cell:
+def _cell(
+    name: str, samples: pd.DataFrame, tokens: pd.DataFrame, stages: Mapping[str, str], origin: Provenance
+) -> Cell:
     """Sort the samples of one cell into those that count and those that are only counted."""
     about = {
         key: str(samples[key].iloc[-1])  # who answers may be known from the first answer on
@@ -269,7 +271,8 @@ def _cell(name: str, samples: pd.DataFrame, tokens: pd.DataFrame, stages: Mappin
     failed = samples["error"] != ""
     good = samples[~samples["warmup"] & ~failed]
     errors = int((failed & ~samples["warmup"]).sum())
-    return Cell(name, about, good, tokens, int(samples["warmup"].sum()), errors, stages)
+    emulated = origin.emulated or about["engine"] == "replay"  # which older folders do not tell otherwise
+    return Cell(name, about, good, tokens, int(samples["warmup"].sum()), errors, stages, emulated)
 
 
 def _place(cell: Cell) -> tuple[float, str, int, str]:

@@ -15,6 +15,7 @@ from uuid import uuid4
 from s2a_bench.facts import (
     CACHE_N,
     END_N,
+    LATENCY_DRAWN_MS,
     LLAMA,
     PREDICTED_MS,
     PREDICTED_N,
@@ -157,7 +158,7 @@ class Own(OpenAI):
     """Our own server: it wants the request's id, and sends empty tokens, token ids and its marks."""
 
     name = OWN
-    tells = LLAMA  # our engines behind it
+    tells = (*LLAMA, LATENCY_DRAWN_MS)  # our engines behind it
     payloads = (*OpenAI.payloads, "raw")
 
     def _extra(self, request: Request) -> dict[str, Any]:

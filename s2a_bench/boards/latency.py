@@ -1,0 +1,167 @@
+"""Latencies as people write them: a number of ms, a family of random ones, a CSV file.
+
+A family is one of `boards.gaps.FAMILIES`, written ``FAMILY:mean_ms=80,key=value,...``; ``bimodal`` is `markov` whose
+pauses come alone. Successive values of a family that remembers (markov, bursty) follow one another. A CSV file has
+the columns ``observation_ns`` and ``received_ns``, or one of ``latency_ns``, ``latency_ms`` and ``latency_s``; others
+are passed over.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, cycle, repeat
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from s2a_bench.boards.gaps import FAMILIES, Constant, Gaps, from_table
+from s2a_bench.errors import UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Ints: TypeAlias = NDArray[np.int64]
+
+EXAMPLE: Final = "lognormal:mean_ms=80,cv=0.5"
+UNITS_NS: Final = {"latency_ns": 1, "latency_ms": 1_000_000, "latency_s": 1_000_000_000}
+"""Column -> ns in its unit."""
+LONGEST_MS: Final = 3_600_000.0
+SEED: Final = 0
+"""Of every sequence of latencies, so that whoever knows what was written knows all of them."""
+STRETCH: Final = 65_536
+"""Latencies that are drawn together."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Latencies:
+    """Latencies to be drawn from ``gaps``, or ``recorded_ns``, whichever there is."""
+
+    gaps: Gaps | None = None
+    recorded_ns: Ints | None = None
+
+
+def read_latency(written: str) -> Latencies | None:
+    """Read latencies as people write them, None for what it does not know; raises UsageError naming the field."""
+    if (constant := _number(written)) is not None:
+        if not 0 <= constant <= LONGEST_MS:
+            raise UsageError(f"`latency`: {written} should be between 0 and {LONGEST_MS:g} ms")
+        return Latencies(Constant(constant / 1e3) if constant else _Nothing())
+    if ":" in written and "/" not in written:
+        return Latencies(family(written))
+    if written.endswith(".csv"):
+        return Latencies(recorded_ns=read_delays(Path(written)))
+    return None
+
+
+def draw_ns(gaps: Gaps, rng: np.random.Generator, count: int) -> Ints:
+    """Draw successive latencies of shape (count,), in ns."""
+    return whole_ns(gaps.sample(rng, count, 1)[:, 0])
+
+
+def sequence_ns(latencies: Latencies) -> Iterator[int]:
+    """Return an iterator over the latencies of requests 0, 1, ... in ns, without end and each time the same.
+
+    A recording is played in its order and starts over at its end. A family that remembers does so for `STRETCH`
+    latencies, and starts afresh then.
+    """
+    import numpy as np
+
+    if latencies.recorded_ns is not None:
+        return cycle(latencies.recorded_ns.tolist())
+    if latencies.gaps is None:
+        raise TypeError("no latencies")
+    rng = np.random.default_rng(SEED)
+    stretches = (draw_ns(gaps, rng, STRETCH).tolist() for gaps in repeat(latencies.gaps))
+    return chain(next(stretches), chain.from_iterable(stretches))  # the first is drawn before anybody waits for it
+
+
+def whole_ns(latency_s: NDArray[np.float64]) -> Ints:
+    """Return latencies in s as whole ns."""
+    import numpy as np
+
+    latency_ns: Ints = np.rint(latency_s * 1e9).astype(np.int64)
+    return latency_ns
+
+
+def family(written: str) -> Gaps:
+    """Read ``FAMILY:mean_ms=80,key=value,...``; raises UsageError naming the field."""
+    name, _, rest = written.partition(":")
+    table: dict[str, str | int | float] = {"family": "markov" if name == "bimodal" else name}
+    for part in filter(None, rest.split(",")):
+        key, equals, value = part.partition("=")
+        number = _number(value)
+        if not equals or number is None:
+            raise UsageError(f"`latency`: {written}: '{part}' should be key=number, as in {EXAMPLE}")
+        table[key.strip()] = int(number) if key == "burst_tokens" and number.is_integer() else number
+    mean_ms = table.pop("mean_ms", None)
+    if name not in {*FAMILIES, "bimodal"}:
+        raise UsageError(f"`latency`: '{name}' is none of the families {', '.join(FAMILIES)}, bimodal")
+    if not isinstance(mean_ms, float) or not 0 < mean_ms <= LONGEST_MS:
+        raise UsageError(f"`latency`: {written}: mean_ms should be above 0 and at most {LONGEST_MS:g}, as in {EXAMPLE}")
+    if name == "bimodal" and isinstance(share := table.get("pause_share"), float) and 0 <= share < 1:
+        table["pause_tokens"] = 1 / (1 - share)
+    try:
+        return from_table(table, mean_ms / 1e3)
+    except UsageError as error:
+        raise UsageError(f"`latency`: {written}: {error}") from error
+
+
+def read_delays(path: Path) -> Ints:
+    """Return the latencies of a CSV file in its order, in ns; raises UsageError naming file, line and column."""
+    import numpy as np
+
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file)
+            latency_of = _reader(reader.fieldnames or (), path)
+            found = [_latency(row, latency_of, f"`latency`: {path}, line {reader.line_num}") for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UsageError(f"`latency`: cannot read {path}: {error}") from error
+    if not found:
+        raise UsageError(f"`latency`: {path} has no rows")
+    return np.array(found, np.int64)
+
+
+def _reader(names: Sequence[str], path: Path) -> Callable[[Mapping[str, str]], float]:
+    """Return what makes a latency of a row."""
+    for column, unit_ns in UNITS_NS.items():
+        if column in names:
+            return lambda row: float(row[column]) * unit_ns
+    if {"observation_ns", "received_ns"} <= {*names}:
+        return lambda row: int(row["received_ns"]) - int(row["observation_ns"])
+    raise UsageError(
+        f"`latency`: {path} has the columns {', '.join(names) or 'none'}; "
+        f"it needs observation_ns and received_ns, or one of {', '.join(UNITS_NS)}"
+    )
+
+
+def _latency(row: Mapping[str, str], latency_of: Callable[[Mapping[str, str]], float], where: str) -> int:
+    try:
+        latency_ns = latency_of(row)
+    except (TypeError, ValueError):
+        raise UsageError(f"{where}: the latency is no number") from None
+    if not (math.isfinite(latency_ns) and 0 <= latency_ns <= LONGEST_MS * 1e6):
+        raise UsageError(f"{where}: a latency of {latency_ns:g} ns should be between 0 and an hour")
+    return round(latency_ns)
+
+
+class _Nothing:
+    """Answers at once: a constant family has to have a mean above 0."""
+
+    mean_s = 0.0
+
+    def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> NDArray[np.float64]:  # noqa: ARG002
+        """Return zeros."""
+        import numpy as np
+
+        return np.zeros((tokens, plans))
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None

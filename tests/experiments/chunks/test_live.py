@@ -1,0 +1,223 @@
+"""Chunks live: what the loop did is what virtual time says of the same latencies, over transports that labs use."""
+
+import json
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from s2a_bench.errors import RequestFailed, RobotError, UsageError
+from s2a_bench.experiments.chunks.config import ChunksConfig
+from s2a_bench.experiments.chunks.run import run_chunks
+from s2a_bench.experiments.chunks.view import show
+from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.chunk import chunk
+from s2a_bench.library import Run
+from s2a_bench.progress import NullProgress
+from s2a_bench.store.run import read_run
+from s2a_bench.types import Action, Request, Token, Vector
+
+ECHO = {"name": "echo"}
+
+
+def act(tmp_path: Path, *, transport: str = "loopback", **asked: object) -> pd.DataFrame:
+    """Act for a moment and return a row a mode."""
+    requests = {"transports": transport, "engine": ECHO, "size": "64x48", "warmup": 1}
+    config = ChunksConfig(**{"live": True, "seconds": 1.5, "requests": requests, **asked})
+    folder = run_chunks(config, tmp_path, NullProgress())
+    return pd.read_csv(folder / "chunks.csv")
+
+
+def folder_of(tmp_path: Path) -> Path:
+    """Return the one run folder."""
+    return next(path for path in tmp_path.iterdir() if path.is_dir())
+
+
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_every_mode_acts_as_computed(tmp_path: Path, rounding: str) -> None:
+    modes = "sync,queue?trigger=4,replace?execute=5,aggregate?trigger=4,streamed?trigger=3"
+    rows = act(tmp_path, modes=modes, rounding=rounding)
+    assert len(rows) == 5
+    assert (rows["agreement"] >= 0.99).all()
+    assert (rows["latency_s"] > 0).all()
+    assert (rows["jitter_s_max"] >= rows["jitter_s_p50"]).all()
+    assert (rows["blocked_s_max"] > 0).all()
+    assert rows.loc[rows["mode"].str.startswith("sync"), "jump_max"].item() == 0
+    ticks = pd.read_csv(folder_of(tmp_path) / "chunk_ticks.csv")
+    assert (ticks["late_ns"] >= 0).all()
+
+
+def test_requests_are_kept_as_samples_with_their_marks_and_ids(tmp_path: Path) -> None:
+    rows = act(tmp_path, modes="replace?execute=8")
+    run = read_run(folder_of(tmp_path))
+    samples, requests = run.samples, pd.read_csv(run.path / "chunk_requests.csv")
+    assert samples["warmup"].sum() == 1
+    assert len(samples) - 1 >= rows["requests"].item()
+    assert set(requests["request_id"]) <= set(samples["request_id"])
+    assert set(rows["cell"]) <= set(run.origins.cells)
+
+
+def test_several_requests_are_under_way_over_clients_of_their_own(tmp_path: Path) -> None:
+    act(tmp_path, modes="replace?execute=2&under_way=many")
+    assert read_run(folder_of(tmp_path)).samples["warmup"].sum() == 4  # of each client
+
+
+def test_a_live_run_is_shown_and_its_latencies_are_a_source(tmp_path: Path) -> None:
+    act(tmp_path, modes="queue?trigger=3,sync")
+    folder = folder_of(tmp_path)
+    shown = show(read_run(folder))
+    assert "loop" in shown.tables
+    assert {"lanes", "reactions"} <= set(shown.figures)
+    assert not any("EMULATED" in str(note) for note in shown.notes)
+    assert shown.json()["cells"][0]["emulated"] is False
+    assert "as virtual time has them" in " ".join(shown.sentences)
+    assert Run(folder).table("loop").shape[0] == 2
+    again = ChunksConfig(latency=f"{folder}#loopback", modes="queue?trigger=3", rules="")
+    assert again.sources[0].recorded_ns is not None
+
+
+def test_delays_of_a_live_run_are_exported(tmp_path: Path) -> None:
+    act(tmp_path, modes="queue", export_delays=tmp_path / "delays.csv")
+    delays = pd.read_csv(tmp_path / "delays.csv")
+    assert len(delays) >= 2
+    assert (delays["received_ns"] > delays["observation_ns"]).all()
+    assert (delays["rounding"] == "floor").all()
+
+
+def test_rules_choose_triggers_as_they_go(tmp_path: Path) -> None:
+    requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
+    asked = {"rules": "calibrated,tracked,maximum,mean", "epsilon": 0.05, "latency": "lognormal:mean_ms=50,cv=.5"}
+    rows = act(tmp_path, modes="queue,sync", requests=requests, seconds=2.5, **asked)
+    assert rows["rule"].value_counts().to_dict() == {"given": 2, "calibrated": 1, "tracked": 1, "maximum": 1, "mean": 1}
+    assert (rows["agreement"] >= 0.99).all()
+    trigger = rows.set_index("rule")["trigger"]
+    assert 0 < trigger["mean"] < trigger["maximum"]
+    assert trigger["calibrated"] > trigger["mean"]
+    shown = show(read_run(folder_of(tmp_path)))
+    assert [row[:2] for row in shown.tables["chunks"].rows][:3] == [
+        ("queue", "given"),
+        ("sync", "given"),
+        ("queue", "calibrated"),
+    ]
+
+
+def test_a_slow_server_slows_actions_down(tmp_path: Path) -> None:
+    requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
+    asked = {"rules": "calibrated", "epsilon": 0.05, "latency": "150", "slowest": 4.0, "horizon": 4}
+    rows = act(tmp_path, modes="queue", requests=requests, seconds=4, **asked).set_index("rule")
+    assert rows.loc["given", "p_stall_cycle"] == 1
+    assert rows.loc["calibrated", "slower"] > 150 / 60
+    assert rows.loc["calibrated", "delta_t_s"] == pytest.approx(0.02 * rows.loc["calibrated", "slower"], rel=1e-3)
+    assert rows.loc["calibrated", "stall_share"] < rows.loc["given", "stall_share"]
+    assert rows.loc["calibrated", "agreement"] >= 0.99
+
+
+moved: list[float] = []
+
+
+def move(action: Vector) -> None:
+    """Stand in for somebody's robot."""
+    moved.append(float(action[0]))
+
+
+def drop(action: Vector) -> None:
+    """Stand in for a robot that breaks."""
+    raise ValueError(f"no grip on {action.size}")
+
+
+def test_a_plant_moves_and_the_policy_is_told_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[float, ...]] = []
+
+    def chunk_of(config: EngineConfig, request: Request) -> Iterator[Action]:
+        told.append(request.state)
+        return chunk(config, request)
+
+    monkeypatch.setattr("s2a_bench.inference.echo.chunk", chunk_of)
+    rows = act(tmp_path, modes="replace?execute=8")
+    assert rows["jerk_rms"].item() > 0
+    assert rows["boundary_jump_p99"].item() >= rows["boundary_jump_mean"].item()
+    assert rows["action_step_mean"].item() > 0
+    assert rows["tracking_rms"].isna().item()  # nobody knows what the policy follows
+    table = show(read_run(folder_of(tmp_path))).tables["smoothness"]
+    assert table.header == ("mode", "jerk", "jump", "p99", "step")
+    assert not any("EMULATED" in note for note in table.notes)
+    assert {len(state) for state in told[2:]} == {7}
+    assert len(set(told[2:])) > 1
+
+
+def test_without_jumps_in_timing_echos_chunks_are_one_trajectory(tmp_path: Path) -> None:
+    rows = act(tmp_path, modes="replace?execute=8")
+    assert rows["jump_max"].item() == 0
+    assert rows["boundary_jump_mean"].item() == pytest.approx(rows["action_step_mean"].item(), rel=0.2)
+
+
+def test_a_function_is_called_with_every_action(tmp_path: Path) -> None:
+    moved.clear()
+    rows = act(tmp_path, modes="queue?trigger=4", robot=f"call?function={__name__}:move")
+    assert len(moved) >= rows["ticks"].item() - rows["stall_ticks"].item()
+    assert rows["jerk_rms"].isna().item()
+    assert read_run(folder_of(tmp_path)).manifest["robot"]["function"].endswith(":move")
+
+
+def test_a_robot_that_breaks_ends_the_run_with_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="drop: ValueError: no grip on 7"):
+        act(tmp_path, modes="sync", robot=f"call?function={__name__}:drop")
+    assert read_run(folder_of(tmp_path)).manifest["state"] == "failed"
+
+
+def test_another_state_than_the_robot_has_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="`state`: `robot` plant has 7 numbers, not 3"):
+        act(tmp_path, modes="sync", requests={"transports": "loopback", "engine": ECHO, "size": "64x48", "state": 3})
+
+
+@pytest.mark.parametrize("transport", ["websocket/openpi", "ros/topic"])
+def test_over_what_labs_use(tmp_path: Path, transport: str) -> None:
+    rows = act(tmp_path, transport=transport, modes="queue?trigger=4,replace?execute=8")
+    assert (rows["agreement"] >= 0.99).all()
+    assert (rows["bytes_up_per_s"] > 0).all()
+
+
+def test_a_chunk_of_another_length_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *asked: islice(chunk(*asked), 5))
+    with pytest.raises(UsageError, match=r"`horizon`: loopback answers with chunks of 5 actions, not 16"):
+        act(tmp_path, modes="sync")
+
+
+def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *_: [Token(0, "go")])
+    with pytest.raises(RequestFailed, match="chunks of actions"):
+        act(tmp_path, modes="sync")
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"live": True, "rules": "mean,oracle"}, "`rules`: nobody is an oracle live"),
+        (
+            {"live": True, "rules": "tracked"},
+            "`warmup`: 5 requests are too few to learn from for `epsilon` 0.01; take 99",
+        ),
+        (
+            {"live": True, "seconds": 80_000, "control_hz": 1000},
+            "`seconds`: 80000 s at `control_hz` 1000 are over",
+        ),
+        ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
+        ({"requests": {"transports": "http"}}, "`transports` is for a control loop"),
+        ({"live": True, "requests": {"transports": "nothing"}}, "nothing"),
+        ({"live": True, "requests": {"engine": {"name": "llama"}}}, "echo or replay"),
+        ({"live": True, "export_delays": "delays.txt"}, "`export_delays`: delays.txt should be"),
+        ({"live": True, "export_delays": "d.csv", "requests": {"transports": "http,ros"}}, "one `transport` at a time"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(asked: dict[str, object], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        ChunksConfig(**asked)
+
+
+def test_json_has_what_is_measured(tmp_path: Path) -> None:
+    act(tmp_path, modes="sync")
+    cell = show(read_run(folder_of(tmp_path))).json()["cells"][0]
+    json.dumps(cell)
+    assert {"agreement", "jitter_s_p99", "blocked_s_max", "late_ticks", "bytes_up_per_s"} <= set(cell)

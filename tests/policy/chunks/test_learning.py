@@ -1,0 +1,76 @@
+"""A queue that learns as it goes does what `follow` says of the same latencies."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from s2a_bench.policy.chunks import Setting
+from s2a_bench.policy.chunks.learning import Learning, LearningStepper
+from s2a_bench.policy.chunks.stepping import step
+from s2a_bench.policy.chunks.trigger import Maximum, Mean, Rule, Tracked, follow
+
+SETTING = Setting(20_000_000, 16)
+
+
+def drawn(count: int, seed: int, scale: float = 80e6) -> NDArray[np.int64]:
+    rng = np.random.default_rng(seed)
+    ticks = rng.lognormal(np.log(scale), 0.5, count) // SETTING.period_ns
+    return ticks.astype(np.int64) * SETTING.period_ns
+
+
+def maximum() -> Rule:
+    return Maximum()
+
+
+def mean() -> Rule:
+    return Mean()
+
+
+def tracked() -> Rule:
+    return Tracked.begin(drawn(500, 1).tolist(), 0.05)
+
+
+@pytest.mark.parametrize("begin", [maximum, mean, tracked])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[], Rule], seed: int) -> None:
+    latency_ns = drawn(300, 100 + seed)
+    mode = Learning(begin)
+    steppers: list[LearningStepper] = []
+
+    class Watched(Learning):
+        def stepper(self, setting: Setting) -> LearningStepper:
+            steppers.append(mode.stepper(setting))
+            return steppers[-1]
+
+    cycles, _ = step(Watched(begin), latency_ns, SETTING)
+    said = follow(begin(), latency_ns, SETTING, 15)
+    assert steppers[0].triggers[: latency_ns.size] == said.trigger.tolist()
+    late = cycles.settled
+    np.testing.assert_array_equal(cycles.stall_ticks[late], said.stall_ticks[late])
+
+
+def test_a_rule_that_tracks_comes_back_after_a_slow_time() -> None:
+    calm, slow = drawn(600, 2, 40e6), drawn(600, 3, 160e6)
+    latency_ns = np.concatenate([calm, slow, calm, calm, calm])
+    stepper = Learning(lambda: Tracked.begin(calm.tolist(), 0.05)).stepper(SETTING)
+    stepper_of = {"maximum": Learning(maximum).stepper(SETTING)}
+    for each in (stepper, stepper_of["maximum"]):
+        tick = 0
+        for request, latency in enumerate(latency_ns.tolist()):
+            while not each.ask(tick):
+                each.act(tick)
+                tick += 1
+            each.arrived(request, 16, tick + latency // SETTING.period_ns)
+    assert stepper.triggers[1100] > stepper.triggers[500]
+    assert stepper.triggers[-1] < stepper.triggers[1100]
+    assert stepper_of["maximum"].triggers[-1] == max(stepper_of["maximum"].triggers)
+
+
+def test_each_robot_has_a_rule_of_its_own() -> None:
+    mode = Learning(maximum)
+    one, other = mode.stepper(SETTING), mode.stepper(SETTING)
+    assert one.ask(0)
+    one.arrived(0, 16, 9)
+    assert (one.rule.latency_ns, other.rule.latency_ns) == (9 * SETTING.period_ns, 0)

@@ -1,0 +1,91 @@
+"""Actions to Python functions, and to robots of other packages."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from types import ModuleType
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from s2a_bench.errors import RobotError, UsageError
+from s2a_bench.robots import ROBOTS, Kind, Robot, kind, open_robot
+from s2a_bench.robots.call import Call
+from s2a_bench.robots.plant import Plant
+from s2a_bench.robots.ros import Ros
+
+
+@pytest.fixture
+def arm(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = ModuleType("somebodys_arm")
+    monkeypatch.setitem(sys.modules, "somebodys_arm", module)
+    return module
+
+
+def test_the_function_gets_each_action_and_no_stall(arm: ModuleType) -> None:
+    seen: list[list[float]] = []
+    arm.move = lambda action: seen.append(action.tolist())  # type: ignore[attr-defined]
+    robot = open_robot("call?function=somebodys_arm:move", 2, 1)
+    for action in (np.array([1, 2], np.float32), None, np.array([3, 4], np.float32)):
+        robot.send(action, 0)
+    assert seen == [[1, 2], [3, 4]]
+    assert robot.state() == ()
+    assert robot.describe() == {"robot": "call", "function": "somebodys_arm:move"}
+    robot.close()
+
+
+def test_what_it_raises_ends_the_run_with_one_line_that_names_it(arm: ModuleType) -> None:
+    def move(_: object) -> None:
+        raise ValueError("joint 3\nis at its limit")
+
+    arm.move = move  # type: ignore[attr-defined]
+    robot = open_robot("call?function=somebodys_arm:move", 1, 1)
+    with pytest.raises(RobotError) as error:
+        robot.send(np.zeros(1, np.float32), 0)
+    assert str(error.value) == r"`robot`: call: somebodys_arm:move: ValueError: joint 3\nis at its limit"
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ("call", "`robot`: call: function = '' should look like module:name"),
+        ("call?function=move", "`robot`: call: function = 'move' should look like module:name"),
+        ("call?function=somebodys_arm:wave", "`robot`: call: somebodys_arm:wave does not load: AttributeError"),
+        ("call?function=no_such_arm:move", "`robot`: call: no_such_arm:move does not load: ModuleNotFoundError"),
+        (
+            "call?function=somebodys_arm:joints",
+            "`robot`: call: somebodys_arm:joints cannot be called: it is of type int",
+        ),
+    ],
+)
+def test_what_is_no_function_is_refused(arm: ModuleType, written: str, message: str) -> None:
+    arm.joints = 7  # type: ignore[attr-defined]
+    with pytest.raises(UsageError) as error:
+        open_robot(written, 1, 1)
+    assert message in str(error.value)
+
+
+def test_each_kind_has_its_name_in_the_table() -> None:
+    kinds: list[Kind] = [Plant(), Ros(), Call("arm:move")]
+    assert {each.name: type(each) for each in kinds} == {name: ROBOTS[name] for name in ROBOTS.built_in()}
+
+
+def test_a_robot_of_another_package_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch, arm: ModuleType) -> None:
+    @dataclass(frozen=True)
+    class Arm:
+        name: ClassVar[str] = "arm"
+        stiff: bool = False
+
+        def open(self, dims: int, period_ns: int) -> Robot:
+            return Plant(20.0 if self.stiff else 2.0).open(dims, period_ns)
+
+    arm.Arm = Arm  # type: ignore[attr-defined]
+    point = EntryPoint("arm", "somebodys_arm:Arm", ROBOTS.group)
+    monkeypatch.setitem(vars(ROBOTS), "_offered", {"arm": point})
+    assert kind("arm?stiff=true") == Arm(stiff=True)
+    assert open_robot("arm?stiff=true", 1, 1).describe()["frequency_hz"] == "20"
+    with pytest.raises(UsageError, match="`robot`: arm: 'soft' is no parameter; its parameters are stiff"):
+        kind("arm?soft=true")
