@@ -26,7 +26,7 @@ RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
 """What may choose the trigger of queue."""
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
-MOST_LIVE_TICKS: Final = 20_000_000
+MOST_LIVE_TICKS: Final = 5_000_000
 
 Sources = Annotated[tuple[str, ...], BeforeValidator(split)]
 """Several sources of latencies; as text with commas between them, which may hold the parameters of a family too."""
@@ -64,7 +64,9 @@ class ChunksConfig(Options):
         CALIBRATION, "further requests that the rules learn from; of a recording its first half at most", ge=1
     )
     tokens_per_action: int = option(7, "tokens of an action, where a profile answers", ge=1, le=1000)
-    shown_ticks: int = option(120, "control ticks of each row that are kept", ge=0, le=100_000)
+    shown_ticks: int = option(
+        120, "control ticks of each row that are drawn, and in virtual time kept", ge=0, le=100_000
+    )
     stability: int = option(
         33,
         "mean latencies of the diagrams of stability (first replace) and smoothness, from 0 to H ticks; 0 for none",

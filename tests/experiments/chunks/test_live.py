@@ -47,6 +47,9 @@ def test_every_mode_acts_as_computed(tmp_path: Path, rounding: str) -> None:
     assert rows.loc[rows["mode"].str.startswith("sync"), "jump_max"].item() == 0
     ticks = pd.read_csv(folder_of(tmp_path) / "chunk_ticks.csv")
     assert (ticks["late_ns"] >= 0).all()
+    first = ticks.dropna(subset="chunk").groupby("cell")["tick"].min()
+    length = ticks.groupby("cell")["tick"].max() + 1 - first
+    pd.testing.assert_series_equal(length, rows.set_index("cell")["ticks"].sort_index(), check_names=False)
 
 
 def test_requests_are_kept_as_samples_with_their_marks_and_ids(tmp_path: Path) -> None:
@@ -65,11 +68,12 @@ def test_several_requests_are_under_way_over_clients_of_their_own(tmp_path: Path
 
 
 def test_a_live_run_is_shown_and_its_latencies_are_a_source(tmp_path: Path) -> None:
-    act(tmp_path, modes="queue?trigger=3,sync")
+    act(tmp_path, modes="queue?trigger=3,sync", shown_ticks=20)
     folder = folder_of(tmp_path)
     shown = show(read_run(folder))
     assert "loop" in shown.tables
     assert {"lanes", "reactions"} <= set(shown.figures)
+    assert {len(lane.ticks) for lane in shown.lanes} == {20}
     assert not any("EMULATED" in str(note) for note in shown.notes)
     assert shown.json()["cells"][0]["emulated"] is False
     assert "as virtual time has them" in " ".join(shown.sentences)

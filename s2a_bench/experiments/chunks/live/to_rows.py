@@ -114,5 +114,6 @@ def write(config: ChunksConfig, writer: RunWriter, live: Live) -> None:
         row = replace(row, p_stall_closed=None, reaction_s_closed=None, margin_ticks=None)  # type: ignore[call-arg]
     writer.append(CHUNKS, [replace(row, **live.timing())])  # type: ignore[arg-type]
     writer.append(REACTIONS, reaction_rows(cell, latency_ns, setting, reaction_s))
-    writer.append(TICKS, tick_rows(cell.cell, ticks, config.shown_ticks, live.acted.late_ns))
-    writer.append(REQUESTS, request_rows(cell.cell, latency_ns, cycles, config.shown_ticks, live.asking.names))
+    whole = ticks.chunk.size  # what is measured is kept
+    writer.append(TICKS, tick_rows(cell.cell, ticks, whole, live.acted.late_ns))
+    writer.append(REQUESTS, request_rows(cell.cell, latency_ns, cycles, whole, live.asking.names))

@@ -51,6 +51,8 @@ class Lane:
 def lanes_of(run: Run) -> list[Lane]:
     """Return the lanes of a run: the modes as given, and the calibrated trigger."""
     ticks, requests = run.table(TICKS), run.table(REQUESTS)
+    shown = int(run.manifest["configuration"]["shown_ticks"])
+    ticks, requests = ticks[ticks["tick"] < shown], requests[requests["request_tick"] < shown]
     found = []
     for row in rows_of(run):
         mine = ticks[ticks["cell"] == row["cell"]]
