@@ -43,6 +43,8 @@ class Closed:
         cycle and the next request's wait add up. For constant waits and cycles it is U(w, w + c). Both are whole ticks,
         so that the distribution is linear between them.
         """
+        from scipy.signal import convolve
+
         if self.wait_ticks is None or self.cycle_ticks is None:
             return None
         rest = np.arange(int(self.cycle_ticks.max()) + 1)
@@ -50,7 +52,8 @@ class Closed:
         within = longer[1:] / self.cycle_ticks.sum()  # of an event k to k + 1 ticks before the next one
         least = int(self.wait_ticks.min())
         waits = np.bincount(self.wait_ticks - least) / self.wait_ticks.size
-        reached = np.concatenate(([0.0], np.cumsum(np.convolve(waits, within))))
+        together = np.maximum(convolve(waits, within), 0)  # by FFT where many ticks would take minutes otherwise
+        reached = np.concatenate(([0.0], np.cumsum(together)))
         found: Floats = np.interp(shares, reached, least + np.arange(reached.size))
         return found
 

@@ -26,6 +26,7 @@ RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
 """What may choose the trigger of queue."""
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
+FASTEST_LIVE_HZ: Final = 10_000.0
 MOST_LIVE_TICKS: Final = 5_000_000
 
 Sources = Annotated[tuple[str, ...], BeforeValidator(split)]
@@ -197,6 +198,10 @@ class ChunksConfig(Options):
         said = self.model_fields_set
         if alone := next((field for field in ("cycles", "calibration_cycles") if field in said), ""):
             raise UsageError(f"`{alone}` is for virtual time; live there are `seconds` and `warmup`")
+        if self.control_hz > FASTEST_LIVE_HZ:
+            raise UsageError(
+                f"`control_hz`: {self.control_hz:g}: live no loop of ours keeps up above {FASTEST_LIVE_HZ:g}"
+            )
         if self.seconds * self.control_hz > MOST_LIVE_TICKS:
             raise UsageError(
                 f"`seconds`: {self.seconds:g} s at `control_hz` {self.control_hz:g} are over {MOST_LIVE_TICKS:.0e} "

@@ -207,6 +207,7 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             {"live": True, "seconds": 80_000, "control_hz": 1000},
             "`seconds`: 80000 s at `control_hz` 1000 are over",
         ),
+        ({"live": True, "control_hz": 1e6}, "`control_hz`: 1e[+]06: live no loop of ours keeps up above 10000"),
         ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
         ({"requests": {"transports": "http"}}, "`transports` is for a control loop"),
         ({"live": True, "requests": {"transports": "nothing"}}, "nothing"),

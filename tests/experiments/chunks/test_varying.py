@@ -34,6 +34,15 @@ def test_its_quantiles_have_the_mean_of_the_closed_form(pairs: list[tuple[int, i
     assert found.mean() == pytest.approx(mean_reaction_s(waits, cycles), rel=1e-3)
 
 
+def test_hundreds_of_thousands_of_ticks_take_no_minutes() -> None:
+    rng = np.random.default_rng(4)
+    waits, cycles = rng.integers(0, 300_000, 500), rng.integers(1, 600_000, 500)
+    found = Closed(0.0, waits, cycles).reaction_ticks((np.arange(2000) + 0.5) / 2000)
+    assert found is not None
+    assert (np.diff(found) >= 0).all()
+    assert found.mean() == pytest.approx(mean_reaction_s(waits, cycles), rel=1e-3)
+
+
 @pytest.mark.parametrize("written", ["sync", "queue?trigger=6", "aggregate?trigger=5", "streamed?trigger=4&gap_s=0.01"])
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
 def test_simulated_reactions_have_the_quantiles_of_the_closed_form(written: str, rounding: str) -> None:
