@@ -34,7 +34,7 @@ from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.requests import FrameRow
 from s2a_bench.store.run import RunWriter
 from s2a_bench.trace import mark_cost_ns
-from s2a_bench.transport import open_client
+from s2a_bench.transport import Client, open_client
 
 GIVE_UP_AFTER = 5
 """Failures of one cell in a row, after which the run ends."""
@@ -247,7 +247,8 @@ def _sessions(
     for cell, place in product(config.pipelines, range(task.clients)):
         with servers.death_explained(cell):
             client = open_client(servers.wiring(cell), servers.alive(cell))
-        clients.callback(client.close)
+        made: list[Session] = []
+        clients.callback(_close_idle, client, made)
         feed: Feed
         if camera is not None:
             random = Random(config.seed)  # noqa: S311 - phases, not secrets
@@ -258,7 +259,14 @@ def _sessions(
             preencoded = cell.payload == "jpeg-preencoded"
             feed = RequestFeed(source, preencoded=preencoded, cameras=config.cameras, size=config.resize)
         name = task.in_process if cell.transport.in_process and task.in_process else cell.name
-        yield Session(replace(cell, name=name), client, feed, config, recorder, sampler, servers.origin(cell))
+        made.append(Session(replace(cell, name=name), client, feed, config, recorder, sampler, servers.origin(cell)))
+        yield made[0]
+
+
+def _close_idle(client: Client, sessions: Sequence[Session]) -> None:
+    """Close a client, unless a thread still waits for an answer of its: that ends with the process."""
+    if not any(session.busy for session in sessions):
+        client.close()
 
 
 def run_blocks(

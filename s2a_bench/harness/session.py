@@ -114,11 +114,20 @@ class Session:
         self._sampler = sampler or Sampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
         self._stages = {*config.stages}
+        self.busy = False
+        """Whether a request is under way, so that nobody else may touch the client."""
         self.prompt_n = 0
         """Tokens of the last prompt, pictures included; 0 where nobody says."""
 
     def measure(self, place: Place, asked: Asked = PLAIN) -> Measured:
         """Make one request; a failure becomes a row with its error, and says whether it is the run's end."""
+        self.busy = True
+        try:
+            return self._measure(place, asked)
+        finally:
+            self.busy = False
+
+    def _measure(self, place: Place, asked: Asked) -> Measured:
         self.feed.get_ready()
         request_id = f"{self.cell.name}-{place.block}"
         seen: list[tuple[Piece, int]] = []

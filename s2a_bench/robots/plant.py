@@ -123,9 +123,9 @@ class PlantRobot:
         """Return what was executed, shape (K, D): a row a tick from the first action on, held ones included."""
         return np.array(self._sent).reshape(-1, self._dims)
 
-    def motion(self) -> Motion | None:
-        """Return how it moved, from the first action on; None before that."""
-        return self._plant.respond(self.actions, self._period_s) if self._sent else None
+    def motion(self, most: int | None = None) -> Motion | None:
+        """Return how it moved, from the first action on for ``most`` ticks if told; None before that."""
+        return self._plant.respond(self.actions[:most], self._period_s) if self._sent else None
 
     def state(self) -> tuple[float, ...]:
         """Return the joints' positions."""

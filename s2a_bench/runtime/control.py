@@ -3,7 +3,8 @@
     loop = ControlLoop(mode("queue?trigger=6"), setting, robot.send, ask, ticks=1000)
     loop.start()                         # ask(request, tick) is called from the loop, and should only pass it on
     loop.arrived(request, actions, now_ns())    # from any thread, with what has come of that request's chunk so far
-    acted = loop.join()
+    loop.join()
+    acted = loop.acted()
 
 Ticks begin at fixed times. What a tick does follows from what had arrived by its time, not by when the thread woke up:
 asking sees what had arrived when the tick began; an action leaves at the end of its tick where d is the floor of
@@ -63,11 +64,6 @@ class Acted:
         missing = [request for request, arrivals in enumerate(self.arrival_ns) if arrivals[-1] < 0]
         return missing[0] if missing else len(self.arrival_ns)
 
-    @property
-    def ticks(self) -> int:
-        """Return how many ticks are decided by whole answers: all before the next request left."""
-        return int(self.asked_tick[self.whole]) if self.whole < self.asked_tick.size else self.chunk.size
-
 
 class ControlLoop:
     """One robot that acts on chunks for so many control ticks."""
@@ -84,6 +80,8 @@ class ControlLoop:
         self._clock = clock or SystemClock()
         self._inbox: deque[tuple[int, int, int]] = deque()
         self._actions: dict[int, Sequence[Vector]] = {}
+        self._executing = 0
+        """The request whose chunk is executed; older ones are not needed any more."""
         self._arrivals: dict[int, list[int]] = {}
         self._asked: list[int] = []
         self._chunk: list[int] = []
@@ -104,20 +102,26 @@ class ControlLoop:
         """Let it end before its time."""
         self._stopped = True
 
-    def join(self, timeout_s: float | None = None) -> Acted | None:
-        """Wait for its end and return what it did, None where that has not come by then; raises what it raised."""
+    def join(self, timeout_s: float | None = None) -> bool:
+        """Wait for its end, and return whether it has come by then; raises what the loop raised."""
         self._thread.join(timeout_s)
         if self._thread.is_alive():
-            return None
+            return False
         if self._failure is not None:
             raise self._failure
-        return self.acted()
+        return True
 
     def arrived(self, request: int, actions: Sequence[Vector], at_ns: int) -> None:
-        """Tell that a request's chunk has come as far as ``actions``, of shape (D,) each, at a time of its clock."""
+        """Tell that a request's chunk has come as far as ``actions``, of shape (D,) each, at a time of its clock.
+
+        What has been told before is passed over.
+        """
         arrivals = self._arrivals.setdefault(request, [])
+        if len(actions) <= len(arrivals):
+            return
         arrivals += [at_ns] * (len(actions) - len(arrivals))
-        self._actions[request] = actions
+        if request >= self._executing:
+            self._actions[request] = actions
         self._inbox.append((at_ns, request, len(actions)))
 
     def run(self) -> None:
@@ -143,7 +147,7 @@ class ControlLoop:
             self._busy.append(self._clock.now_ns() - woke_ns)
 
     def acted(self) -> Acted:
-        """Return what it has done."""
+        """Return what it has done, once nobody calls `arrived` any more."""
         import numpy as np
 
         asked, horizon = np.array(self._asked, np.int64), self._setting.horizon
@@ -197,6 +201,9 @@ class ControlLoop:
         value = None
         if action is not None:
             value = self._blended.popleft() if self._weight < 1 else self._actions[action.request][action.index]
+            while self._executing < action.request:
+                self._actions.pop(self._executing, None)
+                self._executing += 1
         self._send(value, due_ns)
         self._late.append(self._clock.now_ns() - due_ns)
         self._chunk.append(-1 if action is None else action.request)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -26,8 +27,10 @@ RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
 """What may choose the trigger of queue."""
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
+VIRTUAL: Final = ("cycles", "calibration_cycles", "stability", "tokens_per_action")
+"""Options that live runs do not have."""
 FASTEST_LIVE_HZ: Final = 10_000.0
-MOST_LIVE_TICKS: Final = 5_000_000
+MOST_LIVE_TICKS: Final = 1_000_000
 
 Sources = Annotated[tuple[str, ...], BeforeValidator(split)]
 """Several sources of latencies; as text with commas between them, which may hold the parameters of a family too."""
@@ -49,7 +52,7 @@ class ChunksConfig(Options):
     slowest: float = option(
         1.0, "so many times slower calibrated and oracle may make actions where no trigger is enough", ge=1, le=1000
     )
-    control_hz: float = option(50.0, "control ticks a second", gt=0, le=1e6, allow_inf_nan=False)
+    control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=1e6, allow_inf_nan=False)
     horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096)
     rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
     rules: Annotated[Names, one_of(lambda: RULES)] = option(
@@ -177,7 +180,7 @@ class ChunksConfig(Options):
         if self.live:
             self._check_live()
             return
-        if alone := next(self.requests.given(), ""):
+        if alone := next(chain(self.requests.given(), {"seconds"} & self.model_fields_set), ""):
             raise UsageError(f"`{alone}` is for a control loop that runs; it needs `live`")
         self._check_export()
         _ = self.plant
@@ -196,8 +199,22 @@ class ChunksConfig(Options):
         if self.robot:
             kind(self.robot)
         said = self.model_fields_set
-        if alone := next((field for field in ("cycles", "calibration_cycles") if field in said), ""):
+        if alone := next((field for field in VIRTUAL if field in said), ""):
             raise UsageError(f"`{alone}` is for virtual time; live there are `seconds` and `warmup`")
+        self._check_ticks()
+        self._check_learning()
+        if self.known and len(self.latency) > 1:
+            raise UsageError(f"`latency`: live a server keeps one, not {len(self.latency)}; run once for each")
+        if len(self.asked.pipelines) > 1 and self.export_delays is not None:
+            raise UsageError("`export_delays`: of one `transport` at a time")
+        self._check_file()
+
+    def _check_ticks(self) -> None:
+        """Refuse live loops that nobody could run."""
+        if self.seconds * 1e9 < 2 * self.setting.period_ns:
+            raise UsageError(
+                f"`seconds`: {self.seconds:g} s are less than two ticks at `control_hz` {self.control_hz:g}"
+            )
         if self.control_hz > FASTEST_LIVE_HZ:
             raise UsageError(
                 f"`control_hz`: {self.control_hz:g}: live no loop of ours keeps up above {FASTEST_LIVE_HZ:g}"
@@ -207,6 +224,9 @@ class ChunksConfig(Options):
                 f"`seconds`: {self.seconds:g} s at `control_hz` {self.control_hz:g} are over {MOST_LIVE_TICKS:.0e} "
                 "control ticks, which are held in memory; act for a shorter time"
             )
+
+    def _check_learning(self) -> None:
+        """Refuse live rules that know, or have learnt, too little."""
         if "oracle" in self.rules_tried:
             raise UsageError("`rules`: nobody is an oracle live; take calibrated, tracked, maximum or mean")
         if {"calibrated", "tracked"} & {*self.rules_tried} and self.with_rules:
@@ -216,11 +236,6 @@ class ChunksConfig(Options):
                     f"`warmup`: {self.requests.warmup} requests are too few to learn from for `epsilon` "
                     f"{self.epsilon:g}; take {needed} or more, or other `rules`"
                 )
-        if self.known and len(self.latency) > 1:
-            raise UsageError(f"`latency`: live a server keeps one, not {len(self.latency)}; run once for each")
-        if len(self.asked.pipelines) > 1 and self.export_delays is not None:
-            raise UsageError("`export_delays`: of one `transport` at a time")
-        self._check_file()
 
     def _check_export(self) -> None:
         if self.export_delays is None:

@@ -70,7 +70,7 @@ METRICS: Final[Mapping[str, ChunkMetric]] = {
         _number("reaction_s_mean", "s", "reaction", "From an event to the start of the first tick that knows of it."),
         _number("reaction_s_p99", "s", "p99", "Its 99th percentile."),
         _number("reaction_s_closed", "s", "closed form", "Its mean by the closed form, in ticks, where that holds."),
-        _number("first_action_s", "s", "first action", "Time to first action."),
+        _number("first_action_s", "s", "first action", "From the first observation until an action leaves."),
         _number("control_rate_hz", "Hz", "rate", "Executed actions a second, from the first on.", "higher"),
         _ticks("delay_ticks_mean", "d", "Realised d, by the row's convention.", better="neither"),
         _ticks("delay_ticks_p99", "p99", "Its 99th percentile.", better="neither"),

@@ -78,7 +78,8 @@ def metrics_of(
     low, high = interval(stalled, boundaries)
     expected = closed(cell.mode, latency_ns, setting)
     mean_reaction = expected.mean_reaction_ticks
-    delay = cycles.delay_ticks
+    delay = cycles.delay_ticks[: latency_ns.size]  # live, an answer may not have come by the end
+    later = setting.rounding == "floor"  # an action leaves at the end of its tick
     assumed = np.array(cell.triggers, np.float64) if cell.triggers else assumed_ticks(cell.mode)
     length = found["ticks"] or math.nan
     return found | {
@@ -92,7 +93,7 @@ def metrics_of(
         "reaction_s_mean": float(reaction_s.mean()) if reaction_s.size else None,
         "reaction_s_p99": float(np.quantile(reaction_s, 0.99)) if reaction_s.size else None,
         "reaction_s_closed": None if mean_reaction is None else mean_reaction * period_s,
-        "first_action_s": found["first_action_tick"] * period_s if found["age_ticks_mean"] >= 0 else None,
+        "first_action_s": (found["first_action_tick"] + later) * period_s if found["age_ticks_mean"] >= 0 else None,
         "control_rate_hz": (found["ticks"] - found["stall_ticks"]) / length / period_s,
         "delay_ticks_mean": float(delay.mean()),
         "delay_ticks_p99": float(np.quantile(delay, 0.99)),
@@ -153,7 +154,7 @@ def request_rows(
     cell: str, latency_ns: Ints, cycles: Cycles, most: int, names: Mapping[int, str] = NO_NAMES
 ) -> Iterator[RequestRow]:
     """Yield the requests that left within the first ticks of a cell; ``names`` are the ids of their samples."""
-    for request in range(int(np.searchsorted(cycles.request_tick, most))):
+    for request in range(min(latency_ns.size, int(np.searchsorted(cycles.request_tick, most)))):
         executed = int(cycles.executed[request])
         yield RequestRow(
             cell=cell,

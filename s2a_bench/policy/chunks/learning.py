@@ -1,7 +1,7 @@
 """Queue with a rule that chooses its trigger anew for every request, from the delays that it has seen itself.
 
-What `trigger.follow` says of recorded latencies, a robot does here as it goes. It sees whole ticks, which is all that
-matters to a trigger: a delay of d ticks stalls where d is above it.
+What `trigger.follow` says of recorded latencies, a robot does here as it goes. It sees whole ticks, and learns the
+middle of what a delay of d ticks can have been: no matter to a quantile or a maximum, and right for a mean.
 """
 
 from __future__ import annotations
@@ -59,4 +59,5 @@ class LearningStepper(QueueStepper):
         if before and not self.missing:
             delay = tick - self.asked_at
             stalled = request > 0 and delay > self.triggers[-1]
-            self.rule.learn(delay * self.setting.period_ns, stalled=stalled)
+            half_ticks = 2 * delay + (1 if self.setting.rounding == "floor" else -1)
+            self.rule.learn(max(half_ticks, 0) * self.setting.period_ns // 2, stalled=stalled)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 if TYPE_CHECKING:
     from s2a_bench.policy.chunks import ChunkStepper, Cycles, Ints, Mode, Setting, Ticks
@@ -20,8 +20,15 @@ def step(mode: Mode, latency_ns: Ints, setting: Setting) -> tuple[Cycles, Ticks]
     return follow(mode, latency_ns[:, np.newaxis] + shifts, setting)
 
 
-def follow(mode: Mode, arrival_ns: Ints, setting: Setting) -> tuple[Cycles, Ticks]:
-    """Do the same with the arrival of every action after the request's tick began: shape (R, H), in ns."""
+NEVER: Final = 2**61
+"""An arrival that does not come, in ns."""
+
+
+def follow(mode: Mode, arrival_ns: Ints, setting: Setting, most: int = NEVER) -> tuple[Cycles, Ticks]:
+    """Do the same with the arrival of every action after the request's tick began: shape (R, H), in ns.
+
+    It ends after ``most`` ticks, if there have been as many.
+    """
     import numpy as np
 
     from s2a_bench.policy.chunks.cycles import gather
@@ -34,7 +41,7 @@ def follow(mode: Mode, arrival_ns: Ints, setting: Setting) -> tuple[Cycles, Tick
     chunk: list[int] = []
     index: list[int] = []
     tick = 0
-    while True:
+    while tick < most:
         while coming and coming[0][:2] <= (tick, tick):
             _deliver(stepper, heapq.heappop(coming))
         if stepper.ask(tick):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from s2a_bench.errors import RequestFailed, RobotError, UsageError
+from s2a_bench.errors import EngineError, RequestFailed, RobotError, S2AError, UsageError
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.chunks.view import show
@@ -183,6 +183,44 @@ def test_over_what_labs_use(tmp_path: Path, transport: str) -> None:
     assert (rows["bytes_up_per_s"] > 0).all()
 
 
+def recording(tmp_path: Path, *latency_ms: float) -> str:
+    """Write latencies, which are played in their order."""
+    path = tmp_path / "latencies.csv"
+    path.write_text("latency_ms\n" + "\n".join(map(str, latency_ms)) + "\n")
+    return str(path)
+
+
+def test_an_answer_that_has_not_come_by_the_end_counts_as_a_stall_to_the_end(tmp_path: Path) -> None:
+    latency = recording(tmp_path, 10, 10, 10, 2500)  # the first is the warm-up's
+    (tmp_path / "runs").mkdir()
+    row = act(tmp_path / "runs", modes="queue", latency=latency, seconds=1.5).iloc[0]
+    first_tick = round(row["first_action_s"] * 50) - 1
+    assert row["ticks"] == 75 - first_tick
+    assert row["stall_ticks"] > 30
+    assert (row["boundaries"], row["stalled_cycles"], row["p_stall_cycle"]) == (2, 1, 0.5)
+    assert row["agreement"] >= 0.99
+    assert row["latency_s_p99"] > 2  # it came after all
+
+
+def test_the_last_answer_of_a_mode_is_waited_for_and_is_none_of_the_next(tmp_path: Path) -> None:
+    latency = recording(tmp_path, 10, 10, 10, 10, 2000, *[10] * 400)
+    (tmp_path / "runs").mkdir()
+    rows = act(tmp_path / "runs", modes="sync,queue?trigger=3", latency=latency, seconds=1)
+    samples = read_run(folder_of(tmp_path / "runs")).samples
+    assert (samples["error"] == "").all()
+    assert len(samples) - 1 == rows["requests"].sum()
+    assert sorted(rows["latency_s_p99"] > 0.5) == [False, True]
+
+
+def test_where_no_warm_up_succeeds_it_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise EngineError("out of batteries")
+
+    monkeypatch.setattr("s2a_bench.inference.echo.chunk", fails)
+    with pytest.raises(S2AError, match="out of batteries"):
+        act(tmp_path, modes="sync")
+
+
 def test_a_chunk_of_another_length_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *asked: islice(chunk(*asked), 5))
     with pytest.raises(UsageError, match=r"`horizon`: loopback answers with chunks of 5 actions, not 16"):
@@ -208,6 +246,10 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             "`seconds`: 80000 s at `control_hz` 1000 are over",
         ),
         ({"live": True, "control_hz": 1e6}, "`control_hz`: 1e[+]06: live no loop of ours keeps up above 10000"),
+        ({"live": True, "control_hz": 0.1, "seconds": 1}, "`seconds`: 1 s are less than two ticks at `control_hz` 0.1"),
+        ({"live": True, "stability": 5}, "`stability` is for virtual time"),
+        ({"seconds": 5}, "`seconds` is for a control loop"),
+        ({"control_hz": 1e-300}, "`control_hz`"),
         ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
         ({"requests": {"transports": "http"}}, "`transports` is for a control loop"),
         ({"live": True, "requests": {"transports": "nothing"}}, "nothing"),

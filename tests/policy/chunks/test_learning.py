@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from s2a_bench.policy.chunks import Setting
+from s2a_bench.policy.chunks import Rounding, Setting
 from s2a_bench.policy.chunks.learning import Learning, LearningStepper
 from s2a_bench.policy.chunks.stepping import step
 from s2a_bench.policy.chunks.trigger import Maximum, Mean, Rule, Tracked, follow
@@ -17,7 +17,7 @@ SETTING = Setting(20_000_000, 16)
 def drawn(count: int, seed: int, scale: float = 80e6) -> NDArray[np.int64]:
     rng = np.random.default_rng(seed)
     ticks = rng.lognormal(np.log(scale), 0.5, count) // SETTING.period_ns
-    return ticks.astype(np.int64) * SETTING.period_ns
+    return ticks.astype(np.int64) * SETTING.period_ns + SETTING.period_ns // 2
 
 
 def maximum() -> Rule:
@@ -51,6 +51,20 @@ def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[],
     np.testing.assert_array_equal(cycles.stall_ticks[late], said.stall_ticks[late])
 
 
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_a_mean_of_ticks_is_the_mean(rounding: Rounding) -> None:
+    setting = Setting(SETTING.period_ns, 16, rounding)
+    latency_ns = np.random.default_rng(7).lognormal(np.log(70e6), 0.5, 4000).astype(np.int64)
+    stepper = Learning(mean).stepper(setting)
+    tick = 0
+    for request, delay in enumerate(setting.delay_ticks(latency_ns).tolist()):
+        while not stepper.ask(tick):
+            stepper.act(tick)
+            tick += 1
+        stepper.arrived(request, 16, tick + delay)
+    assert stepper.rule.latency_ns == pytest.approx(latency_ns.mean(), rel=0.01)
+
+
 def test_a_rule_that_tracks_comes_back_after_a_slow_time() -> None:
     calm, slow = drawn(600, 2, 40e6), drawn(600, 3, 160e6)
     latency_ns = np.concatenate([calm, slow, calm, calm, calm])
@@ -73,4 +87,4 @@ def test_each_robot_has_a_rule_of_its_own() -> None:
     one, other = mode.stepper(SETTING), mode.stepper(SETTING)
     assert one.ask(0)
     one.arrived(0, 16, 9)
-    assert (one.rule.latency_ns, other.rule.latency_ns) == (9 * SETTING.period_ns, 0)
+    assert (one.rule.latency_ns, other.rule.latency_ns) == (19 * SETTING.period_ns // 2, 0)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from queue import SimpleQueue
 from threading import Event, Thread
+from time import monotonic
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from s2a_bench.errors import RequestFailed, UsageError
@@ -21,8 +22,8 @@ Heard: TypeAlias = "Callable[[int, Sequence[Vector], int], None]"
 """Called with a request's number, what has come of its chunk so far, and when, in ns."""
 
 SEEDS: Final = 2**31
-GRACE_S: Final = 5.0
-"""For answers under way at the end."""
+GRACE_S: Final = 1.0
+"""For answers under way where a run ends before its time."""
 MOST_WAIT_S: Final = 5.0
 """For a server that refused and asks to be left alone."""
 
@@ -40,7 +41,8 @@ class Job:
 class Asking:
     """Asks for chunks in the background; what was measured waits in ``done``.
 
-    A request that fails is made again, as the robot goes on waiting for it.
+    A request that fails before its chunk is whole is made again, as the robot goes on waiting for it; of the new answer
+    only actions count that had not come.
     """
 
     sessions: Sequence[Session]
@@ -61,21 +63,24 @@ class Asking:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Ask while the block runs, and until the last answers are there."""
+        """Ask while the block runs, and until the last answers are there; but for `GRACE_S` where it raises."""
         threads = [
             Thread(target=self._work, args=(session,), name=f"asking-{place}", daemon=True)
             for place, session in enumerate(self.sessions)
         ]
         for thread in threads:
             thread.start()
+        patience_s: float | None = GRACE_S
         try:
             yield
+            patience_s = None  # a client that is in use is of no use to anybody else; its own limits end every answer
         finally:
             self.over.set()
             for _ in threads:
                 self.jobs.put(None)
+            until_s = monotonic() + GRACE_S
             for thread in threads:
-                thread.join(GRACE_S)
+                thread.join(None if patience_s is None else max(0, until_s - monotonic()))
 
     def _work(self, session: Session) -> None:
         try:
@@ -86,14 +91,16 @@ class Asking:
 
     def _ask(self, session: Session, job: Job) -> None:
         """Ask until there is an answer, or nobody waits for one."""
+        chunk: list[Vector] = []
         for attempt in count():
             actions: list[Vector] = []
 
             def heard(piece: Piece, at_ns: int, actions: list[Vector] = actions) -> None:
                 if isinstance(piece, Action):
                     actions.append(piece.values)
-                if self.streams or len(actions) == self.horizon:
-                    self.heard(job.request, actions, at_ns)
+                if len(actions) > len(chunk) and (self.streams or len(actions) == self.horizon):
+                    chunk.extend(actions[len(chunk) :])
+                    self.heard(job.request, chunk, at_ns)
 
             place = Place(next(self.blocks), attempt, warmup=False)
             measured = session.measure(place, Asked(job.state or None, (self.seed + job.tick) % SEEDS, heard))
@@ -102,6 +109,7 @@ class Asking:
             self.done.put((session, measured))
             if not measured.sample.error:
                 check(session, len(actions), self.horizon)
+            if not measured.sample.error or len(chunk) == self.horizon:
                 return
             if measured.fatal is not None or self.over.wait(min(measured.retry_after_s, MOST_WAIT_S)):
                 return

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.errors import UsageError
+from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells
 from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
 from s2a_bench.experiments.chunks.latencies import Source
@@ -22,7 +22,7 @@ from s2a_bench.experiments.chunks.measured import measured
 from s2a_bench.harness.rounds import Launch, Task, run_requests
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.robots import open_robot
-from s2a_bench.runtime.control import Acted, ControlLoop
+from s2a_bench.runtime.control import ControlLoop
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.config import ChunksConfig
@@ -83,13 +83,16 @@ def _warm_up(
 ) -> tuple[Ints, int]:
     """Return the latencies of requests before any loop starts, in ns, and of how many numbers an action is."""
     latency_ns: list[int] = []
-    dims = 0
+    dims, error = 0, ""
     for session, _ in product(sessions, range(launch.config.warmup)):
         warm, numbers = warm_up(session, Place(next(blocks), 0, warmup=True), config.horizon)
         launch.keep(session, warm)
         dims = dims or numbers
         if not warm.sample.error and warm.sample.last_token_ns is not None:
             latency_ns.append(warm.sample.last_token_ns - warm.sample.marks[0][1])
+        error = warm.sample.error
+    if not dims:
+        raise TransportError(f"no request of {sessions[0].cell.name} succeeded while warming up, at last with {error}")
     return np.array(latency_ns, np.int64), dims
 
 
@@ -128,17 +131,15 @@ def _act(
 
     send = _nowhere if robot is None else robot.send
     loop = ControlLoop(cell.mode, setting, send, ask, max(2, round(config.seconds * 1e9 / setting.period_ns)))
-    acted: Acted | None = None
     with asking.running():
         try:
             loop.start()
-            while acted is None:
-                acted = loop.join(LOOK_S)
+            while not loop.join(LOOK_S):
                 _keep(asking, launch)
         finally:
             loop.stop()
     _keep(asking, launch)
-    return Live(cell, setting, sessions[0], acted, asking, robot, tuple(getattr(loop.stepper, "triggers", ())))
+    return Live(cell, setting, sessions[0], loop.acted(), asking, robot, tuple(getattr(loop.stepper, "triggers", ())))
 
 
 def _nowhere(action: Vector | None, at_ns: int) -> None:

@@ -1,0 +1,78 @@
+"""Requests of a control loop: what is heard of answers that fail, and when a request is made again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.chunks.live.asking import Asking, Job
+from s2a_bench.harness.session import Asked, Measured, Place, Session
+from s2a_bench.types import Action, Vector
+
+
+@dataclass
+class Server:
+    """A session whose answers are as long, and end, as they are told to."""
+
+    answers: list[tuple[int, str]]
+    """Actions, and the error."""
+    places: list[Place] = field(default_factory=list)
+    cell: Any = field(default_factory=lambda: SimpleNamespace(name="fake"))
+
+    def measure(self, place: Place, asked: Asked) -> Measured:
+        self.places.append(place)
+        actions, error = self.answers[len(self.places) - 1]
+        for index in range(actions):
+            asked.heard(Action(index, np.full(1, len(self.places), np.float32)), 100 * len(self.places) + index)
+        sample: Any = SimpleNamespace(error=error, request_id=f"fake-{place.block}", payload_bytes=7)
+        return Measured(sample, [], 0)
+
+
+def ask(*answers: tuple[int, str], streams: bool = False) -> tuple[list[tuple[list[float], int]], Asking, Server]:
+    """Ask once, and return what was heard: the chunk so far, and when."""
+    server = Server(list(answers))
+    heard: list[tuple[list[float], int]] = []
+
+    def hear(_request: int, actions: Sequence[Vector], at_ns: int) -> None:
+        heard.append(([float(action[0]) for action in actions], at_ns))
+
+    asking = Asking([cast("Session", server)], 3, 0, streams, hear, count())
+    with asking.running():
+        asking.jobs.put(Job(0, 0, ()))
+        while asking.done.qsize() < len(answers) and asking.failure is None:
+            pass
+    return heard, asking, server
+
+
+def test_a_request_that_fails_is_made_again_and_its_chunk_is_that_of_one_answer() -> None:
+    heard, asking, server = ask((2, "broken"), (3, ""))
+    assert heard == [([2.0] * 3, 202)]
+    assert [place.position for place in server.places] == [0, 1]
+    assert asking.done.qsize() == 2
+    assert asking.sent_bytes == 14
+    assert asking.names == {0: "fake-1"}
+
+
+def test_of_a_second_answer_only_actions_count_that_had_not_come() -> None:
+    heard, _, _ = ask((2, "broken"), (3, ""), streams=True)
+    assert heard == [([1.0], 100), ([1.0] * 2, 101), ([1.0, 1.0, 2.0], 202)]
+
+
+@pytest.mark.parametrize("streams", [False, True])
+def test_an_answer_that_fails_once_it_is_whole_is_not_asked_for_again(streams: bool) -> None:
+    heard, asking, server = ask((3, "the marks were lost"), streams=streams)
+    assert heard[-1] == ([1.0] * 3, 102)
+    assert len(server.places) == 1
+    assert asking.failure is None
+
+
+def test_a_chunk_of_another_length_fails_the_loop() -> None:
+    _, asking, _ = ask((2, ""))
+    assert isinstance(asking.failure, UsageError)
