@@ -44,7 +44,7 @@ fuzz: setup
 
 # Hostile peers mostly wait: they are met beside all else, and what came of them is shown at the end.
 test-all: setup
-	@$(BIN)/python -m pytest tests/hostile > hostile.log 2>&1 & hostile=$$!; \
+	@$(BIN)/python -m pytest tests/hostile > hostile.log 2>&1 & hostile=$$!; trap "kill $$hostile" INT TERM; \
 	$(BIN)/python -m pytest --ignore=tests/hostile; rest=$$?; \
 	wait $$hostile; hostile=$$?; cat hostile.log; exit $$((rest + hostile))
 

@@ -136,6 +136,8 @@ def _act(
             loop.start()
             while not loop.join(LOOK_S):
                 _keep(asking, launch)
+            if any(session.busy for session in sessions):
+                launch.progress.stage("waiting for the last answer")
         finally:
             loop.stop()
     _keep(asking, launch)
