@@ -1,6 +1,8 @@
 """Chunks live: what the loop did is what virtual time says of the same latencies, over transports that labs use."""
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -268,3 +270,14 @@ def test_json_has_what_is_measured(tmp_path: Path) -> None:
     cell = show(read_run(folder_of(tmp_path))).json()["cells"][0]
     json.dumps(cell)
     assert {"agreement", "jitter_s_p99", "blocked_s_max", "late_ticks", "bytes_up_per_s"} <= set(cell)
+
+
+def test_without_websockets_packages_it_goes_over_http() -> None:
+    program = """
+import sys
+sys.modules["websockets"] = None
+from s2a_bench.experiments.chunks.config import ChunksConfig
+print(*ChunksConfig(live=True).asked.transports)
+"""
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert told.stdout.split() == ["http/binary"]

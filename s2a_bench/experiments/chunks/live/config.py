@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Final
 
+from s2a_bench import extras
 from s2a_bench.harness.plan import FirstVariants, RequestsConfig
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Names, group, option
@@ -21,7 +22,10 @@ class LiveRequests(RequestsConfig):
     COUNTS_TOKENS: ClassVar[str] = ""
 
     transports: Names = option(
-        ("websocket",), "transports as in latency; several with commas, each with every mode", flag="transport"
+        ("websocket" if all(map(extras.installed, ("msgpack", "websockets"))) else "http/binary",),
+        "transports as in latency; several with commas, each with every mode [default: websocket, http/binary where "
+        "its packages are not installed]",
+        flag="transport",
     )
     variants: FirstVariants = group(FirstVariants)
     engine: EngineConfig = group(EngineConfig, only=("name", "profile", "gaps", "action_dim"))
