@@ -8,6 +8,11 @@ from s2a_bench import extras
 from s2a_bench.harness.plan import FirstVariants, RequestsConfig
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Names, group, option
+from s2a_bench.transport.http import BINARY, HTTP
+from s2a_bench.transport.websocket import WEBSOCKET
+
+WITHOUT: Final = f"{HTTP.name}/{BINARY}"
+"""What carries actions with no extra installed."""
 
 SHOWN: Final = (
     *("transports", "variants", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
@@ -22,9 +27,9 @@ class LiveRequests(RequestsConfig):
     COUNTS_TOKENS: ClassVar[str] = ""
 
     transports: Names = option(
-        ("websocket" if all(map(extras.installed, ("msgpack", "websockets"))) else "http/binary",),
-        "transports as in latency; several with commas, each with every mode [default: websocket, http/binary where "
-        "its packages are not installed]",
+        (WEBSOCKET.name if all(map(extras.installed, WEBSOCKET.packages)) else WITHOUT,),
+        "transports as in latency; several with commas, each with every mode "
+        f"[default: {WEBSOCKET.name}, {WITHOUT} where its packages are not installed]",
         flag="transport",
     )
     variants: FirstVariants = group(FirstVariants)
