@@ -7,6 +7,7 @@ import os
 import socket
 import stat
 import struct
+import tracemalloc
 from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -32,6 +33,7 @@ from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.shm import checks, door, ring
 from s2a_bench.transport.shm.memory import ANSWER_BYTES, PICTURES_AT, PLACE, Memory
 from s2a_bench.transport.shm.pieces import packed, unpacked
+from s2a_bench.transport.shm.reading import HEADER_BYTES, Header, Held
 from s2a_bench.types import Action, Frame, Request, Token
 
 NOBODY = 65534
@@ -351,6 +353,25 @@ def test_requests_under_way_are_limited_together() -> None:
         with pytest.raises(RequestFailed, match="are under way already"):
             ask(client, Request("a", "plan", (yuyv_frame(),)))
         assert len(ask(client, Request("a", "plan"))[0]) == 1
+
+
+@pytest.mark.parametrize("unit", [b"{}", b"[[]]", b'{"":[]}', b'"a"'])
+def test_a_header_takes_less_than_64_mib_while_it_is_read(unit: bytes) -> None:
+    """Python's own memory stays where it was once needed: links that ask at once make the server so much larger."""
+    text = b"[" + b",".join([unit] * (HEADER_BYTES // (len(unit) + 1) - 1)) + b"]"
+    file = os.memfd_create("header")
+    os.ftruncate(file, PICTURES_AT + len(text))
+    memory = Memory(file, PICTURES_AT + len(text), writes=True)
+    os.close(file)
+    memory.map[PICTURES_AT:] = text
+    tracemalloc.start()
+    try:
+        Held(Limits()).take(memory, PICTURES_AT, len(text))
+        with pytest.raises(RequestFailed, match="should be an object"):
+            Header.read(memory, PICTURES_AT, len(text), Limits())
+        assert 8 * len(text) < tracemalloc.get_traced_memory()[1] < 64 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_memory_above_the_limit_is_refused() -> None:

@@ -16,8 +16,9 @@ from s2a_bench.transport.pictures import decoded, rgb_of
 from s2a_bench.transport.shm.memory import PICTURES_AT, Memory
 from s2a_bench.types import Frame, Request
 
-HEADER_BYTES: Final = 4 << 20
-"""The longest header: JSON takes up to 30 times its size while it is read."""
+HEADER_BYTES: Final = 1 << 20
+"""The longest header: JSON takes up to 45 times its size while it is read, and leaves holes
+that Python does not give back."""
 BYTES_A_PIXEL: Final = {"bgr8": 3, "yuv422_yuy2": 2}
 
 
