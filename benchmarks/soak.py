@@ -43,8 +43,9 @@ PROMPT, TOKENS = "go on and stop", 8
 PATIENCE_S, READY_S, SETTLES_S = 120.0, 300.0, 45.0
 SILENCE_S = 30.0
 """Over ROS the last messages of an answer may be lost: a client hears nothing, and asks again."""
-WARM_UP = 0.2
-"""Of the minutes, before them; more where not every hostile client has come by then as often as there are attackers."""
+WARM_UP, WARM_UP_S = 0.2, 30.0
+"""Of the minutes, before them, and at least so long: what a server keeps for good it has by then. More where not every
+hostile client has come as often as there are attackers."""
 HOSTILE = {"http": http.CLIENTS, "ros": ros.CLIENTS, "shm": shm.CLIENTS, "zmq": zmq.CLIENTS}
 WARM_UP_ONLY = frozenset({"a prompt of 16 MiB", "8 requests of 16 MiB"})
 """Over ROS requests are received on many threads, and glibc keeps the most that each ever held (machine/tuning.py):
@@ -321,7 +322,8 @@ def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = B
                 return uses, *idle(client, other, blocks, BLOCK.get(engine, 5))
 
         bare, _, _ = quiet(None, 1)
-        Load(Result(transport, engine, minutes), server.address).run(minutes * 60 * WARM_UP, at_least=ATTACKERS)
+        warm_up = Load(Result(transport, engine, minutes), server.address)
+        warm_up.run(max(minutes * 60 * WARM_UP, WARM_UP_S), at_least=ATTACKERS)
         result.before, plain_before, relative_before = quiet(bare, blocks)
         processes, load = [*family(pid)], Load(result, server.address, WARM_UP_ONLY)
         load.run(minutes * 60)
