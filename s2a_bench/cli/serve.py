@@ -13,7 +13,7 @@ from pydantic import create_model
 from s2a_bench.cli.adapter import command, flags_of
 from s2a_bench.cli.ros_args import read as read_ros_args
 from s2a_bench.errors import UsageError
-from s2a_bench.inference import ACTING, ANSWERS, EngineConfig, acts
+from s2a_bench.inference import ACTING, ANSWERS, EngineConfig, acts, check_engine
 from s2a_bench.options import Options, group, option, placed, places
 from s2a_bench.provenance import Provenance
 from s2a_bench.toml_file import loads
@@ -158,11 +158,8 @@ def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
     """Serve until SIGINT or SIGTERM, then end cleanly with exit code 0; a server that died is started again once."""
     from s2a_bench.harness.serving import ServerJob
     from s2a_bench.harness.supervisor import keep_serving
-    from s2a_bench.inference.echo import check_latency
-    from s2a_bench.inference.replay import check_replay
 
-    check_replay(config)
-    check_latency(config)
+    check_engine(config)
     transport = TRANSPORTS[wiring.transport]
 
     def ready(server: ServerProcess) -> None:

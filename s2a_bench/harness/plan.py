@@ -13,7 +13,7 @@ from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
 from s2a_bench.frames import SOURCES
-from s2a_bench.inference import ACTING, EngineConfig, acts, default_engine
+from s2a_bench.inference import ACTING, EngineConfig, acts, check_engine, default_engine
 from s2a_bench.machine.resources.rows import SPENT
 from s2a_bench.options import Grammar, Names, Options, Size, Square, TextOrFile, group, option
 from s2a_bench.trace import path_of
@@ -249,17 +249,13 @@ class RequestsConfig(Options):
 
     def check(self) -> None:
         """Raise UsageError, naming the field, for a combination that makes no sense."""
-        from s2a_bench.inference.echo import check_latency
-        from s2a_bench.inference.replay import check_replay
-
         if not self.transports:
             raise UsageError(f"`transport`: name at least one of {', '.join(TRANSPORTS)}")
         if not (16 <= self.width <= LARGEST and 16 <= self.height <= LARGEST) or self.width % 2:  # noqa: PLR2004
             raise UsageError(
                 f"`size`: {self.width}x{self.height} should be 16x16 to {LARGEST}x{LARGEST}, of even width"
             )
-        check_replay(self.engine)
-        check_latency(self.engine)
+        check_engine(self.engine)
         self._check_answer()
         self._check_observation()
         if self.record is not None and self.record.exists():

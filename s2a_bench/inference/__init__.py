@@ -154,6 +154,15 @@ def default_engine(say: Callable[[str], None]) -> str:
     return "echo"
 
 
+def check_engine(config: EngineConfig) -> None:
+    """Raise UsageError where an engine's own options, and the engine, do not go together."""
+    from s2a_bench.inference.echo import check_latency
+    from s2a_bench.inference.replay import check_replay
+
+    check_replay(config)
+    check_latency(config)
+
+
 def need_engine(name: str) -> None:
     """Raise MissingExtra where what an engine needs is not installed."""
     if name == "llama":
