@@ -32,6 +32,7 @@ from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 import pytest
 
 from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.errors import RequestFailed
 from s2a_bench.harness.processes import OwnServer
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
@@ -126,7 +127,7 @@ class Target:
     def __init__(self, told: Wiring[Any], server: OwnServer, honest: Client) -> None:
         """Ask a first time: the connection is there from now on."""
         self._told, self._server, self._honest = told, server, honest
-        self._expected = _answer(honest)
+        self._expected = answer_of(honest)
 
     def attacked(self, case: Case[Attack]) -> Attacked:
         """Return what comes of one hostile client."""
@@ -136,7 +137,7 @@ class Target:
         began = now_ns()
         said = case.does(self._told)
         seconds = (now_ns() - began) / 1e9
-        answer, peak_mib = _answer(self._honest), usage(pid).peak_mib
+        answer, peak_mib = answer_of(self._honest), usage(pid).peak_mib
         tidy = _settled(lambda: usage(pid).descriptors <= before.descriptors)
         return Attacked(said, seconds, peak_mib, answer, self._expected, self._server.alive(), tidy)
 
@@ -263,9 +264,16 @@ def own_server(told: Wiring[Any], log: Path, **engine: Any) -> Iterator[OwnServe
         yield server
 
 
-def _answer(client: Client) -> list[str]:
-    """Return what one short question is answered."""
-    return [piece.text for piece in ask(client, Request("honest", "go on", max_tokens=3))[0]]
+def answer_of(client: Client) -> list[str]:
+    """Return what one short question is answered; while it is told to come again it does, for `SETTLES_S`."""
+    deadline = now_ns() + round(SETTLES_S * 1e9)
+    while True:
+        try:
+            return [piece.text for piece in ask(client, Request("honest", "go on", max_tokens=3))[0]]
+        except RequestFailed as error:
+            if error.retry_after_s is None or now_ns() > deadline:
+                raise
+            SystemClock().sleep_until_ns(now_ns() + round(min(error.retry_after_s, SETTLES_S) * 1e9))
 
 
 def _settled(met: Callable[[], bool]) -> bool:
