@@ -34,19 +34,17 @@ bench-ray: setup
 	$(BIN)/python -m pip install --quiet -e '.[ray]' -c constraints.txt
 	$(BIN)/python -m benchmarks.sweep_scaling
 
+# In two processes, one a core. A file is one process's, and so are all hostile peers: tests/conftest.py.
 test: setup
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -n 2 -m "not slow"
 	@echo "slow tests were left out: make test-all runs them too"
 
 # Ten minutes of damage to everything that reads what comes from outside; finds are tried first the next time.
 fuzz: setup
 	S2A_FUZZ_S=600 $(BIN)/python -m pytest tests/fuzz
 
-# Hostile peers mostly wait: they are met beside all else, and what came of them is shown at the end.
 test-all: setup
-	@$(BIN)/python -m pytest tests/hostile > hostile.log 2>&1 & hostile=$$!; trap "kill $$hostile" INT TERM; \
-	$(BIN)/python -m pytest --ignore=tests/hostile; rest=$$?; \
-	wait $$hostile; hostile=$$?; cat hostile.log; exit $$((rest + hostile))
+	$(BIN)/python -m pytest -n 2
 
 # Everything that is tested against hostile peers, faults and load; `make test-all` has it with two transports' faults.
 hostile: setup
@@ -57,12 +55,13 @@ check: setup
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python tools/size.py
 
 # Can every supported platform install the dependencies from wheels? Asks the package index, installs nothing.
 check-platforms: setup
 	$(BIN)/python tools/check_platforms.py
 
-# How many of 300 random changes of the code do the tests notice? Takes about an hour; docs/mutation.md.
+# How many of 300 random changes of the code do the tests notice? Takes some hours; docs/mutation.md.
 mutate: setup
 	$(BIN)/python -m pip install --quiet 'cosmic-ray>=8.4,<9'
 	$(BIN)/python tools/mutate.py

@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.timing import turns_s
 from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.policy.chunks import Mode, Setting, mode
-from s2a_bench.policy.chunks.stepping import step
+from s2a_bench.policy.chunks.cycles import step
 
 MODES = (
     "sync",

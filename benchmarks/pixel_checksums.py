@@ -9,8 +9,9 @@ from statistics import median, quantiles
 from threading import Thread
 
 from s2a_bench.frames import open_source
+from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.harness.plan import Plan, resolve
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.inference import EngineConfig, open_engine
@@ -26,10 +27,10 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=300)
     asked = parser.parse_args()
     cell = one_pipeline(asked.transport)
-    config = RequestsConfig(transports=asked.transport, max_tokens=4)
+    plan = resolve(RequestsConfig(transports=asked.transport, max_tokens=4))
     e2e_ms: dict[bool, list[float]] = {True: [], False: []}
     with ExitStack() as stack:
-        sessions = {pixels: _session(cell, config, stack, pixels=pixels) for pixels in e2e_ms}
+        sessions = {pixels: _session(cell, plan, stack, pixels=pixels) for pixels in e2e_ms}
         random = Random(0)  # noqa: S311 - an order, not a secret
         for block in range(asked.runs):
             for pixels in random.sample([True, False], 2):
@@ -43,7 +44,7 @@ def main() -> None:
         print(f"{name:15} e2e median {median(values):.3f} ms, quartiles {low:.3f} and {high:.3f}, n = {len(values)}")
 
 
-def _session(cell: Pipeline, config: RequestsConfig, stack: ExitStack, *, pixels: bool) -> Session:
+def _session(cell: Pipeline, plan: Plan, stack: ExitStack, *, pixels: bool) -> Session:
     """Open a server, a client and a camera of their own."""
     engine = open_engine(EngineConfig(name="echo"))
     server = open_server(cell.wiring(), engine_handler(engine, pixels=pixels))
@@ -51,9 +52,9 @@ def _session(cell: Pipeline, config: RequestsConfig, stack: ExitStack, *, pixels
     stack.callback(server.stop)
     client = open_client(cell.wiring(server.address))
     stack.callback(client.close)
-    source = open_source("synthetic", config.width, config.height, fps=30.0, seed=0)
+    source = open_source("synthetic", *plan.feed.size, fps=30.0, seed=0)
     stack.callback(source.close)
-    return Session(cell, client, RequestFeed(source, preencoded=False), config)
+    return Session(cell, client, RequestFeed(source, preencoded=False), plan.request)
 
 
 if __name__ == "__main__":

@@ -17,8 +17,7 @@ from scipy.signal import lfilter
 
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.batches import Memory
-from s2a_bench.stats.change import ratio_of_launches
-from s2a_bench.stats.power import Noise
+from s2a_bench.stats.change import Noise, ratio_of_launches
 
 RATIO = 6.0
 REQUESTS_SD = 0.15

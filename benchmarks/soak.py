@@ -1,8 +1,8 @@
-"""Hostile and honest clients together on a server: ``python -m benchmarks.soak http|ros|shm|zmq [--minutes M]``.
+"""Hostile and honest clients together on a server: ``python -m benchmarks.soak http|ros|... [--minutes M]``.
 
 The server is a `serve` process, and so is its twin, which nobody attacks: the idle latency of the one is divided by
 that of the other in interleaved blocks, before the load and after it, so that what else the machine does cancels out.
-The hostile clients are those of `s2a_bench.testing.hostile`. They load the server before anything is measured too: the
+The hostile clients are those of `tests/hostile/wires`. They load the server before anything is measured too: the
 memory that a pool keeps for good is no growth. Prints what came of it, writes it as JSON, and exits with 1 where a
 promise is broken.
 """
@@ -20,7 +20,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -32,29 +32,42 @@ import httpx
 
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.stats.change import ratio_of_blocks
-from s2a_bench.testing.hostile import http, ros, shm, zmq
-from s2a_bench.testing.hostile.usage import Usage, family, usage
+from s2a_bench.testing.hostile import Attack, Case
+from s2a_bench.testing.hostile.asker import Usage, family, usage
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.http.own import PATHS
 from s2a_bench.types import Request
+from tests.hostile.test_floods import FLOODS
+from tests.hostile.wires import http, ros, shm, websocket, zmq
 
 PROMPT, TOKENS = "go on and stop", 8
-PATIENCE_S, READY_S, SETTLES_S = 120.0, 300.0, 45.0
+PATIENCE_S, READY_S, SETTLES_S, ENDS_S = 120.0, 300.0, 45.0, 60.0
 SILENCE_S = 30.0
 """Over ROS the last messages of an answer may be lost: a client hears nothing, and asks again."""
 WARM_UP, WARM_UP_S = 0.2, 30.0
 """Of the minutes, before them, and at least so long: what a server keeps for good it has by then. More where not every
 hostile client has come as often as there are attackers."""
-HOSTILE = {"http": http.CLIENTS, "ros": ros.CLIENTS, "shm": shm.CLIENTS, "zmq": zmq.CLIENTS}
+HOSTILE = {
+    "http": http.CLIENTS,
+    "http/best-effort": http.FAST,
+    "ros": ros.CLIENTS,
+    "shm": shm.CLIENTS,
+    "websocket": websocket.CLIENTS,
+    "zmq": zmq.CLIENTS,
+}
+FLOODED = {"http": "http/as-deployed", "websocket": "websocket/openpi", "zmq": "zmq/gr00t"}
+"""What `--floods` adds the attacks of, where it has another name there."""
 WARM_UP_ONLY = frozenset({"a prompt of 16 MiB", "8 requests of 16 MiB"})
 """Over ROS requests are received on many threads, and glibc keeps the most that each ever held (machine/tuning.py):
 with these the memory swings by 150 MiB, which would hide growth."""
 HONEST = {
-    "http": ("http", "http/best-effort", "whole"),
+    "http": ("http", "http", "whole"),
+    "http/best-effort": ("http/best-effort", "http/binary", "whole"),
     "ros": ("ros/topic", "ros/topic", "ros/action"),
     "shm": ("shm", "shm", "shm"),
-    "zmq": ("zmq", "zmq", "zmq?layout=n1.5"),
+    "websocket": ("websocket", "websocket/openpi-stream", "websocket"),
+    "zmq": ("zmq", "zmq?layout=n1.7", "zmq?layout=n1.5"),
 }
 """What the honest clients speak; "whole" is an answer that is not streamed."""
 ATTACKERS = 3
@@ -63,8 +76,8 @@ BLOCKS = 15
 BLOCK = {"echo": 20}
 """Requests of a block of idle latencies; of an engine that computes a quarter."""
 GROWTH_MIB, PEAK_MIB, SLOWER = 20.0, 1024.0, 1.2
-LAZY = 4
-"""Threads that a pool may start later than the warm-up: a leak has as many as there were attacks."""
+LAZY = 66
+"""Threads that a pool may start later than the warm-up, all of them: a leak has as many as there were attacks."""
 REFUSED = re.compile(r"requests are waiting|are under way|rejected the goal|answered 503")
 LOST = re.compile(r"^(no token|no feedback) for|letters|came instead of|marks did not arrive")
 
@@ -92,6 +105,8 @@ class Result:
     """Times that messages of an answer were lost, which the client was told or saw by the silence; it came again."""
     failed: list[str] = field(default_factory=list)
     attacks: int = 0
+    not_met: list[str] = field(default_factory=list)
+    """Hostile clients that never came."""
     idle_ms_before: float = 0.0
     idle_ms_after: float = 0.0
     slower: float | None = None
@@ -125,6 +140,7 @@ class Result:
             f"the memory has grown by {self.growth_mib:.0f} MiB": self.growth_mib < GROWTH_MIB,
             f"the server held {self.peak_mib:.0f} MiB": self.peak_mib < PEAK_MIB,
             f"the idle latency is {self.slower or 0:.2f} times that of before": (self.slower_low or 0) <= SLOWER,
+            f"these hostile clients never came: {self.not_met}": not self.not_met,
             f"SIGTERM ended it in {self.ended_s:.1f} s with {self.exit_code}": self.exit_code == 0,
         }
         return [said for said, kept in promises.items() if not kept]
@@ -138,9 +154,10 @@ def served(transport: str, engine: str, name: str, log: Path) -> Iterator[Served
         "http": (["--port", "0"], r"http://[\d.:]+"),
         "ros": (["--namespace", f"/{name}_{os.getpid()}", "--max-tokens", str(TOKENS)], rf"/{name}_\d+"),
         "shm": ([], r"/\S+\.sock"),
+        "websocket": (["--port", "0"], r"ws://[\d.:]+"),
         "zmq": (["--port", "0"], r"tcp://[\d.:]+"),
     }
-    flags, address = own[transport]
+    flags, address = own[transport.partition("/")[0]]
     line += flags
     with (
         log.open("a") as errors,
@@ -194,10 +211,9 @@ class Honest:
 class Load:
     """Clients of both kinds, each on a thread of its own, until told to stop."""
 
-    def __init__(self, result: Result, address: str, without: frozenset[str] = frozenset()) -> None:
+    def __init__(self, result: Result, address: str, cases: Sequence[Case[Attack]]) -> None:
         """Start nothing yet."""
-        self._result, self._address = result, address
-        self._cases = [case for case in HOSTILE[result.transport] if case.name not in without]
+        self._result, self._address, self.cases = result, address, cases
         self._over, self._lock = Event(), Lock()
         self.attacks: Counter[str] = Counter()
 
@@ -210,7 +226,7 @@ class Load:
             thread.start()
         time.sleep(seconds)
         deadline = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline and any(self.attacks[case.name] < at_least for case in self._cases):
+        while time.monotonic() < deadline and any(self.attacks[case.name] < at_least for case in self.cases):
             time.sleep(0.1)
         self._over.set()
         for thread in threads:
@@ -249,7 +265,7 @@ class Load:
                 return "" if tokens else "an empty answer"
 
     def _hostile(self, seed: int) -> None:
-        cases = [*self._cases]
+        cases = [*self.cases]
         chosen = random.Random(seed)  # noqa: S311 - not secret
         while not self._over.is_set():
             chosen.shuffle(cases)
@@ -282,10 +298,15 @@ def idle(client: Client, twin: Client, blocks: int, of: int) -> tuple[list[float
     return plain, relative
 
 
-def latency_ms(client: Client) -> float:
-    """Return how long one whole answer takes."""
+def latency_ms(client: Client, tries: int = 5) -> float:
+    """Return how long one whole answer takes; one whose messages were lost is asked for again."""
     began = time.perf_counter()
-    ask(client, Request("idle", PROMPT, max_tokens=TOKENS))
+    try:
+        ask(client, Request("idle", PROMPT, max_tokens=TOKENS))
+    except RequestFailed as error:
+        if tries == 1 or not LOST.search(str(error)):
+            raise
+        return latency_ms(client, tries - 1)
     return (time.perf_counter() - began) * 1e3
 
 
@@ -303,9 +324,16 @@ def settled(pid: int, before: Usage, client: Client) -> Usage:
         time.sleep(0.5)
 
 
-def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = BLOCKS) -> Result:
-    """Load a server for so long and return what came of it."""
-    result = Result(transport, engine, minutes)
+def hostile(transport: str, *, floods: bool) -> list[Case[Attack]]:
+    """Return the hostile clients of a transport."""
+    pipeline = FLOODED.get(transport, transport)
+    more = [Case(flood.name, flood.does) for flood in FLOODS if floods and flood.pipeline == pipeline]
+    return [*HOSTILE[transport], *more]
+
+
+def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = BLOCKS, *, floods: bool) -> Result:
+    """Load a server for so long, and until each hostile client has come; return what came of it."""
+    result, cases = Result(transport, engine, minutes), hostile(transport, floods=floods)
     with ExitStack() as stack:
         server = stack.enter_context(served(transport, engine, "soak", log))
         twin = stack.enter_context(served(transport, engine, "twin", log))
@@ -322,14 +350,16 @@ def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = B
                 return uses, *idle(client, other, blocks, BLOCK.get(engine, 5))
 
         bare, _, _ = quiet(None, 1)
-        warm_up = Load(Result(transport, engine, minutes), server.address)
+        warm_up = Load(Result(transport, engine, minutes), server.address, cases)
         warm_up.run(max(minutes * 60 * WARM_UP, WARM_UP_S), at_least=ATTACKERS)
         result.before, plain_before, relative_before = quiet(bare, blocks)
-        processes, load = [*family(pid)], Load(result, server.address, WARM_UP_ONLY)
-        load.run(minutes * 60)
+        processes = [*family(pid)]
+        load = Load(result, server.address, [case for case in cases if case.name not in WARM_UP_ONLY])
+        load.run(minutes * 60, at_least=1)
         result.after, plain_after, relative_after = quiet(result.before, blocks)
         result.survived = server.process.poll() is None and processes == [*family(pid)]
         result.peak_mib, result.attacks = usage(pid).peak_mib, load.attacks.total()
+        result.not_met = sorted({case.name for case in load.cases} - {*load.attacks})
         result.idle_ms_before, result.idle_ms_after = median(plain_before), median(plain_after)
         later = {block + blocks: values for block, values in relative_after.items()}
         if (ratio := ratio_of_blocks(later, relative_before, 1)) is not None:
@@ -337,7 +367,7 @@ def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = B
         began = time.monotonic()
         server.process.send_signal(signal.SIGTERM)
         with suppress(subprocess.TimeoutExpired):
-            result.exit_code = server.process.wait(10)
+            result.exit_code = server.process.wait(ENDS_S)
         result.ended_s = time.monotonic() - began
     return result
 
@@ -358,10 +388,11 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10)
     parser.add_argument("--blocks", type=int, default=BLOCKS, help="of idle latencies, before the load and after it")
     parser.add_argument("--output", type=Path, help="[default: soak-TRANSPORT-ENGINE.json]")
+    parser.add_argument("--floods", action="store_true", help="with those of tests/hostile/test_floods.py")
     given = parser.parse_args()
-    output = given.output or Path(f"soak-{given.transport}-{given.engine}.json")
+    output = given.output or Path(f"soak-{given.transport.replace('/', '-')}-{given.engine}.json")
     log = output.with_suffix(".log")
-    whole = result_json(soak(given.transport, given.engine, given.minutes, log, given.blocks))
+    whole = result_json(soak(given.transport, given.engine, given.minutes, log, given.blocks, floods=given.floods))
     text = json.dumps(whole, indent=1)
     output.write_text(text + "\n")
     print(text)

@@ -1,6 +1,6 @@
 """s2a-bench: what wiring a vision-language model to a robot costs, and when the robot may act on what it streams.
 
-The library's face: every experiment is a function (`latency`, `throughput`, `timeline`, `chunks`, `boundary`, `study`,
+The library's face: every experiment is a function (`latency`, `throughput`, `timeline`, `chunks`, `boundary`,
 `ccrb`), `load` opens a run folder, `compare` compares two. See docs/library.md.
 """
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     ccrb = command("ccrb")
     chunks = command("chunks")
     latency = command("latency")
-    study = command("study")
     throughput = command("throughput")
     timeline = command("timeline")
 
@@ -30,7 +29,6 @@ __all__ = [
     "compare",
     "latency",
     "load",
-    "study",
     "throughput",
     "timeline",
 ]

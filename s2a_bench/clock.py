@@ -31,20 +31,16 @@ def realtime_offset_ns() -> int:
 class Clock(Protocol):
     """Something that tells the time and can wait for a time."""
 
-    def now_ns(self) -> int:
-        """Tell the time."""
-        ...
+    def now_ns(self) -> int: ...
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Return at ``deadline_ns`` or at once if that is past."""
-        ...
 
 
 class SystemClock:
     """CLOCK_MONOTONIC."""
 
     def now_ns(self) -> int:
-        """Read CLOCK_MONOTONIC."""
         return now_ns()
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
@@ -57,11 +53,9 @@ class VirtualClock:
     """A clock that jumps: sleeping takes no time and moves the clock to the deadline."""
 
     def __init__(self, start_ns: int = 0) -> None:
-        """Start at ``start_ns``."""
         self._now_ns = start_ns
 
     def now_ns(self) -> int:
-        """Tell the virtual time."""
         return self._now_ns
 
     def sleep_until_ns(self, deadline_ns: int) -> None:

@@ -1,32 +1,29 @@
-"""Every error a user can meet, as one tree; the message names the field, path or key and the way out.
+"""Every error a user can meet, as one tree; the message names the field, path or key and the way out. And exit codes.
 
 A field of a configuration stands in backquotes, as `runs`: the command line shows it as its flag, --runs.
 
 S2AError
-├── UsageError           a flag's value, or a combination of flags, makes no sense (exit code 2)
-├── MissingExtra         a library that this needs is not installed
-├── SourceError          a camera, video or image folder cannot deliver frames
-├── EngineError          an engine cannot start or answer
-│   ├── ModelError       a model file is missing, damaged or of the wrong kind
-│   ├── BadRequest       no engine like this can answer this request: its grammar, its pictures, its length
-│   └── Overdue          an answer takes longer than the server allows
-├── TransportError       a request did not make its way
-│   ├── RequestFailed    the server refused or broke off this one request; the next may succeed
-│   │   ├── Busy         too many requests wait for the engine
-│   │   └── MessagesLost the middleware lost messages of this request
-│   ├── MissingInterface the ROS 2 workspace has not built a message's package, or another version of it
-│   ├── PortInUse        a server cannot bind its address
-│   └── ServerDied       the server's process is gone
-├── SimulatorError       a simulator cannot start, or goes away
-├── RobotError           a robot cannot be reached, or fails at an action
-├── StoreError           a run folder cannot be written or read
-└── UnlikeRuns           runs of other machines, models or settings, which are not to be compared
+├── UsageError, MissingExtra, SourceError, SimulatorError, RobotError, StoreError, UnlikeRuns
+├── EngineError: ModelError, BadRequest, Overdue
+└── TransportError: MissingInterface, PortInUse, ServerDied
+    └── RequestFailed: Busy, TooLarge, MessagesLost
 """
 
 from __future__ import annotations
 
+from signal import SIGILL
+
 from s2a_bench.secrets import struck
 from s2a_bench.text import one_line
+
+TRIPPED = 3
+"""Exit code of `compare` where a gate trips."""
+UNDECIDED = 4
+"""Exit code of `compare` where no gate trips and one could not have seen a change of the size of its limit."""
+
+SETUP_AGAIN = "run `make setup` again"
+COMPILE_AGAIN = "compile it on this machine"
+"""The way out for a program that is the user's own."""
 
 
 class S2AError(Exception):
@@ -77,13 +74,16 @@ class RequestFailed(TransportError):
     """The server refused or broke off this one request; the next may succeed, perhaps after ``retry_after_s``."""
 
     def __init__(self, message: str = "", *, retry_after_s: float | None = None) -> None:
-        """Keep the message, and how long the server asked to wait, if it did."""
         super().__init__(message)
         self.retry_after_s = retry_after_s
 
 
 class Busy(RequestFailed):
     """Too many requests wait for the engine."""
+
+
+class TooLarge(RequestFailed):
+    """The request is larger than the server takes."""
 
 
 class MessagesLost(RequestFailed):
@@ -116,3 +116,15 @@ class StoreError(S2AError):
 
 class UnlikeRuns(S2AError):
     """Runs of other machines, models or settings, which are not to be compared."""
+
+
+def how_it_ended(code: int | None, cure: str = SETUP_AGAIN) -> str:
+    """Describe a `returncode` of `subprocess`; an illegal instruction says where it comes from, and the ``cure``."""
+    if code is None or code >= 0:
+        return f"exit code {code}"
+    if -code != SIGILL:
+        return f"killed by signal {-code}"
+    return (
+        f"killed by signal {-code} (SIGILL): llama.cpp was compiled for another processor, or by a compiler whose "
+        f"code for AMX does not work; {cure}"
+    )

@@ -17,7 +17,6 @@ EXTRAS: Final = {
     "llama": "the llama engine",
     "llama-server": "llama.cpp's own server, without a compiler",
     "ccrb": "the embedded simulator and pictures of the road",
-    "scenario": "OpenSCENARIO files",
     "nvidia": "load, memory and power of NVIDIA GPUs",
     "openvla": "the openvla dialect",
     "ray": "sweeps on a Ray cluster",

@@ -22,18 +22,19 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, experiment_of
+from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, experiment_of, write_shown
 from s2a_bench.machine import tuning
 from s2a_bench.options import Options, placed
 from s2a_bench.progress import NullProgress, Progress
 from s2a_bench.store import run as store
+from s2a_bench.writers.style import paper_column
+from s2a_bench.writers.tables import TextTable
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
     from s2a_bench.report.compare.comparison import ComparedRuns
-    from s2a_bench.writers.tables import TextTable
 
 Folder: TypeAlias = "str | Path | Run"
 
@@ -47,7 +48,6 @@ class Run:
 
     @property
     def path(self) -> Path:
-        """The run folder."""
         return self._run.path
 
     @property
@@ -84,8 +84,6 @@ class Run:
 
     def figures(self) -> dict[str, Figure]:
         """Draw every figure of the run."""
-        from s2a_bench.writers.style import paper_column
-
         with paper_column():
             return {name: draw() for name, draw in self._shown.figures.items()}
 
@@ -95,8 +93,6 @@ class Run:
 
     def save(self) -> Path:
         """Write tables and figures into the run folder, as the command does, and return it."""
-        from s2a_bench.experiments.files import write_shown
-
         write_shown(self._run, self._shown)
         return self.path
 
@@ -121,19 +117,18 @@ class Comparison:
     """What changed between two runs. Shows its table in a notebook."""
 
     def __init__(self, compared: ComparedRuns) -> None:
-        """Keep what was found."""
         self._compared = compared
 
     def table(self) -> pd.DataFrame:
         """Return a row a cell and metric: both values, the change with its interval, the verdict."""
         import pandas as pd
 
-        from s2a_bench.report.compare.tables import compare_csv
+        from s2a_bench.report.compare.shown import compare_csv
 
         return pd.read_csv(io.StringIO(compare_csv(self._compared)))
 
     def _repr_html_(self) -> str:
-        from s2a_bench.report.compare.tables import compare_table
+        from s2a_bench.report.compare.shown import compare_table
 
         return _html(compare_table(self._compared))
 
@@ -172,8 +167,7 @@ def compare(
     """
     from s2a_bench.report.compare import comparison
 
-    sides = [[store.read_run(_path(each)) for each in _several(side)] for side in (baseline, other)]
-    opened = comparison.open_comparison(*sides, unlike=unlike, least=least)
+    opened = comparison.open_comparison(_opened(baseline), _opened(other), unlike=unlike, least=least)
     wanted = comparison.metrics_of(opened, metrics) if metrics else comparison.shown_metrics(opened)
     return Comparison(comparison.compare(opened, wanted))
 
@@ -193,12 +187,9 @@ def command(name: str) -> Callable[..., Run]:
     return call
 
 
-def _several(side: Folder | Sequence[Folder]) -> Sequence[Folder]:
-    return [side] if isinstance(side, (str, Path, Run)) else side
-
-
-def _path(folder: Folder) -> Path:
-    return folder.path if isinstance(folder, Run) else Path(folder)
+def _opened(side: Folder | Sequence[Folder]) -> list[store.Run]:
+    folders = [side] if isinstance(side, (str, Path, Run)) else side
+    return [store.read_run(folder.path if isinstance(folder, Run) else Path(folder)) for folder in folders]
 
 
 def _html(table: TextTable) -> str:

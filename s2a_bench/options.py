@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from s2a_bench.errors import UsageError
+from s2a_bench.text import read_text
 
 Made = TypeVar("Made", bound="Options")
 
@@ -33,7 +34,6 @@ class Options(BaseModel):
             raise UsageError(_line(error.errors()[0], type(self))) from None
 
     def model_post_init(self, _context: Any) -> None:
-        """Check what depends on several fields."""
         self.check()
 
     def check(self) -> None:
@@ -46,7 +46,11 @@ class Options(BaseModel):
 
     def but(self: Made, **changes: Any) -> Made:  # noqa: PYI019 - typing has Self since Python 3.11
         """Return a copy with some fields changed, checked like a new one."""
-        return type(self)(**{name: getattr(self, name) for name in self.model_fields_set} | changes)
+        return type(self)(**self.given_values() | changes)
+
+    def given_values(self) -> dict[str, Any]:
+        """Return the fields that were given, and their values."""
+        return {name: getattr(self, name) for name in self.model_fields_set}
 
     def given(self, options: type[Options] | None = None) -> Iterator[str]:
         """Yield the fields, of ``options`` that this class is derived from if told, that were given a value."""
@@ -55,8 +59,16 @@ class Options(BaseModel):
                 value = getattr(self, name)
                 yield from value.given() if isinstance(value, Options) else [name]
 
+    def risks(self) -> Iterator[tuple[str, str, str]]:
+        """Yield the fields given whose value a file of somebody else's should not decide: name, `risk` and value."""
+        for name in self.model_fields_set:
+            value = getattr(self, name)
+            if isinstance(value, Options):
+                yield from value.risks()
+            elif value and (risk := str(extra_of(type(self).model_fields[name]).get("risk", ""))):
+                yield name, risk, str(value)
+
     def to_manifest(self) -> dict[str, Any]:
-        """Return the options as plain data."""
         return self.model_dump()
 
 
@@ -68,15 +80,17 @@ def option(
     argument: bool = False,
     hidden: bool = False,
     side: str = "",
+    risk: Literal["", "program", "url", "key"] = "",
     **bounds: Any,
 ) -> Any:
     """Declare a field: ``about`` is its help, ``flag`` its name on the command line where that is not the field's.
 
     On the command line an ``argument`` is given by its place instead of a flag, and a ``hidden`` flag is left out of
-    the help. ``side`` is for the options of a transport, see `transport.options`. A field whose ``default`` is `...`
-    has to be given. ``bounds`` are pydantic's: ge, gt, le, lt, min_length, pattern.
+    the help. ``side`` is for the options of a transport, see `transport`. ``risk`` says that the value names
+    a program to run, a server that requests go to, or a key for it. A field whose ``default`` is `...` has to be given.
+    ``bounds`` are pydantic's: ge, gt, le, lt, min_length, pattern.
     """
-    extra: dict[str, Any] = {"flag": flag, "argument": argument, "hidden": hidden, "side": side}
+    extra: dict[str, Any] = {"flag": flag, "argument": argument, "hidden": hidden, "side": side, "risk": risk}
     return Field(default, description=about, json_schema_extra=extra, **bounds)
 
 
@@ -147,7 +161,6 @@ def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
 
 
 def _line(error: ErrorDetails, options: type[Options]) -> str:
-    """Return one line for what is wrong with one field."""
     field = str(error["loc"][0]) if error["loc"] else ""
     if error["type"] == "extra_forbidden":
         return f"`{field}` is none of the options {', '.join(options.model_fields)}"
@@ -207,7 +220,7 @@ def _grammar(value: Any) -> Any:
 
 def _content(path: str | Path) -> str:
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"cannot read {path}: {error}") from error
 
@@ -223,13 +236,8 @@ SEVERAL = BeforeValidator(listed)
 """What makes a tuple of text with commas between its elements, each once."""
 
 Names = Annotated[tuple[str, ...], SEVERAL]
-"""Several names; as text with commas between them, each once."""
-
 Numbers = Annotated[tuple[float, ...], SEVERAL]
-"""Several numbers; as text with commas between them, each once."""
-
 WholeNumbers = Annotated[tuple[int, ...], SEVERAL]
-"""Several whole numbers; as text with commas between them, each once."""
 
 Size = Annotated[tuple[int, int], BeforeValidator(_size)]
 """Width and height; as text 640x480."""

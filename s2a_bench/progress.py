@@ -13,23 +13,18 @@ class Progress(Protocol):
 
     def opened(self, folder: Path) -> None:
         """Say where the results go, before the first of them."""
-        ...
 
     def say(self, line: str) -> None:
         """Say one line that stays."""
-        ...
 
     def stage(self, text: str) -> None:
         """Say what is being done now."""
-        ...
 
     def expect(self, samples: int) -> None:
         """Say how many samples are to come."""
-        ...
 
     def advance(self) -> None:
         """Say that one more sample is done."""
-        ...
 
 
 class NullProgress:
@@ -40,22 +35,18 @@ class NullProgress:
     expected = done = 0
 
     def opened(self, folder: Path) -> None:
-        """Keep the folder."""
         self.folder = folder
 
     def say(self, line: str) -> None:
         """Say nothing."""
 
     def stage(self, text: str) -> None:
-        """Keep the text."""
         self.text = text
 
     def expect(self, samples: int) -> None:
-        """Keep the number."""
         self.expected = samples
 
     def advance(self) -> None:
-        """Count."""
         self.done += 1
 
 
@@ -64,11 +55,9 @@ class Picture(Protocol):
 
     def draw(self, width: int) -> Any:
         """Return how it looks now, so many columns wide, as rich renders it."""
-        ...
 
     def lines(self) -> Iterable[str]:
         """Return what came of it, for where there is no terminal."""
-        ...
 
 
 def watching(progress: Progress, picture: Picture) -> AbstractContextManager[None]:

@@ -22,7 +22,6 @@ LABELS: Final = {
     ("tokens", "paced"): "paced",
     ("link", "emulated"): "emulated link",
     ("engine", UNKNOWN): "engine unknown",
-    ("engine", "echo"): "echo engine",
 }
 """Field and value -> the label that marks a run wherever runs are listed."""
 
@@ -76,7 +75,6 @@ class Provenance:
         return cls(**{name: _text(value) for name in _FIELDS if isinstance(value := told.get(name), str) and value})
 
     def to_dict(self) -> dict[str, str]:
-        """Return it as plain data, all fields."""
         return asdict(self)
 
     @property
@@ -92,7 +90,9 @@ class Provenance:
     @property
     def labels(self) -> tuple[str, ...]:
         """Return the labels of what is not plainly a real model, measured."""
-        return tuple(label for (name, value), label in LABELS.items() if getattr(self, name) == value)
+        found = tuple(label for (name, value), label in LABELS.items() if getattr(self, name) == value)
+        no_model = self.weights == NONE and self.engine not in {NONE, UNKNOWN}
+        return (*found, f"{self.engine} engine") if no_model else found
 
     @property
     def code(self) -> str:
@@ -132,19 +132,17 @@ class Origins:
 
     @classmethod
     def of_manifest(cls, manifest: Mapping[str, Any]) -> Origins:
-        """Read a manifest's ``provenance``; a folder from before has what its own servers said, or unknown."""
+        """Read a manifest's ``provenance``; where it has none, as before anything answered, nothing is known."""
         told = manifest.get("provenance")
         if not isinstance(told, Mapping):
-            return cls(Provenance.of_engine(manifest.get("model") or {}))
+            return cls(Provenance())
         cells = {str(name): Provenance.from_dict(cell) for name, cell in (told.get("cells") or {}).items()}
         return cls(Provenance.from_dict(told.get("run") or {}), cells)
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return it as a manifest holds it."""
         return {"run": self.run.to_dict(), "cells": {name: cell.to_dict() for name, cell in self.cells.items()}}
 
     def of(self, cell: str) -> Provenance:
-        """Return a cell's."""
         return self.cells.get(cell, self.run)
 
     def of_row(self, cell: str) -> str:
@@ -158,12 +156,10 @@ class Origins:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Return the labels of all cells."""
         return tuple(dict.fromkeys(label for each in self.every for label in each.labels))
 
     @property
     def line(self) -> str:
-        """Return in one line where a run's numbers come from."""
         alike: dict[Provenance, list[str]] = {}
         for each in self.every:
             alike.setdefault(replace(each, profile=""), []).append(each.profile)

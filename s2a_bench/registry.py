@@ -61,8 +61,11 @@ class Registry(Mapping[str, T], Generic[T]):
         return len(self._builtins) + len(self._offered)
 
     def built_in(self) -> tuple[str, ...]:
-        """Return the names of the implementations that are our own."""
         return tuple(self._builtins)
+
+    def where(self, name: str) -> str:
+        """Return the module of an implementation of our own."""
+        return self._builtins[name].partition(":")[0]
 
     def loaded(self) -> Iterator[tuple[str, T]]:
         """Yield every name with its implementation, leaving out packages that do not load."""

@@ -1,13 +1,28 @@
-"""Text from outside, as it may be shown: no letter of it moves the cursor, forges a line or turns what follows."""
+"""Text from outside: read within bounds; shown so that no letter moves the cursor, forges a line or turns others."""
 
 from __future__ import annotations
 
 import re
+from pathlib import Path
+from typing import Final
 
 _HIDDEN = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff\ufff9-\ufffb]"
 )
 """Control characters (C0, C1), marks and overrides of direction, invisible letters, halves of surrogate pairs."""
+
+
+FILE_LETTERS: Final = 8 << 20
+"""The longest text file that is read where a user names one."""
+
+
+def read_text(path: str | Path, most: int = FILE_LETTERS) -> str:
+    """Read a UTF-8 file that a user names; raises UnicodeDecodeError, OSError, for one longer than ``most`` too."""
+    with Path(path).open(encoding="utf-8") as file:
+        text = file.read(most + 1)
+    if len(text) > most:
+        raise OSError(f"it is longer than {most} letters")
+    return text
 
 
 def visible(text: str) -> str:

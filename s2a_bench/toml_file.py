@@ -5,6 +5,7 @@ Every complaint is one line that names the file and the key.
 
 from __future__ import annotations
 
+import re
 import reprlib
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -27,12 +28,14 @@ _SHOULD_BE = {
     "dict_type": "a table",
     "model_type": "a table",
     "list_type": "a list",
+    "tuple_type": "a list",
     "string_type": "a text",
     "int_type": "a whole number",
     "float_type": "a number",
     "bool_type": "true or false",
 }
 """Type of an error of pydantic -> what there should be, in TOML's words."""
+_WRONG = {"missing": "is missing", "too_short": "is empty"}
 
 
 def _one_line(text: str) -> str:
@@ -51,8 +54,14 @@ class TomlTable(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
+_DEEP = re.compile(r"""(?<![\w-])(?:("[^"\n]*"|'[^'\n]*'|[\w-]+)[ \t]*\.[ \t]*){32}""")
+"""A key of more parts than anybody writes: tomllib's time goes with the square of their number."""
+
+
 def loads(text: str, where: str, parse_float: Callable[[str], Any] = float) -> dict[str, Any]:
     """Read TOML text; ``where`` begins every error. Raises UsageError."""
+    if _DEEP.search(text):
+        raise UsageError(f"{where}: no TOML that can be read: it has a dotted key of more than 32 parts")
     try:
         return tomllib.loads(text, parse_float=parse_float)
     except RecursionError:
@@ -78,7 +87,6 @@ def like(key: str, names: Iterable[str]) -> str:
 
 
 def _line(error: ErrorDetails, table: type[TomlTable], content: Any) -> str:
-    """Return one line for what is wrong with one key."""
     *inside, last = error["loc"]
     path = _path(error["loc"], content)
     if error["type"] == "extra_forbidden":
@@ -86,15 +94,18 @@ def _line(error: ErrorDetails, table: type[TomlTable], content: Any) -> str:
             table = _table_of(table.model_fields[step].annotation) if isinstance(step, str) else table
         names = ", ".join(table.model_fields)
         return f"{path}: there is no such key{like(str(last), table.model_fields) or f'; there are {names}'}"
-    if error["type"] == "missing":
-        return f"{path}: is missing"
-    if error["type"] == "too_short":
-        return f"{path}: is empty"
+    return f"{path}: {wrong(error)}"
+
+
+def wrong(error: ErrorDetails) -> str:
+    """Return what is wrong with the value of a key, in TOML's words."""
+    if error["type"] in _WRONG:
+        return _WRONG[error["type"]]
     if error["type"] == "value_error":
-        return f"{path}: {error['ctx']['error']}"
+        return str(error["ctx"]["error"])
     should = error["msg"].partition(" should ")[2] or error["msg"]
     wanted = _SHOULD_BE.get(error["type"])
-    return f"{path}: {reprlib.repr(error['input'])} should {f'be {wanted}' if wanted else should}"
+    return f"{reprlib.repr(error['input'])} should {f'be {wanted}' if wanted else should}"
 
 
 def _path(steps: Iterable[int | str], content: Any) -> str:

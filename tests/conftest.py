@@ -1,36 +1,54 @@
-"""Fixtures for every test: a DDS domain of this test run's own, and models that cannot end the run."""
+"""Fixtures for every test: a DDS domain of this process's own, and models that cannot end the run."""
 
 from __future__ import annotations
 
 import functools
 import os
 import signal
+import socket
 from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
 
 import pytest
 from hypothesis import settings
 
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.smoke import smoke_test
-from tests.made_runs import black_box, make_row, make_run, plausible  # noqa: F401 - fixtures
+from tests.made_runs import black_box, fast_board, make_row, make_run, plausible  # noqa: F401 - fixtures
+
+pytest.register_assert_rewrite("tests.ros.action_suite", "tests.ros.middleware_suite")
 
 # These machines are shared: time is not judged. What is drawn is the same each time, as what judges a change must be;
 # S2A_RANDOM=1 draws anew, and so does `make fuzz`.
 settings.register_profile("s2a", deadline=None, derandomize="S2A_RANDOM" not in os.environ)
 settings.load_profile("s2a")
 
-DOMAINS = range(101, 201)
-"""Far from ROS's default 0, and with valid ports."""
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Let a file's tests share their fixtures in one worker, and hostile peers never meet one another."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Files(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return "tests/hostile" if nodeid.startswith("tests/hostile/") else nodeid.partition("::")[0]
+
+    return Files(config, log)
+
+
+DOMAINS = range(20, 99)
+"""Far from ROS's default 0; the UDP ports of a domain above 100 are among those that the kernel gives to any client."""
+UNUSED_PORT = 2
+"""Of the 250 ports of a domain, one that DDSI-RTPS gives no meaning (9.6.1)."""
 
 
 @pytest.fixture(scope="session", autouse=True)
-def dds_domain() -> int:
-    """Keep DDS on loopback, in a domain that another test run on this machine is unlikely to use.
+def dds_domain() -> Iterator[int]:
+    """Keep DDS on loopback, in a domain that no other test process on this machine has.
 
     In a sourced ROS 2 environment, too, the middleware is Cyclone DDS from PyPI unless a test names another.
     """
-    domain = DOMAINS[os.getpid() % len(DOMAINS)]
-    os.environ["ROS_DOMAIN_ID"] = str(domain)
     for name in (
         "ROS_AUTOMATIC_DISCOVERY_RANGE",
         "ROS_STATIC_PEERS",
@@ -39,7 +57,16 @@ def dds_domain() -> int:
         "ROS_DISTRO",
     ):
         os.environ.pop(name, None)
-    return domain
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as claim:
+        for turn in range(len(DOMAINS)):
+            domain = DOMAINS[(os.getpid() + turn) % len(DOMAINS)]
+            with suppress(OSError):
+                claim.bind(("127.0.0.1", 7400 + 250 * domain + UNUSED_PORT))
+                break
+        else:
+            pytest.exit("each DDS domain of tests is taken by another test process", returncode=1)
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        yield domain
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,5 +1,6 @@
 """Runs made by hand: durations in ms a stage and cell, the empty name being the residual."""
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -8,11 +9,46 @@ from typing import Any, TypeAlias
 import numpy as np
 import pytest
 
+from s2a_bench.boards.profile import to_toml
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
 
 Durations: TypeAlias = Mapping[str, float]
 MakeRun: TypeAlias = Callable[..., Run]
+
+SCHEMA: Any = json.loads((Path(__file__).parents[1] / "docs" / "schema" / "s2a-bench-1.json").read_text())
+"""What --json prints."""
+STAGES = {
+    "capture": "capture",
+    "convert": "encode",
+    "image_encode": "encode",
+    "base64_encode": "encode",
+    "json_pack": "pack",
+    "cdr_pack": "pack",
+    "connect": "network",
+    "network": "network",
+    "accept": "network",
+    "ingest": "ingest",
+    "json_parse": "parse",
+    "cdr_parse": "parse",
+    "base64_decode": "decode",
+    "image_decode": "decode",
+    "yuv_decode": "decode",
+    "channel_swap": "decode",
+    "queue": "queue",
+    "inference": "inference",
+    "server": "server",
+    "return": "return",
+}
+"""Stage -> group of the runs made here, where a test does not say."""
+
+
+def known(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a manifest with the stages and the provenance that a run writes, where it has none."""
+    origins = Origins(Provenance.of_engine(manifest.get("model") or {}))
+    return {"stages": STAGES, "provenance": origins.to_manifest(), **manifest}
+
 
 PLAUSIBLE: dict[str, Durations] = {
     "http/as-deployed": {
@@ -85,7 +121,7 @@ def marks_of(durations: Durations, start_ns: int, factor: float = 1.0) -> list[t
 
 def row_of(cell: str, durations: Durations, block: int, **facts: Any) -> SampleRow:
     pipeline, _, variant = cell.partition("/")
-    payload = {"http": "jpeg", "ros": "bgr"}.get(pipeline, "none")
+    payload = {"http": "jpeg", "ros": "raw"}.get(pipeline, "none")
     whole: dict[str, Any] = {
         "cell": cell,
         "pipeline": pipeline,
@@ -107,12 +143,13 @@ def row_of(cell: str, durations: Durations, block: int, **facts: Any) -> SampleR
 
 @pytest.fixture
 def make_run(tmp_path: Path) -> MakeRun:
-    """Make a run of lognormal durations (``spread`` > 0) or exact ones (``spread`` = 0)."""
+    """Make a run of lognormal durations (``spread`` > 0) or exact ones (``spread`` = 0), ``n`` over all launches."""
 
     def make(
         cells: Mapping[str, Durations] = PLAUSIBLE,
         *,
         n: int = 50,
+        launches: int = 1,
         spread: float = 0.15,
         n_tokens: int = 3,
         manifest: Mapping[str, Any] | None = None,
@@ -121,12 +158,13 @@ def make_run(tmp_path: Path) -> MakeRun:
         **facts: Any,
     ) -> Run:
         rng = np.random.default_rng(1)
-        with RunWriter.create(tmp_path, "latency", dict(manifest or {})) as run:
+        with RunWriter.create(tmp_path, "latency", known(manifest or {})) as run:
             for block in range(-5, n):
                 load = rng.lognormal(0, spread)
                 for cell, durations in cells.items():
                     marks = marks_of(durations, 10**9, load * rng.lognormal(0, spread))
-                    row = row_of(cell, durations, block, marks=marks, warmup=block < 0, n_tokens=n_tokens, **facts)
+                    place = {"warmup": block < 0, "launch": max(block, 0) * launches // n}
+                    row = row_of(cell, durations, block, marks=marks, n_tokens=n_tokens, **place, **facts)
                     row = replace(row, payload=(payloads or {}).get(row.pipeline, row.payload))
                     run.sample(row)
                     run.tokens(
@@ -138,6 +176,15 @@ def make_run(tmp_path: Path) -> MakeRun:
         return read_run(run.path)
 
     return make
+
+
+@pytest.fixture
+def fast_board(tmp_path: Path) -> str:
+    """The profile of a board of 120 tokens a second."""
+    facts = {"title": "A board", "origin": "measured", "tokens_per_s": 120.0, "prompt_s": 0.05}
+    path = tmp_path / "fast.toml"
+    path.write_text(to_toml({**facts, "gaps": {"family": "constant"}}))
+    return str(path)
 
 
 @pytest.fixture

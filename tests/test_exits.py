@@ -1,6 +1,6 @@
 from signal import SIGILL, SIGKILL
 
-from s2a_bench.exits import COMPILE_AGAIN, how_it_ended
+from s2a_bench.errors import COMPILE_AGAIN, how_it_ended
 
 
 def test_an_exit_code_is_told_as_it_is() -> None:

@@ -9,7 +9,7 @@ from dataclasses import fields
 import orjson
 
 from s2a_bench.facts import PROMPT_N, Fact, facts_json
-from s2a_bench.machine.resources.rows import SPENT, ResourceRow
+from s2a_bench.machine.resources import SPENT, ResourceRow
 from s2a_bench.trace import Trace
 
 

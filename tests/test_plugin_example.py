@@ -13,6 +13,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from s2a_bench.testing.transport import Recorder
+from tests.servers.sockets import serving
+from tests.servers.speakers import Ollama, answering
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -145,6 +149,92 @@ def test_its_policy_takes_its_parameter(command: Command) -> None:
     assert "1 or more" in command(*asked, "--policy", "toy-policy?factor=0.5", code=2).stderr
 
 
+def test_its_policy_is_calibrated_and_tracked(command: Command, tmp_path: Path) -> None:
+    asked = ("timeline", "--profile", "jetson-orin-nano", "--tokens-per-skill", "4", "--jitter", "profile")
+    asked += ("--plans", "30", "--calibration-plans", "99", "--policy", "toy-careful,naive", "--json")
+    done = command(*asked)
+    cells = {cell["policy"]: cell for cell in json.loads(done.stdout)["cells"]}
+    (found,) = json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())["calibrations"].values()
+    assert found["plans"] == 99
+    assert found["caution"] > 0
+    assert cells["toy-careful"]["caution"] == found["caution"]
+    assert cells["toy-careful"]["p_any_stall"] < cells["naive"]["p_any_stall"]
+    assert json.loads(command(*asked, "--track").stdout)["cells"]
+
+
+def test_its_mode_has_its_trigger_learnt(command: Command, tmp_path: Path) -> None:
+    asked = ("chunks", "--modes", "toy-mode?trigger=2", "--latency", "lognormal:mean_ms=90,cv=0.3", "--cycles", "300")
+    done = command(*asked, "--calibration-cycles", "200", "--json")
+    rows = {cell["rule"]: cell for cell in json.loads(done.stdout)["cells"]}
+    assert set(rows) == {"given", "calibrated", "tracked", "maximum", "mean", "oracle"}
+    assert {cell["mode"] for rule, cell in rows.items() if rule != "given"} == {"toy-mode"}
+    assert rows["given"]["trigger"] == 2
+    assert rows["calibrated"]["trigger"] > rows["mean"]["trigger"] > 2
+    assert rows["calibrated"]["p_stall_cycle"] < 0.05 < rows["given"]["p_stall_cycle"]
+    triggers = pd.read_csv(folder_of(done, tmp_path) / "chunk_triggers.csv")
+    assert set(triggers["mode"]) == {"toy-mode"}
+    assert triggers["p_stall_cycle"].is_monotonic_decreasing
+
+
+def test_its_engine_answers_over_any_transport(command: Command, tmp_path: Path) -> None:
+    asked = [*SMALL]
+    asked[asked.index("echo")] = "toy-words"
+    done = command("latency", "--transport", "http,toy", *asked)
+    folder = folder_of(done, tmp_path)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["provenance"]["run"]["engine"] == "toy-words"
+    assert manifest["facts"]["toy_counted"]["unit"] == "words"
+    samples = pd.read_csv(folder / "samples.csv")
+    assert {json.loads(told)["toy_counted"] for told in samples[samples["cell"] != "toy"]["facts"]} == {3.0}
+    assert "Toy-words engine" in done.stdout
+    assert "computes nothing" in command("throughput", "--engine", "toy-words", code=2).stderr
+    assert "for an engine with a model" in command("latency", *asked, "--gpu-layers", "1", code=2).stderr
+
+
+def test_its_robot_gets_the_actions_of_its_engine_in_its_mode(command: Command, tmp_path: Path) -> None:
+    asked = (
+        "chunks",
+        "--live",
+        "--transport",
+        "loopback",
+        "--engine",
+        "toy-words",
+        "--size",
+        "64x48",
+        "--seconds",
+        "1",
+    )
+    asked += ("--modes", "toy-mode?trigger=2", "--rules", "maximum", "--horizon", "8", "--control-hz", "50")
+    done = command(*asked, "--robot", "toy-robot?log=actions.txt", "--json")
+    rows = {cell["rule"]: cell for cell in json.loads(done.stdout)["cells"]}
+    assert set(rows) == {"given", "maximum"}
+    assert min(cell["agreement"] for cell in rows.values()) > 0.5
+    lines = (tmp_path / "actions.txt").read_text().splitlines()
+    assert sum(line.startswith("action ") for line in lines) > 50
+    assert json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())["robot"] == {"robot": "toy-robot"}
+    assert "virtual time has no actions" in command("chunks", "--robot", "toy-robot", code=2).stderr
+
+
+def test_its_robot_carries_out_skills(command: Command, tmp_path: Path) -> None:
+    asked = ("timeline", "--live", "--engine", "replay", "--profile", "rtx-4080", "--transport", "loopback")
+    command(*asked, "--n-skills", "2", "--t-nom", "0.05", "--policy", "naive", "--robot", "toy-robot?log=skills.txt")
+    assert len((tmp_path / "skills.txt").read_text().splitlines()) == 2
+
+
+def test_its_dialect_is_asked(command: Command, tmp_path: Path) -> None:
+    class Speaker(Ollama):
+        path = "/toy/chat"
+
+    asked = Recorder(["one", " two", " three"])
+    spoken = ["--dialect", "toy-chat", "--served-model", "toy", "--transport", "http"]
+    with serving(answering(Speaker(), asked)) as url:
+        done = command("latency", "--url", url, *spoken, "--size", "64x48", "--runs", "3", "--warmup", "1")
+    samples = pd.read_csv(folder_of(done, tmp_path) / "samples.csv")
+    assert len(asked.requests) == len(samples) == 4 * samples["cell"].nunique()
+    assert samples["error"].isna().all()
+    assert json.loads(samples["facts"][0])["predicted_ms"] == 30
+
+
 def test_its_dialect_is_known_by_name(command: Command) -> None:
     spoken = ["--dialect", "toy-chat", "--served-model", "toy"]
     done = command("latency", "--url", "http://127.0.0.1:9", *spoken, "--transport", "http", *SMALL, code=1)
@@ -165,7 +255,7 @@ def test_its_experiment_is_a_command_and_a_function(
     assert json.loads(command("compare", str(one), str(other), "--json").stdout)["comparisons"]
     command("report", str(one), "--output", str(tmp_path / "report.html"))
     assert "cost of a reading" in (tmp_path / "report.html").read_text()
-    code = "from s2a_bench import library; print(len(library.run('toy-clock', readings=7).table('metrics')))"
+    code = "from s2a_bench import library; print(len(library.run('toy-clock', readings=7).table('readings')))"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=installed, cwd=tmp_path
     )

@@ -10,19 +10,18 @@ from typing import Any
 import pytest
 
 import s2a_bench as s2a
-from s2a_bench.experiments import EXPERIMENTS, Shown
-from s2a_bench.experiments.files import write_shown
+from s2a_bench.experiments import EXPERIMENTS, Shown, write_shown
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.provenance import Origins, Provenance, joined
 from s2a_bench.report.compare.alike import differences
+from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
-from s2a_bench.report.page.config import ReportConfig
 from s2a_bench.report.page.files import make_report, write_report
 from s2a_bench.store.run import Run, RunWriter, read_run
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.figures import new_figure, save
-from s2a_bench.writers.latex import to_siunitx
-from s2a_bench.writers.tables import TextTable, to_latex, to_markdown
+from s2a_bench.writers.latex import to_latex, to_siunitx
+from s2a_bench.writers.tables import TextTable, to_markdown
 
 LLAMA = {"engine": "llama", "model": "/m/tiny.gguf", "name": "tiny", "dummy": True, "model_sha256": "ab"}
 
@@ -82,10 +81,8 @@ def test_a_run_knows_its_cells_and_what_is_made_of_all() -> None:
     assert joined([Origins(known), Origins(unknown)]).every == (known, unknown)
 
 
-def test_folders_from_before_have_what_their_own_servers_said_or_unknown() -> None:
-    assert Origins.of_manifest({"model": {"engine": "echo", "model": "none"}}).run.engine == "echo"
-    assert not Origins.of_manifest({"model": {}}).run.known
-    assert not Origins.of_manifest({}).run.known
+def test_of_a_run_without_provenance_nothing_is_known() -> None:
+    assert Origins.of_manifest({"model": {"engine": "echo", "model": "none"}}) == Origins(Provenance())
 
 
 def test_boards_alike_but_for_the_profile_share_a_line() -> None:

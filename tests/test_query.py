@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from s2a_bench.experiments.latency.view.cells import cells_of
+from s2a_bench.experiments.requests import cells_of
 from s2a_bench.store.run import read_run
 
 ROOT = Path(__file__).parent.parent

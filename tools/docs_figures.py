@@ -1,7 +1,7 @@
 """Draw the figures of docs/{policies,timeline,boundary,chunks}.md: `.venv/bin/python tools/docs_figures.py`.
 
-They come from runs in virtual time with fixed seeds, so that running this again changes no figure. Those of
-docs/studies.md take minutes and are drawn where they are named: `... study-targets study-frontier`.
+They come from runs in virtual time with fixed seeds, so that running this again changes no figure. Those of the
+studies are drawn by `python -m studies figures`.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import numpy as np
 
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
-from s2a_bench.experiments.boundary.view.figure import build_boundary
+from s2a_bench.experiments.boundary.view import build_boundary
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
-from s2a_bench.experiments.chunks.view.figures import build_reactions, build_stability, build_triggers
-from s2a_bench.experiments.chunks.view.lanes import build_lanes
-from s2a_bench.experiments.chunks.view.smoothness import build_smoothness
-from s2a_bench.experiments.study.config import StudyConfig
-from s2a_bench.experiments.study.run import run_study
-from s2a_bench.experiments.study.view.figures import build_frontier, build_targets
-from s2a_bench.experiments.study.view.rules import build_shift, build_split
-from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.experiments.chunks.view.figures import (
+    build_lanes,
+    build_reactions,
+    build_smoothness,
+    build_stability,
+    build_triggers,
+)
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours
+from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
 from s2a_bench.store.run import Run, read_run
@@ -78,11 +78,6 @@ def boundary(config: BoundaryConfig) -> Figure:
 def chunks(latency: str) -> Run:
     """Make a run of chunks, four modes and the rules."""
     return _run(lambda output: run_chunks(ChunksConfig(latency=latency, shown_ticks=90), output, Quiet()))
-
-
-def study(config: StudyConfig) -> Run:
-    """Make a study's run."""
-    return _run(lambda output: run_study(config, output, Quiet()))
 
 
 def safe_start_figure() -> Figure:
@@ -138,20 +133,11 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "boundary": lambda: boundary(BoundaryConfig()),
     "boundary-jitter": lambda: boundary(BoundaryConfig(jitter="lognormal:cv=0.2")),
     "chunks-lanes": lambda: build_lanes(chunks(SPREAD)),
-    "chunks-stability": lambda: build_stability(chunks("80")),
-    "chunks-stability-spread": lambda: build_stability(chunks(SPREAD)),
+    "chunks-stability": lambda: build_stability(chunks(SPREAD)),
     "chunks-triggers": lambda: build_triggers(chunks(f"{SPREAD},{SLOW_ONES}")),
     "chunks-reactions": lambda: build_reactions(chunks("80")),
     "chunks-smoothness": lambda: build_smoothness(chunks(SPREAD)),
 }
-
-SLOW: dict[str, Callable[[], Figure]] = {
-    "study-targets": lambda: build_targets(study(StudyConfig(name="targets", seed=20261121))),
-    "study-frontier": lambda: build_frontier(study(StudyConfig(name="frontier"))),
-    "study-shift": lambda: build_shift(study(StudyConfig(name="shift", seeds=10, jobs=2))),
-    "study-split": lambda: build_split(study(StudyConfig(name="split", seeds=10, jobs=2))),
-}
-"""Drawn where they are named."""
 
 
 def main() -> None:
@@ -159,7 +145,7 @@ def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     for name in sys.argv[1:] or FIGURES:
         with paper_column():
-            (FIGURES | SLOW)[name]().savefig(FOLDER / f"{name}.png", dpi=DPI)
+            FIGURES[name]().savefig(FOLDER / f"{name}.png", dpi=DPI)
         print(FOLDER / f"{name}.png")
 
 

@@ -19,8 +19,8 @@ from typer.main import get_command
 from s2a_bench.cli import app
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, Fact
-from s2a_bench.inference import ENGINES, told_by
-from s2a_bench.machine.resources.rows import SPENT
+from s2a_bench.inference import ENGINES
+from s2a_bench.machine.resources import SPENT
 from s2a_bench.options import Options, group_of
 from s2a_bench.transport import TRANSPORTS
 from s2a_bench.transport.http.dialects import DIALECTS
@@ -71,9 +71,9 @@ def _belongs(command: str, name: str, row: str, group: str) -> bool:
 
 def fact_table() -> str:
     """Return the table of the facts, in the order in which they come to be told."""
-    tellers: dict[str, Sequence[Fact]] = {name: TRANSPORTS[name].tells for name in TRANSPORTS.built_in()}
+    tellers: dict[str, Sequence[Fact]] = {name: TRANSPORTS[name].facts for name in TRANSPORTS.built_in()}
     tellers |= {name: DIALECTS[name]().tells for name in DIALECTS.built_in()}
-    tellers |= {name: told_by(name) for name in ENGINES.built_in()}
+    tellers |= {name: ENGINES[name].tells for name in ENGINES.built_in()}
     tellers |= {"`--mode stream`": (FRAMES_PUBLISHED, FRAMES_LOST), "[resources](resources.md)": SPENT}
     lines = ["| fact | unit | what it says | told by |", "|---|---|---|---|"]
     for fact in dict.fromkeys(fact for told in tellers.values() for fact in told):

@@ -22,7 +22,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from difflib import unified_diff
@@ -43,8 +43,10 @@ TESTS = {
     "stats": ["tests/stats"],
     "policy": ["tests/policy"],
     "plan": ["tests/plan"],
-    "runtime": ["tests/runtime"],
+    "act": ["tests/act"],
     "store": ["tests/store", "tests/sweep/test_sweep.py"],
+    "library.py": ["tests/test_library.py"],
+    "transport": ["tests/transport", "tests/harness/test_serving.py"],
     "report/claims": [f"tests/report/test_claim{part}.py" for part in ("_rules", "_texts", "s", "_cases")],
 }
 """Package -> the tests that belong to it."""
@@ -131,11 +133,11 @@ def meaning(source: str) -> str | None:
         return None
 
 
-def sample(number: int, seed: int) -> list[Mutant]:
-    """Draw mutants; every place has the same chance."""
+def sample(number: int, seed: int, packages: Sequence[str]) -> list[Mutant]:
+    """Draw mutants of packages; every place has the same chance."""
     chance = random.Random(seed)  # noqa: S311 - not secret
     drawn: list[Mutant] = []
-    everywhere = [place for package in TESTS for place in places(package)]
+    everywhere = [place for package in packages for place in places(package)]
     for place in chance.sample(everywhere, len(everywhere)):
         mutant = chance.choice(place)
         if meaning(mutant.source()) not in {None, meaning((ROOT / mutant.path).read_text())}:
@@ -256,9 +258,10 @@ def main() -> None:
     parser.add_argument("--mutants", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("--packages", nargs="+", choices=[*TESTS], default=[*TESTS], metavar="PACKAGE")
     parser.add_argument("--again", action="store_true", help="only those not known to be noticed")
     asked = parser.parse_args()
-    drawn = sample(asked.mutants, asked.seed)
+    drawn = sample(asked.mutants, asked.seed, asked.packages)
     known = noticed() if asked.again and RESULTS.exists() else {}
     rest = [mutant for mutant in drawn if mutant not in known]
     RESULTS.parent.mkdir(parents=True, exist_ok=True)

@@ -17,18 +17,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from s2a_bench.experiments import EXPERIMENTS
-from s2a_bench.experiments.ccrb.view.cell import CcrbFollower, CcrbSensitivity, CcrbStudy
-from s2a_bench.experiments.profile_capture.as_json import Board, ProfileJson
-from s2a_bench.experiments.throughput.view.cell import Reference
-from s2a_bench.inference.files_json import Fetched, Info
+from s2a_bench.experiments.ccrb.view.tables import CcrbFollower, CcrbSensitivity, CcrbStudy
+from s2a_bench.experiments.profile_capture import Board, ProfileJson
+from s2a_bench.experiments.throughput.metrics import Reference
+from s2a_bench.inference.fetch import FetchedFile
+from s2a_bench.inference.gguf_file import GgufInfo
 from s2a_bench.provenance import Origins
-from s2a_bench.report.compare.as_json import CompareJson
+from s2a_bench.report.compare.shown import CompareJson
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.sweep.as_json import PlannedCell, SweptCell
 from s2a_bench.writers.as_json import RatioJson
 
 FOLDER = Path(__file__).parent.parent / "docs/schema"
-PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", type(None): "null"}
+PLAIN = {str: "string", Path: "string", int: "integer", float: "number", bool: "boolean", type(None): "null"}
 
 
 class Parts:
@@ -117,7 +118,7 @@ def profile_schema() -> dict[str, Any]:
 
 def model_schema() -> dict[str, Any]:
     """Return the schema of `model fetch --json` and `model info --json`."""
-    return _redefined("s2a-bench-model-1", {"fetched": Fetched, "info": Info})
+    return _redefined("s2a-bench-model-1", {"fetched": FetchedFile, "info": GgufInfo})
 
 
 def _redefined(name: str, named: dict[str, Any], kept: Sequence[str] = ()) -> dict[str, Any]:

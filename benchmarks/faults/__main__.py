@@ -15,17 +15,20 @@ TABLE = re.compile(r"(<!-- faults -->\n).*?(<!-- /faults -->)", re.DOTALL)
 
 
 def table(came: dict[Fault, str]) -> str:
-    """Return the matrix in Markdown; a broken promise stands out."""
+    """Return the matrix in Markdown, times of a like outcome in one row; a broken promise stands out."""
     lines = [f"| {' | '.join(('what', 'when', *TRANSPORTS))} |", "|---" * (2 + len(TRANSPORTS)) + "|"]
     for what in WHATS:
+        rows: dict[tuple[str, ...], list[str]] = {}
         for when in WHENS:
-            cells = []
-            for transport in TRANSPORTS:
-                fault = Fault(what, when, transport)
-                got = came.get(fault, "-")
-                cells.append(got if got in fault.promised or got == "-" else f"**{got[:80]}**")
-            lines.append(f"| {' | '.join((what, when, *cells))} |")
+            faults = [Fault(what, when, transport) for transport in TRANSPORTS]
+            cells = tuple(_cell(fault, came.get(fault, "-")) for fault in faults)
+            rows.setdefault(cells, []).append(when)
+        lines += [f"| {' | '.join((what, ', '.join(whens), *cells))} |" for cells, whens in rows.items()]
     return "\n".join(lines)
+
+
+def _cell(fault: Fault, got: str) -> str:
+    return got if got in {*fault.promised, "-"} else f"**{got[:80]}**"
 
 
 def main() -> None:

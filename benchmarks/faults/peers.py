@@ -20,7 +20,7 @@ from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.trace import RESIDUAL, Trace
-from s2a_bench.transport import TRANSPORTS, Wiring, open_client
+from s2a_bench.transport import Wiring, open_client
 from s2a_bench.types import Request
 
 TOKENS, PER_S = 24, 25.0
@@ -139,7 +139,7 @@ def serving(transport: str) -> Iterator[OwnServer]:
     told = wiring(transport, timeout_s=SILENCE_S, max_tokens=TOKENS)
     if transport.startswith("ros"):
         told = replace(told, address=f"/faults_{next(_numbers)}")
-    answer = TRANSPORTS[told.transport].answers(told.variant, told.options)[0]
+    answer = told.capabilities.answer_kinds[0]
     engine = EngineConfig(name="echo", pace=PER_S, answer=answer, horizon=TOKENS)
     with tempfile.TemporaryDirectory() as folder:
         server = OwnServer("faulty", ServerJob(told, engine), Path(folder) / "log")

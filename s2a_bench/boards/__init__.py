@@ -1,1 +1,1 @@
-"""Hardware profiles: what a board is, the families of its gaps, its file, where files are found, and fitting."""
+"""Hardware profiles: what a board is, its file, where files are found; the families of its gaps, and fitting."""

@@ -10,15 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
-from s2a_bench.boards.gaps import Gaps, Lognormal, Markov, Quantiles
+import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Floats: TypeAlias = NDArray[np.float64]
+from s2a_bench.boards.gaps import Floats, Gaps, Lognormal, Markov, Quantiles
 
 Rows: TypeAlias = Sequence[Sequence[float]]
 """Gaps in s, one row a request."""
@@ -45,8 +42,6 @@ class Fit:
 
 def fit_gaps(rows: Rows) -> Fit:
     """Choose among FITS; raises ValueError for fewer than 40 gaps."""
-    import numpy as np
-
     rows = [row for row in rows if len(row)]
     if sum(map(len, rows)) < _LEAST_GAPS:
         raise ValueError(f"a fit needs {_LEAST_GAPS} gaps, there are {sum(map(len, rows))}")
@@ -62,8 +57,6 @@ def fit_gaps(rows: Rows) -> Fit:
 
 def lag1(rows: Rows) -> float:
     """Return the correlation of a gap with the next within requests; 0 where gaps do not vary."""
-    import numpy as np
-
     centred = [np.asarray(row) - np.mean(row) for row in rows if len(row) > 1]
     power = sum(float(row @ row) for row in centred)
     return sum(float(row[1:] @ row[:-1]) for row in centred) / power if power else 0.0
@@ -71,8 +64,6 @@ def lag1(rows: Rows) -> float:
 
 def fit_lognormal(rows: Rows) -> Lognormal:
     """Fit by maximum likelihood, the mean being that of the gaps."""
-    import numpy as np
-
     gaps = _flat(rows)
     mean = float(gaps.mean())
     square = float(np.mean(np.log(gaps / mean) ** 2))
@@ -82,8 +73,6 @@ def fit_lognormal(rows: Rows) -> Lognormal:
 
 def fit_markov(rows: Rows) -> Markov:
     """Fit two lognormal states by expectation maximisation, then how long pauses last from how states follow."""
-    import numpy as np
-
     logs = np.log(_flat(rows))
     low, high = np.quantile(logs, (0.5, 0.99))
     share, variance = 0.05, max(float(logs.var()) / 4, 1e-9)
@@ -116,8 +105,6 @@ def fit_quantiles(rows: Rows) -> Quantiles:
 
     What still misses goes into the largest, so that keeping the mean does not move the body.
     """
-    import numpy as np
-
     gaps = np.sort(_flat(rows))
     last = len(gaps) - 1
     total = np.concatenate(([0.0], np.cumsum((gaps[1:] + gaps[:-1]) / 2)))  # the area under the quantiles
@@ -144,7 +131,6 @@ FITS: dict[str, Callable[[Rows], Gaps]] = {
 
 def _distances(gaps: Gaps, rows: Rows) -> tuple[float, float]:
     """Return the distance of single gaps and that of sums over a skill; 0 where no request is that long."""
-    import numpy as np
     from scipy.stats import ks_2samp
 
     drawn = gaps.sample(np.random.default_rng(0), SKILL_TOKENS, _DRAWS)
@@ -155,14 +141,10 @@ def _distances(gaps: Gaps, rows: Rows) -> tuple[float, float]:
 
 
 def _flat(rows: Rows) -> Floats:
-    import numpy as np
-
     return np.maximum(np.fromiter(chain.from_iterable(rows), np.float64), 1e-9)  # a clock's tick, for the logarithm
 
 
 def _split(values: NDArray[np.bool_], rows: Rows) -> list[NDArray[np.bool_]]:
-    import numpy as np
-
     return np.split(values, np.cumsum([len(row) for row in rows])[:-1])
 
 

@@ -8,16 +8,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from dataclasses import fields
+from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol, TypeAlias
+
+from pydantic import ConfigDict, Field, ValidationError
+from pydantic.dataclasses import dataclass
 
 from s2a_bench.errors import UsageError
+from s2a_bench.toml_file import wrong
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    Floats: TypeAlias = NDArray[np.float64]
+Floats: TypeAlias = "NDArray[np.float64]"
+Mean = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Number = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Numbers = Annotated[tuple[float, ...], Field(strict=False)]
+"""TOML has lists."""
+STRICT: Final = ConfigDict(strict=True)
 
 
 class Gaps(Protocol):
@@ -26,48 +35,35 @@ class Gaps(Protocol):
     @property
     def mean_s(self) -> float:
         """Return the mean gap, 1 / rate."""
-        ...
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
         """Draw gaps of shape (tokens, plans) in s; a column is one uninterrupted stretch, columns are independent."""
-        ...
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=STRICT)
 class Constant:
     """No jitter."""
 
-    mean_s: float
-
-    def __post_init__(self) -> None:
-        """Refuse what is no mean."""
-        _between("mean_s", self.mean_s, 0)
+    mean_s: Mean
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:  # noqa: ARG002 - nothing is random
-        """Return the same gap everywhere."""
         import numpy as np
 
         return np.full((tokens, plans), self.mean_s)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=STRICT)
 class Lognormal:
     """Independent lognormal gaps; ``cv`` is standard deviation / mean."""
 
-    mean_s: float
-    cv: float
-
-    def __post_init__(self) -> None:
-        """Refuse parameters that make no distribution."""
-        _between("mean_s", self.mean_s, 0)
-        _between("cv", self.cv, 0)
+    mean_s: Mean
+    cv: Number
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
-        """Draw gaps."""
         return _lognormal(rng, self.mean_s, self.cv, (tokens, plans))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=STRICT)
 class Markov:
     """Two states, normal and pause, each with lognormal gaps: a machine that is sometimes kept from working.
 
@@ -75,31 +71,25 @@ class Markov:
     correlation of states falls geometrically.
     """
 
-    mean_s: float
-    cv: float
+    mean_s: Mean
+    cv: Number
     """Within a state."""
-    pause_share: float
+    pause_share: Annotated[float, Field(ge=0, le=0.999)]
     """Share of the tokens whose gap is a pause."""
-    pause_ratio: float
+    pause_ratio: Number
     """Mean gap of a pause over the mean normal gap."""
-    pause_tokens: float
+    pause_tokens: Number
     """Mean number of gaps that pauses last for; 1 / (1 - pause_share), its least, means independent gaps."""
 
     def __post_init__(self) -> None:
-        """Refuse parameters that make no chain."""
-        _between("mean_s", self.mean_s, 0)
-        _between("cv", self.cv, 0)
-        _between("pause_share", self.pause_share, 0, 0.999)
-        _between("pause_ratio", self.pause_ratio, 0)
-        _between("pause_tokens", self.pause_tokens, 1 / (1 - self.pause_share))
+        if self.pause_tokens < (least := 1 / (1 - self.pause_share)):
+            raise UsageError(f"pause_tokens: {self.pause_tokens:g} should be {least:g} or more")
 
     @property
     def normal_s(self) -> float:
-        """Return the mean normal gap."""
         return self.mean_s / (1 + self.pause_share * (self.pause_ratio - 1))
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
-        """Draw gaps."""
         import numpy as np
 
         shape = (tokens, plans)
@@ -113,53 +103,42 @@ class Markov:
         return gaps
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=STRICT)
 class Bursty:
     """Tokens that travel together, as through a network or proxy that batches: one long gap, then short ones.
 
     A stretch starts anywhere within a burst.
     """
 
-    mean_s: float
-    cv: float
+    mean_s: Mean
+    cv: Number
     """Of the long gaps, and of the short ones."""
-    burst_tokens: int
+    burst_tokens: Annotated[int, Field(ge=1)]
     """Tokens a burst."""
-    within: float
+    within: Annotated[float, Field(ge=0, le=1)]
     """Mean gap inside a burst over the mean of all gaps."""
 
-    def __post_init__(self) -> None:
-        """Refuse parameters that make no bursts."""
-        _between("mean_s", self.mean_s, 0)
-        _between("cv", self.cv, 0)
-        _between("burst_tokens", self.burst_tokens, 1)
-        _between("within", self.within, 0, 1)
-
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
-        """Draw gaps."""
         import numpy as np
 
         burst = self.burst_tokens
         scale = np.full(burst, self.within)
         scale[0] = burst - (burst - 1) * self.within
         places = np.arange(tokens)[:, None] + rng.integers(burst, size=plans)
-        gaps: Floats = _lognormal(rng, self.mean_s, self.cv, (tokens, plans)) * scale[places % burst]
-        return gaps
+        return np.asarray(_lognormal(rng, self.mean_s, self.cv, (tokens, plans)) * scale[places % burst])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=STRICT)
 class Quantiles:
     """Independent gaps of any distribution, given as a piecewise linear quantile function."""
 
-    mean_s: float
-    levels: tuple[float, ...]
+    mean_s: Mean
+    levels: Numbers
     """Probabilities, from 0 to 1, increasing."""
-    values: tuple[float, ...]
+    values: Numbers
     """The quantiles at ``levels``, in any unit: they are scaled so that the mean is ``mean_s``."""
 
     def __post_init__(self) -> None:
-        """Refuse what is no quantile function."""
-        _between("mean_s", self.mean_s, 0)
         if len(self.levels) < 2 or (self.levels[0], self.levels[-1]) != (0, 1):  # noqa: PLR2004 - a line has two ends
             raise UsageError("levels: should run from 0 to 1")
         if any(not low < high for low, high in zip(self.levels, self.levels[1:], strict=False)):
@@ -180,30 +159,25 @@ class Quantiles:
         return values * (self.mean_s / mean)
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
-        """Draw gaps."""
         import numpy as np
 
-        gaps: Floats = np.interp(rng.random((tokens, plans)), self.levels, self.quantiles_s())
-        return gaps
+        return np.interp(rng.random((tokens, plans)), self.levels, self.quantiles_s())
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=STRICT)
 class Recorded:
     """A recording, played from a random place in each stretch and from its start again at its end."""
 
-    mean_s: float
-    trace: tuple[float, ...]
+    mean_s: Mean
+    trace: Numbers
     """Gaps in their order, in any unit: they are scaled so that their mean is ``mean_s``."""
 
     def __post_init__(self) -> None:
-        """Refuse what is no recording."""
-        _between("mean_s", self.mean_s, 0)
         if not self.trace or not all(0 <= gap < math.inf for gap in self.trace) or not any(self.trace):
             raise UsageError("trace: should hold finite gaps, none negative, not all 0")
 
     @staticmethod
     def of(trace_s: tuple[float, ...]) -> Recorded:
-        """Take a recording in s as it is."""
         return Recorded(_mean(trace_s), trace_s)
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
@@ -220,8 +194,7 @@ class Recorded:
         import numpy as np
 
         gaps = np.asarray(self.trace, dtype=np.float64) * (self.mean_s / _mean(self.trace))
-        picked: Floats = gaps[(np.arange(tokens)[:, None] + starts) % len(gaps)]
-        return picked
+        return np.asarray(gaps[(np.arange(tokens)[:, None] + starts) % len(gaps)])
 
 
 FAMILIES: dict[str, type[Constant | Lognormal | Markov | Bursty | Quantiles | Recorded]] = {
@@ -244,13 +217,30 @@ def from_table(table: Mapping[str, Any], mean_s: float) -> Gaps:
     if not isinstance(name, str) or name not in FAMILIES:
         raise UsageError(f"family: {name!r} is none of {', '.join(FAMILIES)}")
     family = FAMILIES[name]
-    kinds = {field.name: str(field.type) for field in fields(family) if field.name != "mean_s"}
-    for key in table:
-        if key != "family" and key not in kinds:
-            raise UsageError(f"{key}: {name} gaps have no such key; they have {', '.join(kinds) or 'none'}")
-    values = {key: _value(key, table, kind, name) for key, kind in kinds.items()}
-    gaps: Gaps = family(mean_s, **values)
-    return gaps
+    keys = [field.name for field in fields(family) if field.name != "mean_s"]
+    values = {key: value for key, value in table.items() if key != "family"}
+    if unknown := [key for key in values if key not in keys]:
+        raise UsageError(f"{unknown[0]}: {name} gaps have no such key; they have {', '.join(keys) or 'none'}")
+    try:
+        return family(mean_s=mean_s, **values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UsageError(f"{first['loc'][0]}: {wrong(first)}") from error
+
+
+def read_family(written: str, field: str) -> dict[str, str | int | float]:
+    """Read ``FAMILY:key=number,...`` as a table; raises UsageError naming the ``field``."""
+    family, _, rest = written.partition(":")
+    table: dict[str, str | int | float] = {"family": family}
+    for part in filter(None, rest.split(",")):
+        key, _, value = part.partition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            wanted = f"'{part}' should be key=number, as in lognormal:cv=0.5"
+            raise UsageError(f"`{field}`: {written}: {wanted}") from None
+        table[key.strip()] = int(number) if number.is_integer() else number
+    return table
 
 
 def to_table(gaps: Gaps) -> dict[str, Any]:
@@ -261,35 +251,6 @@ def to_table(gaps: Gaps) -> dict[str, Any]:
     return {"family": names[family]} | {
         key: list(value) if isinstance(value, tuple) else value for key, value in values.items()
     }
-
-
-def _value(key: str, table: Mapping[str, Any], kind: str, family: str) -> Any:
-    """Read one parameter of the type that the family's field has."""
-    if key not in table:
-        raise UsageError(f"{key}: missing; {family} gaps need it")
-    value = table[key]
-    if kind.startswith("tuple"):
-        if isinstance(value, list) and all(_is_number(item) for item in value):
-            return tuple(float(item) for item in value)
-        raise UsageError(f"{key}: should be a list of numbers")
-    if kind == "int":
-        if isinstance(value, int) and not isinstance(value, bool):
-            return value
-        raise UsageError(f"{key}: {value!r} should be a whole number")
-    if not _is_number(value):
-        raise UsageError(f"{key}: {value!r} should be a number")
-    return float(value)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _between(key: str, value: float, least: float, most: float = math.inf) -> None:
-    """Refuse a parameter that is out of its range, infinite or no number; the mean may not be 0."""
-    if not (least <= value <= most and math.isfinite(value)) or (key == "mean_s" and value == 0):
-        bound = f"between {least:g} and {most:g}" if most < math.inf else f"{least:g} or more, and finite"
-        raise UsageError(f"{key}: {value:g} should be {'above 0, and finite' if key == 'mean_s' else bound}")
 
 
 def _mean(values: tuple[float, ...]) -> float:

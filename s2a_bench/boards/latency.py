@@ -16,7 +16,7 @@ from itertools import chain, cycle, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from s2a_bench.boards.gaps import FAMILIES, Constant, Gaps, from_table
+from s2a_bench.boards.gaps import FAMILIES, Constant, Gaps, from_table, read_family
 from s2a_bench.errors import UsageError
 
 if TYPE_CHECKING:
@@ -82,27 +82,22 @@ def whole_ns(latency_s: NDArray[np.float64]) -> Ints:
     """Return latencies in s as whole ns."""
     import numpy as np
 
-    latency_ns: Ints = np.rint(latency_s * 1e9).astype(np.int64)
-    return latency_ns
+    return np.rint(latency_s * 1e9).astype(np.int64)
 
 
 def family(written: str) -> Gaps:
     """Read ``FAMILY:mean_ms=80,key=value,...``; raises UsageError naming the field."""
-    name, _, rest = written.partition(":")
-    table: dict[str, str | int | float] = {"family": "markov" if name == "bimodal" else name}
-    for part in filter(None, rest.split(",")):
-        key, equals, value = part.partition("=")
-        number = _number(value)
-        if not equals or number is None:
-            raise UsageError(f"`latency`: {written}: '{part}' should be key=number, as in {EXAMPLE}")
-        table[key.strip()] = int(number) if key == "burst_tokens" and number.is_integer() else number
+    table = read_family(written, "latency")
+    name = table["family"]
     mean_ms = table.pop("mean_ms", None)
     if name not in {*FAMILIES, "bimodal"}:
         raise UsageError(f"`latency`: '{name}' is none of the families {', '.join(FAMILIES)}, bimodal")
-    if not isinstance(mean_ms, float) or not 0 < mean_ms <= LONGEST_MS:
+    if not isinstance(mean_ms, int | float) or not 0 < mean_ms <= LONGEST_MS:
         raise UsageError(f"`latency`: {written}: mean_ms should be above 0 and at most {LONGEST_MS:g}, as in {EXAMPLE}")
-    if name == "bimodal" and isinstance(share := table.get("pause_share"), float) and 0 <= share < 1:
-        table["pause_tokens"] = 1 / (1 - share)
+    if name == "bimodal":
+        table["family"] = "markov"
+        if isinstance(share := table.get("pause_share"), int | float) and 0 <= share < 1:
+            table["pause_tokens"] = 1 / (1 - share)
     try:
         return from_table(table, mean_ms / 1e3)
     except UsageError as error:
@@ -154,7 +149,6 @@ class _Nothing:
     mean_s = 0.0
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> NDArray[np.float64]:  # noqa: ARG002
-        """Return zeros."""
         import numpy as np
 
         return np.zeros((tokens, plans))

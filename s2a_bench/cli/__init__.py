@@ -5,39 +5,48 @@ Modules here import heavy libraries inside their functions only, so that ``--hel
 
 from __future__ import annotations
 
+import resource
 import signal
 import sys
-from typing import Any, ClassVar
+from errno import EAGAIN, EDQUOT, EMFILE, ENFILE, ENOMEM, ENOSPC
+from typing import Any, ClassVar, Final
 
 import typer
 
 from s2a_bench import __version__
 from s2a_bench.cli.adapter import with_flags
-from s2a_bench.cli.experiment import Commands
+from s2a_bench.cli.experiment import PLAIN, Commands, ParseError
 from s2a_bench.cli.output import shown
 from s2a_bench.cli.ros_args import folded
-from s2a_bench.cli.shortage import check_limits, shortage
 from s2a_bench.errors import S2AError
+from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.machine import tuning
 
 INTERRUPTED = 130
-ParseError: Any = typer.BadParameter.__mro__[1]
-"""Click's UsageError: newer typer brings a click of its own, so it cannot be named by import."""
 
 
 class TopCommands(Commands):
     """The commands below, and the experiments."""
 
+    experiments = EXPERIMENTS
     lazy: ClassVar[dict[str, tuple[str, str]]] = {
-        name: (f"s2a_bench.cli.{name}:{what}", about)
-        for name, what, about in (
-            ("compare", "compare", "Compare run B with run A: effect sizes with intervals, one test, gates for CI."),
-            ("doctor", "doctor", "Check this machine: a line for each finding, warnings with what mends them."),
-            ("model", "app", "Fetch, make and inspect model files."),
-            ("profile", "app", "Measure this machine as a hardware profile, and look at profiles."),
-            ("report", "report", "Make one page of runs, and their tables and figures for a paper. Measures nothing."),
-            ("serve", "serve", "Serve a model until interrupted: over HTTP, as a ROS 2 node, or otherwise."),
-            ("sweep", "sweep", "Run a command for every cell of a grid; what is done is kept, and it can go on."),
+        name: (f"s2a_bench.cli.{where}", about)
+        for name, where, about in (
+            (
+                "compare",
+                "report:compare",
+                "Compare run B with run A: effect sizes with intervals, one test, gates for CI.",
+            ),
+            ("doctor", "doctor:doctor", "Check this machine: a line for each finding, warnings with what mends them."),
+            ("model", "model:app", "Fetch, make and inspect model files."),
+            ("profile", "profile:app", "Measure this machine as a hardware profile, and look at profiles."),
+            (
+                "report",
+                "report:report",
+                "Make one page of runs, and their tables and figures for a paper. Measures nothing.",
+            ),
+            ("serve", "serve:serve", "Serve a model until interrupted: over HTTP, as a ROS 2 node, or otherwise."),
+            ("sweep", "sweep:sweep", "Run a command for every cell of a grid; what is done is kept, and it can go on."),
         )
     }
 
@@ -47,9 +56,7 @@ app = typer.Typer(
     name="s2a-bench",
     help="Measure how a vision-language model is wired to a robot, and when the robot may act.",
     no_args_is_help=True,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    add_completion=False,
+    **PLAIN,
 )
 
 
@@ -96,3 +103,35 @@ def main() -> None:
 def _say(line: str, code: int) -> int:
     print(shown(line), file=sys.stderr)  # noqa: T201 - the command line's own output
     return code
+
+
+LEAST_FILES: Final = 64
+LEAST_BYTES: Final = 2**30
+"""Of address space; with less the numerical libraries end the process as they are loaded."""
+
+
+def check_limits() -> None:
+    """Raise S2AError where the limits of this process leave too little for any command."""
+    files, space = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_NOFILE, resource.RLIMIT_AS))
+    if files != resource.RLIM_INFINITY and files < LEAST_FILES:
+        raise S2AError(f"this process may open {files} files, and {LEAST_FILES} are needed; raise `ulimit -n`")
+    if space != resource.RLIM_INFINITY and space < LEAST_BYTES:
+        raise S2AError(
+            f"this process may use {space >> 20} MiB of address space, and {LEAST_BYTES >> 20} are needed; "
+            "raise `ulimit -v`"
+        )
+
+
+def shortage(error: Exception) -> str | None:
+    """Return what there is too little of, and the way out; None where the error is another one."""
+    number = getattr(error, "errno", None)
+    text = str(error)
+    if number in {EMFILE, ENFILE}:
+        return "too many open files; raise `ulimit -n`, or stop what else has files open"
+    if number in {ENOSPC, EDQUOT}:
+        return f"{text}; make room there, or choose another folder"
+    if isinstance(error, MemoryError) or number == ENOMEM or "failed to map segment" in text:
+        return "out of memory; stop what else runs, raise `ulimit -v`, or ask for less"
+    if number == EAGAIN or "can't start new thread" in text:
+        return "no more processes or threads may be started; raise `ulimit -u` or `ulimit -v`"
+    return None

@@ -49,28 +49,23 @@ class Flag:
         return self.name.upper() if self.argument else f"--{self.name}"
 
     @property
-    def several(self) -> bool:
-        """Whether it may be given more than once."""
-        return get_origin(self.kind) is list
-
-    @property
     def parameter(self) -> inspect.Parameter:
         """Return it as a parameter of the function that typer reads; None says that it was not given."""
-        default = inspect.Parameter.empty if self.needed else None
+        default, about = inspect.Parameter.empty if self.needed else None, self.whose + self.about
         declared: Any = (
             typer.Argument(
-                metavar=self.spelled + "..." * self.several, help=self.whose + self.about, show_default=False
+                metavar=self.spelled + "..." * (get_origin(self.kind) is list), help=about, show_default=False
             )
             if self.argument
-            else typer.Option(self.spelled, help=self.whose + self.about, show_default=False, hidden=self.hidden)
+            else typer.Option(self.spelled, help=about, show_default=False, hidden=self.hidden)
         )
         kind: Any = self.kind if self.needed else Union[self.kind, None]  # noqa: UP007 - made at run time
-        annotation: Any = Annotated[kind, declared]
-        return inspect.Parameter(self.key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        return inspect.Parameter(
+            self.key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, declared]
+        )
 
     @property
     def key(self) -> str:
-        """Return the parameter's name."""
         return "__".join(self.path).replace("-", "_")
 
 
@@ -159,14 +154,10 @@ def build(options: type[Options], given: Mapping[str, Any]) -> Options:
     from s2a_bench.options import nested
 
     flags = [*flags_of(options)]
-    typed = _owners(flags)
-    said = ((flag, typed[flag.name]) for flag in flags)
+    owners = _owners(flags)
+    values = ((flag, owners[flag.name], given.get(owners[flag.name].key)) for flag in flags)
     return options(
-        **nested(
-            (flag.path, given[owner.key])
-            for flag, owner in said
-            if _same(flag, owner) and given.get(owner.key) is not None
-        )
+        **nested((flag.path, value) for flag, owner, value in values if value is not None and _same(flag, owner))
     )
 
 
@@ -187,12 +178,9 @@ def with_flags(message: str, spelled: Mapping[str, str] | None = None) -> str:
 
 def _keywords(function: Callable[..., None]) -> dict[str, inspect.Parameter]:
     """Return the keyword-only parameters of a function that are declared for typer."""
-    parameters = inspect.signature(function, eval_str=True).parameters.items()
-    return {
-        name: each
-        for name, each in parameters
-        if each.kind is each.KEYWORD_ONLY and get_origin(each.annotation) is Annotated
-    }
+    every = inspect.signature(function, eval_str=True).parameters.values()
+    declared = (each for each in every if each.kind is each.KEYWORD_ONLY and get_origin(each.annotation) is Annotated)
+    return {each.name: each for each in declared}
 
 
 def _kind(annotation: Any) -> type:

@@ -1,7 +1,9 @@
-"""`model`: fetch model files, write dummy ones, say what is in them."""
+"""`model`: fetch model files, write dummy ones, and show what is in them."""
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,35 +14,33 @@ from s2a_bench.cli.adapter import command, with_flags
 from s2a_bench.cli.experiment import PLAIN, Commands
 from s2a_bench.cli.output import Json, print_json
 from s2a_bench.cli.output import console as open_console
-from s2a_bench.inference.files_config import DummyConfig, FetchConfig, InfoConfig
+from s2a_bench.errors import ModelError
+from s2a_bench.inference import DummyConfig, EngineConfig, FetchConfig, InfoConfig
+from s2a_bench.inference.gguf_file import GgufInfo, Vocabulary, describe, read_header
+from s2a_bench.store.manifest import present
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
     from rich.progress import Progress, TaskID
+    from rich.table import Table
 
     from s2a_bench.inference.fetch import Fetched
+
 
 SCHEMA = "s2a-bench-model/1"
 """Of `--json`; described by ``docs/schema/s2a-bench-model-1.json``."""
 
 
-class ModelCommands(Commands):
-    """The commands below and the experiments on a model alone."""
-
-    group = "model"
-
-
 app = typer.Typer(
-    cls=ModelCommands, no_args_is_help=True, help="Fetch model files, write dummy ones, say what is in them.", **PLAIN
+    cls=Commands, no_args_is_help=True, help="Fetch model files, write dummy ones, say what is in them.", **PLAIN
 )
 
 
 def _fetch(config: FetchConfig, *, json_: Json = False) -> None:
-    from s2a_bench.inference.fetch import fetch as fetch_files
-    from s2a_bench.inference.fetch import wanted
-    from s2a_bench.inference.gguf_file import read_header
+    from s2a_bench.inference import fetch
 
     extras.need("model", "huggingface_hub", "gguf")
-    want = wanted(config.what, config.quant, config.mmproj)
+    want = fetch.wanted(config.what, config.quant, config.mmproj)
     with _bytes_bar() as bar:
         tasks: dict[str, TaskID] = {}
 
@@ -49,12 +49,15 @@ def _fetch(config: FetchConfig, *, json_: Json = False) -> None:
                 tasks[name] = bar.add_task(name)
             bar.update(tasks[name], completed=there, total=total)
 
-        done = fetch_files(want, show)
+        done = fetch.fetch(want, show)
     for file in done.files:
         read_header(file.path, "model fetch")
     latency = _latency_command(done)
     if json_:
-        print_json(_fetched_json(done, latency))
+        files = [present(file) for file in done.files]
+        facts = {"endpoint": done.endpoint, "repository": done.repository, "commit": done.commit, "files": files}
+        more = {"latency": latency} if latency else {}
+        print_json({"schema": SCHEMA, "command": "model fetch", **facts, **more})
         return
     for file in done.files:
         typer.echo(file.path)
@@ -64,10 +67,6 @@ def _fetch(config: FetchConfig, *, json_: Json = False) -> None:
 
 def _latency_command(done: Fetched) -> str | None:
     """Return the command that measures with these files; None where they are no language model with its mmproj."""
-    from shlex import join
-
-    from s2a_bench.errors import ModelError
-    from s2a_bench.inference import EngineConfig
     from s2a_bench.inference.models import load_headers
 
     model, *mmproj = (file.path for file in done.files)
@@ -76,35 +75,23 @@ def _latency_command(done: Fetched) -> str | None:
     except ModelError as error:
         typer.echo(f"note: {with_flags(str(error))}", err=True)
         return None
-    return join(["s2a-bench", "latency", "--model", str(files.model.path), "--mmproj", str(files.mmproj.path)])
-
-
-def _fetched_json(done: Fetched, latency: str | None) -> dict[str, Any]:
-    from s2a_bench.inference.files_json import fetched_json
-
-    files = [fetched_json(file) for file in done.files]
-    facts = {"endpoint": done.endpoint, "repository": done.repository, "commit": done.commit, "files": files}
-    return {"schema": SCHEMA, "command": "model fetch", **facts} | ({"latency": latency} if latency else {})
+    return shlex.join(["s2a-bench", "latency", "--model", str(files.model.path), "--mmproj", str(files.mmproj.path)])
 
 
 def _info(config: InfoConfig, *, json_: Json = False) -> None:
-    from s2a_bench.cli.model_text import renderables
-    from s2a_bench.inference.fetch_names import HUB_MODELS, fetched
-    from s2a_bench.inference.files_json import info_json
-    from s2a_bench.inference.gguf_info import describe
-    from s2a_bench.inference.models import remembered_sha256, sha256
+    from s2a_bench.inference.models import HUB_MODELS, fetched, remembered_sha256, sha256
 
     what = config.what
     known = what in HUB_MODELS and not Path(what).is_file()
     paths = fetched(what, "model info") if known else (Path(what),)
-    found = [(describe(path, "model info"), sha256(path) if config.hash else remembered_sha256(path)) for path in paths]
+    hash_of = sha256 if config.hash else remembered_sha256
+    found = [describe(path, "model info", hash_of) for path in paths]
     if json_:
-        files = [info_json(facts, hash_known) for facts, hash_known in found]
-        print_json({"schema": SCHEMA, "command": "model info", "files": files})
+        print_json({"schema": SCHEMA, "command": "model info", "files": [present(info) for info in found]})
         return
     console = open_console()
-    for facts, hash_known in found:
-        for part in renderables(facts, hash_known):
+    for info in found:
+        for part in renderables(info):
             console.print(part, soft_wrap=isinstance(part, str), highlight=False, markup=False)
 
 
@@ -112,7 +99,7 @@ def _bytes_bar(*, disable: bool = False) -> Progress:
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn()
     return Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), disable=disable)
 
 
@@ -140,3 +127,75 @@ for _name, _function, _config, _about in (
     ("dummy", _dummy, DummyConfig, "Write weights of random numbers in MiniCPM-V 2.6's shapes, to measure speed with."),
 ):
     app.command(_name)(command(_function, _config, about=_about))
+
+_TEMPLATE_CHARACTERS = 300
+_CONTROL_TOKENS = 24
+
+
+def renderables(info: GgufInfo) -> list[RenderableType]:
+    """Return what to print, in order."""
+    parts: list[RenderableType] = [
+        "\n".join(_head(info)),
+        _table("weights by type", ["type"], ["tensors", "parameters", "MB", "bits/weight"], _types(info)),
+        _table("weights by tensor (N: the layer)", ["tensor", "shape", "type"], ["tensors", "MB"], _groups(info)),
+    ]
+    parts.append("settings: " + _clean(", ".join(f"{key} {value}" for key, value in info.settings.items())))
+    if info.vocabulary is not None:
+        parts.append("\n".join(_vocabulary(info.vocabulary, info.tokenizer)))
+    if info.chat_template is not None:
+        text, cut = info.chat_template, len(info.chat_template) > _TEMPLATE_CHARACTERS
+        more = f" ... ({len(text)} characters; --json has all of them)" if cut else ""
+        parts.append(f"chat template: {text[:_TEMPLATE_CHARACTERS]!r}{more}")
+    return parts
+
+
+def _clean(text: object) -> str:
+    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in str(text))
+
+
+def _head(info: GgufInfo) -> list[str]:
+    kind = "mmproj (vision tower and projector)" if info.mmproj else "language model"
+    lines = [
+        f"{info.path}",
+        f"{kind}, architecture {_clean(info.architecture) or 'not given'}" + (", DUMMY WEIGHTS" if info.dummy else ""),
+    ]
+    lines += [f"{key}: {_clean(value)}" for key, value in info.general.items()]
+    size = f"{info.bytes / 1e9:.3f} GB, {info.parameters:,} parameters, GGUF version {info.gguf_version}"
+    lines.append(size + (f", file type {info.file_type}" if info.file_type else ""))
+    lines.append(f"sha256: {info.sha256}" if info.sha256 else "sha256: not computed; --hash computes it")
+    return lines
+
+
+def _types(info: GgufInfo) -> Iterator[tuple[object, ...]]:
+    for each in info.types:
+        bits = f"{each.bytes * 8 / each.parameters:.2f}" if each.parameters else ""
+        yield each.kind, each.tensors, f"{each.parameters:,}", f"{each.bytes / 1e6:,.1f}", bits
+
+
+def _groups(info: GgufInfo) -> Iterator[tuple[object, ...]]:
+    for each in info.groups:
+        shape = " x ".join(map(str, each.shape))
+        yield _clean(each.name), shape, ", ".join(each.kinds), each.tensors, f"{each.bytes / 1e6:,.1f}"
+
+
+def _table(title: str, texts: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[object]]) -> Table:
+    from rich.table import Table
+
+    table = Table(*texts, title=title, title_justify="left")
+    for name in numbers:
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(*map(str, row))
+    return table
+
+
+def _vocabulary(vocabulary: Vocabulary, tokenizer: dict[str, Any]) -> list[str]:
+    named = ", ".join(f"{key} {value}" for key, value in tokenizer.items())
+    special = ", ".join(f"{role} {token.id} {token.text!r}" for role, token in vocabulary.special.items())
+    control = vocabulary.control
+    more = f" ... ({len(control)} in all)" if len(control) > _CONTROL_TOKENS else ""
+    return [
+        f"vocabulary: {vocabulary.tokens} tokens, {vocabulary.merges} merges; tokeniser {_clean(named)}",
+        f"special tokens: {special or 'none named'}",
+        f"control tokens: {_clean(' '.join(control[:_CONTROL_TOKENS])) or 'none'}{more}",
+    ]

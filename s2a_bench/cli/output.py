@@ -37,3 +37,8 @@ def console() -> Console:
 
     terminal = Console()
     return terminal if terminal.is_terminal else Console(width=WIDTH)
+
+
+def print_line(line: str, to: Console | None = None) -> None:
+    """Print one line as it is, however long, on a console; without one, on standard output."""
+    (to or console()).print(shown(line), markup=False, highlight=False, soft_wrap=True)

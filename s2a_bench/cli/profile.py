@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from s2a_bench.boards.gaps import to_table
+from s2a_bench.boards.profile import Profile, find_profile, profile_files, read_profile
 from s2a_bench.cli.adapter import command, with_flags
 from s2a_bench.cli.experiment import PLAIN, Commands
 from s2a_bench.cli.output import Json, print_json
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.profile_capture.as_json import profile_json, ttft_s
-from s2a_bench.experiments.profile_capture.config import CaptureConfig
+from s2a_bench.experiments.profile_capture import CaptureConfig, profile_json, ttft_s
+from s2a_bench.machine.environment import board_facts, differences, matches
 from s2a_bench.store.manifest import plain
 
-if TYPE_CHECKING:
-    from s2a_bench.boards.profile import Profile
-
-
-class ProfileCommands(Commands):
-    """The commands below."""
-
-    group = "profile"
-
-
-ABOUT = "Measure this machine as a hardware profile, and look at profiles."
-app = typer.Typer(cls=ProfileCommands, no_args_is_help=True, help=ABOUT, **PLAIN)
-
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    help="Measure this machine as a hardware profile, and look at profiles.",
+    **PLAIN,
+)
 SCHEMA = "s2a-bench-profile/1"
 """Of `--json`; described by ``docs/schema/s2a-bench-profile-1.json``."""
 
@@ -41,14 +36,12 @@ def list_(json_: Json = False) -> None:
 
     found = _readable()
     if json_:
-        print_profiles("list", [profile_json(profile, path) for profile, path in found])
+        _print_profiles("list", [profile_json(profile, path) for profile, path in found])
         return
     table = Table(box=None, pad_edge=False)
-    for header in ("name", "board", "origin"):
-        table.add_column(header, no_wrap=header != "board")
-    for header in ("tokens/s", "TTFT s"):
-        table.add_column(header, justify="right", no_wrap=True)
-    table.add_column("gaps")
+    for header in ("name", "board", "origin", "tokens/s", "TTFT s", "gaps"):
+        number = header in {"tokens/s", "TTFT s"}
+        table.add_column(header, justify="right" if number else "left", no_wrap=header not in {"board", "gaps"})
     for profile, _ in found:
         ttft = f"{ttft_s(profile):.3g}" + (" (assumed)" if "prompt_s" in profile.assumed else "")
         origin = profile.origin + (", dummy" if profile.dummy else "")
@@ -60,13 +53,10 @@ def list_(json_: Json = False) -> None:
 @app.command("show")
 def show(name: Annotated[str, typer.Argument(help="a name of 'profile list', or a path")], json_: Json = False) -> None:
     """Show one profile: its numbers, where they are from, and what is known of board, model and fit."""
-    from s2a_bench.boards.file import read_profile
-    from s2a_bench.boards.search import find_profile
-
     path = find_profile(name)
     profile = read_profile(path)
     if json_:
-        print_profiles("show", [profile_json(profile, path)])
+        _print_profiles("show", [profile_json(profile, path)])
         return
     typer.echo(line_of(profile))
     typer.echo(f"file: {path}")
@@ -84,13 +74,11 @@ def show(name: Annotated[str, typer.Argument(help="a name of 'profile list', or 
 @app.command("match")
 def match(json_: Json = False) -> None:
     """Say which profiles are of a board like this one; exit code 1 where none is."""
-    from s2a_bench.machine.board import board_facts, differences, matches
-
     board = board_facts()
     found = [(profile, path) for profile, path in _readable() if matches(profile, board)]
     if json_:
         same = [profile_json(profile, path, differences(profile, board)) for profile, path in found]
-        print_profiles("match", same, board=board)
+        _print_profiles("match", same, board=board)
     else:
         kind = ", ".join(str(board[key]) for key in ("model", "gpu", "cpu") if key in board)
         typer.echo(f"this board: {kind}, {board['cores']} cores")
@@ -104,9 +92,6 @@ def match(json_: Json = False) -> None:
 
 def _readable() -> list[tuple[Profile, Path]]:
     """Read the profiles that can be given by name, and name those that cannot be read."""
-    from s2a_bench.boards.file import read_profile
-    from s2a_bench.boards.search import profile_files
-
     found = []
     for path in profile_files().values():
         try:
@@ -116,14 +101,8 @@ def _readable() -> list[tuple[Profile, Path]]:
     return found
 
 
-def _origin(profile: Profile) -> str:
-    return profile.origin + (", dummy weights" if profile.dummy else "")
-
-
 def _gaps(profile: Profile, *, full: bool = True) -> str:
     """Name the family, with its parameters where ``full``, and how many gaps were recorded."""
-    from s2a_bench.boards.gaps import to_table
-
     table = to_table(profile.gaps)
     numbers = "".join(f" {key} {value:.3g}" for key, value in table.items() if full and isinstance(value, int | float))
     recorded = f", {len(profile.trace_s)} recorded" if profile.trace_s else ""
@@ -132,23 +111,14 @@ def _gaps(profile: Profile, *, full: bool = True) -> str:
 
 
 def line_of(profile: Profile) -> str:
-    """Say in one line what a profile is."""
-    return (
-        f"{profile.name}: {profile.title}, {profile.tokens_per_s:.4g} tokens/s, first token after "
-        f"{ttft_s(profile):.3g} s ({_origin(profile)})"
-    )
+    """Return what a profile is, in one line."""
+    origin = profile.origin + (", dummy weights" if profile.dummy else "")
+    rate = f"{profile.tokens_per_s:.4g} tokens/s, first token after {ttft_s(profile):.3g} s"
+    return f"{profile.name}: {profile.title}, {rate} ({origin})"
 
 
-def distances(profile: Profile) -> str:
-    """Return how far each family of gaps is from the recorded ones."""
-    fit = profile.facts["fit"]
-    return ", ".join(f"{name} {max(gap, fit['distance_sum'][name]):.3f}" for name, gap in fit["distance_gap"].items())
-
-
-def print_profiles(command: str, profiles: list[dict[str, Any]], **more: Any) -> None:
-    """Print the one object of ``--json``."""
-    whole = {"schema": SCHEMA, "command": f"profile {command}", **more, "profiles": profiles}
-    print_json(plain(whole))
+def _print_profiles(command: str, profiles: list[dict[str, Any]], **more: Any) -> None:
+    print_json(plain({"schema": SCHEMA, "command": f"profile {command}", **more, "profiles": profiles}))
 
 
 def _capture(
@@ -169,17 +139,16 @@ def _capture(
             progress.say(f"warning: {warning}")
     profile = write_profile(tables, path, force=force)
     if json_:
-        print_profiles("capture", [profile_json(profile, path)])
+        _print_profiles("capture", [profile_json(profile, path)])
         return
+    fit = profile.facts["fit"]
+    distances = {name: max(gap, fit["distance_sum"][name]) for name, gap in fit["distance_gap"].items()}
     typer.echo(line_of(profile))
-    typer.echo(f"gaps: {profile.facts['fit']['family']}, the nearest of {distances(profile)}")
+    typer.echo(
+        f"gaps: {fit['family']}, the nearest of {', '.join(f'{name} {gap:.3f}' for name, gap in distances.items())}"
+    )
     typer.echo(f"profile: {path}")
 
 
-app.command("capture")(
-    command(
-        _capture,
-        CaptureConfig,
-        about="Measure this machine: rate, time to first token and every gap between tokens, for others to replay.",
-    )
-)
+_ABOUT = "Measure this machine: rate, time to first token and every gap between tokens, for others to replay."
+app.command("capture")(command(_capture, CaptureConfig, about=_ABOUT))

@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
-from s2a_bench.cli.output import shown
+from s2a_bench.cli.output import print_line, shown
 from s2a_bench.clock import now_ns
-
-if TYPE_CHECKING:
-    from s2a_bench.progress import Picture
+from s2a_bench.progress import Picture
 
 REFRESHES_HZ = 8
 PLAIN_STEPS = 5
@@ -41,10 +38,8 @@ class RunProgress:
             disable=not self.console.is_terminal,
         )
         self._task = self._bar.add_task("starting", total=None)
-        self._total = 0
-        self._done = 0
+        self._total, self._done, self._started_ns = 0, 0, now_ns()
         self._said = ""
-        self._started_ns = now_ns()
 
     def __enter__(self) -> RunProgress:  # noqa: PYI034 - Self is typing's since 3.11
         self._bar.start()
@@ -54,8 +49,7 @@ class RunProgress:
         self._bar.stop()
 
     def say(self, line: str) -> None:
-        """Print one line, above the bar."""
-        self.console.print(shown(line), markup=False, highlight=False, soft_wrap=True)
+        print_line(line, self.console)
 
     @contextmanager
     def watch(self, picture: Picture) -> Iterator[None]:
@@ -77,24 +71,20 @@ class RunProgress:
             self._bar.start()
 
     def opened(self, folder: Path) -> None:
-        """Remember where the results go."""
         self.folder = folder
 
     def stage(self, text: str) -> None:
-        """Show what is being done."""
         self._bar.update(self._task, description=escape(shown(text)))
         if self._bar.disable and text != self._said:
             self.say(text)
         self._said = text
 
     def expect(self, samples: int) -> None:
-        """Start counting."""
         self._total = samples
         self._started_ns = now_ns()
         self._bar.update(self._task, total=samples)
 
     def advance(self) -> None:
-        """Count one."""
         self._done += 1
         self._bar.advance(self._task)
         step = max(1, self._total // PLAIN_STEPS)

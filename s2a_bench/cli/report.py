@@ -1,35 +1,93 @@
-"""`s2a-bench report`: runs as one page to look at, and as tables and figures to publish."""
+"""`compare`: what changed between runs, with gates on it; `report`: runs as one page, or for a paper."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import typer
+
 from s2a_bench.cli.adapter import command
-from s2a_bench.cli.output import shown
-from s2a_bench.report.page.config import ReportConfig
+from s2a_bench.cli.output import Json, print_json, print_line, shown
+from s2a_bench.cli.output import console as open_console
+from s2a_bench.errors import TRIPPED, UNDECIDED
+from s2a_bench.report.compare import CompareConfig
+from s2a_bench.report.page import ReportConfig
+from s2a_bench.writers.tables import lay_out
+
+if TYPE_CHECKING:
+    from s2a_bench.report.compare.gates import Judgement
+
+
+def _compare(config: CompareConfig, *, json_: Json = False) -> None:
+    from s2a_bench.report.compare.comparison import compare as compare_runs
+    from s2a_bench.report.compare.comparison import metrics_of, open_comparison, read_side, shown_metrics, warnings_of
+    from s2a_bench.report.compare.gates import judge, read_gate
+    from s2a_bench.report.compare.shown import compare_json, compare_table, write_comparison
+
+    gates = [read_gate(text) for text in config.fail_if]
+    sides = read_side(config.baseline, "A"), read_side(config.other, "B")
+    compared = open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
+    names = config.metrics
+    compared = compare_runs(compared, metrics_of(compared, names) if names else shown_metrics(compared))
+    judgements = judge(compared, gates, strict=config.strict)
+    found = warnings_of(compared)
+    whole = compare_json(compared, judgements, found)
+    for warning in found:
+        _say(f"note [{warning.code}]: {warning.message}; {warning.advice}")
+    written = write_comparison(config.output, compared, whole) if config.output else []
+    if json_:
+        print_json(whole)
+    else:
+        table = compare_table(compared)
+        open_console().print(lay_out(table))
+        for line in (*table.notes, *(f"written: {path}" for path in written)):
+            print_line(line)
+    raise typer.Exit(_gate_code(judgements))
+
+
+def _gate_code(judgements: Sequence[Judgement]) -> int:
+    """Print what the gates found, and return the exit code: a tripped gate before one that cannot be judged."""
+    from s2a_bench.report.compare import gates as compare_gates
+    from s2a_bench.report.compare.shown import change_text, seen_text
+
+    for one in judgements:
+        line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {change_text(one.comparison)}"
+        p = "" if one.p_holm is None else f", p = {one.p_holm:.2g}"
+        seen = f", sees {seen_text(one.detectable)}"
+        few = "; measure more launches (--launches), or --strict" if one.outcome == compare_gates.UNDECIDED else ""
+        _say(line + p + ("; too few values for a test" if one.detectable is None else seen) + few)
+    outcomes = {one.outcome for one in judgements}
+    return TRIPPED if compare_gates.TRIPPED in outcomes else UNDECIDED if compare_gates.UNDECIDED in outcomes else 0
+
+
+def _say(line: str) -> None:
+    print(shown(line), file=sys.stderr)  # noqa: T201 - the command line's own output
+
+
+compare = command(_compare, CompareConfig)
 
 
 def _report(config: ReportConfig) -> None:
-    from rich.console import Console
-
     from s2a_bench.report.page.chapters import read_chapters
     from s2a_bench.report.page.files import make_report, write_report
     from s2a_bench.report.page.page import tally
 
     against_paper = bool(config.against)
     found = make_report(read_chapters(config.runs, against_paper=against_paper), against_paper=against_paper)
-    errors = Console(stderr=True)
     unfinished = [f"{chapter.title}: {caveat}" for chapter in found.chapters for caveat in chapter.caveats]
     for caveat in (*found.caveats, *unfinished):
-        errors.print(shown(f"warning: {caveat}"), markup=False, highlight=False, soft_wrap=True)
+        _say(f"warning: {caveat}")
     written = write_report(found, config)
-    console = Console()
     if found.judged:
-        console.print(f"the paper's claims: {tally(found.judged)}", markup=False, highlight=False, soft_wrap=True)
+        print_line(f"the paper's claims: {tally(found.judged)}")
     outputs = (config.page, "page"), (config.markdown, "Markdown"), (config.latex, "LaTeX"), (config.csv, "CSV")
     for path, what in outputs:
         if path is not None:
             inside = sum(path in (each, *each.parents) for each in written)
             count = f", {inside} files" if inside > 1 else ""
-            console.print(f"{what}: {path}{count}", markup=False, highlight=False, soft_wrap=True)
+            print_line(f"{what}: {path}{count}")
 
 
 report = command(_report, ReportConfig)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from s2a_bench.errors import UsageError
+from s2a_bench.text import read_text
 
 FLAG: Final = "--ros-args"
 END: Final = "--"
@@ -36,18 +37,16 @@ PARAMETERS: Final = "ros__parameters"
 def folded(arguments: Sequence[str]) -> list[str]:
     """Return a command line with what stands between ``--ros-args`` and ``--`` or the end as one value of that flag."""
     ordinary: list[str] = []
-    ours: list[str] | None = None
-    inside = False
+    ours: list[str] = []
+    into = ordinary
     for argument in arguments:
         if argument == FLAG:
-            inside, ours = True, ours or []
-        elif inside and argument == END:
-            inside = False
-        elif inside and ours is not None:
-            ours.append(argument)
+            into = ours
+        elif into is ours and argument == END:
+            into = ordinary
         else:
-            ordinary.append(argument)
-    return ordinary if ours is None else [*ordinary, f"{FLAG}={shlex.join(ours)}"]
+            into.append(argument)
+    return [*ordinary, f"{FLAG}={shlex.join(ours)}"] if FLAG in arguments else ordinary
 
 
 @dataclass(slots=True)
@@ -85,7 +84,6 @@ def read(text: str, known: Sequence[str], node: Mapping[str, str]) -> Read:
 
 
 def _given(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Yield kind and value of each argument."""
     rest = iter(arguments)
     for argument in rest:
         if QUIET.fullmatch(argument):
@@ -122,9 +120,8 @@ def _take(found: Read, values: Mapping[str, Any], known: Sequence[str], where: s
 
 
 def _read_file(found: Read, path: Path, known: Sequence[str], node_name: str) -> None:
-    """Keep what a file has for our node."""
     try:
-        whole = _yaml(path.read_text(encoding="utf-8"), f"--params-file {path}")
+        whole = _yaml(read_text(path), f"--params-file {path}")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"`ros_args`: cannot read --params-file {path}: {error}") from error
     sections = list(_sections(whole, ""))
@@ -163,7 +160,6 @@ def _flat(tree: Any, path: str) -> Iterator[tuple[str, Any]]:
 
 
 def _yaml(text: str, where: str) -> Any:
-    """Read YAML; raises UsageError."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 

@@ -1,35 +1,41 @@
-"""`s2a-bench sweep`: a grid of settings from a file, which survives crashes and goes on where it was."""
+"""`s2a-bench sweep`: a grid of settings from a file, and how it sees the commands that it repeats."""
 
 from __future__ import annotations
 
+import json
+import shlex
+from collections.abc import Sequence
 from contextlib import ExitStack
-from pathlib import Path
+from ipaddress import ip_address
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any
+from typing import Any
+from urllib.parse import urlsplit
 
-from s2a_bench.cli import sweep_cells
-from s2a_bench.cli.adapter import command
-from s2a_bench.cli.output import Json, print_json
-from s2a_bench.errors import S2AError
-from s2a_bench.sweep import WORKERS
-from s2a_bench.sweep.config import SweepConfig
-
-if TYPE_CHECKING:
-    from s2a_bench.sweep import Workers
-    from s2a_bench.sweep.plan import Plan
+from s2a_bench.cli.adapter import command, flags_named
+from s2a_bench.cli.experiment import ParseError, click_command, config_of, options_of
+from s2a_bench.cli.output import Json, print_json, print_line, shown
+from s2a_bench.cli.output import console as open_console
+from s2a_bench.errors import S2AError, UsageError
+from s2a_bench.experiments import EXPERIMENTS
+from s2a_bench.machine.environment import collect
+from s2a_bench.store.run import RunWriter
+from s2a_bench.store.sweep import CELLS, Sweep, read_sweep
+from s2a_bench.sweep import WORKERS, Cell, Command, SweepConfig, Workers
+from s2a_bench.sweep.as_json import plan_json, sweep_json
+from s2a_bench.sweep.file import read_sweep_file
+from s2a_bench.sweep.plan import Plan, plan_sweep
+from s2a_bench.sweep.run import Expected, SweepRun, check_resume, earlier, expect, only_one, pending, start_sweep
+from s2a_bench.text import visible
 
 
 def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
     from s2a_bench.cli.progress import RunProgress
-    from s2a_bench.store.run import RunWriter
-    from s2a_bench.store.sweep import CELLS
-    from s2a_bench.sweep.file import read_sweep_file
-    from s2a_bench.sweep.plan import plan_sweep
-    from s2a_bench.sweep.run import SweepRun, check_resume, only_one, start_sweep
 
     resume, source, boards = config.resume, config.source, config.boards
-    found = read_sweep_file(source)
-    plan = plan_sweep(found, sweep_cells.command_of(found.command, f"{source}: command"), boards)
+    trust = " --trust-file" if config.trust_file else ""
+    file = read_sweep_file(source)
+    repeated = command_of(file.command, f"{source}: command", trusted=config.trust_file)
+    plan = plan_sweep(file, repeated, boards)
     if resume is not None:
         check_resume(resume, plan)
     if config.dry_run:
@@ -45,58 +51,154 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
         progress.opened(writer.path)
         try:
             with writer:
-                run = SweepRun(writer, plan, progress)
+                sitting = SweepRun(writer, plan, progress)
                 with workers:
-                    run.work(run.pending(retry_failed=config.retry_failed), workers)
-                run.finish()
+                    sitting.work(sitting.pending(retry_failed=config.retry_failed), workers)
+                sitting.finish()
         except (S2AError, KeyboardInterrupt):
-            progress.say(f"sweep so far: {writer.path}; go on with: s2a-bench sweep --resume {writer.path}")
+            progress.say(f"sweep so far: {writer.path}; go on with: s2a-bench sweep --resume {writer.path}{trust}")
             raise
-    _show(writer.path, as_json=json_)
-    if run.failed:
+    swept = read_sweep(writer.path)
+    if json_:
+        print_json(sweep_json(swept))
+    else:
+        print_sweep(swept)
+    if sitting.failed:
         raise S2AError(
-            f"{run.failed} of {len(plan.cells)} cells failed; run them again with: "
-            f"s2a-bench sweep --resume {writer.path} --retry-failed"
+            f"{sitting.failed} of {len(plan.cells)} cells failed; run them again with: "
+            f"s2a-bench sweep --resume {writer.path} --retry-failed{trust}"
         )
 
 
 def _workers(plan: Plan, ray: str, width: int) -> Workers:
-    """Choose where cells run."""
-    made: Any = resolve_name(WORKERS["ray" if ray else "here"])
-    workers: Workers = made(sweep_cells.ENTRY, ray, plan, width)
+    workers: Workers = resolve_name(WORKERS["ray" if ray else "here"])(ENTRY, ray, plan, width)
     return workers
 
 
 def _show_plan(plan: Plan, config: SweepConfig, *, as_json: bool) -> None:
-    """Print what would run, and how long it would take."""
-    from s2a_bench.cli.sweep_text import print_plan
-    from s2a_bench.machine.environment import collect
-    from s2a_bench.store.sweep import read_sweep
-    from s2a_bench.sweep.as_json import plan_json
-    from s2a_bench.sweep.run import pending
-    from s2a_bench.sweep.timing import earlier, expect
-
     resume = config.resume
     cells = pending(plan, read_sweep(resume).attempts.to_dict("records") if resume else [], retry_failed=False)
     sweeps = earlier(resume.parent if resume else config.output, plan.command)
     expected = expect(cells, plan.rest_s, config.width, sweeps, _workers(plan, "", config.width))
     if as_json:
         print_json(plan_json(cells, expected, collect()))
-        return
-    print_plan(plan, cells, expected)
-
-
-def _show(folder: Path, *, as_json: bool) -> None:
-    """Print how the cells went."""
-    from s2a_bench.cli.sweep_text import print_sweep
-    from s2a_bench.store.sweep import read_sweep
-    from s2a_bench.sweep.as_json import sweep_json
-
-    found = read_sweep(folder)
-    if as_json:
-        print_json(sweep_json(found))
-        return
-    print_sweep(found)
+    else:
+        print_plan(plan, cells, expected)
 
 
 sweep = command(_sweep, SweepConfig)
+
+MINUTE_S, HOUR_S = 60, 3600
+
+
+def print_plan(plan: Plan, cells: Sequence[Cell], expected: Expected) -> None:
+    """Print every cell as the command that it is, and the time to expect."""
+    console = open_console()
+    for cell in cells:
+        where = f"  on {cell.board}" if cell.board else ""
+        console.print(
+            visible(f"{cell.label}  s2a-bench {shlex.join(cell.argv)}{where}"),
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
+    virtual = sum(cell.virtual for cell in cells)
+    counts = f"{len(cells)} of {len(plan.cells)} cells to run, {virtual} virtual and {len(cells) - virtual} measured"
+    rests = f", {plan.rest_s:g} s of rest after each measured one" if plan.rest_s and virtual < len(cells) else ""
+    time = "not known" if expected.seconds is None else f"about {duration(expected.seconds)}"
+    print_line(f"{counts}{rests}")
+    print_line(f"time to expect: {time}: {expected.source}")
+
+
+def print_sweep(sweep: Sweep) -> None:
+    """Print the failed cells, and a line for all."""
+    from rich.table import Table
+    from rich.text import Text
+
+    cells = sweep.cells
+    failed = cells[cells["state"] == "failed"]
+    if len(failed):
+        table = Table(title="Cells that failed", title_justify="left")
+        for name in ("cell", "setting", "error"):
+            table.add_column(name, overflow="fold")
+        for row in failed.to_dict("records"):
+            setting = " ".join(f"{key}={value}" for key, value in json.loads(row["settings"]).items())
+            texts = (f"{row['cell']}-r{row['repeat']}", setting, row["error"])
+            table.add_row(*(Text(shown(text)) for text in texts))
+        open_console().print(table)
+    print_line(f"{len(cells) - len(failed)} of {len(cells)} cells finished on {', '.join(sorted(set(cells['host'])))}")
+    print_line(f"sweep folder: {sweep.path}")
+
+
+def duration(seconds: float) -> str:
+    """Write a time for people."""
+    if seconds < MINUTE_S:
+        return f"{max(seconds, 1):.0f} s"
+    if seconds < HOUR_S:
+        return f"{seconds / MINUTE_S:.0f} min"
+    return f"{seconds / HOUR_S:.1f} h"
+
+
+ENTRY = f"{__name__}:run"
+"""Where a worker finds `run`."""
+
+
+def command_of(name: str, key: str = "command", *, trusted: bool = False) -> Command:
+    """Describe a command; raises UsageError for one that cannot be swept.
+
+    Its cells may run programs, and send keys and files to a URL, if the file that wants that is ``trusted``.
+    """
+    known = sorted(EXPERIMENTS)
+    if name not in known:
+        raise UsageError(f"{key}: '{name}' is none of {', '.join(known)}")
+    flags: dict[str, Any] = {}
+    for parameter in click_command(name).params:
+        if parameter.param_type_name == "argument":
+            flags[parameter.name] = "argument"
+        else:
+            long = next(flag for flag in parameter.opts if flag.startswith("--"))
+            kind = "value" if not parameter.is_flag else "toggle" if parameter.secondary_opts else "switch"
+            flags[long.removeprefix("--")] = kind
+    return Command(name, flags, lambda argv: _check(name, argv, trusted=trusted))
+
+
+def run(argv: Sequence[str]) -> None:
+    """Run a command as ``s2a-bench ARGV`` does; raises S2AError."""
+    try:
+        click_command(argv[0]).main(args=list(argv[1:]), prog_name=f"s2a-bench {argv[0]}", standalone_mode=False)
+    except ParseError as error:
+        raise UsageError(error.format_message()) from error
+
+
+def _check(name: str, argv: Sequence[str], *, trusted: bool) -> bool:
+    """Parse arguments and run nothing; return True if the command would compute and measure nothing."""
+    try:
+        given = click_command(name).make_context(name, list(argv)).params
+    except ParseError as error:
+        raise UsageError(error.format_message()) from error
+    experiment = EXPERIMENTS[name]
+    config = config_of(experiment, given)
+    if not trusted and (danger := _danger([*config.risks()])):
+        with flags_named(*options_of(experiment)):
+            raise UsageError(f"{danger}; read the file, and allow it with `trust_file`")
+    return config.virtual
+
+
+def _danger(risks: Sequence[tuple[str, str, str]]) -> str:
+    """Return what a file should not decide by itself, or nothing."""
+    named = {risk: name for name, risk, _ in risks}
+    if "program" in named:
+        return f"`{named['program']}` runs a program"
+    if {"url", "key"} <= named.keys():
+        return f"`{named['key']}` sends a key to a URL"
+    away = (name for name, risk, value in risks if risk == "url" and not _is_loopback(value))
+    return next((f"`{name}` sends requests off this machine" for name in away), "")
+
+
+def _is_loopback(url: str) -> bool:
+    """Whether a URL, or an endpoint as tcp/HOST:PORT, has an address of loopback; no name is resolved."""
+    host = urlsplit(url if "://" in url else url.replace("/", "://", 1)).hostname or ""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

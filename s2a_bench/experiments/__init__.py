@@ -18,13 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol, TypeAlias, TypeVar
 
 from s2a_bench.registry import Registry
+from s2a_bench.store.schema import Facts
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from s2a_bench.writers.csv_text import CsvTable
     from s2a_bench.writers.tables import TextTable
 
+TIME, COUNT, FLAG, SHARE, NUMBER = "time", "count", "flag", "share", "number"
 Better: TypeAlias = Literal["lower", "higher", "neither"]
 Rows: TypeAlias = "list[NDArray[np.float64]]"
 """The values of a metric: one array a request or plan, in the order in which they were made."""
@@ -46,7 +47,10 @@ Rows: TypeAlias = "list[NDArray[np.float64]]"
 class Metric:
     """A number that cells of runs have: its unit, which way is better, and the statistic it is judged by.
 
-    ``title`` is what people read, ``statistic`` median or mean. JSON, CSV, comparison and plain table follow from it.
+    ``title`` is the heading of its columns, ``statistic`` median or mean, ``about`` its description in the schema,
+    ``bounds`` between what it lies. ``kind`` is `TIME` (in s, kept in whole nanoseconds), `COUNT`, `FLAG` (true or
+    false of a plan: its mean is the share of the plans), `SHARE` (shown in percent) or `NUMBER`; a row may be without
+    an ``optional`` one. Rows, JSON, CSV, tables and comparison follow from it.
     """
 
     name: str
@@ -54,6 +58,37 @@ class Metric:
     better: Better = "lower"
     title: str = ""
     statistic: str = "median"
+    about: str = ""
+    bounds: tuple[float | None, float | None] = (None, None)
+    kind: str = NUMBER
+    optional: bool = False
+
+    @property
+    def column(self) -> str:
+        """Return the name of its column in the rows of a run folder."""
+        if self.kind == TIME:
+            return f"{self.name.removesuffix('_s')}_ns"
+        return self.name.removeprefix("p_") if self.kind == FLAG else self.name
+
+    @property
+    def column_type(self) -> Any:
+        types: dict[str, Any] = {TIME: int, COUNT: int, FLAG: bool}
+        return types.get(self.kind, float)
+
+    @property
+    def schema(self) -> dict[str, Any]:
+        """Return what an annotation says of it, in the words of JSON Schema."""
+        facts = {"description": self.about or None, "minimum": self.bounds[0], "maximum": self.bounds[1]}
+        return {key: value for key, value in facts.items() if value is not None}
+
+
+AnyMetric = TypeVar("AnyMetric", bound=Metric)
+
+
+def columns(metrics: Iterable[Metric]) -> dict[str, Any]:
+    """Return the columns of metrics with their annotations, for the dataclass of a row."""
+    kinds = {metric: metric.column_type | None if metric.optional else metric.column_type for metric in metrics}
+    return {metric.column: Annotated[kind, Facts(metric.schema)] for metric, kind in kinds.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +161,7 @@ def _marked(build: Callable[[], Figure], line: str) -> Figure:
     return marked(build(), line)
 
 
-def by_name(metrics: Iterable[Metric]) -> dict[str, Metric]:
+def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:
     """Index metrics by their names."""
     return {metric.name: metric for metric in metrics}
 
@@ -152,8 +187,6 @@ class Experiment:
     """Class of a cell of its ``--json``, a dataclass, from which docs/schema follows; not declared: any object."""
     unit: str = "samples"
     """What progress counts, and what is kept of a run that breaks off."""
-    commands: str = ""
-    """The commands that manifests of its runs name, as a shell's pattern: study-*; empty: its name."""
 
     def run_with(self, config: Options, output: Path, progress: Progress) -> Path:
         """Run it and return the run folder; raises S2AError for what a user can mend."""
@@ -192,14 +225,24 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
         "latency": "s2a_bench.experiments.latency:EXPERIMENT",
         "throughput": "s2a_bench.experiments.throughput:EXPERIMENT",
         "timeline": "s2a_bench.experiments.timeline:EXPERIMENT",
-        "model validity": "s2a_bench.experiments.model_validity:EXPERIMENT",
-        "study": "s2a_bench.experiments.study:EXPERIMENT",
     },
 )
-"""The experiments by their commands; `model validity` is a command of the group `model`."""
+"""The experiments by their commands."""
+
+
+def write_shown(run: Run, shown: Shown) -> None:
+    """Write tables, figures and what else a run shows into its folder; raises StoreError."""
+    from s2a_bench.writers.csv_text import write_texts
+
+    write_texts(run, shown.tables, shown.csvs)
+    if shown.figures:
+        from s2a_bench.writers.figures import save
+
+        save(run.path / "figures", shown.figures)
+    for name, write_file in shown.files.items():
+        write_file(run.path / name)
 
 
 def experiment_of(command: str) -> Experiment | None:
     """Return the experiment whose runs name this command; None if there is none, or it is not installed."""
-    found = (each for _, each in EXPERIMENTS.loaded() if fnmatchcase(command, each.commands or each.name))
-    return next(found, None)
+    return next((each for _, each in EXPERIMENTS.loaded() if each.name == command), None)

@@ -22,7 +22,6 @@ class AgainstPaper(Options):
     against: str = option("", "paper: draw the paper's values beside ours")
 
     def check(self) -> None:
-        """Refuse any other publication."""
         if self.against not in {"", "paper"}:
             raise UsageError(f"`against`: '{self.against}' should be paper")
 

@@ -42,8 +42,8 @@ SOURCES: Final[Registry[SourceKind]] = Registry(
     "source",
     {
         "synthetic": "s2a_bench.frames.synthetic:SyntheticCamera",
-        "video": "s2a_bench.frames.video:VideoFile",
-        "images": "s2a_bench.frames.images:ImageFolder",
+        "video": "s2a_bench.frames.files:VideoFile",
+        "images": "s2a_bench.frames.files:ImageFolder",
         "v4l2": "s2a_bench.frames.v4l2:V4L2Camera",
         "bag": "s2a_bench.frames.bag:Recording",
     },

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
@@ -17,10 +17,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.frames import check_size
 from s2a_bench.frames.convert import bgr_to_rgb, decode_image, resize, yuyv_to_bgr
-from s2a_bench.types import Encoding, Frame
-
-if TYPE_CHECKING:
-    from s2a_bench.types import Pixels
+from s2a_bench.types import Encoding, Frame, Pixels
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -47,7 +44,6 @@ class Recording:
     where: ClassVar[str] = "FILE[?topic=/NAME]"
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
-        """Open the recording and look at its first picture."""
         check_size(width, height)
         self._path, key, topic = where.partition(TOPIC_KEY)
         if key and not topic.startswith("/"):
@@ -58,7 +54,7 @@ class Recording:
         self._reader: Any = _open(self._path)
         try:
             self._connection = _connection(self._reader.connections, self._path, topic)
-            self._messages = self._start()
+            self._messages: Iterator[tuple[Any, int, bytes]] = self._reader.messages([self._connection])
             self._ahead: Any = self._next()
             self.encoding: Encoding = self._delivered(self._ahead)
             if self.encoding == "yuv422_yuy2":
@@ -69,7 +65,6 @@ class Recording:
         self._index = 0
 
     def read(self) -> Frame:
-        """Return the next picture, after the last one the first; SourceError once closed."""
         stamp_ns = now_ns()
         if self._reader is None:
             raise SourceError(f"`source`: {self.name} was closed, it has no more frames")
@@ -88,21 +83,17 @@ class Recording:
         return frame
 
     def close(self) -> None:
-        """Close the file."""
         if self._reader is not None:
             with suppress(Exception):  # a damaged file may not even close
                 self._reader.close()
         self._reader = None
-
-    def _start(self) -> Iterator[tuple[Any, int, bytes]]:
-        return cast("Iterator[tuple[Any, int, bytes]]", self._reader.messages([self._connection]))
 
     def _next(self) -> Any:
         """Deserialise the next message, starting over once."""
         try:
             found = next(self._messages, None)
             if found is None:
-                self._messages = self._start()
+                self._messages = self._reader.messages([self._connection])
                 found = next(self._messages, None)
             if found is not None:
                 return self._types.deserialize_cdr(found[2], self._connection.msgtype)
@@ -177,7 +168,6 @@ def _check_metadata(path: Path) -> None:
 
 
 def _connection(connections: list[Any], path: str, topic: str) -> Any:
-    """Choose the image topic to read."""
     images = [connection for connection in connections if connection.msgtype in {IMAGE, COMPRESSED_IMAGE}]
     chosen = [connection for connection in images if topic in {"", connection.topic}]
     if chosen:

@@ -7,15 +7,14 @@ the pixels of a row lie together; ``out`` must not overlap ``data``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, TypeAlias, cast
+from typing import Final, TypeAlias, cast
 
 import cv2
 import numpy as np
 
-if TYPE_CHECKING:
-    from s2a_bench.types import Frame, Pixels
+from s2a_bench.types import Frame, Pixels
 
-    BytesLike: TypeAlias = bytes | bytearray | memoryview | Pixels
+BytesLike: TypeAlias = "bytes | bytearray | memoryview | Pixels"
 
 # Newer OpenCV has the decoder write RGB itself: the same pixels without another pass over the picture; 4.9 cannot.
 _DECODE_RGB: int | None = getattr(cv2, "IMREAD_COLOR_RGB", None)
@@ -138,7 +137,6 @@ def _convert(data: Pixels, channels: int, code: int, out: Pixels | None = None) 
 
 
 def _encode(suffix: str, bgr: Pixels, parameters: list[int]) -> Pixels:
-    """Compress with one of OpenCV's encoders."""
     done, data = cv2.imencode(suffix, bgr, parameters)
     if not done:
         raise ValueError(f"OpenCV cannot write {bgr.dtype} {bgr.shape} as {suffix}")

@@ -30,13 +30,11 @@ class Stamped:
     """A source whose frames are stamped in their upper left 16x16 pixels; compressed ones pass as they are."""
 
     def __init__(self, source: FrameSource, nonce: str) -> None:
-        """Stamp the frames of ``source``, and close it when told to."""
         self.name, self.encoding = source.name, source.encoding
         self.width, self.height = source.width, source.height
         self._source, self._nonce = source, nonce
 
     def read(self) -> Frame:
-        """Return the next frame, stamped; raises SourceError."""
         frame = self._source.read()
         if frame.encoding in {"jpeg", "png"}:
             return frame
@@ -46,7 +44,6 @@ class Stamped:
         return frame
 
     def close(self) -> None:
-        """Close the source."""
         self._source.close()
 
     def _stamp(self, frame: Frame) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from random import Random
 from threading import Condition, Thread
-from typing import Protocol
+from typing import TypeAlias
 
 from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import S2AError, SourceError
@@ -16,18 +16,6 @@ from s2a_bench.trace import RESIDUAL, Mark, Trace
 from s2a_bench.transport import CameraSink
 from s2a_bench.transport.pictures import JPEG_QUALITY, bgr_of
 from s2a_bench.types import Frame
-
-
-class Feed(Protocol):
-    """Gives each request its frame."""
-
-    def get_ready(self) -> None:
-        """Do what need not be timed."""
-        ...
-
-    def capture(self, trace: Trace) -> tuple[Frame, ...]:
-        """Return the frames that go with the prompt, none when the server has it; marks the trace."""
-        ...
 
 
 class RequestFeed:
@@ -51,7 +39,6 @@ class RequestFeed:
             )
 
     def capture(self, trace: Trace) -> tuple[Frame, ...]:
-        """Read the frames, or hand over those that are ready."""
         trace.mark(RESIDUAL)
         frames = self._ready or self._read()
         trace.mark("capture")
@@ -61,7 +48,6 @@ class RequestFeed:
         return tuple(self._source.read() for _ in range(self._cameras))
 
     def _scaled(self, frame: Frame, trace: Trace) -> Frame:
-        """Scale one frame, as ``bgr8``."""
         width, height = self._size or (frame.width, frame.height)
         pixels = resize(bgr_of(frame, trace).data, width, height)
         trace.mark("resize")
@@ -116,11 +102,9 @@ class Camera:
         self._thread = Thread(target=self._run, name="camera", daemon=True)
 
     def start(self) -> None:
-        """Start reading."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop reading."""
         self._stopped = True
         if self._thread.is_alive():
             self._thread.join()
@@ -133,20 +117,15 @@ class Camera:
 
     def next_frame(self, after: int, timeout_s: float = 10.0) -> int:
         """Wait for a frame whose index is above ``after`` and return its index; raises what the source raised."""
-
-        def is_there() -> bool:
-            return self._failure is not None or (self._newest is not None and self._newest[0].index > after)
-
         with self._changed:
-            came = self._changed.wait_for(is_there, timeout_s)
+            self._changed.wait_for(lambda: self._failure or (self._newest and self._newest[0].index > after), timeout_s)
             if self._failure is not None:
                 raise self._failure
-            if not came or self._newest is None:
+            if self._newest is None or self._newest[0].index <= after:
                 raise SourceError(f"`source`: the camera delivered nothing for {timeout_s:.0f} s")
             return self._newest[0].index
 
     def newest(self) -> tuple[StreamedFrame, Frame] | None:
-        """Return the newest frame, as record and picture."""
         with self._changed:
             return self._newest
 
@@ -200,7 +179,7 @@ class StreamFeed:
 
     def __init__(self, camera: Camera, sink: CameraSink | None, period_ns: int, random: Random) -> None:
         """Use ``sink`` for pipelines whose server keeps the newest frame itself."""
-        self._camera = camera
+        self.camera = camera
         self.sink = sink
         self._period_ns = period_ns
         self._random = random
@@ -209,21 +188,21 @@ class StreamFeed:
 
     def get_ready(self) -> None:
         """Wait for two new frames, so that the server has one, and then for a random part of the period."""
-        self._camera.use(self.sink)
-        newest = self._camera.newest()
-        first = self._camera.next_frame(newest[0].index if newest else -1)
-        self._camera.next_frame(first)
+        self.camera.use(self.sink)
+        newest = self.camera.newest()
+        first = self.camera.next_frame(newest[0].index if newest else -1)
+        self.camera.next_frame(first)
         self._clock.sleep_until_ns(self._clock.now_ns() + self._random.randrange(self._period_ns))
-
-    def drain(self) -> list[StreamedFrame]:
-        """Return the camera's frames since the last call."""
-        return self._camera.drain()
 
     def capture(self, trace: Trace) -> tuple[Frame, ...]:
         """Start the prompt's clock and take the newest frame; none where the server has it."""
-        newest = self._camera.newest()
+        newest = self.camera.newest()
         trace.mark(RESIDUAL)
         if newest is None:
             return ()
         self.last = newest[0]
         return () if self.sink else (newest[1],)
+
+
+Feed: TypeAlias = RequestFeed | StreamFeed
+"""Gets ready what need not be timed, then captures the frames that go with a prompt, which marks the trace."""

@@ -12,10 +12,8 @@ import sys
 from typing import Any
 
 from s2a_bench import extras
+from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
-
-KINDS = {"f32": "F32", "f16": "F16", "q8_0": "Q8_0", "q4_0": "Q4_0"}
-"""Type of the KV cache -> its name in ggml."""
 
 
 def told(engine: EngineConfig, port: int, *, ignore_end: bool) -> dict[str, Any]:
@@ -49,15 +47,18 @@ def main() -> int:
     wanted.n_batch = wanted.n_ubatch = asked["batch"]
     wanted.cpuparams.n_threads = wanted.cpuparams_batch.n_threads = asked["threads"]
     wanted.n_gpu_layers, wanted.mmproj_use_gpu = asked["gpu_layers"], asked["gpu_layers"] != 0
-    wanted.cache_type_k = wanted.cache_type_v = getattr(llama.ggml_type, f"GGML_TYPE_{KINDS[asked['kv_type']]}")
+    wanted.cache_type_k = wanted.cache_type_v = getattr(llama.ggml_type, f"GGML_TYPE_{asked['kv_type'].upper()}")
     flash = {"auto": "AUTO", "on": "ENABLED", "off": "DISABLED"}[asked["flash_attention"]]
     wanted.flash_attn_type = getattr(llama.llama_flash_attn_type, f"LLAMA_FLASH_ATTN_TYPE_{flash}")
     wanted.sampling.ignore_eos = asked["ignore_end"]
     wanted.hostnames, wanted.port, wanted.endpoint_metrics = ["127.0.0.1"], asked["port"], True
     try:
+        if asked["gpu_layers"] and not any("CPU" not in device["type"].name for device in llama.get_device_info()):
+            raise UsageError("`gpu_layers`: xllamacpp is built for the CPU alone; name another `llama_server`")
         server = llama.Server(wanted)
     except Exception as error:  # noqa: BLE001 - whatever llama.cpp says, who started it must hear of it
-        print(json.dumps({"error": f"llama-server: {error}", "kind": "EngineError"}), file=answers, flush=True)
+        kind, where = ("UsageError", "") if isinstance(error, UsageError) else ("EngineError", "llama-server: ")
+        print(json.dumps({"error": f"{where}{error}", "kind": kind}), file=answers, flush=True)
         return 1
     version = f"xllamacpp {llama.__version__}"
     print(json.dumps({"address": server.listening_address, "version": version}), file=answers, flush=True)

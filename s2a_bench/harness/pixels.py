@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench.facts import Fact
 from s2a_bench.frames.convert import to_rgb
 from s2a_bench.types import Frame, Pixels
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 RGB_ENGINE = Fact("rgb_engine", "", "checksum of the engine's pixels")
 """What a server tells besides; it becomes a column of its own."""
@@ -60,6 +57,5 @@ _ODD = 0x9E3779B97F4A7C15
 
 @lru_cache(maxsize=4)
 def _weights(size: int) -> NDArray[np.uint64]:
-    """Return one odd number a word."""
     weights: NDArray[np.uint64] = np.arange(size, dtype=np.uint64) * np.uint64(_ODD - 1) + np.uint64(1)
     return weights

@@ -1,331 +1,160 @@
-"""What a run of requests is asked to do, checked, and the pipelines that follow from it."""
+"""The plan of a run of requests: all that follows from its configuration, decided once, and handed out in parts."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
-
-from pydantic import create_model
+from typing import Any
 
 from s2a_bench import extras
-from s2a_bench.errors import UsageError
 from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
-from s2a_bench.frames import SOURCES
-from s2a_bench.inference import ACTING, EngineConfig, acts, check_engine, default_engine
-from s2a_bench.machine.resources.rows import SPENT
-from s2a_bench.options import Grammar, Names, Options, Size, Square, TextOrFile, group, option
+from s2a_bench.frames import FrameSource, open_source
+from s2a_bench.frames.stamp import new_nonce
+from s2a_bench.harness.config import RequestsConfig
+from s2a_bench.harness.recording import namespace_of
+from s2a_bench.inference import EngineConfig, need_engine
+from s2a_bench.machine.resources import SPENT
 from s2a_bench.trace import path_of
-from s2a_bench.transport import ACTIONS, TRANSPORTS, Transport, named_by
-from s2a_bench.transport.options import PAYLOADS, SERVING, Payload, sides
-from s2a_bench.transport.pipeline import Pipeline, answer_over, pipelines, require_payload
+from s2a_bench.transport import ACTIONS
+from s2a_bench.transport.pipeline import Pipeline
 
-LARGEST = 16_384
-
-DEFAULT_PROMPT = """You are a robot task planner.
-Skills: go_to(location), open(object), close(object), pick(object), place(object, location).
-Rules: Output only numbered skill calls, one per line.
-Do not output any explanation."""
-"""The paper's prompt (section IV-E)."""
+LARGE_PICTURE = 640 * 480
+"""Pixels above which UDP needs more receive buffer than Linux gives by default."""
 
 
-def _options() -> type[Options]:
-    """Make a group of the options of each transport; what only concerns `serve` is no flag."""
-    return _made(
-        {
-            name: (each.options, group(each.options, only=[n for n, side in sides(each.options) if side != SERVING]))
-            for name, each in TRANSPORTS.loaded()
-        }
+@dataclass(frozen=True, slots=True)
+class BlocksPlan:
+    """How often every cell has its turn, and the order."""
+
+    runs: int
+    warmup: int
+    launches: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class FeedPlan:
+    """Where pictures come from, and how they come to a request."""
+
+    source: str
+    size: tuple[int, int]
+    """Width and height as captured."""
+    fps: float
+    seed: int
+    nonce: str
+    stream: bool
+    """Whether a camera runs; else a request captures its own."""
+    cameras: int
+    resize: tuple[int, int] | None
+    """Width and height as sent; None: as captured."""
+
+    def open(self) -> FrameSource:
+        return open_source(self.source, *self.size, fps=self.fps, seed=self.seed)
+
+
+@dataclass(frozen=True, slots=True)
+class RequestPlan:
+    """What a request says, and what its row says of it."""
+
+    prompt: str
+    grammar: str
+    max_pieces: int
+    """The most tokens, or actions, of an answer."""
+    seed: int
+    state: int
+    """Numbers of the robot's state."""
+    mode: str
+    size: str
+    stages: Mapping[str, str]
+    """Stage -> group of all transports, in the order of the path."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServersPlan:
+    """What servers and clients are told."""
+
+    engine: EngineConfig
+    """Of all cells, but for what a cell's name says of it."""
+    grammar: bool
+    """Whether answers obey a grammar."""
+    tuned: bool
+    """Whether this process and the servers keep large blocks of memory for the next picture."""
+    timeout_s: float
+    deadline_s: float
+    max_tokens: int
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """One run of requests."""
+
+    cells: tuple[Pipeline, ...]
+    """What is compared."""
+    blocks: BlocksPlan
+    feed: FeedPlan
+    request: RequestPlan
+    servers: ServersPlan
+    finds_model: bool
+    """Whether the model's files are yet to be found."""
+    sample_resources_hz: float
+    record: Path | None
+    namespace: str
+    """Of the topics that are recorded."""
+    checks: Mapping[str, str]
+    """Code -> check of the doctor's, of those that concern the transports."""
+    manifest: Mapping[str, Any]
+    """What the manifest says of the plan."""
+
+    def telling(self, **facts: Any) -> Plan:
+        """Return it with more in the manifest, or in place of what was there."""
+        return replace(self, manifest={**self.manifest, **facts})
+
+
+def resolve(config: RequestsConfig) -> Plan:
+    """Decide what follows from a configuration; nothing is opened, started or asked.
+
+    Raises MissingExtra where what an engine of ours, or somebody else's server, needs is not installed.
+    """
+    if config.own_engine:
+        need_engine(config.engine)
+    if config.starts_program:
+        extras.need("model", "gguf")
+    cells = tuple(config.pipelines)
+    used = list({cell.transport.name: cell.transport for cell in cells}.values())
+    engine, stream = config.served_engine, config.mode == "stream"
+    large = config.size[0] * config.size[1] > LARGE_PICTURE
+    stages = path_of(transport.stages for transport in used)
+    facts = [fact for cell in cells for fact in cell.capabilities.facts]
+    facts += engine.kind.told(engine) if config.own_engine else ()
+    facts += (FRAMES_PUBLISHED, FRAMES_LOST) if stream else ()
+    facts += SPENT if config.sample_resources_hz else ()
+    max_pieces = engine.horizon if config.answer == ACTIONS else config.max_tokens
+    nonce, size = config.nonce or new_nonce(), "{}x{}".format(*config.size)
+    return Plan(
+        cells=cells,
+        blocks=BlocksPlan(config.runs, config.warmup, config.launches, config.seed),
+        feed=FeedPlan(
+            config.source, config.size, config.fps, config.seed, nonce, stream, config.cameras, config.resize
+        ),
+        request=RequestPlan(
+            config.prompt, config.grammar, max_pieces, config.seed, config.state, config.mode, size, stages
+        ),
+        servers=ServersPlan(
+            engine, bool(config.grammar), config.tuned, config.timeout_s, config.deadline_s, max_pieces
+        ),
+        finds_model=config.reads_model and engine.kind.needs_model,
+        sample_resources_hz=config.sample_resources_hz,
+        record=config.record,
+        namespace=namespace_of(config.options),
+        checks={code: each.checks[code] for each in used for code in each.udp_checks if large},
+        manifest={
+            "configuration": config.to_manifest(),
+            "stages": stages,
+            "facts": facts_json(facts),
+            "seeds": {**dict.fromkeys(("order", "sampling", "source", "bootstrap"), config.seed), "nonce": nonce},
+            "cadence": f"closed loop over an open-loop camera at {config.fps:g} Hz, prompts at random moments"
+            if stream
+            else "closed loop, the next request when the last is done",
+        },
     )
-
-
-def _variants(*, first: bool) -> type[Options]:
-    """Make an option for each transport with variants: which to measure, unless told the first or its own choice."""
-    fields: dict[str, Any] = {}
-    for name, each in TRANSPORTS.loaded():
-        if each.variants:
-            about = f"{', '.join(each.variants)}; several with commas"
-            measured = each.variants[:1] if first else each.measured(each.options(), (), "")
-            default = measured if first else ()
-            fields[name] = (Names, option(default, f"{about} [default: {','.join(measured)}]"))
-    return _made(fields)
-
-
-def _schemes() -> list[str]:
-    """Return what URLs of servers begin with."""
-    return [f"{scheme}://" for _, each in TRANSPORTS.loaded() for scheme in each.schemes]
-
-
-def _with_url(url: str, options: Options | Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of transports, the one that a URL's scheme names told the URL."""
-    told = {name: own if isinstance(own, Mapping) else _said(own) for name, own in dict(options).items()}
-    name = named_by(url)
-    return {**told, name: {**told.get(name, {}), "url": url}}
-
-
-def _said(options: Options) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in options.model_fields_set}
-
-
-def _made(fields: dict[str, Any]) -> type[Options]:
-    made: type[Options] = create_model("PerTransport", __base__=Options, **fields)
-    return made
-
-
-if TYPE_CHECKING:
-    TransportOptions: TypeAlias = Options
-    Variants: TypeAlias = Options
-    FirstVariants: TypeAlias = Options
-else:
-    TransportOptions = _options()
-    Variants = _variants(first=False)
-    FirstVariants = _variants(first=True)
-
-
-class RequestsConfig(Options):
-    """The settings of one run of requests."""
-
-    QUICK: ClassVar[dict[str, int]] = {"runs": 10, "warmup": 2, "max_tokens": 8}
-    """What ``quick`` sets, unless told."""
-    COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
-    """Why answers of actions are no use here; empty: they are."""
-
-    transports: Names = option(
-        ("http", "ros"),
-        f"{', '.join(TRANSPORTS)}; several with commas, with /VARIANT and ?OPTION=VALUE: ros/topic?payload=yuyv",
-        flag="transport",
-    )
-    source: str = option("synthetic", f"{', '.join(SOURCES)}, as video:FILE")
-    size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]")
-    cameras: int = option(1, "pictures a request, read one after the other from the source", ge=1, le=16)
-    resize: Square | None = option(
-        None, "WIDTHxHEIGHT, or 224 for 224x224: pictures are scaled to it before they travel [default: as captured]"
-    )
-    state: int = option(0, "numbers (float32) of the robot's state that go with a request", ge=0, le=4096)
-    payload: Payload = option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: http jpeg, ros raw]")
-    variants: Variants = group(Variants)
-    """The variants to measure where a pipeline's name has none; those that a transport measures by default if empty."""
-    options: TransportOptions = group(TransportOptions)
-    """The options of every transport, for names that do not say them themselves."""
-    url: str = option(
-        "", f"a server that runs already (a black box), of the transport that its scheme names: {', '.join(_schemes())}"
-    )
-    engine: EngineConfig = group(EngineConfig)
-    runs: int = option(50, "samples a pipeline [default: 50, quick: 10]", ge=1, le=10**9)
-    warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
-    launches: int = option(1, "fresh sets of servers, --runs samples each; ratios then hold beyond one", ge=1, le=1000)
-    mode: Literal["request", "stream"] = option("request", "request (a frame each), stream (a camera runs)")
-    fps: float = option(30.0, "rate of the camera in --mode stream", ge=0.1, le=1000)
-    max_tokens: int = option(32, "tokens an answer [default: 32, quick: 8]", ge=1, le=2**20)
-    prompt: TextOrFile = option(DEFAULT_PROMPT, "text, or @FILE [default: the paper's prompt]")
-    grammar: Grammar = option("", "GBNF file that every answer obeys")
-    seed: int = option(0, "seed of the order, the source and the sampling", ge=0, le=2**31 - 1)
-    nonce: str = option(
-        "",
-        "nonce of another run, to send its very pictures again [default: a new one]",
-        pattern="^[0-9A-Za-z_-]{0,64}$",
-    )
-    timeout_s: float = option(300.0, "longest silence of a server, in seconds", flag="timeout", ge=0.1, le=86_400)
-    deadline_s: float = option(
-        0.0,
-        "longest time of a whole answer, in seconds; 0: --timeout and 5 s a token",
-        flag="deadline",
-        ge=0,
-        le=86_400,
-    )
-    sample_resources_hz: float = option(
-        10.0,
-        "readings a second of CPU, memory, GPU and power beside the run; 0: none",
-        flag="sample-resources",
-        ge=0,
-        le=1000,
-    )
-    record: Path | None = option(None, "also record frames, requests and tokens, as run.mcap (rosbag2)")
-    quick: bool = option(False, "fewer samples: a first look")
-
-    def __init__(self, **given: Any) -> None:
-        """Keep what is given, few samples where a quick look is asked for; raises UsageError naming the field."""
-        given = {**self.QUICK, **given} if given.get("quick") else given
-        if given.get("url"):
-            given["options"] = _with_url(given["url"], given.get("options") or {})
-        super().__init__(**given)
-
-    @property
-    def width(self) -> int:
-        """Return the width of the frames in pixels."""
-        return self.size[0]
-
-    @property
-    def height(self) -> int:
-        """Return the height of the frames in pixels."""
-        return self.size[1]
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Return pipeline names: ``transport[/variant][?option=value&...]``."""
-        return self.transports
-
-    @cached_property
-    def pipelines(self) -> list[Pipeline]:
-        """Return what is compared, a cell each; raises UsageError."""
-        told = {name: _said(given) for name, given in self.options}
-        return pipelines(self.names, {**told, "": {"payload": self.payload}}, dict(self.variants), self.engine.name)
-
-    @cached_property
-    def answer(self) -> str:
-        """Return what the answers of all cells are made of; raises UsageError."""
-        return answer_over(self.engine.answer, self.pipelines)
-
-    @property
-    def served_engine(self) -> EngineConfig:
-        """Return the engine as servers are told."""
-        return self.engine.but(answer=self.answer)
-
-    @property
-    def most_pieces(self) -> int:
-        """Return the most tokens, or actions, of an answer."""
-        return self.engine.horizon if self.answer == ACTIONS else self.max_tokens
-
-    @property
-    def used(self) -> list[Transport[Any]]:
-        """Return the transports, each once."""
-        return list({pipeline.transport.name: pipeline.transport for pipeline in self.pipelines}.values())
-
-    @property
-    def tuned(self) -> bool:
-        """Whether this process and the servers keep large blocks of memory for the next picture."""
-        return all(TRANSPORTS[name].tuned(given) for name, given in self.options)
-
-    @property
-    def stages(self) -> dict[str, str]:
-        """Return stage -> group of the transports, in the order of the path."""
-        return path_of(transport.stages for transport in self.used)
-
-    @property
-    def facts(self) -> dict[str, dict[str, str]]:
-        """Return fact -> unit and meaning, of all that may be told of a request."""
-        told = [fact for each in self.pipelines for fact in each.transport.told(each.options)]
-        told += self.engine.told if self.own_engine else ()
-        told += (FRAMES_PUBLISHED, FRAMES_LOST) if self.mode == "stream" else ()
-        return facts_json([*told, *(SPENT if self.sample_resources_hz else ())])
-
-    @property
-    def packages(self) -> list[str]:
-        """Return the packages whose versions belong beside the results of the transports."""
-        return [package for transport in self.used for package in transport.packages]
-
-    @property
-    def own_engine(self) -> bool:
-        """Whether an engine of ours answers over any transport."""
-        return not all(pipeline.black_box for pipeline in self.pipelines)
-
-    @property
-    def starts_program(self) -> bool:
-        """Whether somebody else's server is started on the model's files."""
-        return any(pipeline.transport.program(pipeline.options) for pipeline in self.pipelines)
-
-    @property
-    def foreign(self) -> str:
-        """Return the first option that says that a server is not ours, or nothing."""
-        found = (pipeline.transport.foreign_by(pipeline.options) for pipeline in self.pipelines)
-        return next((name for name in found if name), "")
-
-    def answered(self, say: Callable[[str], None]) -> RequestsConfig:
-        """Return it with the engine that can answer where none is named, and ``say`` which if that is not llama."""
-        if "name" in self.engine.model_fields_set or not self.own_engine:
-            return self
-        if self.answer == ACTIONS:
-            say("the echo engine answers with actions; a model's are those of its own server, see `url`")
-            return self.but(engine=self.engine.but(name="echo"))
-        if self.starts_program and not extras.installed("llama_cpp"):
-            only = [each.name for each in self.pipelines if each.transport.program(each.options)]
-            say(f"only {', '.join(only)}: our own servers have no engine here; {extras.how_to_install('llama')}")
-            return self.but(transports=only)
-        chosen = self.but(engine=self.engine.but(name=default_engine(say)))
-        if left_out := {each.name for each in self.pipelines} - {each.name for each in chosen.pipelines}:
-            say(f"{', '.join(sorted(left_out))}: left out, as it needs a model")
-        return chosen
-
-    def check(self) -> None:
-        """Raise UsageError, naming the field, for a combination that makes no sense."""
-        if not self.transports:
-            raise UsageError(f"`transport`: name at least one of {', '.join(TRANSPORTS)}")
-        if not (16 <= self.width <= LARGEST and 16 <= self.height <= LARGEST) or self.width % 2:  # noqa: PLR2004
-            raise UsageError(
-                f"`size`: {self.width}x{self.height} should be 16x16 to {LARGEST}x{LARGEST}, of even width"
-            )
-        check_engine(self.engine)
-        self._check_answer()
-        self._check_observation()
-        if self.record is not None and self.record.exists():
-            raise UsageError(f"`record`: {self.record} exists already and is not overwritten; name another")
-        for pipeline in self.pipelines:
-            self._check(pipeline)
-        if self.launches > 1 and self.foreign:
-            raise UsageError(
-                f"`launches`: a server that runs already cannot be started afresh; leave out `{self.foreign}`"
-            )
-        if self.engine.name == "replay" and self.foreign:
-            raise UsageError(f"`engine` replay needs our own servers; leave out `{self.foreign}`")
-        if self.engine.latency and self.foreign:
-            raise UsageError(f"`latency` is about our own servers; leave out `{self.foreign}`")
-        self._check_unused()
-
-    def _check(self, pipeline: Pipeline) -> None:
-        """Check one cell against the settings of the run."""
-        pipeline.transport.check(pipeline.variant, pipeline.options, mode=self.mode, engine=self.engine.name)
-        require_payload(pipeline)
-        if self.mode == "stream" and pipeline.payload == "jpeg-preencoded":
-            raise UsageError("`payload` jpeg-preencoded has no meaning in `mode` stream; use jpeg")
-
-    def _check_answer(self) -> None:
-        """Check that what the answers are made of can be said, and is of use."""
-        if self.answer != ACTIONS:
-            return
-        if self.COUNTS_TOKENS:
-            carrier = next((each.name for each in self.pipelines if each.answers == (ACTIONS,)), "`answer` actions")
-            raise UsageError(f"{self.COUNTS_TOKENS}, and {carrier} brings actions; 's2a-bench latency' measures them")
-        if self.own_engine and "name" in self.engine.model_fields_set and not acts(self.engine.name):
-            alone = next(each.name for each in self.pipelines if each.answers == (ACTIONS,))
-            raise UsageError(
-                f"`engine` {self.engine.name} answers with tokens, and {alone} carries actions; use `engine` {ACTING}"
-            )
-
-    def _check_observation(self) -> None:
-        """Check that what a request brings can be made, and carried."""
-        if self.resize is not None and not all(1 <= side <= LARGEST for side in self.resize):
-            raise UsageError(f"`resize`: {self.resize[0]}x{self.resize[1]} should be 1x1 to {LARGEST}x{LARGEST}")
-        if self.mode == "stream" and (self.cameras > 1 or self.resize):
-            name = "cameras" if self.cameras > 1 else "resize"
-            raise UsageError(f"`{name}`: in `mode` stream one camera runs, whose frames travel as they are")
-        for pipeline in self.pipelines:
-            if self.resize and pipeline.payload in {"yuyv", "jpeg-preencoded"}:
-                raise UsageError(
-                    f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png"
-                )
-            if self.state and not pipeline.transport.takes_state(pipeline.variant, pipeline.options):
-                raise UsageError(f"`state`: a request of {pipeline.name} has no place for it; leave one of them out")
-
-    @property
-    def observation(self) -> str:
-        """Return what a request brings besides the prompt, in words: 3 x 640x480 as 224x224, state of 14."""
-        size = f"{self.width}x{self.height}"
-        said = f"{self.cameras} x {size}" if self.cameras > 1 else size
-        said += f" as {self.resize[0]}x{self.resize[1]}" if self.resize else ""
-        return f"{said}, state of {self.state}" if self.state else said
-
-    def _check_unused(self) -> None:
-        """Refuse a server of somebody else's that nobody would ask."""
-        used = {transport.name for transport in self.used}
-        for name, given in self.options:
-            if name not in used and (field := TRANSPORTS[name].foreign_by(given)):
-                raise UsageError(f"`{field}` needs {name} among `transport`")
-
-    def to_manifest(self) -> dict[str, Any]:
-        """Return the settings as plain data, with what every pipeline came to be told."""
-        told = {each.name: each.options.model_dump(mode="json", exclude_defaults=True) for each in self.pipelines}
-        own = self.model_dump(exclude={"quick", "nonce"})  # the nonce stands with the seeds
-        size = {"width": self.width, "height": self.height, "size": f"{self.width}x{self.height}"}
-        size |= {"observation": self.observation}
-        return {**own, **size, "tuned": self.tuned, "engine": self.served_engine.to_manifest(), "pipelines": told}

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
+from dataclasses import replace
 from pathlib import Path
 from selectors import EVENT_READ, DefaultSelector
 from typing import IO, Any
@@ -18,14 +20,12 @@ import httpx
 
 from s2a_bench import errors
 from s2a_bench.clock import SystemClock, now_ns
-from s2a_bench.errors import EngineError, PortInUse, ServerDied, UsageError
-from s2a_bench.exits import COMPILE_AGAIN, SETUP_AGAIN, how_it_ended
+from s2a_bench.errors import COMPILE_AGAIN, SETUP_AGAIN, EngineError, PortInUse, ServerDied, UsageError, how_it_ended
 from s2a_bench.harness import llama_wheel
-from s2a_bench.harness.llama_flags import llama_flags
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.models import ModelFiles, load_headers, sha256
-from s2a_bench.machine.children import start_child
+from s2a_bench.machine.tuning import start_child
 from s2a_bench.transport import Program
 
 READY_TIMEOUT_S = 600.0
@@ -33,7 +33,7 @@ READY_TIMEOUT_S = 600.0
 STOP_TIMEOUT_S = 3.0
 
 
-class ServerProcess(ABC):
+class ServerProcess(AbstractContextManager["ServerProcess"]):
     """A child process that serves; use as a context manager."""
 
     def __init__(self, name: str, command: list[str], log: Path | None) -> None:
@@ -60,15 +60,13 @@ class ServerProcess(ABC):
 
     @property
     def pid(self) -> int:
-        """Return the process id."""
         return self._process.pid
 
     def alive(self) -> bool:
-        """Return whether the process still runs."""
         return self._process.poll() is None
 
     def ends_within(self, timeout_s: float | None) -> bool:
-        """Give a process whose connections broke a moment to be seen as ended, or wait for the end of one (None)."""
+        """Give a process a moment to end, or to be seen as ended where its connections broke; without end for None."""
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -101,9 +99,6 @@ class ServerProcess(ABC):
     def _ask_to_stop(self) -> None:
         self._process.terminate()
 
-    def __enter__(self) -> ServerProcess:  # noqa: PYI034 - Self is typing's since 3.11
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.stop()
 
@@ -112,7 +107,6 @@ class OwnProcess(ServerProcess):
     """A module of ours that is told its job in one line, answers with one, and serves until its input ends."""
 
     def __init__(self, name: str, module: str, job: str, log: Path | None) -> None:
-        """Start ``module`` and tell it its ``job``."""
         super().__init__(name, [sys.executable, "-m", module], log)
         assert self._process.stdin is not None  # noqa: S101 - opened as a pipe above
         self._process.stdin.write(job.encode() + b"\n")
@@ -124,7 +118,6 @@ class OwnProcess(ServerProcess):
             self._process.stdin.close()
 
     def wait_ready(self) -> None:
-        """Read the one line it answers."""
         stdout = self._process.stdout
         assert stdout is not None  # noqa: S101 - opened as a pipe above
         with DefaultSelector() as selector:
@@ -151,8 +144,55 @@ class OwnServer(OwnProcess):
     """Our instrumented server."""
 
     def __init__(self, name: str, job: ServerJob, log: Path | None = None) -> None:
-        """Start it and tell it its job."""
         super().__init__(name, "s2a_bench.harness.serving", job.to_json(), log)
+
+
+def keep_serving(job: ServerJob, ready: Callable[[ServerProcess], None], died: Callable[[str], None]) -> None:
+    """Serve until a signal comes; raises ServerDied at the second death.
+
+    ``ready`` is called whenever the server has started, ``died`` with one line after the first death. The server that
+    is started again has the first one's address.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
+    with suppress(KeyboardInterrupt):
+        address, death = _serve(job, ready)
+        died(f"{death}; it is started again, once")
+        _, death = _serve(replace(job, wiring=replace(job.wiring, address=address, restarted=True)), ready)
+        raise death
+
+
+def _serve(job: ServerJob, ready: Callable[[ServerProcess], None]) -> tuple[str, ServerDied]:
+    """Serve until the process ends; return its address, and how it ended."""
+    with OwnServer(job.wiring.transport, job) as server:
+        server.wait_ready()
+        ready(server)
+        server.ends_within(None)
+        return server.address, server.death()
+
+
+ALL_LAYERS = 999
+NO_GPU = "no usable GPU found"
+"""What llama.cpp says of itself where it leaves --n-gpu-layers out."""
+
+
+def llama_flags(engine: EngineConfig) -> list[str]:
+    """Return flags that make ``llama-server`` and ``llama-bench`` compute as our own engine does.
+
+    Every CPU this process may use, and nothing on a GPU unless told.
+    """
+    batch = str(min(engine.batch, engine.context))
+    flags = {
+        "--model": str(engine.model),
+        "--threads": str(engine.threads or len(os.sched_getaffinity(0))),
+        "--n-gpu-layers": str(engine.gpu_layers if engine.gpu_layers >= 0 else ALL_LAYERS),
+        "--batch-size": batch,
+        "--ubatch-size": batch,
+        "--cache-type-k": engine.kv_type,
+        "--cache-type-v": engine.kv_type,
+        "--flash-attn": engine.flash_attention,
+    }
+    return [word for pair in flags.items() for word in pair]
 
 
 class LlamaServer(ServerProcess):
@@ -169,9 +209,10 @@ class LlamaServer(ServerProcess):
         if not (program.path.is_file() and os.access(program.path, os.X_OK)):
             raise UsageError(f"`llama_server`: {program.path} is no program that can be run")
         port = _free_port(program.port)
-        command = [str(program.path), *llama_flags(engine), "--mmproj", str(engine.mmproj)]
+        command = [str(program.path.absolute()), *llama_flags(engine), "--mmproj", str(engine.mmproj)]
         command += ["--host", "127.0.0.1", "--port", str(port), "--ctx-size", str(engine.context), "--parallel", "1"]
-        if engine.gpu_layers == 0:
+        self._on_gpu = engine.gpu_layers != 0
+        if not self._on_gpu:
             command.append("--no-mmproj-offload")
         files = load_headers(engine)
         if files.dummy and not has_grammar:
@@ -188,10 +229,13 @@ class LlamaServer(ServerProcess):
             if not self.alive():
                 raise self.death()
             try:
-                if httpx.get(self.address + "/health", trust_env=False).is_success and self.alive():
-                    return
+                ready = httpx.get(self.address + "/health", trust_env=False).is_success and self.alive()
             except httpx.TransportError:
-                pass  # it does not listen yet
+                ready = False  # it does not listen yet
+            if ready and self._on_gpu and self.log is not None and NO_GPU in self.log.read_text(errors="replace"):
+                raise UsageError("`gpu_layers`: this `llama_server` finds no GPU; name another, or leave it out")
+            if ready:
+                return
             clock.sleep_until_ns(now_ns() + 100_000_000)
         raise ServerDied(f"llama-server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
 
@@ -209,7 +253,6 @@ class WheelServer(OwnProcess):
         self._files, self._job = files, job
 
     def wait_ready(self) -> None:
-        """Read the one line it answers."""
         super().wait_ready()
         self.facts["told"] = self._job
         self.facts["engine"] = {"engine": "llama-server", **_described(self._files)}

@@ -8,6 +8,7 @@ while a sample is measured; in stream mode, which has no pauses, a thread writes
 from __future__ import annotations
 
 import re
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from s2a_bench.clock import realtime_offset_ns
@@ -21,17 +22,22 @@ from s2a_bench.transport.ros.wire import request_message, token_message
 from s2a_bench.types import Frame, Piece, Request
 
 
-class RunRecorder:
+def namespace_of(options: Options) -> str:
+    """Return the namespace of the recorded topics: that of ``ros`` among the options of transports."""
+    found: str = getattr(options, ROS.name).namespace
+    return found or NAMESPACE
+
+
+class RunRecorder(AbstractContextManager["RunRecorder"]):
     """The recording of one run. Use as a context manager."""
 
-    def __init__(self, path: Path, options: Options, *, live: bool) -> None:
-        """Create the file, under the namespace that ROS has among ``options``; raises StoreError, naming the path."""
+    def __init__(self, path: Path, namespace: str, *, live: bool) -> None:
+        """Create the file, whose topics are under ``namespace``; raises StoreError, naming the path."""
         self._recorder = Recorder(path, live=live)
-        self._namespace = getattr(options, ROS.name).namespace or NAMESPACE
+        self._namespace = namespace
         self._offset_ns = realtime_offset_ns()
 
     def frame(self, frame: Frame) -> None:
-        """Note a frame as the camera delivered it."""
         stamp_ns = frame.stamp_ns + self._offset_ns
         if frame.encoding in ros.CHANNELS:
             message = ros.image_message(frame, stamp_ns, FRAME_ID)
@@ -52,9 +58,6 @@ class RunRecorder:
     def flush(self) -> None:
         """Write what waits; called between samples."""
         self._recorder.flush()
-
-    def __enter__(self) -> RunRecorder:  # noqa: PYI034 - Self is typing's since 3.11
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._recorder.close()

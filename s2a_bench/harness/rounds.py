@@ -2,42 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from random import Random
 from typing import Any, TypeAlias
 
 from s2a_bench import extras
-from s2a_bench.clock import SystemClock
+from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import TransportError
-from s2a_bench.frames import FrameSource, open_source
-from s2a_bench.frames.stamp import Stamped, new_nonce
-from s2a_bench.harness.backoff import Backoff
+from s2a_bench.frames import FrameSource
+from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
-from s2a_bench.harness.flash_attention import decided
-from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.harness.plan import BlocksPlan, FeedPlan, Plan
 from s2a_bench.harness.recording import RunRecorder
-from s2a_bench.harness.servers import ServerSet
+from s2a_bench.harness.servers import ServerSet, on_files
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.harness.warnings import Counters, SampleGuard, before_run
-from s2a_bench.inference import need_engine
-from s2a_bench.inference.models import resolve
 from s2a_bench.machine import environment
 from s2a_bench.machine.doctor import Machine
 from s2a_bench.machine.resources.sampler import Sampler, open_sampler
 from s2a_bench.machine.tuning import is_allowed, keep_large_blocks, limit_threads
 from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins, Provenance
-from s2a_bench.store.requests import FrameRow
+from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
+from s2a_bench.store.schema import Table
 from s2a_bench.trace import mark_cost_ns
-from s2a_bench.transport import Client, open_client
+from s2a_bench.transport import Client
 
 GIVE_UP_AFTER = 5
 """Failures of one cell in a row, after which the run ends."""
+LONGEST_WAIT_S = 60.0
+"""The longest wait that a server gets; one that wants more refuses again after it, and soon ends the run that way."""
 
 
 Slot: TypeAlias = Callable[[Place], None]
@@ -49,7 +49,7 @@ class Launch:
     """One set of servers that runs, and what asks them."""
 
     number: int
-    config: RequestsConfig
+    plan: Plan
     """With the model files that were found."""
     writer: RunWriter
     sessions: Sequence[Session]
@@ -57,12 +57,18 @@ class Launch:
     keep: Callable[[Session, Measured], None]
     """Writes down a request, and raises what makes the next one useless; not thread-safe."""
     progress: Progress
+    warnings: list[RunWarning]
+    """What the run warns of besides what is seen of its requests."""
 
 
 def in_blocks(launch: Launch, others: Sequence[Slot] = ()) -> None:
     """Measure every cell in turn; ``others`` is what else has a turn in every block."""
-    slots = [_slot(session, launch.keep) for session in launch.sessions]
-    run_blocks(slots, others, launch.config, launch.progress, launch.number)
+
+    def slot(session: Session) -> Slot:
+        return lambda place: launch.keep(session, session.measure(place))
+
+    slots = [slot(session) for session in launch.sessions]
+    run_blocks(slots, others, launch.plan.blocks, launch.progress, launch.number)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,71 +76,45 @@ class Task:
     """What a measuring command asks for besides the requests themselves."""
 
     command: str
-    in_process: str = ""
-    """What the command calls a cell whose server is in this process; empty: its own name."""
-    needs_model: bool = False
-    """Whether the command itself reads the model's files, whoever answers the requests."""
     drive: Callable[[Launch], None] = in_blocks
     """Asks the servers of a launch."""
     clients: int = 1
     """How many clients a cell has."""
-    told: Mapping[str, Any] = field(default_factory=dict)
-    """What the manifest says besides."""
+    tables: Sequence[Table[Any]] = ()
+    """Those whose files are there from the start, besides those of requests."""
+    source: Callable[[FeedPlan], FrameSource] | None = None
+    """Opens the one camera, whose pictures are stamped already; None: those that the plan names, a stamp a cell."""
 
 
-def run_requests(task: Task, config: RequestsConfig, output: Path, progress: Progress) -> Path:
+def run_requests(task: Task, plan: Plan, output: Path, progress: Progress) -> Path:
     """Measure and return the run folder; whatever happens, the samples so far are in it.
 
     Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
     """
-    if config.own_engine:
-        need_engine(config.engine.name)
-    if config.starts_program:
-        extras.need("model", "gguf")
     limit_threads()
-    malloc_tuned = config.tuned and keep_large_blocks()
-    with ExitStack() as stack:
-        config = config.model_copy(update={"nonce": config.nonce or new_nonce()})
-        sources = _Sources(config, stack)
-        manifest = _manifest(config, malloc_tuned=malloc_tuned)
-        writer = stack.enter_context(RunWriter.create(output, task.command, manifest))
-        writer.update(**task.told)
-        progress.opened(writer.path)
-        needed = config.own_engine or config.starts_program or task.needs_model
-        if needed and config.engine.name == "llama" and extras.installed("gguf"):  # else nobody here reads the files
-            config = _with_model(config, writer, progress)
-        _measure(task, config, sources, writer, progress)
-        return writer.path
-
-
-def _with_model(config: RequestsConfig, writer: RunWriter, progress: Progress) -> RequestsConfig:
-    """Find or make the model files, and decide about flash attention, so that every server gets the same."""
-    progress.stage("reading the model's headers" if config.engine.model else "the tiny dummy model, made on first use")
-    model, mmproj = resolve(config.engine)
-    engine, told = decided(
-        config.engine.but(model=model, mmproj=mmproj), progress.stage, writer.path / "flash-attention.log"
-    )
-    writer.update(**told)
-    return config.model_copy(update={"engine": engine})
-
-
-def _manifest(config: RequestsConfig, *, malloc_tuned: bool) -> dict[str, Any]:
-    return {
-        "configuration": config.to_manifest(),
-        "stages": config.stages,
-        "facts": config.facts,
-        "environment": environment.collect(config.packages),
-        "seeds": {**dict.fromkeys(("order", "sampling", "source", "bootstrap"), config.seed), "nonce": config.nonce},
-        "tuning": {
-            "dds": "tuned" if config.tuned else "default",
-            "malloc_keeps_large_blocks": malloc_tuned,
-            "process": is_allowed(),
-        },
-        "cadence": "closed loop, the next request when the last is done"
-        if config.mode == "request"
-        else f"closed loop over an open-loop camera at {config.fps:g} Hz, prompts at random moments",
-        "mark_cost_ns": round(mark_cost_ns(), 1),
+    tuning = {
+        "dds": "tuned" if plan.servers.tuned else "default",
+        "malloc_keeps_large_blocks": plan.servers.tuned and keep_large_blocks(),
+        "process": is_allowed(),
     }
+    with ExitStack() as stack:
+        sources = _Sources(task, plan.feed, stack)
+        packages = [package for cell in plan.cells for package in cell.transport.packages]
+        facts = {"environment": environment.collect(packages), "mark_cost_ns": round(mark_cost_ns(), 1)}
+        manifest = {**plan.manifest, **facts, "tuning": tuning}
+        writer = stack.enter_context(RunWriter.create(output, task.command, manifest))
+        for table in task.tables:
+            writer.append(table, [])
+        progress.opened(writer.path)
+        if plan.finds_model and extras.installed("gguf"):  # without gguf no file is read here
+            engine = on_files(plan.servers.engine, progress)
+            plan = replace(plan, servers=replace(plan.servers, engine=engine))
+        guard = SampleGuard({cell.name: cell.options.against_loss for cell in plan.cells})
+        run = _Run(task, plan, sources, writer, progress, guard)
+        if plan.record is not None:
+            run.recorder = stack.enter_context(RunRecorder(plan.record, plan.namespace, live=plan.feed.stream))
+        run.measure()
+        return writer.path
 
 
 class _Sources:
@@ -143,10 +123,11 @@ class _Sources:
     Cells of a server that is not ours differ in their stamps, as it may keep what it made of a picture.
     """
 
-    def __init__(self, config: RequestsConfig, stack: ExitStack) -> None:
-        self._config = config
+    def __init__(self, task: Task, plan: FeedPlan, stack: ExitStack) -> None:
+        self._task = task
+        self._plan = plan
         self._stack = stack
-        self._shared = config.source.startswith("v4l2")
+        self._shared = plan.source.startswith("v4l2")
         self._ready: FrameSource | None = self._new()  # what is wrong with a source shows before anything starts
         self._open: dict[str, FrameSource] = {}
 
@@ -155,112 +136,116 @@ class _Sources:
         if user not in self._open:
             source = self._ready or self._new()
             self._ready = source if self._shared else None
-            self._open[user] = Stamped(source, f"{self._config.nonce}/{stamp}")
+            self._open[user] = source if self._task.source else Stamped(source, f"{self._plan.nonce}/{stamp}")
         return self._open[user]
 
     def _new(self) -> FrameSource:
-        config = self._config
-        source = open_source(config.source, config.width, config.height, fps=config.fps, seed=config.seed)
+        source = self._task.source(self._plan) if self._task.source else self._plan.open()
         self._stack.callback(source.close)
         return source
 
 
-def _measure(task: Task, config: RequestsConfig, sources: _Sources, writer: RunWriter, progress: Progress) -> None:
-    """Measure every launch, and write down what there is to warn of."""
-    machine = Machine(output=writer.path)
-    watches_udp = any(transport.watches_udp for transport in config.used)
-    warnings = before_run(config, machine)
-    before = Counters.read(watches_udp=watches_udp)
-    guard = SampleGuard({cell.name: cell.transport.against_loss(cell.options) for cell in config.pipelines})
-    writer.update(warnings=[warning.to_manifest() for warning in warnings])
-    with ExitStack() as stack:
-        recorder: RunRecorder | None = None
-        if config.record is not None:
-            recorder = stack.enter_context(RunRecorder(config.record, config.options, live=config.mode == "stream"))
+@dataclass(slots=True)
+class _Run:
+    """One run under way: what its launches share."""
+
+    task: Task
+    plan: Plan
+    sources: _Sources
+    writer: RunWriter
+    progress: Progress
+    guard: SampleGuard
+    recorder: RunRecorder | None = None
+    warnings: list[RunWarning] = field(default_factory=list)
+
+    def measure(self) -> None:
+        """Measure every launch, and write down what there is to warn of."""
+        plan, warnings = self.plan, self.warnings
+        watches_udp = any(cell.transport.udp_checks for cell in plan.cells)
+        warnings += before_run(plan.checks, Machine(output=self.writer.path))
+        before = Counters.read(watches_udp=watches_udp)
+        self.writer.update(warnings=[warning.to_manifest() for warning in warnings])
         try:
-            for launch in range(config.launches):
-                _launch(launch, task, config, sources, recorder, guard, writer, progress)
+            for number in range(plan.blocks.launches):
+                with ExitStack() as stack:
+                    self._launch(number, stack)
         finally:
-            advice = guard.advice(cell.name for cell in config.pipelines if cell.transport.watches_udp)
-            warnings += [*guard.warnings(), *Counters.read(watches_udp=watches_udp).warnings_since(before, advice)]
-            writer.update(warnings=[warning.to_manifest() for warning in warnings])
+            advice = self.guard.advice(cell.name for cell in plan.cells if cell.transport.udp_checks)
+            warnings += self.guard.warnings()
+            warnings += Counters.read(watches_udp=watches_udp).warnings_since(before, advice)
+            self.writer.update(warnings=[warning.to_manifest() for warning in warnings])
 
-
-def _launch(
-    launch: int,
-    task: Task,
-    config: RequestsConfig,
-    sources: _Sources,
-    recorder: RunRecorder | None,
-    guard: SampleGuard,
-    writer: RunWriter,
-    progress: Progress,
-) -> None:
-    """Start the servers and measure all blocks of one launch."""
-    with ExitStack() as stack:
-        servers = ServerSet(config, stack, writer.path, launch)
+    def _launch(self, number: int, stack: ExitStack) -> None:
+        """Start the servers and measure all blocks of one launch."""
+        writer = self.writer
+        servers = ServerSet(self.plan.cells, self.plan.servers, stack, writer.path, number)
         if servers.count:
-            progress.stage(f"starting {servers.count} server{'s' if servers.count > 1 else ''}")
+            self.progress.stage(f"starting {servers.count} server{'s' if servers.count > 1 else ''}")
         facts = servers.start()
-        writer.update(servers=facts, model=servers.model(facts))
+        model = servers.model(facts)
+        writer.update(servers=facts, model=model)
         pids = [server["pid"] for server in facts.values()]
-        sampler = stack.enter_context(open_sampler(config.sample_resources_hz, pids))
-        sessions = list(_sessions(task, config, servers, sources, recorder, sampler, stack))
-        asked = {session.cell.name: session.client.describe() for session in sessions}
+        sampler = stack.enter_context(open_sampler(self.plan.sample_resources_hz, pids))
+        sessions = list(self._sessions(servers, sampler, stack))
+        asked = {session.cell.name: how for session in sessions if (how := session.client.describe())}
         origins = {session.cell.name: session.origin for session in sessions}
-        run = Provenance.of_engine(servers.model(facts))
-        writer.update(
-            asked={name: how for name, how in asked.items() if how}, provenance=Origins(run, origins).to_manifest()
-        )
+        writer.update(asked=asked, provenance=Origins(Provenance.of_engine(model), origins).to_manifest())
         hits = servers.cache_hits()
-        backoff = Backoff(SystemClock(), progress.stage)
-        keep = _keeper(servers, writer, guard, backoff, sampler)
+        keep = partial(self._keep, servers, sampler)
         try:
-            task.drive(Launch(launch, config, writer, sessions, keep, progress))
-            guard.see_hits(hits, servers.cache_hits())
+            self.task.drive(Launch(number, self.plan, writer, sessions, keep, self.progress, self.warnings))
+            self.guard.see_hits(hits, servers.cache_hits())
             for session in sessions:
-                _write_frames(writer, session.frames(keep=0))
-                if not guard.successes(session.cell.name):
-                    last = guard.last_error(session.cell.name)
+                for row in session.frames(keep=0):
+                    writer.frame(row)
+                if not self.guard.succeeded[session.cell.name]:
+                    last = self.guard.last_error.get(session.cell.name, "")
                     raise TransportError(f"no request of {session.cell.name} succeeded, at last with {last}")
         finally:
             sampler.flush(writer)
             writer.update(resources=sampler.describe())
 
+    def _sessions(self, servers: ServerSet, sampler: Sampler, stack: ExitStack) -> Iterator[Session]:
+        """Open a client and a feed for each cell."""
+        plan, recorder = self.plan.feed, self.recorder
+        clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
+        camera: Camera | None = None
+        if plan.stream:
+            source = self.sources.of("camera", "camera")
+            camera = Camera(source, plan.fps, on_frame=recorder.frame if recorder else None)
+            camera.start()
+            stack.callback(camera.stop)
+        for cell, place in product(self.plan.cells, range(self.task.clients)):
+            client = servers.client(cell)
+            made: list[Session] = []
+            clients.callback(_close_idle, client, made)
+            feed: Feed
+            if camera is not None:
+                random = Random(plan.seed)  # noqa: S311 - phases, not secrets
+                with servers.death_explained(cell):
+                    feed = StreamFeed(camera, client.camera, int(1e9 / plan.fps), random)
+            else:
+                user = f"{cell.name} {place}" if place else cell.name
+                source = self.sources.of(user, user if cell.black_box or place else "")
+                preencoded = cell.payload == "jpeg-preencoded"
+                feed = RequestFeed(source, preencoded=preencoded, cameras=plan.cameras, size=plan.resize)
+            made.append(Session(cell, client, feed, self.plan.request, recorder, sampler, servers.origin(cell)))
+            yield made[0]
 
-def _sessions(
-    task: Task,
-    config: RequestsConfig,
-    servers: ServerSet,
-    sources: _Sources,
-    recorder: RunRecorder | None,
-    sampler: Sampler,
-    stack: ExitStack,
-) -> Iterator[Session]:
-    """Open a client and a feed for each cell."""
-    clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
-    camera: Camera | None = None
-    if config.mode == "stream":
-        camera = Camera(sources.of("camera", "camera"), config.fps, on_frame=recorder.frame if recorder else None)
-        camera.start()
-        stack.callback(camera.stop)
-    for cell, place in product(config.pipelines, range(task.clients)):
-        with servers.death_explained(cell):
-            client = open_client(servers.wiring(cell), servers.alive(cell))
-        made: list[Session] = []
-        clients.callback(_close_idle, client, made)
-        feed: Feed
-        if camera is not None:
-            random = Random(config.seed)  # noqa: S311 - phases, not secrets
-            feed = StreamFeed(camera, client.camera, int(1e9 / config.fps), random)
-        else:
-            who = f"{cell.name} {place}" if place else cell.name
-            source = sources.of(who, who if cell.black_box or place else "")
-            preencoded = cell.payload == "jpeg-preencoded"
-            feed = RequestFeed(source, preencoded=preencoded, cameras=config.cameras, size=config.resize)
-        name = task.in_process if cell.transport.in_process and task.in_process else cell.name
-        made.append(Session(replace(cell, name=name), client, feed, config, recorder, sampler, servers.origin(cell)))
-        yield made[0]
+    def _keep(self, servers: ServerSet, sampler: Sampler, session: Session, measured: Measured) -> None:
+        """Keep a request, and look whether the run can go on."""
+        name, sample, writer = session.cell.name, measured.sample, self.writer
+        keep_origin(writer, name, session.origin)
+        writer.sample(sample)
+        writer.tokens(measured.tokens)
+        sampler.flush(writer)
+        for row in session.frames():
+            writer.frame(row)
+        self.guard.see(sample, measured.fingerprint, measured.odd)
+        servers.raise_if_over(session.cell, measured)
+        if self.guard.in_a_row[name] >= GIVE_UP_AFTER:
+            raise TransportError(f"{name} failed {GIVE_UP_AFTER} times in a row, at last with {sample.error}")
+        back_off(name, measured.retry_after_s, SystemClock(), self.progress.stage)
 
 
 def _close_idle(client: Client, sessions: Sequence[Session]) -> None:
@@ -270,54 +255,23 @@ def _close_idle(client: Client, sessions: Sequence[Session]) -> None:
 
 
 def run_blocks(
-    slots: Sequence[Slot], others: Sequence[Slot], config: RequestsConfig, progress: Progress, launch: int = 0
+    slots: Sequence[Slot], others: Sequence[Slot], plan: BlocksPlan, progress: Progress, launch: int = 0
 ) -> None:
     """Run every slot once a block, in a new random order each time; in a launch's first block the others come last.
 
     So that what is compared with the requests can learn from the first of them how long their prompts are.
     """
     everyone = [*slots, *others]
-    blocks = config.warmup + config.runs
-    progress.expect(len(everyone) * blocks * config.launches)
-    random = Random(config.seed + launch)  # noqa: S311 - an order, not a secret
-    which = f", launch {launch + 1} of {config.launches}" if config.launches > 1 else ""
+    blocks = plan.warmup + plan.runs
+    progress.expect(len(everyone) * blocks * plan.launches)
+    random = Random(plan.seed + launch)  # noqa: S311 - an order, not a secret
+    which = f", launch {launch + 1} of {plan.launches}" if plan.launches > 1 else ""
     for block in range(blocks):
-        progress.stage(f"{'warming up' if block < config.warmup else 'measuring'}{which}")
+        progress.stage(f"{'warming up' if block < plan.warmup else 'measuring'}{which}")
         order = random.sample(everyone, len(everyone))
         for position, slot in enumerate(order if block else sorted(order, key=lambda slot: slot in others)):
-            slot(Place(launch * blocks + block, position, block < config.warmup, launch))
+            slot(Place(launch * blocks + block, position, block < plan.warmup, launch))
             progress.advance()
-
-
-def _slot(session: Session, keep: Callable[[Session, Measured], None]) -> Slot:
-    """Return a session's slot: one request, kept at once."""
-    return lambda place: keep(session, session.measure(place))
-
-
-def _keeper(
-    servers: ServerSet, writer: RunWriter, guard: SampleGuard, backoff: Backoff, sampler: Sampler
-) -> Callable[[Session, Measured], None]:
-    """Return what keeps a request, and looks whether the run can go on."""
-
-    def keep(session: Session, measured: Measured) -> None:
-        keep_origin(writer, session.cell.name, session.origin)
-        writer.sample(measured.sample)
-        writer.tokens(measured.tokens)
-        sampler.flush(writer)
-        _write_frames(writer, session.frames())
-        guard.see(measured.sample, measured.fingerprint)
-        guard.see_odd(session.cell.name, measured.odd)
-        if isinstance(measured.fatal, KeyboardInterrupt):
-            raise measured.fatal
-        servers.raise_if_dead(session.cell, suspect=bool(measured.sample.error))
-        if measured.fatal is not None:
-            raise measured.fatal
-        if guard.failures_in_a_row(session.cell.name) >= GIVE_UP_AFTER:
-            name, error = session.cell.name, measured.sample.error
-            raise TransportError(f"{name} failed {GIVE_UP_AFTER} times in a row, at last with {error}")
-        backoff.wait(session.cell.name, measured.retry_after_s)
-
-    return keep
 
 
 def keep_origin(writer: RunWriter, cell: str, origin: Provenance) -> None:
@@ -326,6 +280,8 @@ def keep_origin(writer: RunWriter, cell: str, origin: Provenance) -> None:
         writer.update(provenance={"cells": {cell: origin.to_dict()}})
 
 
-def _write_frames(writer: RunWriter, rows: list[FrameRow]) -> None:
-    for row in rows:
-        writer.frame(row)
+def back_off(cell: str, retry_after_s: float, clock: Clock, say: Callable[[str], None]) -> None:
+    """Let ``retry_after_s`` pass, or `LONGEST_WAIT_S` if that is less, before the next request; nothing for 0."""
+    if wait_s := min(retry_after_s, LONGEST_WAIT_S):
+        say(f"waiting {wait_s:g} s, as the server of {cell} asks")
+        clock.sleep_until_ns(clock.now_ns() + int(wait_s * 1e9))

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from threading import Thread
 from typing import Any
 
 from s2a_bench.errors import ServerDied
-from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.harness.plan import ServersPlan
 from s2a_bench.harness.processes import PROGRAMS, OwnServer, ServerProcess
 from s2a_bench.harness.serving import ServerJob, engine_handler
-from s2a_bench.inference import open_engine
+from s2a_bench.harness.session import Measured
+from s2a_bench.inference import Engine, EngineConfig, open_engine
+from s2a_bench.inference.models import resolve
+from s2a_bench.progress import Progress
 from s2a_bench.provenance import NONE, Provenance
-from s2a_bench.transport import Program, Wiring, open_server
+from s2a_bench.transport import Client, Wiring, open_client, open_server
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import Pipeline
 
@@ -24,6 +28,13 @@ LAST_MOMENT_S = 0.5
 
 RUN_LIMITS = Limits(answer_s=86_400, answer_tokens=1 << 20)
 """In a run it is the client who says how long an answer may be and take: a slow model is a result."""
+
+
+def on_files(engine: EngineConfig, progress: Progress) -> EngineConfig:
+    """Find or make the model files, so that every server gets the same."""
+    progress.stage("reading the model's headers" if engine.model else "the tiny dummy model, made on first use")
+    model, mmproj = resolve(engine)
+    return engine.but(model=model, mmproj=mmproj)
 
 
 @dataclass(slots=True)
@@ -38,28 +49,27 @@ class _Running:
 class ServerSet:
     """The servers of a run; cells whose server would be told the same share one."""
 
-    def __init__(self, config: RequestsConfig, stack: ExitStack, folder: Path, launch: int = 0) -> None:
-        """Start what ``config`` needs; `ExitStack` stops it. Later launches than 0 show in the servers' names."""
-        self._config = config
+    def __init__(
+        self, cells: Sequence[Pipeline], plan: ServersPlan, stack: ExitStack, folder: Path, launch: int = 0
+    ) -> None:
+        """Start what ``cells`` need; `ExitStack` stops it. Later launches than 0 show in the servers' names."""
+        self._cells = cells
+        self._plan = plan
         self._suffix = f"-launch-{launch + 1}" if launch else ""
         self._stack = stack
         self._folder = folder
         self._servers: dict[tuple[object, ...], _Running] = {}
         self._bound: dict[str, list[str]] = {}
-        self._local_engine: dict[str, Any] | None = None
+        self._local_engine: Engine | None = None
+        self._local_facts: dict[str, Any] = {}
 
     @property
     def count(self) -> int:
-        """Return how many servers this run starts."""
-        return len({pipeline.server for pipeline in self._config.pipelines if not self._is_foreign(pipeline)})
-
-    @staticmethod
-    def _is_foreign(pipeline: Pipeline) -> bool:
-        return bool(pipeline.transport.foreign(pipeline.options))
+        return len({each.server for each in self._cells if not each.options.external_address})
 
     def start(self) -> dict[str, Any]:
         """Start all servers and wait until they are ready; return what they say about themselves."""
-        for pipeline in self._config.pipelines:
+        for pipeline in self._cells:
             if pipeline.server not in self._servers:
                 self._servers[pipeline.server] = self._launch(pipeline)
         facts = {}
@@ -71,52 +81,48 @@ class ServerSet:
         return facts
 
     def _launch(self, pipeline: Pipeline) -> _Running:
-        transport, config = pipeline.transport, self._config
+        transport, plan = pipeline.transport, self._plan
         bound = self._bound.setdefault(transport.name, [])
         name = (f"{transport.name}-{len(bound) + 1}" if bound else transport.name) + self._suffix
-        if address := transport.foreign(pipeline.options):
+        if address := pipeline.options.external_address:
             return _Running(name, address)
-        address = transport.bind(pipeline.options, bound)
+        for address in pipeline.options.addresses():
+            if address not in bound:
+                break
         bound.append(address)
+        engine = plan.engine.but(**dict(pipeline.engine))
         if transport.in_process:
-            return _Running(name, self._serve_here(self._wiring(pipeline, address)))
+            return _Running(name, self._serve_here(self._wiring(pipeline, address), engine))
         log = self._folder / f"server-{name}.log"
-        if program := transport.program(pipeline.options):
-            process = self._start_program(program, log)
+        if program := pipeline.options.program:
+            process = PROGRAMS[program.kind](program, engine, log, has_grammar=plan.grammar)
         else:
-            wiring = self._wiring(pipeline, address)
-            process = OwnServer(name, ServerJob(wiring, config.served_engine, tuned=config.tuned), log)
+            process = OwnServer(name, ServerJob(self._wiring(pipeline, address), engine, tuned=plan.tuned), log)
         return _Running(name, address, self._stack.enter_context(process))
 
-    def _start_program(self, program: Program, log: Path) -> ServerProcess:
-        has_grammar = bool(self._config.grammar)
-        return PROGRAMS[program.kind](program, self._config.engine, log, has_grammar=has_grammar)
-
-    def _serve_here(self, wiring: Wiring[Any]) -> str:
-        """Serve on a thread of this process, and return the address."""
-        engine = open_engine(self._config.served_engine)
+    def _serve_here(self, wiring: Wiring[Any], told: EngineConfig) -> str:
+        engine = open_engine(told, self._local_engine)
         self._stack.callback(engine.close)
-        self._local_engine = engine.describe()
+        self._local_engine, self._local_facts = self._local_engine or engine, engine.describe()
         server = open_server(wiring, engine_handler(engine, limits=wiring.limits))
         self._stack.callback(server.stop)
         Thread(target=server.serve, daemon=True).start()
         return server.address
 
     def _wiring(self, pipeline: Pipeline, address: str) -> Wiring[Any]:
-        config = self._config
-        told = {"timeout_s": config.timeout_s, "deadline_s": config.deadline_s, "max_tokens": config.most_pieces}
+        plan = self._plan
+        told = {"timeout_s": plan.timeout_s, "deadline_s": plan.deadline_s, "max_tokens": plan.max_tokens}
         return pipeline.wiring(address, limits=RUN_LIMITS, **told)
-
-    def wiring(self, pipeline: Pipeline) -> Wiring[Any]:
-        """Return what the client of a cell is told, its server being ready."""
-        return self._wiring(pipeline, self._servers[pipeline.server].address)
 
     def cache_hits(self) -> dict[str, float]:
         """Return counter -> hits of caches that the servers which are not ours have counted so far."""
-        asked = {pipeline.server: pipeline for pipeline in self._config.pipelines}
+        asked = {pipeline.server: pipeline for pipeline in self._cells}
         found: dict[str, float] = {}
-        for pipeline in asked.values():
-            for name, hits in pipeline.transport.cache_hits(self.wiring(pipeline)).items():
+        for server, pipeline in asked.items():
+            if not (pipeline.black_box and (hits_of := pipeline.transport.urls.cache_hits)):
+                continue
+            wiring = self._wiring(pipeline, self._servers[server].address)
+            for name, hits in resolve_name(hits_of)(wiring).items():
                 found[name] = found.get(name, 0.0) + hits
         return found
 
@@ -124,25 +130,37 @@ class ServerSet:
         """Return what our engine says about the model, the same in every server of ours; else what others' is known."""
         own = {server.name for server in self._servers.values() if isinstance(server.process, OwnServer)}
         names = sorted(facts, key=lambda name: name not in own)
-        return self._local_engine or next((facts[name]["engine"] for name in names if "engine" in facts[name]), {})
+        told = self._local_facts or next((facts[name]["engine"] for name in names if "engine" in facts[name]), {})
+        differs = {name for pipeline in self._cells for name, _ in pipeline.engine}
+        return {name: fact for name, fact in told.items() if name not in differs}
 
     def origin(self, pipeline: Pipeline) -> Provenance:
         """Return where a cell's numbers come from: what its engine says of itself; a server of others is unknown."""
         process = self._servers[pipeline.server].process
         if pipeline.transport.in_process:
-            return Provenance.of_engine(self._local_engine or {}, link=NONE)
+            return Provenance.of_engine(self._local_facts, link=NONE)
         return Provenance.of_engine(process.facts.get("engine", {}) if process else {})
 
-    def alive(self, pipeline: Pipeline) -> Callable[[], bool]:
-        """Return the question whether the server of a cell still runs."""
-        process = self._servers[pipeline.server].process
-        return process.alive if process else lambda: True
+    def client(self, pipeline: Pipeline) -> Client:
+        """Open a client of a cell, whose server is ready."""
+        server = self._servers[pipeline.server]
+        with self.death_explained(pipeline):
+            alive = server.process.alive if server.process else lambda: True
+            return open_client(self._wiring(pipeline, server.address), alive)
 
     def raise_if_dead(self, pipeline: Pipeline, *, suspect: bool = False) -> None:
         """Raise ServerDied with the whole story if the process has ended; a suspect is given a moment to end."""
         process = self._servers[pipeline.server].process
         if process is not None and process.ends_within(LAST_MOMENT_S if suspect else 0):
             raise process.death()
+
+    def raise_if_over(self, pipeline: Pipeline, measured: Measured) -> None:
+        """Raise what makes the next request useless: Ctrl-C, the server's end, an error that will come again."""
+        if isinstance(measured.fatal, KeyboardInterrupt):
+            raise measured.fatal
+        self.raise_if_dead(pipeline, suspect=bool(measured.sample.error))
+        if measured.fatal is not None:
+            raise measured.fatal
 
     @contextmanager
     def death_explained(self, pipeline: Pipeline) -> Iterator[None]:

@@ -20,13 +20,13 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.facts import PREPROCESS_MS
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, together
-from s2a_bench.inference import Engine, EngineConfig, honoured_by, open_engine
+from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
 from s2a_bench.provenance import Provenance
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Server, Wiring, open_server
 from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.transport.turns import Queued, Turn
+from s2a_bench.transport.serving import Queued, Turn
 from s2a_bench.types import Piece, Request
 
 GRACE_S = 4.0
@@ -75,14 +75,12 @@ class ServerJob:
     pixels: bool = True
 
     def to_json(self) -> str:
-        """Write as one line."""
         told = {"tuned": self.tuned, "pixels": self.pixels}
         engine = self.engine.model_dump(mode="json")
         return json.dumps({"wiring": self.wiring.to_json(), "engine": engine, **told})
 
     @staticmethod
     def from_json(line: str) -> ServerJob:
-        """Read what `to_json` wrote."""
         fields: dict[str, Any] = json.loads(line)
         wiring, engine = Wiring.from_json(fields.pop("wiring")), EngineConfig(**fields.pop("engine"))
         return ServerJob(wiring, engine, **fields)
@@ -115,7 +113,7 @@ def main() -> int:
         keeps = job.tuned and keep_large_blocks()
         engine = open_engine(job.engine)
         handler = engine_handler(engine, pixels=job.pixels, limits=job.wiring.limits)
-        handler.settings, handler.honours = job.engine, honoured_by(job.engine.name)
+        handler.settings, handler.honours = job.engine, job.engine.kind.honours
         server = open_server(job.wiring, handler)
     except S2AError as error:
         print(json.dumps({"error": str(error), "kind": type(error).__name__}), file=answers, flush=True)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 
+from s2a_bench.act.events import PlanFeed
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, RequestFailed, S2AError, ServerDied, SourceError, UsageError
 from s2a_bench.facts import (
@@ -20,16 +21,15 @@ from s2a_bench.facts import (
 )
 from s2a_bench.harness.feed import Feed, StreamedFrame, StreamFeed
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint, together
-from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.harness.plan import RequestPlan
 from s2a_bench.harness.recording import RunRecorder
-from s2a_bench.inference.chunk import swing
+from s2a_bench.inference import swing
 from s2a_bench.machine.resources.sampler import Sampler
 from s2a_bench.provenance import UNKNOWN, Provenance
 from s2a_bench.secrets import struck_pieces
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import STAGES, Mark, Trace
-from s2a_bench.transport import Client
-from s2a_bench.transport.options import LOSSLESS
+from s2a_bench.transport import LOSSLESS, Client
 from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.types import Frame, Piece, Request, Token
 
@@ -66,20 +66,18 @@ class Measured:
     """What the server said of itself that can be no fact."""
 
 
-def _nobody(piece: Piece, at_ns: int) -> None:
-    """Listen to no piece."""
-
-
 @dataclass(frozen=True, slots=True)
 class Asked:
     """What one request is told that others of the run are not, and who hears of its pieces as they arrive."""
 
     state: tuple[float, ...] | None = None
     """Of the robot; None: of a robot that nobody has."""
-    seed: int | None = None
-    """None: the run's."""
-    heard: Callable[[Piece, int], None] = _nobody
+    heard: Callable[[Piece, int], None] | None = None
     """Called on the thread that measures, with each piece and the time, in ns, at which it was there."""
+    plan: PlanFeed | None = None
+    """Told the answer as it arrives, from the start of the capture."""
+    request: RequestPlan | None = None
+    """None: the run's."""
 
 
 PLAIN = Asked()
@@ -96,7 +94,7 @@ class Session:
         cell: Pipeline,
         client: Client,
         feed: Feed,
-        config: RequestsConfig,
+        request: RequestPlan,
         recorder: RunRecorder | None = None,
         sampler: Sampler | None = None,
         origin: Provenance = UNKNOWN_ORIGIN,
@@ -109,11 +107,10 @@ class Session:
         self.cell = cell
         self.client = client
         self.feed = feed
-        self._config = config
+        self.request = request
         self._recorder = recorder
         self._sampler = sampler or Sampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
-        self._stages = {*config.stages}
         self.busy = False
         """Whether a request is under way, so that nobody else may touch the client."""
         self.prompt_n = 0
@@ -134,18 +131,16 @@ class Session:
         trace = Trace()
         error, retry_after_s = "", 0.0
         fatal: S2AError | KeyboardInterrupt | None = None
-        state = state_at(place.block, self._config.state) if asked.state is None else asked.state
+        told, state = asked.request or self.request, asked.state
+        if state is None:  # another one in each block, float32
+            state = tuple(swing(1, told.state, place.block)[0].tolist()) if told.state else ()
         started_ns = now_ns()
         self._sampler.edge()
         frames = self.feed.capture(trace)
-        config = self._config
-        said = config.prompt, frames, config.most_pieces, config.grammar
-        request = Request(request_id, *said, config.seed if asked.seed is None else asked.seed, state=state)
+        request = Request(request_id, told.prompt, frames, told.max_pieces, told.grammar, told.seed, state=state)
         try:
-            for piece in self.client.request(request, trace):
-                at_ns = now_ns()
-                seen.append((piece, at_ns))
-                asked.heard(piece, at_ns)
+            for piece_at in self._pieces(request, trace, asked):
+                seen.append(piece_at)  # noqa: PERF402 - what came before an error is kept
         except S2AError as failure:
             error = f"{type(failure).__name__}: {failure}"
             fatal = failure if isinstance(failure, FATAL) else None
@@ -155,20 +150,38 @@ class Session:
             error, fatal = INTERRUPTED, interrupt
         self._sampler.edge()
         texts = iter(struck_pieces([piece.text for piece, _ in seen if isinstance(piece, Token)]))
-        seen = [
-            (replace(piece, text=next(texts)) if isinstance(piece, Token) else piece, at_ns) for piece, at_ns in seen
-        ]
+        seen = [(replace(piece, text=next(texts)) if isinstance(piece, Token) else piece, at) for piece, at in seen]
         trace.facts.update(self._sampler.window(started_ns, now_ns()))
         if not error and not seen:
             error = "RequestFailed: the answer was empty"
         if self._recorder is not None:
-            if config.mode == "request":  # in stream mode the camera records its frames
+            if told.mode == "request":  # in stream mode the camera records its frames
                 for frame in frames:
                     self._recorder.frame(frame)
             self._recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
             self._recorder.flush()
         rows = self._rows(place, request_id, frames, trace, seen, error)
         return replace(rows, fatal=fatal, retry_after_s=retry_after_s)
+
+    def _pieces(self, request: Request, trace: Trace, asked: Asked) -> Iterator[tuple[Piece, int]]:
+        """Yield the pieces with the times, in ns, at which they are there, and tell who listens."""
+        plan = asked.plan
+        if plan is not None:
+            plan.requested(trace.marks[0][1])
+        try:
+            for piece in self.client.request(request, trace):
+                at_ns = now_ns()
+                if asked.heard is not None:
+                    asked.heard(piece, at_ns)
+                if plan is not None:
+                    plan.token(piece.text, at_ns)
+                yield piece, at_ns
+        except S2AError as error:
+            if plan is not None:
+                plan.broke(f"{type(error).__name__}: {error}", now_ns())
+            raise
+        if plan is not None:
+            plan.ended(now_ns())
 
     def _rows(
         self,
@@ -179,8 +192,7 @@ class Session:
         seen: list[tuple[Piece, int]],
         error: str,
     ) -> Measured:
-        """Turn what was seen into rows."""
-        config, facts = self._config, trace.facts
+        facts = trace.facts
         told = trace.provenance or (trace.remote.provenance if trace.remote else {})
         if told.get("engine", UNKNOWN) != UNKNOWN:
             self.origin = replace(Provenance.from_dict(told), link=self.origin.link)
@@ -206,12 +218,9 @@ class Session:
             payload=self.cell.payload,
             connection=getattr(self.cell.options, "connection", ""),
             engine=self.origin.engine,
-            mode=config.mode,
-            size=f"{config.width}x{config.height}",
-            block=place.block,
-            position=place.position,
-            warmup=place.warmup,
-            launch=place.launch,
+            mode=self.request.mode,
+            size=self.request.size,
+            **asdict(place),
             request_id=request_id,
             frame_index=index,
             error=error,
@@ -244,7 +253,7 @@ class Session:
 
     def _doubt(self, trace: Trace, rgb_source: int | None, rgb_engine: int | None) -> str:
         """Return why a request that was answered is none that counts, or nothing."""
-        if unknown := {stage for stage, _ in trace.chain() if stage} - self._stages:
+        if unknown := {stage for stage, _ in trace.chain() if stage} - self.request.stages.keys():
             return f"TransportError: {self.cell.transport.name} does not declare the stage {', '.join(sorted(unknown))}"
         if self.cell.payload in LOSSLESS and None not in {rgb_source, rgb_engine} and rgb_source != rgb_engine:
             return "TransportError: the engine saw other pixels than the camera gave, though nothing should be lost"
@@ -254,7 +263,7 @@ class Session:
         """Find the camera frame that the answer is about, and complete its marks with the server's."""
         if not isinstance(self.feed, StreamFeed):
             return None
-        self._frames.update((frame.key, frame) for frame in self.feed.drain())
+        self._frames.update((frame.key, frame) for frame in self.feed.camera.drain())
         used = self.feed.last
         if self.feed.sink is not None:
             used = self._frames.get(trace.remote.frame_stamp_ns) if trace.remote else None
@@ -274,11 +283,6 @@ class Session:
             frame = self._frames.pop(next(iter(self._frames)))
             rows.append(FrameRow(self.cell.name, frame.index, frame.intended_ns, frame.marks, frame.used_by))
         return rows
-
-
-def state_at(block: int, numbers: int) -> tuple[float, ...]:
-    """Return the state of a robot that nobody has: so many joints, another in each block, float32."""
-    return tuple(swing(1, numbers, block)[0].tolist()) if numbers else ()
 
 
 def inference_start_ns(trace: Trace) -> int | None:

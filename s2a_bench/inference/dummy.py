@@ -3,25 +3,212 @@
 Token speed depends on shapes and types, not on values. The language model is Qwen2-7B's; the mmproj is SigLIP-so400m
 at 980 pixels' positions with a `resampler` of 64 queries (minicpmv_version 3). Names and keys are those that llama.cpp
 reads (``src/models/qwen2.cpp``, ``tools/mtmd/clip.cpp``) and its converter writes (``tools/mtmd/legacy-models``).
+
+Weights are drawn as bytes of each type's blocks, nothing is quantised from floats: from a generator of 64-bit integers,
+so that a seed gives the same bytes with every numpy. Only the spread matters: a matrix has about ``1 / sqrt(columns)``,
+so that activations keep their size through the layers.
 """
 
 from __future__ import annotations
 
+import math
 import os
+import string
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench import extras
 from s2a_bench.errors import ModelError, UsageError
-from s2a_bench.inference.dummy_vocab import Vocab, make_vocab
-from s2a_bench.inference.dummy_weights import Kind, Tensor
-from s2a_bench.inference.files_config import Quant, Size
+from s2a_bench.inference import Quant, Size
 
 if TYPE_CHECKING:
     from gguf import GGUFWriter
+
+Kind: TypeAlias = Literal["f32", "f16", "q8_0", "q4_0", "q6_k"]
+Bytes: TypeAlias = NDArray[np.uint8]
+
+CHUNK_BYTES = 1 << 24
+
+_F16_SPREAD = math.sqrt(7 / 3)  # of a number uniform in +-[1, 2)
+_Q4_SPREAD = math.sqrt((16**2 - 1) / 12)
+_Q6_SPREAD = math.sqrt((64**2 - 1) / 12)
+_Q8_SPREAD = math.sqrt((256**2 - 1) / 12)
+_Q6_SCALE = 8  # keeps the half-precision factor beside it a normal number
+
+
+@dataclass(frozen=True, slots=True)
+class Tensor:
+    """One tensor: its shape as numpy writes it (columns last); a ``value``, or one for each, where it is not random."""
+
+    name: str
+    shape: tuple[int, ...]
+    kind: Kind = "f32"
+    value: float | Sequence[float] | None = None
+
+    @property
+    def nbytes(self) -> int:
+        block, size, _ = KINDS[self.kind]
+        return math.prod(self.shape) // block * size
+
+    @property
+    def spread(self) -> float:
+        return 1 / math.sqrt(math.prod(self.shape[1:])) if len(self.shape) > 1 else 0.02
+
+    def chunks(self, seed: int) -> Iterator[Bytes]:
+        """Yield the tensor's bytes; the same for the same seed and name."""
+        block, size, draw = KINDS[self.kind]
+        left = math.prod(self.shape) // block
+        generator = np.random.Generator(np.random.SFC64([seed, zlib.crc32(self.name.encode())]))
+        while left:
+            blocks = min(left, CHUNK_BYTES // size)
+            left -= blocks
+            if self.value is None:
+                yield draw(_random_bytes(generator, blocks * size), self.spread)
+            else:
+                yield np.broadcast_to(np.asarray(self.value, _FLOATS[self.kind]), blocks).copy().view(np.uint8)
+
+
+def _random_bytes(generator: np.random.Generator, size: int) -> Bytes:
+    words = generator.integers(0, 2**64 - 1, -(-size // 8), np.uint64, endpoint=True)
+    return words.view(np.uint8)[:size]
+
+
+def _f32(raw: Bytes, spread: float) -> Bytes:
+    numbers = raw.view("<i4").astype("<f4") * np.float32(spread * math.sqrt(3) / 2**31)
+    return numbers.view(np.uint8)
+
+
+def _f16(raw: Bytes, spread: float) -> Bytes:
+    # sign and mantissa stay random, the exponent is set: no conversion, which would take minutes for 15 GB
+    exponent = 15 + round(math.log2(spread / _F16_SPREAD))
+    halves = raw.view("<u2")
+    halves &= 0x83FF
+    halves |= exponent << 10
+    return raw
+
+
+def _alternating(blocks: NDArray[np.void], field: str, value: float) -> None:
+    """Turn every second block's sign, so that codes that are not symmetric about 0 average to 0."""
+    blocks[field][0::2] = value
+    blocks[field][1::2] = -value
+
+
+def _q8_0(raw: Bytes, spread: float) -> Bytes:
+    _alternating(raw.view([("d", "<f2"), ("q", "i1", 32)]), "d", spread / _Q8_SPREAD)
+    return raw
+
+
+def _q4_0(raw: Bytes, spread: float) -> Bytes:
+    _alternating(raw.view([("d", "<f2"), ("q", "u1", 16)]), "d", spread / _Q4_SPREAD)
+    return raw
+
+
+def _q6_k(raw: Bytes, spread: float) -> Bytes:
+    blocks = raw.view([("ql", "u1", 128), ("qh", "u1", 64), ("scales", "i1", 16), ("d", "<f2")])
+    blocks["scales"] = _Q6_SCALE
+    _alternating(blocks, "d", spread / _Q6_SPREAD / _Q6_SCALE)
+    return raw
+
+
+KINDS: dict[Kind, tuple[int, int, Callable[[Bytes, float], Bytes]]] = {
+    "f32": (1, 4, _f32),
+    "f16": (1, 2, _f16),
+    "q8_0": (32, 34, _q8_0),
+    "q4_0": (32, 18, _q4_0),
+    "q6_k": (256, 210, _q6_k),
+}
+"""Tensor type -> (numbers in a block, bytes of a block, what makes random bytes into blocks)."""
+
+_FLOATS: dict[Kind, str] = {"f32": "<f4", "f16": "<f2"}
+
+
+NORMAL, CONTROL = 1, 3
+"""Token types of GGUF (``gguf.TokenType``)."""
+
+FULL_BASE = 151_643
+"""Qwen2's byte-level tokens and merges; the special tokens follow."""
+
+FULL_UNKNOWN = 128_244
+"""MiniCPM-V 2.6 keeps ``<unk>`` within Qwen2's range."""
+
+_LETTERS = "etaoinshrdlcumwfgypbvkjxqz"
+
+_QWEN_SPECIAL = ("<|endoftext|>", "<|im_start|>", "<|im_end|>")
+_IMAGE_SPECIAL = tuple(
+    mark
+    for name in ("image", "ref", "box", "quad", "point", "slice", "image_id")
+    for mark in (f"<{name}>", f"</{name}>")
+)
+_RESERVED = tuple(f"<|reserved_special_token_{index}|>" for index in range(6))
+TEXT = frozenset(string.ascii_letters + string.digits + string.punctuation + " \n")
+SPECIAL = _QWEN_SPECIAL + _IMAGE_SPECIAL + _RESERVED
+
+
+@dataclass(frozen=True, slots=True)
+class Vocab:
+    """Tokens by index with their GGUF types, merges by rank, and the indices that the file's keys name."""
+
+    tokens: list[str]
+    types: list[int]
+    merges: list[str]
+    pad: int
+    bos: int
+    eos: int
+    unknown: int
+
+    def texts(self) -> list[bool]:
+        """Return of each token whether it is text by itself: no control token, no byte of a longer character."""
+        unreadable = {name for byte, name in byte_names().items() if chr(byte) not in TEXT}
+        return [kind == NORMAL and token not in unreadable for token, kind in zip(self.tokens, self.types, strict=True)]
+
+
+def byte_names() -> dict[int, str]:
+    """Return GPT-2's printable character for each of the 256 bytes (``bytes_to_unicode``), in GPT-2's order."""
+    printable = [*range(33, 127), *range(161, 173), *range(174, 256)]
+    others = [byte for byte in range(256) if byte not in printable]
+    return {byte: chr(byte) for byte in printable} | {byte: chr(256 + index) for index, byte in enumerate(others)}
+
+
+def make_vocab(*, full: bool) -> Vocab:
+    """Make the vocabulary of Qwen2's size, or the byte-level one of the tiny model."""
+    alphabet = byte_names().values()
+    tokens, merges = list(alphabet), ["\u0120 t"]  # llama.cpp wants at least one merge; \u0120 stands for a space
+    if full:
+        merges = _letter_merges(FULL_BASE - len(alphabet))
+    tokens += [merge.replace(" ", "") for merge in merges]
+    types = [NORMAL] * len(tokens) + [CONTROL] * len(SPECIAL)
+    first = len(tokens)
+    tokens += SPECIAL
+    if full:
+        unknown = FULL_UNKNOWN
+        tokens[unknown], types[unknown] = "<unk>", CONTROL
+    else:
+        unknown = len(tokens)
+        tokens.append("<unk>")
+        types.append(CONTROL)
+    return Vocab(tokens, types, merges, pad=first, bos=first + 1, eos=first + 2, unknown=unknown)
+
+
+def _letter_merges(count: int) -> list[str]:
+    """Return ``count`` merges, shorter words first: pairs of letters, the same after a space, triples, fours."""
+    pairs = [first + second for first, second in product(_LETTERS, repeat=2)]
+    merges = [f"{pair[0]} {pair[1]}" for pair in pairs]
+    merges += [f"\u0120 {pair}" for pair in pairs]
+    merges += [f"{pair} {letter}" for pair, letter in product(pairs, _LETTERS)]
+    # the commonest pairs with each other, so that English text takes about as few tokens as it does in Qwen2
+    side = math.isqrt(count - len(merges) - 1) + 1
+    merges += [f"{first} {second}" for first, second in product(pairs[:side], repeat=2)]
+    return merges[:count]
+
 
 Progress: TypeAlias = Callable[[int, int], None]
 """Called with (bytes written, bytes in all)."""
@@ -101,84 +288,64 @@ def write_dummy(
         model.append(
             Tensor("output.bias", (len(vocab.tokens),), value=[0 if text else _NEVER for text in vocab.texts()])
         )
-    meter = _Meter(sum(tensor.nbytes for tensor in (*model, *mmproj)), progress)
+    done, total = 0, sum(tensor.nbytes for tensor in (*model, *mmproj))
+
+    def tell(count: int) -> None:
+        nonlocal done
+        done += count
+        if progress is not None:
+            progress(done, total)
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write(files.mmproj, "clip", lambda writer: _mmproj_keys(writer, shape, size), mmproj, seed=seed, meter=meter)
-        _write(
-            files.model,
-            "qwen2",
-            lambda writer: _model_keys(writer, shape, size, quant, vocab),
-            model,
-            seed=seed,
-            meter=meter,
-        )
+        with _writer(files.mmproj, "clip") as writer:
+            _mmproj_keys(writer, shape, size)
+            _write(writer, mmproj, seed, tell)
+        with _writer(files.model, "qwen2") as writer:
+            _model_keys(writer, shape, size, quant, vocab)
+            _write(writer, model, seed, tell)
     except OSError as error:
         raise ModelError(
             f"`output` {folder}: cannot write the dummy model ({error.strerror or error}); "
-            f"it needs {meter.total / 1e9:.2f} GB, choose another folder"
+            f"it needs {total / 1e9:.2f} GB, choose another folder"
         ) from error
     return files
 
 
-class _Meter:
-    """Adds up bytes written and passes them on."""
-
-    def __init__(self, total: int, progress: Progress | None) -> None:
-        self.total = total
-        self._done = 0
-        self._progress = progress
-
-    def add(self, count: int) -> None:
-        self._done += count
-        if self._progress is not None:
-            self._progress(self._done, self.total)
-
-
-def _write(
-    path: Path,
-    architecture: str,
-    keys: Callable[[GGUFWriter], None],
-    tensors: Iterable[Tensor],
-    *,
-    seed: int,
-    meter: _Meter,
-) -> None:
-    """Write one file: gguf-py writes header and keys, the tensors are streamed behind them."""
-    import numpy as np
-
+@contextmanager
+def _writer(path: Path, architecture: str) -> Iterator[GGUFWriter]:
+    """Open a file that takes its name when it is whole."""
     gguf = extras.require("gguf", "model")
-
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     os.close(handle)
     temporary = Path(name)
     writer: GGUFWriter = gguf.GGUFWriter(temporary, architecture)
     try:
-        keys(writer)
-        for tensor in tensors:
-            writer.add_tensor_info(
-                tensor.name,
-                tensor.shape,
-                np.dtype(np.float32),
-                tensor.nbytes,
-                raw_dtype=gguf.GGMLQuantizationType[tensor.kind.upper()],
-            )
-        writer.write_header_to_file()
-        writer.write_kv_data_to_file()
-        writer.write_ti_data_to_file()
-        (file,) = writer.fout
-        writer.write_padding(file, file.tell())
-        for tensor in tensors:
-            for chunk in tensor.chunks(seed):
-                file.write(chunk.data)
-                meter.add(chunk.nbytes)
-            writer.write_padding(file, tensor.nbytes)
+        yield writer
         writer.close()
         temporary.chmod(0o644)
         temporary.replace(path)
     finally:
         writer.close()
         temporary.unlink(missing_ok=True)
+
+
+def _write(writer: GGUFWriter, tensors: Iterable[Tensor], seed: int, tell: Callable[[int], None]) -> None:
+    """Write one file: gguf-py writes header and keys, the tensors are streamed behind them."""
+    kinds = extras.require("gguf", "model").GGMLQuantizationType
+    for tensor in tensors:
+        kind = kinds[tensor.kind.upper()]
+        writer.add_tensor_info(tensor.name, tensor.shape, np.dtype(np.float32), tensor.nbytes, raw_dtype=kind)
+    writer.write_header_to_file()
+    writer.write_kv_data_to_file()
+    writer.write_ti_data_to_file()
+    (file,) = writer.fout
+    writer.write_padding(file, file.tell())
+    for tensor in tensors:
+        for chunk in tensor.chunks(seed):
+            file.write(chunk.data)
+            tell(chunk.nbytes)
+        writer.write_padding(file, tensor.nbytes)
 
 
 def _general_keys(writer: GGUFWriter, size: Size, quant: Quant, part: str) -> None:

@@ -6,27 +6,15 @@ emulated, never measured.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import cycle, islice
 
 from s2a_bench.boards.latency import read_latency, sequence_ns
 from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import EngineError, UsageError
 from s2a_bench.facts import LATENCY_DRAWN_MS, Fact
-from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.chunk import chunk
+from s2a_bench.inference import Engine, EngineConfig, chunk
 from s2a_bench.types import Piece, Request, Token
-
-
-def check_latency(config: EngineConfig) -> None:
-    """Raise UsageError where ``latency`` is none, or goes with no echo."""
-    if not config.latency:
-        return
-    if config.name != "echo":
-        raise UsageError(f"`latency` needs `engine` echo; `engine` {config.name} answers at its own speed")
-    if config.pace:
-        raise UsageError("`pace`: with `latency` the whole answer comes at once; leave out one of them")
-    _sequence_ns(config)
 
 
 def _sequence_ns(config: EngineConfig) -> Iterator[int]:
@@ -36,7 +24,7 @@ def _sequence_ns(config: EngineConfig) -> Iterator[int]:
     return sequence_ns(latencies)
 
 
-class EchoEngine:
+class EchoEngine(Engine):
     """Says the prompt's words again and again until ``max_tokens``, or a chunk of actions; the rest is ignored.
 
     With ``latency`` request k, counted from 0 since the engine was opened, is answered with the k-th latency: all
@@ -44,21 +32,36 @@ class EchoEngine:
     """
 
     acts = True
+    needs_model = False
+    computes = False
+    own = ("latency",)
     tells = (LATENCY_DRAWN_MS,)
 
-    @staticmethod
-    def told(config: EngineConfig) -> tuple[Fact, ...]:
-        """Return the facts that it tells, set like this."""
-        return EchoEngine.tells if config.latency else ()
+    @classmethod
+    def check(cls, config: EngineConfig) -> None:
+        """Raise UsageError where ``latency`` is none, or goes with a pace."""
+        if not config.latency:
+            return
+        if config.pace:
+            raise UsageError("`pace`: with `latency` the whole answer comes at once; leave out one of them")
+        _sequence_ns(config)
+
+    @classmethod
+    def told(cls, config: EngineConfig) -> Sequence[Fact]:
+        return cls.tells if config.latency else ()
 
     def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
-        """Read the latencies, if any; raises UsageError for what `check_latency` refuses."""
-        check_latency(config)
-        self.facts: dict[str, float] = {}
+        """Read the latencies, if any; raises UsageError for what `check` refuses."""
+        self.check(config)
+        self._facts: dict[str, float] = {}
         self._config = config
         self._clock = clock or SystemClock()
         self._latencies_ns = _sequence_ns(config) if config.latency else None
         self._closed = False
+
+    @property
+    def facts(self) -> dict[str, float]:
+        return self._facts
 
     def generate(self, request: Request) -> Iterator[Piece]:
         """Yield the prompt's words as tokens, where there are none "echo"; or the actions of a chunk."""
@@ -66,7 +69,7 @@ class EchoEngine:
             raise EngineError("echo: the engine is closed; open a new one")
         if self._latencies_ns is not None:
             asked_ns, latency_ns = self._clock.now_ns(), next(self._latencies_ns)
-            self.facts = {LATENCY_DRAWN_MS: latency_ns / 1e6}
+            self._facts = {LATENCY_DRAWN_MS: latency_ns / 1e6}
             self._clock.sleep_until_ns(asked_ns + latency_ns)
         if self._config.chunks:
             yield from chunk(self._config, request)
@@ -82,5 +85,4 @@ class EchoEngine:
         return told | ({"answer": self._config.pieces} if self._config.chunks else {})
 
     def close(self) -> None:
-        """Refuse further requests."""
         self._closed = True

@@ -8,21 +8,23 @@ finds it.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import io
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from logging import ERROR, getLogger
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 from s2a_bench import extras
 from s2a_bench.errors import ModelError, UsageError
-from s2a_bench.inference.fetch_errors import no_hub, one_line
-from s2a_bench.inference.fetch_names import HUB_MODELS
-from s2a_bench.inference.models import digest, remember_sha256, sha256
+from s2a_bench.inference.gguf_file import Sha256
+from s2a_bench.inference.models import HUB_MODELS, digest, remember_sha256, sha256
+from s2a_bench.store.schema import Count, about
 
 Progress: TypeAlias = Callable[[str, int, int], None]
 """Called with (file, bytes that are there, bytes in all)."""
@@ -30,6 +32,8 @@ Progress: TypeAlias = Callable[[str, int, int], None]
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _SPARE_BYTES = 100 << 20
 """Left free on the disk, for everything else."""
+_REFUSED = (401, 403, 404)
+"""What a hub answers to a wrong name, a wrong token, or none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,29 +43,30 @@ class Wanted:
     repository: str
     files: tuple[str, ...]
 
-    @property
-    def in_words(self) -> str:
-        """Return the files as a person would list them."""
-        return f"{' and '.join(self.files)} of {self.repository}"
-
 
 @dataclass(frozen=True, slots=True)
 class HubFile:
-    """One file as the hub lists it."""
+    """One file as the hub lists it, and where the hub's cache keeps its content (its documented layout)."""
 
     name: str
     nbytes: int
     sha256: str
+    blob: Path
+
+    @property
+    def part(self) -> Path:
+        """Return where it grows until it is whole."""
+        return self.blob.with_name(f"{self.blob.name}.s2a-bench.part")
 
 
 @dataclass(frozen=True, slots=True)
 class FetchedFile:
-    """A file that is there and has the hub's checksum; ``resumed_at`` bytes of it were there before."""
+    """One file that was fetched."""
 
     path: Path
-    nbytes: int
-    sha256: str
-    resumed_at: int
+    bytes: Count
+    sha256: Sha256
+    resumed_at: Annotated[Count, about("Bytes that were there before; all of them where nothing was downloaded.")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,14 +102,17 @@ def fetch(want: Wanted, progress: Progress | None = None) -> Fetched:
 
     Raises ModelError, one line, for whatever is in the way: no network, no such file, gated, disk full, wrong content.
     """
-    constants = extras.require("huggingface_hub.constants", "model")
     extras.require("huggingface_hub.utils", "model").disable_progress_bars()
     getLogger("huggingface_hub").setLevel(ERROR)  # it tells of each retry with the whole, signed address
-    with one_line(want.repository, want.in_words):
+    with _one_line(want):
         commit, files = _listing(want)
         _check_space(want.repository, files)
         done = tuple(_fetch_file(want.repository, commit, file, progress) for file in files)
-    return Fetched(str(constants.ENDPOINT), want.repository, commit, done)
+    return Fetched(_endpoint(), want.repository, commit, done)
+
+
+def _endpoint() -> str:
+    return str(extras.require("huggingface_hub.constants", "model").ENDPOINT)
 
 
 def _listing(want: Wanted) -> tuple[str, tuple[HubFile, ...]]:
@@ -115,7 +123,7 @@ def _listing(want: Wanted) -> tuple[str, tuple[HubFile, ...]]:
         info = hub.HfApi().model_info(want.repository, files_metadata=True, timeout=timeout_s)
         siblings = {sibling.rfilename: sibling for sibling in info.siblings or ()}
     except (ValueError, LookupError, TypeError, AttributeError) as error:  # no JSON, or not a hub's
-        raise no_hub(want.repository, want.in_words) from error
+        raise ModelError(f"{want.repository}: {_no_hub(want)}") from error
     by_case = {name.lower(): name for name in siblings} | {name: name for name in siblings}
     names = (by_case.get(file) or by_case.get(file.lower(), file) for file in want.files)
     return str(info.sha), tuple(_hub_file(want.repository, name, siblings) for name in names)
@@ -128,29 +136,19 @@ def _hub_file(repository: str, name: str, siblings: dict[str, Any]) -> HubFile:
     lfs = siblings[name].lfs
     if lfs is None or not _SHA256.fullmatch(lfs.sha256):
         raise ModelError(f"{repository}: gives no SHA-256 for {name}, so it cannot be checked; download it by hand")
-    return HubFile(name, int(lfs.size), lfs.sha256)
-
-
-def _blob(repository: str, file: HubFile) -> Path:
-    """Return where the hub's cache keeps a content (its documented layout)."""
     download = extras.require("huggingface_hub.file_download", "model")
     cache: str = extras.require("huggingface_hub.constants", "model").HF_HUB_CACHE
     folder: str = download.repo_folder_name(repo_id=repository, repo_type="model")
-    return Path(cache).expanduser() / folder / "blobs" / file.sha256
-
-
-def _part(blob: Path) -> Path:
-    return blob.with_name(f"{blob.name}.s2a-bench.part")
+    return HubFile(name, int(lfs.size), lfs.sha256, Path(cache).expanduser() / folder / "blobs" / lfs.sha256)
 
 
 def _check_space(repository: str, files: tuple[HubFile, ...]) -> None:
     """Refuse before the first byte where the disk cannot hold what is missing."""
     missing = 0
     for file in files:
-        blob = _blob(repository, file)
-        if not blob.is_file():
-            missing += file.nbytes - (_part(blob).stat().st_size if _part(blob).is_file() else 0)
-    folder = _blob(repository, files[0]).parent
+        if not file.blob.is_file():
+            missing += file.nbytes - (file.part.stat().st_size if file.part.is_file() else 0)
+    folder = files[0].blob.parent
     there = next(parent for parent in (folder, *folder.parents) if parent.exists())
     free = shutil.disk_usage(there).free
     if missing > 0 and free < missing + _SPARE_BYTES:
@@ -162,10 +160,10 @@ def _check_space(repository: str, files: tuple[HubFile, ...]) -> None:
 
 def _fetch_file(repository: str, commit: str, file: HubFile, progress: Progress | None) -> FetchedFile:
     hub = extras.require("huggingface_hub", "model")
-    blob, resumed_at = _blob(repository, file), file.nbytes
-    if not blob.is_file():
-        blob.parent.mkdir(parents=True, exist_ok=True)
-        resumed_at = _download(repository, commit, file, blob, progress)
+    resumed_at = file.nbytes
+    if not file.blob.is_file():
+        file.blob.parent.mkdir(parents=True, exist_ok=True)
+        resumed_at = _download(repository, commit, file, progress)
     if progress is not None:
         progress(file.name, file.nbytes, file.nbytes)
     path = Path(hub.hf_hub_download(repository, file.name))  # finds the blob there and links it
@@ -187,18 +185,17 @@ class _Part(io.BufferedWriter):
         return written
 
 
-def _download(repository: str, commit: str, file: HubFile, blob: Path, progress: Progress | None) -> int:
+def _download(repository: str, commit: str, file: HubFile, progress: Progress | None) -> int:
     """Append what is missing, check all of it, and make it the blob; return how much was there before."""
     hub = extras.require("huggingface_hub", "model")
     http_get = extras.require("huggingface_hub.file_download", "model").http_get
     headers = extras.require("huggingface_hub.utils", "model").build_hf_headers()
-    part = _part(blob)
-    with _Part(part, lambda done: progress(file.name, done, file.nbytes) if progress else None) as content:
+    with _Part(file.part, lambda done: progress(file.name, done, file.nbytes) if progress else None) as content:
         try:
             fcntl.flock(content, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ModelError(f"{file.name}: another process fetches it now ({part}); wait for that one") from None
-        if blob.is_file():  # another process has just finished
+            raise ModelError(f"{file.name}: another process fetches it now ({file.part}); wait for that one") from None
+        if file.blob.is_file():  # another process has just finished
             return file.nbytes
         if content.tell() > file.nbytes:
             content.seek(0)
@@ -208,12 +205,67 @@ def _download(repository: str, commit: str, file: HubFile, blob: Path, progress:
         url = hub.hf_hub_url(repository, file.name, revision=commit)
         http_get(url, content, resume_size=there, headers=headers, expected_size=file.nbytes)
         content.flush()
-        found = digest(part)
+        found = digest(file.part)
         if found != file.sha256:
-            part.unlink()
+            file.part.unlink()
             raise ModelError(
                 f"{file.name}: has SHA-256 {found}, the hub says {file.sha256}; what arrived was deleted, fetch again"
             )
-        part.replace(blob)
-    remember_sha256(blob, found)
+        file.part.replace(file.blob)
+    remember_sha256(file.blob, found)
     return there
+
+
+def _by_hand(want: Wanted) -> str:
+    return f"download {' and '.join(want.files)} of {want.repository} by hand and give --model PATH --mmproj PATH"
+
+
+def _no_hub(want: Wanted) -> str:
+    return f"{_endpoint()} does not answer as a hub does; check HF_ENDPOINT and your proxy, or {_by_hand(want)}"
+
+
+def _status(error: Any, want: Wanted) -> str:
+    status = int(error.response.status_code)
+    said = f": {error.server_message}" if error.server_message else ""
+    way_out = "check the name, or set HF_TOKEN" if status in _REFUSED else f"try again later, or {_by_hand(want)}"
+    return f"{_endpoint()} answered {status}{said}; {way_out}"
+
+
+def _unreachable(error: Any, want: Wanted) -> str:
+    if getattr(error, "errno", None) == errno.ENOSPC:
+        return "the disk is full; make room, or set HF_HOME to a folder on another disk, and fetch again"
+    if getattr(error, "filename", None):
+        return f"cannot write {error.filename} ({error.strerror}); set HF_HOME to a folder you may write"
+    return (
+        f"cannot be fetched from {_endpoint()} ({type(error).__name__}: {error}); what has arrived is "
+        f"kept, so try again, set HF_ENDPOINT to a hub in reach, or {_by_hand(want)}"
+    )
+
+
+@contextmanager
+def _one_line(want: Wanted) -> Iterator[None]:
+    """Turn what the hub library raises into a ModelError of one line that names the way out."""
+    errors = extras.require("huggingface_hub.errors", "model")
+    # the hub library has changed its HTTP client twice, so the client's base error cannot be named by import
+    client_error: Any = errors.HfHubHTTPError.__mro__[1]
+    try:
+        yield
+    except Exception as error:
+        match error:
+            case errors.OfflineModeIsEnabled():
+                reason = f"HF_HUB_OFFLINE is set, so nothing is fetched; unset it, or {_by_hand(want)}"
+            case errors.GatedRepoError():
+                reason = f"gated; ask for access on its page at {_endpoint()}, then set HF_TOKEN and fetch again"
+            case errors.RepositoryNotFoundError():
+                reason = f"no such repository at {_endpoint()}, or a private one; check the name, or set HF_TOKEN"
+            case errors.FileMetadataError():
+                reason = _no_hub(want)
+            case errors.LocalEntryNotFoundError():
+                reason = _unreachable(error, want)
+            case errors.HfHubHTTPError():
+                reason = _status(error, want)
+            case client_error() | OSError() | ValueError():
+                reason = _unreachable(error, want)
+            case _:
+                raise
+        raise ModelError(" ".join(f"{want.repository}: {reason}".split())) from error

@@ -13,7 +13,7 @@ import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import BadRequest, EngineError, ModelError
+from s2a_bench.errors import BadRequest, EngineError, ModelError, UsageError
 from s2a_bench.facts import (
     FIRST_DECODE_MS,
     PREDICTED_MS,
@@ -24,19 +24,27 @@ from s2a_bench.facts import (
     PROMPT_N,
     VISION_ENCODE_MS,
 )
-from s2a_bench.inference import EngineConfig, llama_log
-from s2a_bench.inference.grammar_limits import beyond_limits
-from s2a_bench.inference.llama_decode import GreedySampler, Sampler, TokenBatch, TokenBytes
-from s2a_bench.inference.llama_gbnf import GrammarSampler, grammar_error
-from s2a_bench.inference.llama_pictures import PixelHandler
-from s2a_bench.inference.llama_settings import (
+from s2a_bench.inference import (
     FLASH_ATTENTION,
     KV_TYPES,
     LAST_N,
     PENALTY_LAST_N,
     SAMPLER_ARGUMENTS,
     SAMPLINGS,
+    Engine,
+    EngineConfig,
+    llama_log,
 )
+from s2a_bench.inference.llama_decode import (
+    GrammarSampler,
+    GreedySampler,
+    Sampler,
+    TokenBatch,
+    TokenBytes,
+    beyond_limits,
+    grammar_error,
+)
+from s2a_bench.inference.llama_pictures import PixelHandler
 from s2a_bench.inference.models import ModelFiles, load_headers, sha256
 from s2a_bench.types import Request, Token
 
@@ -44,8 +52,7 @@ llama_cpp = extras.require("llama_cpp", "llama")
 
 _URL = "s2a-bench:image/{:04d}/"
 _MS_NS = 1_000_000
-
-
+_DESCRIBED = ("gpu_layers", "context", "batch", "kv_type", "flash_attention", "sampling")
 _GRAMMARS = 64
 """How many are remembered as checked: each can be a MiB."""
 
@@ -93,7 +100,7 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
         return iter(())
 
 
-class LlamaCppEngine:
+class LlamaCppEngine(Engine):
     """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names.
 
     ``prompt_n`` is what llama.cpp says it evaluated, pictures included; ``prompt_ms`` is the time from the request to
@@ -103,8 +110,13 @@ class LlamaCppEngine:
     """
 
     def __init__(self, config: EngineConfig) -> None:
-        """Load both files; raises ModelError where llama.cpp refuses one."""
-        self.facts: dict[str, float] = {}
+        """Load both files; raises UsageError for layers on a GPU that this build cannot use, ModelError."""
+        self._facts: dict[str, float] = {}
+        if config.gpu_layers and not llama_cpp.llama_supports_gpu_offload():
+            raise UsageError(
+                "`gpu_layers`: this llama-cpp-python is built for the CPU alone; "
+                "build it for the GPU ('s2a-bench doctor' says how), or leave it out"
+            )
         self._files = load_headers(config)
         self._config = config
         self._threads = config.threads or len(os.sched_getaffinity(0))
@@ -116,6 +128,10 @@ class LlamaCppEngine:
         self._handler = PixelHandler(str(self._files.mmproj.path), use_gpu=config.gpu_layers != 0)
         self._llama = self._load(self._files)
         self._batch = TokenBatch()
+
+    @property
+    def facts(self) -> dict[str, float]:
+        return self._facts
 
     def _load(self, files: ModelFiles) -> _Prefilled:
         try:
@@ -159,7 +175,7 @@ class LlamaCppEngine:
         self._evaluate(llama, request)
         prompt_done = now_ns()
         perf = llama_cpp.llama_perf_context(llama.ctx)
-        self.facts = {
+        self._facts = {
             PROMPT_N: float(perf.n_p_eval),
             PROMPT_MS: (prompt_done - started) / _MS_NS,
             PREPROCESS_MS: (self._handler.steps.prepared_ns - started) / _MS_NS,
@@ -168,7 +184,7 @@ class LlamaCppEngine:
             PREDICTED_MS: 0.0,
         }
         if request.images:
-            self.facts[VISION_ENCODE_MS] = self._handler.steps.encode_ns / _MS_NS
+            self._facts[VISION_ENCODE_MS] = self._handler.steps.encode_ns / _MS_NS
         ignore_end = self._files.dummy and not request.grammar  # random weights end at random, counts should not
         decode = codecs.getincrementaldecoder("utf-8")("replace").decode
         llama.set_seed(request.seed & 0x7FFF_FFFF)  # 2**32-1 would mean a random seed
@@ -182,7 +198,7 @@ class LlamaCppEngine:
                 asked_ns = now_ns()
                 token = next(ids)
                 if index == 1:
-                    self.facts[FIRST_DECODE_MS] = (now_ns() - asked_ns) / _MS_NS
+                    self._facts[FIRST_DECODE_MS] = (now_ns() - asked_ns) / _MS_NS
                 if not ignore_end and llama_cpp.llama_vocab_is_eog(llama._model.vocab, token):  # noqa: SLF001
                     return
                 text = decode(pieces[token], index + 1 == request.max_tokens)
@@ -192,8 +208,8 @@ class LlamaCppEngine:
             raise EngineError(f"llama: generation failed: {llama_log.reason() or error}") from error
         finally:
             if turn == self._turn:
-                self.facts[PREDICTED_N] = float(count)
-                self.facts[PREDICTED_MS] = (last_ns - prompt_done) / _MS_NS
+                self._facts[PREDICTED_N] = float(count)
+                self._facts[PREDICTED_MS] = (last_ns - prompt_done) / _MS_NS
 
     def _evaluate(self, llama: _Prefilled, request: Request) -> None:
         """Run pictures and prompt through the model, on an empty KV cache, up to the first token's logits."""
@@ -254,13 +270,8 @@ class LlamaCppEngine:
             "projector": str(mmproj.fields.get("clip.projector_type", "")),
             "llama_cpp_python": version("llama-cpp-python"),
             "threads": self._threads,
-            "gpu_layers": self._config.gpu_layers,
             "gpu_offload_supported": bool(llama_cpp.llama_supports_gpu_offload()),
-            "context": self._config.context,
-            "batch": self._config.batch,
-            "kv_type": self._config.kv_type,
-            "flash_attention": self._config.flash_attention,
-            "sampling": self._config.sampling,
+            **{name: getattr(self._config, name) for name in _DESCRIBED},
         }
         if self._llama is not None:
             handle = self._llama.model

@@ -1,4 +1,4 @@
-"""The loop that writes an answer token by token, with little between two calls of ``llama_decode``.
+"""How an answer is written token by token, with little between two calls of ``llama_decode``; and its grammar.
 
 llama-cpp-python's own loop (``Llama.generate``) trims the KV cache, fills a batch and copies tokens for every one; with
 a small model that is a tenth of the time.
@@ -7,6 +7,11 @@ a small model that is a tenth of the time.
 from __future__ import annotations
 
 import ctypes
+import math
+import os
+import re
+import tempfile
+import weakref
 from collections.abc import Iterator
 from typing import Any, Protocol
 
@@ -14,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench import extras
+from s2a_bench.inference import llama_log
 
 llama_cpp = extras.require("llama_cpp", "llama")
 bindings = llama_cpp.llama_cpp
@@ -26,6 +32,20 @@ _logits_address.restype = ctypes.c_void_p
 _PIECE_BYTES = 1024
 
 
+_STDERR = 2
+GRAMMAR_BYTES = 1 << 20
+DEPTH = 200
+"""Of parentheses in each other."""
+RULES = 5_000
+"""llama.cpp also recurses along rules that name each other."""
+REPETITIONS = 10_000
+"""Of braces in each other, multiplied: llama.cpp writes out what is repeated."""
+
+_DIGITS = 6
+_LEXEME = re.compile(r'"(?:\\.|[^"\\])*"?|\[(?:\\.|[^\]\\])*\]?|#[^\n]*|\{([^}]*)\}?|[()]', re.DOTALL)
+"""What is left open goes on to the end, so that no text is read twice."""
+
+
 class TokenBytes(dict[int, bytes]):
     """The bytes of each token written so far; the library's `detokenize` cuts at 32. Special tokens have none."""
 
@@ -35,7 +55,6 @@ class TokenBytes(dict[int, bytes]):
         self._piece = ctypes.create_string_buffer(_PIECE_BYTES)
 
     def __missing__(self, token: int) -> bytes:
-        """Ask llama.cpp, once a token."""
         size = llama_cpp.llama_token_to_piece(self._vocab, token, self._piece, _PIECE_BYTES, 0, False)
         self[token] = found = self._piece.raw[: max(0, size)]
         return found
@@ -57,7 +76,6 @@ class GreedySampler:
     """
 
     def __init__(self, n_vocab: int) -> None:
-        """Sample from ``n_vocab`` logits."""
         self._n_vocab = n_vocab
         self._address = 0
         self._logits: NDArray[np.float32] = np.zeros(0, np.float32)
@@ -77,7 +95,6 @@ class TokenBatch:
     """A batch of one token of sequence 0, allocated once."""
 
     def __init__(self) -> None:
-        """Allocate; `close` frees."""
         self._batch = llama_cpp.llama_batch_init(1, 0, 1)
         self._batch.n_tokens = 1
         self._batch.n_seq_id[0] = 1
@@ -105,3 +122,100 @@ class TokenBatch:
         if self._batch is not None:
             llama_cpp.llama_batch_free(self._batch)
             self._batch = None
+
+
+llama_cpp = extras.require("llama_cpp", "llama")
+
+
+class GrammarSampler:
+    """Stands in for the library's `LlamaSampler` where a request has a grammar, as llama-server applies it.
+
+    llama-cpp-python puts a grammar at the head of its chain of samplers, where it judges every token of the vocabulary:
+    9 ms a token with Qwen2's 151666 on the machine this was written on. llama.cpp's own programs ask it about the token
+    that was sampled, and about all only where it refuses that one (``common/sampling.cpp``); so does this.
+    """
+
+    def __init__(self, chain: Any, vocab: Any, grammar: str, candidates: Any) -> None:
+        """Sample from ``chain``, a sampler without grammar; ``candidates`` is scratch space for the vocabulary."""
+        self._chain = chain
+        self._grammar = llama_cpp.llama_sampler_init_grammar(vocab, grammar.encode(), b"root")
+        self._candidates = candidates
+        weakref.finalize(self, llama_cpp.llama_sampler_free, self._grammar)
+
+    def sample(self, ctx: Any, idx: int = -1) -> int:
+        """Return a token that the grammar allows, and move the grammar on."""
+        token = self._chain.sample(ctx, idx)
+        if not self._allows(token):
+            token = self._among_allowed(ctx, idx)
+        llama_cpp.llama_sampler_accept(self._grammar, token)
+        return int(token)
+
+    def _allows(self, token: int) -> bool:
+        data = (llama_cpp.llama_token_data * 1)(llama_cpp.llama_token_data(id=token, logit=1.0, p=0.0))
+        array = llama_cpp.llama_token_data_array(data=data, size=1, selected=-1, sorted=False)
+        llama_cpp.llama_sampler_apply(self._grammar, ctypes.byref(array))
+        return not math.isinf(data[0].logit)
+
+    def _among_allowed(self, ctx: Any, idx: int) -> int:
+        logits = llama_cpp.llama_get_logits_ith(ctx.ctx, idx)
+        self._candidates.copy_logits(np.ctypeslib.as_array(logits, (self._candidates.n_vocab,)))
+        array = self._candidates.candidates
+        array.selected = -1
+        llama_cpp.llama_sampler_apply(self._grammar, ctypes.byref(array))
+        llama_cpp.llama_sampler_apply(self._chain.sampler, ctypes.byref(array))
+        return int(array.data[array.selected].id)
+
+
+def grammar_error(vocab: Any, grammar: str) -> str:
+    """Return what is wrong with a GBNF grammar, "" if nothing is.
+
+    llama.cpp's parser writes to stderr directly, so that is redirected for the moment, for the whole process.
+    """
+    llama_log.reason()
+    with tempfile.TemporaryFile() as file:
+        saved = os.dup(_STDERR)
+        os.dup2(file.fileno(), _STDERR)
+        try:
+            sampler = llama_cpp.llama_sampler_init_grammar(vocab, grammar.encode(), b"root")
+        finally:
+            os.dup2(saved, _STDERR)
+            os.close(saved)
+        file.seek(0)
+        said = file.read().decode(errors="replace").strip().splitlines()
+    if sampler:
+        llama_cpp.llama_sampler_free(sampler)
+        return ""
+    logged = llama_log.reason()
+    return re.sub(r"^[a-z_]+: (error parsing grammar: )?", "", said[0]) if said else logged or "llama.cpp refuses it"
+
+
+def beyond_limits(grammar: str) -> str:
+    """Return by what a grammar is beyond what llama.cpp's recursive parser survives; "" if it is not."""
+    if len(grammar) > GRAMMAR_BYTES or len(grammar.encode(errors="replace")) > GRAMMAR_BYTES:
+        return f"it is longer than {GRAMMAR_BYTES} bytes"
+    if "\0" in grammar:
+        return "it has a NUL"
+    if grammar.count("::=") > RULES:
+        return f"it has more than {RULES} rules"
+    repeated, last = [1], 1  # the most that anything is repeated in each open parenthesis, and the last thing was
+    for lexeme in _LEXEME.finditer(grammar):
+        said, times = lexeme[0], 1
+        if said == "(":
+            repeated.append(1)
+        elif said == ")" and len(repeated) > 1:
+            times = repeated.pop()
+        elif lexeme[1] is not None:
+            times = last * _most(lexeme[1])
+        last = times
+        repeated[-1] = max(repeated[-1], times)
+        if len(repeated) > DEPTH + 1:
+            return f"it nests deeper than {DEPTH} parentheses"
+        if times > REPETITIONS:
+            return f"it repeats something more than {REPETITIONS} times"
+    return ""
+
+
+def _most(braces: str) -> int:
+    """Return the largest number in braces, at least 1."""
+    numbers = re.findall(r"\d+", braces)
+    return max([1, *(int(digits) if len(digits) <= _DIGITS else REPETITIONS + 1 for digits in numbers)])

@@ -27,12 +27,10 @@ class Steps:
     """
 
     def __init__(self) -> None:
-        """Start with no prompt."""
         self.prepared_ns = 0
         self.encode_ns = 0
 
     def __getattr__(self, name: str) -> Any:
-        """Return what is not timed."""
         return getattr(mtmd_cpp, name)
 
     def mtmd_tokenize(self, *arguments: Any) -> int:
@@ -89,7 +87,6 @@ class PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, nam
         self.mtmd_ctx = None
 
     def load_image(self, image_url: str) -> Frame:
-        """Return the frame that the URL counts."""
         return self.frames[int(image_url.rstrip("/").rpartition("/")[2])]
 
     def _create_bitmap_from_bytes(self, image_bytes: Frame) -> Any:

@@ -6,17 +6,59 @@ import hashlib
 import json
 import os
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from s2a_bench import extras
 from s2a_bench.errors import ModelError
-from s2a_bench.inference import EngineConfig
+from s2a_bench.inference import EngineConfig, Size
 from s2a_bench.inference.dummy import dummy_files, write_dummy
-from s2a_bench.inference.fetch_names import HUB_MODELS, fetched
-from s2a_bench.inference.files_config import Quant, Size
 from s2a_bench.inference.gguf_file import GgufHeader, read_header
 
 CACHE_VARIABLE = "S2A_BENCH_CACHE"
+
+
+@dataclass(frozen=True, slots=True)
+class HubModel:
+    """Where a model's two files lie on the hub."""
+
+    repository: str
+    model: str
+    """File name of the language model with ``{quant}`` in it."""
+    mmproj: str
+    quant: str
+    """Quantisation that is fetched unless the user names one."""
+
+    def model_file(self, quant: str) -> str:
+        return self.model.format(quant=quant)
+
+
+HUB_MODELS: dict[str, HubModel] = {
+    "minicpm-v-2.6": HubModel(
+        "openbmb/MiniCPM-V-2_6-gguf", "ggml-model-{quant}.gguf", "mmproj-model-f16.gguf", "Q4_K_M"
+    ),
+}
+"""Name for `model fetch`, `model info` and ``--model`` -> its files."""
+
+
+def fetched(name: str, flag: str) -> tuple[Path, Path]:
+    """Return the paths of a known model's fetched language model and mmproj, in the hub's own cache.
+
+    Raises ModelError where it is not fetched yet, or where several quantisations are there.
+    """
+    hub = extras.require("huggingface_hub", "model")
+    known = HUB_MODELS[name]
+    mmproj = hub.try_to_load_from_cache(known.repository, known.mmproj)
+    folder = Path(mmproj).parent if isinstance(mmproj, str) else None
+    models = [path for path in sorted(folder.glob(known.model_file("*"))) if path.is_file()] if folder else []
+    if not models or not isinstance(mmproj, str):
+        raise ModelError(f"{flag} {name}: not fetched yet; run: s2a-bench model fetch {name}")
+    if len(models) > 1:
+        before, after = known.model_file("*").split("*")
+        quants = ", ".join(path.name.removeprefix(before).removesuffix(after) for path in models)
+        raise ModelError(f"{flag} {name}: several were fetched ({quants}); give a path, as {models[0]}")
+    return models[0], Path(mmproj)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +70,6 @@ class ModelFiles:
 
     @property
     def dummy(self) -> bool:
-        """Return whether any of the weights are dummies."""
         return self.model.is_dummy or self.mmproj.is_dummy
 
 
@@ -46,11 +87,10 @@ def dummy_folder(size: Size) -> Path:
 
 def tiny_dummy() -> tuple[Path, Path]:
     """Return the tiny dummy's two files, written first if they are not in the cache; processes may race."""
-    size: Size = "tiny"
-    quant: Quant = "f16"
-    files = dummy_files(dummy_folder(size), size, quant)
-    if not (files.model.is_file() and files.mmproj.is_file()):
-        write_dummy(dummy_folder(size), size, quant)
+    folder = dummy_folder("tiny")
+    files = dummy_files(folder, "tiny", "f16")
+    if not all(file.is_file() for file in files):
+        write_dummy(folder, "tiny", "f16")
     return files
 
 
@@ -129,13 +169,11 @@ def remembered_sha256(path: Path) -> str | None:
 def remember_sha256(path: Path, value: str) -> None:
     """Write the note in one step; a cache that cannot be written costs time, nothing else."""
     note = _note(path)
-    try:
+    with suppress(OSError):
         note.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile("w", dir=note.parent, delete=False) as file:
             json.dump({"path": str(path.resolve()), "sha256": value}, file)
         Path(file.name).replace(note)
-    except OSError:
-        return
 
 
 def _note(path: Path) -> Path:

@@ -1,8 +1,9 @@
-"""An engine kept on one thread, whichever threads ask it.
+"""An engine around an engine keeps it on one thread, whichever threads ask.
 
 llama.cpp computes with OpenMP, and libgomp keeps a team of threads for every thread that ever asked. Where a server's
 threads take turns, teams add up, libgomp sees more threads than cores and stops spinning between operations: half the
-speed for a small model. So all of an engine's work is done on one thread; changing to it is part of `inference`.
+speed for a small model. So all of an engine's work is done on one thread, which engines that take turns in one process
+share; changing to it is part of `inference`.
 
 Changing threads costs some 50 us, a sixth of a small model's token. So the engine does not wait for who reads: it
 computes the next token while the last one is sent, as llama-server does, and is at most `AHEAD` tokens ahead.
@@ -17,8 +18,7 @@ from typing import Any
 
 from s2a_bench.errors import EngineError
 from s2a_bench.facts import LLAMA
-from s2a_bench.inference import Engine, EngineConfig
-from s2a_bench.inference.llama_settings import PENALTY_LAST_N, SAMPLER_ARGUMENTS
+from s2a_bench.inference import PENALTY_LAST_N, SAMPLER_ARGUMENTS, Engine, EngineConfig, leave
 from s2a_bench.types import Piece, Request
 
 AHEAD = 8
@@ -41,7 +41,7 @@ class _Answer:
             while self._room() and (token := next(tokens, None)) is not None:
                 self._tokens.put(token)
         finally:
-            _close(tokens)
+            leave(tokens)
             self._tokens.put(None)
 
     def _room(self) -> bool:
@@ -50,34 +50,32 @@ class _Answer:
         return self.wanted
 
     def read(self) -> Iterator[Piece]:
-        """Yield the tokens until the engine has no more."""
         while (token := self._tokens.get()) is not None:
             self._places.put(None)
             yield token
 
     def cancel(self) -> None:
-        """Want no more."""
         self.wanted = False
         self._places.put(None)
 
 
-class OneThreadEngine:
+class OneThreadEngine(Engine):
     """Does everything an engine does on a thread of its own; behaves like the engine otherwise."""
 
-    def __init__(self, make: Callable[[], Engine]) -> None:
-        """Make the engine on its thread; raises what ``make`` raises."""
+    def __init__(self, make: Callable[[], Engine], thread: ThreadPoolExecutor | None = None) -> None:
+        """Make the engine on a thread of its own, or on another engine's ``thread``; raises what ``make`` raises."""
         self._closed = False
         self._answer = _Answer()
-        self._thread = ThreadPoolExecutor(1, "engine")
+        self._thread = thread or ThreadPoolExecutor(1, "engine")
+        self._shares = thread is not None
         try:
             self._engine = self._thread.submit(make).result()
         except BaseException:
-            self._thread.shutdown()
+            self._end_thread()
             raise
 
     @property
     def facts(self) -> dict[str, float]:
-        """Return the engine's own facts about the last request."""
         return self._engine.facts
 
     def generate(self, request: Request) -> Generator[Piece, None, None]:
@@ -97,16 +95,18 @@ class OneThreadEngine:
             wait([writing])
 
     def describe(self) -> dict[str, str | int | float | bool]:
-        """Return what the engine says."""
         described: dict[str, str | int | float | bool] = self._submit(self._engine.describe).result()
         return described
 
     def close(self) -> None:
-        """Free the engine and end its thread."""
         if not self._closed:
             self._answer.cancel()
             self._submit(self._engine.close).result()
             self._closed = True
+            self._end_thread()
+
+    def _end_thread(self) -> None:
+        if not self._shares:
             self._thread.shutdown()
 
     def _submit(self, work: Callable[[], Any]) -> Future[Any]:
@@ -116,25 +116,21 @@ class OneThreadEngine:
         return self._thread.submit(work)
 
 
-def _close(tokens: object) -> None:
-    """Cancel what an engine's iterator has not yielded."""
-    close = getattr(tokens, "close", None)
-    if close is not None:
-        close()
-
-
 class Llama(OneThreadEngine):
-    """The llama engine, on a thread of its own."""
+    """The llama engine, on a thread of its own or of another one."""
 
+    needs = ("llama", "llama_cpp", "gguf")
     tells = LLAMA
     honours = (*SAMPLER_ARGUMENTS, PENALTY_LAST_N)
 
-    def __init__(self, config: EngineConfig) -> None:
-        """Load the model."""
-
+    def __init__(self, config: EngineConfig, thread: ThreadPoolExecutor | None = None) -> None:
         def make() -> Engine:
             from s2a_bench.inference.llama_cpp import LlamaCppEngine
 
             return LlamaCppEngine(config)
 
-        super().__init__(make)
+        super().__init__(make, thread)
+
+    def open_beside(self, config: EngineConfig) -> Llama:
+        """Return another engine that computes on this one's thread; one answers at a time, and this one closes last."""
+        return Llama(config, self._thread)

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import accumulate, count, islice
+from random import Random
 from typing import TYPE_CHECKING, TypeAlias
 
 from s2a_bench.boards.gaps import Constant, Gaps, Lognormal, Recorded, to_table
-from s2a_bench.boards.profile import Profile
-from s2a_bench.boards.search import load_profile
+from s2a_bench.boards.profile import Profile, load_profile
 from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import EngineError, UsageError
 from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_MS
-from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.chunk import chunk
+from s2a_bench.inference import Engine, EngineConfig, chunk
 from s2a_bench.types import Piece, Request, Token
 
 if TYPE_CHECKING:
@@ -30,14 +29,6 @@ _PLACES = ("kitchen", "table", "shelf", "sofa")
 _OBJECTS = ("cup", "box", "bottle", "jar")
 _ARGUMENTS = {"go_to": _PLACES, "open": _OBJECTS, "close": _OBJECTS, "pick": _OBJECTS}
 """Skills of the household set with one argument, so that its parser understands what is said here."""
-
-
-def _constant(profile: Profile) -> Draw:
-    return _drawn(Constant(profile.gaps.mean_s))
-
-
-def _parametric(profile: Profile) -> Draw:
-    return _drawn(profile.gaps)
 
 
 def _trace(profile: Profile) -> Draw:
@@ -54,17 +45,12 @@ def _drawn(gaps: Gaps) -> Draw:
     return lambda rng, tokens, _start: gaps.sample(rng, tokens, 1)[:, 0].tolist()
 
 
-GAPS: dict[str, Callable[[Profile], Draw]] = {"constant": _constant, "parametric": _parametric, "trace": _trace}
+GAPS: dict[str, Callable[[Profile], Draw]] = {
+    "constant": lambda profile: _drawn(Constant(profile.gaps.mean_s)),
+    "parametric": lambda profile: _drawn(profile.gaps),
+    "trace": _trace,
+}
 """Value of ``--gaps`` -> where the gaps come from."""
-
-
-def check_replay(config: EngineConfig) -> None:
-    """Raise UsageError where --engine, --profile and --gaps do not go together, or the profile is not there."""
-    if config.name == "replay":
-        _settings(config)
-    elif config.profile or config.gaps:
-        flag = "`profile`" if config.profile else "`gaps`"
-        raise UsageError(f"{flag} needs `engine` replay; `engine` {config.name} answers at its own speed")
 
 
 def _settings(config: EngineConfig) -> tuple[Profile, str, Draw]:
@@ -77,7 +63,7 @@ def _settings(config: EngineConfig) -> tuple[Profile, str, Draw]:
     return profile, gaps, GAPS[gaps](profile)
 
 
-class ReplayEngine:
+class ReplayEngine(Engine):
     """Says numbered skill calls of six tokens each, or actions, at a profile's speed; the rest is ignored.
 
     Text depends on ``request.seed`` alone. Times are drawn from the seed and the number of requests before, as equal
@@ -86,16 +72,28 @@ class ReplayEngine:
 
     tells = (PROMPT_MS, PREDICTED_N, PREDICTED_MS)
     acts = True
+    needs_model = False
+    own = ("profile", "gaps")
+    plays = ("household", 6)
+
+    @classmethod
+    def check(cls, config: EngineConfig) -> None:
+        """Raise UsageError where the profile and --gaps do not go together, or the profile is not there."""
+        _settings(config)
 
     def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
-        """Load the profile; raises UsageError for what `check_replay` refuses."""
-        self.facts: dict[str, float] = {}
+        """Load the profile; raises UsageError for what `check` refuses."""
+        self._facts: dict[str, float] = {}
         self._profile, self._gaps, self._draw = _settings(config)
         self._config = config
         self._clock = clock or SystemClock()
         self._requests = 0
         self._played = 0
         self._closed = False
+
+    @property
+    def facts(self) -> dict[str, float]:
+        return self._facts
 
     def generate(self, request: Request) -> Iterator[Piece]:
         """Yield pieces, each at the time of a token, until ``max_tokens``."""
@@ -109,13 +107,14 @@ class ReplayEngine:
         rng = np.random.default_rng((request.seed % 2**32, self._requests))
         self._requests += 1
         prompt_s = self._prompt_s(rng)
-        due_ns = accumulate(round(gap * 1e9) for gap in self._gaps_s(rng, prompt_s, self._count(request)))
-        self.facts = {PROMPT_MS: prompt_s * 1e3, PREDICTED_N: 0.0, PREDICTED_MS: 0.0}
+        most = min(request.max_tokens, self._config.horizon) if self._config.chunks else request.max_tokens
+        due_ns = accumulate(round(gap * 1e9) for gap in self._gaps_s(rng, prompt_s, most))
+        self._facts = {PROMPT_MS: prompt_s * 1e3, PREDICTED_N: 0.0, PREDICTED_MS: 0.0}
         for index, (piece, due) in enumerate(zip(self._pieces(request), due_ns, strict=True)):
             self._clock.sleep_until_ns(started_ns + due)
             self._played += index > 0
-            self.facts[PREDICTED_N] = float(index + 1)
-            self.facts[PREDICTED_MS] = (self._clock.now_ns() - started_ns) / 1e6 - self.facts[PROMPT_MS]
+            self._facts[PREDICTED_N] = float(index + 1)
+            self._facts[PREDICTED_MS] = (self._clock.now_ns() - started_ns) / 1e6 - self._facts[PROMPT_MS]
             yield piece
 
     def _gaps_s(self, rng: np.random.Generator, prompt_s: float, pieces: int) -> Iterator[float]:
@@ -123,12 +122,7 @@ class ReplayEngine:
         yield prompt_s + self._profile.gaps.mean_s
         yield from self._draw(rng, pieces - 1, self._played)
 
-    def _count(self, request: Request) -> int:
-        """Return how many pieces an answer has."""
-        return min(request.max_tokens, self._config.horizon) if self._config.chunks else request.max_tokens
-
     def _pieces(self, request: Request) -> Iterator[Piece]:
-        """Yield the answer, without its times."""
         if self._config.chunks:
             return chunk(self._config, request)
         return (Token(index, text) for index, text in enumerate(islice(_plan(request.seed), request.max_tokens)))
@@ -159,14 +153,11 @@ class ReplayEngine:
         }
 
     def close(self) -> None:
-        """Refuse further requests."""
         self._closed = True
 
 
 def _plan(seed: int) -> Iterator[str]:
     """Yield the tokens of an endless plan, six a skill: ``1. go_to(table)`` and a line's end."""
-    from random import Random
-
     random = Random(seed)  # noqa: S311 - words, not secrets
     for number in count(1):
         skill = random.choice(tuple(_ARGUMENTS))

@@ -1,4 +1,4 @@
-"""See whether llama.cpp answers at all: the tiny dummy in every type of weights, in a process of its own.
+"""See how llama.cpp was built, and whether it answers: the tiny dummy in every type of weights, in its own process.
 
 A build for another processor, or by a compiler whose code for AMX does not work, dies by an illegal instruction, and
 perhaps with quantised weights only. So ``python -m s2a_bench.inference.smoke`` is what `make setup`, the doctor and
@@ -8,6 +8,8 @@ signal.
 
 from __future__ import annotations
 
+import platform
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -15,16 +17,27 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import get_args
 
-from s2a_bench.errors import EngineError
-from s2a_bench.exits import how_it_ended
-from s2a_bench.inference import EngineConfig
+import numpy as np
+
+from s2a_bench import extras
+from s2a_bench.errors import EngineError, how_it_ended
+from s2a_bench.inference import EngineConfig, Quant
 from s2a_bench.inference.dummy import write_dummy
-from s2a_bench.inference.files_config import Quant
+from s2a_bench.machine.doctor import Finding, Machine
+from s2a_bench.machine.doctor.gpu import has_nvidia
+from s2a_bench.types import Frame, Request
 
 CHILD = [sys.executable, "-m", "s2a_bench.inference.smoke"]
 """The process that may die; it gets a folder for the dummies."""
 LONGEST_S = 600.0
 TOKENS = 6
+CUDA_BUILD = (
+    "make setup CUDA=1, or CMAKE_ARGS=-DGGML_CUDA=on pip install --no-binary llama-cpp-python --force-reinstall"
+)
+CUDA_BUILD += " --no-cache-dir llama-cpp-python"
+AMX_BUILD = "CC=gcc-14 CXX=g++-14 make clean setup, with GCC 13.3 or newer or clang"
+BUILT_FOR = f"{sys.prefix}/s2a-bench-llama".lstrip("/")
+"""Where `make setup` notes what it built llama-cpp-python for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +67,7 @@ def smoke_test() -> Smoke:
 
 def answer(folder: Path) -> None:
     """Let a dummy of every type answer about a picture, naming each type on standard output before it may die."""
-    import numpy as np
-
     from s2a_bench.inference.llama_cpp import LlamaCppEngine
-    from s2a_bench.types import Frame, Request
 
     frame = Frame(0, 0, 64, 48, "rgb8", np.zeros((48, 64, 3), np.uint8))
     for quant in get_args(Quant):
@@ -68,6 +78,45 @@ def answer(folder: Path) -> None:
         engine.close()
         if count != TOKENS:
             raise EngineError(f"{count} tokens instead of {TOKENS}")
+
+
+def llama_build(machine: Machine) -> Finding | None:
+    """Return what llama-cpp-python was built for, whether GPU or AMX lie idle because of it, and whether it works."""
+    if not machine.finds("llama_cpp"):
+        return None
+    seen = smoke_test()
+    if seen.message:
+        return Finding("llama-build", "error", seen.message, "make clean setup")
+    llama_cpp = extras.require("llama_cpp", "llama")
+    from s2a_bench.inference.llama_log import silence
+
+    silence()
+    llama_cpp.llama_backend_init()
+    text = llama_cpp.llama_print_system_info().decode(errors="replace")
+    flags = re.findall(r"(\w+) = 1\b", text)
+    offload = bool(llama_cpp.llama_supports_gpu_offload())
+    cpuinfo = machine.read("proc/cpuinfo") or ""
+    amx = _amx(machine, cpuinfo, flags)
+    told = f"llama-cpp-python {llama_cpp.__version__}, {'with' if offload else 'without'} GPU; {' '.join(flags)}; {amx}"
+    if has_nvidia(machine) and not offload:
+        return Finding("llama-build", "warning", f"{told}: the NVIDIA GPU of this machine is not used", CUDA_BUILD)
+    if platform.machine() == "x86_64" and " avx2" in cpuinfo and "AVX2" not in flags:
+        return Finding(
+            "llama-build", "warning", f"{told}: built without this CPU's AVX2, far slower", "make clean setup"
+        )
+    if amx.startswith("AMX off"):
+        return Finding("llama-build", "advice", told, AMX_BUILD)
+    return Finding("llama-build", "state", told)
+
+
+def _amx(machine: Machine, cpuinfo: str, flags: list[str]) -> str:
+    """Return whether this CPU has AMX and llama.cpp uses it."""
+    if " amx_tile" not in cpuinfo:
+        return "no AMX in this CPU"
+    if "AMX_INT8" in flags:
+        return "AMX used"
+    wrong = (machine.read(BUILT_FOR) or "").endswith("no-amx")
+    return "AMX off, as the compiler's code for it does not work" if wrong else "AMX off, left out of this build"
 
 
 def main() -> int:

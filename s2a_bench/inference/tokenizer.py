@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import weakref
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from s2a_bench import extras
 from s2a_bench.errors import ModelError
 from s2a_bench.inference import llama_log
 from s2a_bench.inference.gguf_file import read_header
+from s2a_bench.inference.llama_decode import TokenBytes
 from s2a_bench.inference.models import tiny_dummy
 
 llama_cpp = extras.require("llama_cpp", "llama")
@@ -37,13 +37,12 @@ class Tokenizer:
         weakref.finalize(self, llama_cpp.llama_model_free, self._model)
         self._vocab = llama_cpp.llama_model_get_vocab(self._model)
         self.size = int(llama_cpp.llama_vocab_n_tokens(self._vocab))
-        """Tokens in the vocabulary."""
         self.name = str(header.fields.get("general.name", path.name))
         """What the file calls the model."""
+        self._pieces = TokenBytes(self._vocab)
         self._newline = self._tokenize("\n")
 
     def __call__(self, text: str) -> list[int]:
-        """Return the token ids of a text."""
         ids = self._tokenize(f"\n{text}")
         start = len(self._newline)
         return ids[start:] if ids[:start] == self._newline else self._tokenize(text)
@@ -59,6 +58,4 @@ class Tokenizer:
 
     def piece(self, token: int) -> bytes:
         """Return the bytes of a token; none for a special one."""
-        buffer = ctypes.create_string_buffer(1024)
-        size = llama_cpp.llama_token_to_piece(self._vocab, token, buffer, len(buffer), 0, False)
-        return buffer.raw[: max(0, size)]
+        return self._pieces[token]

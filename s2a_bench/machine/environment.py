@@ -1,18 +1,19 @@
-"""The facts of this machine that belong beside every result; an unreadable fact is an absent key."""
+"""Facts of this machine that belong beside every result, and its kind of board; an unreadable fact is an absent key."""
 
 from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
+import re
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from s2a_bench import __version__
+from s2a_bench.boards.profile import Profile
 from s2a_bench.clock import clock_id
 from s2a_bench.machine.doctor import Machine
 from s2a_bench.machine.doctor.gpu import current_power_mode, identity, nvml
+from s2a_bench.machine.doctor.software import installed
 
 PACKAGES = (
     "huggingface-hub",
@@ -32,16 +33,25 @@ ROS_VARIABLES = (
     "CYCLONEDDS_URI",
 )
 KERNEL_FACTS = {
-    "rmem_max": "/proc/sys/net/core/rmem_max",
-    "wmem_max": "/proc/sys/net/core/wmem_max",
-    "governor": "/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor",
-    "clock_source": "/sys/devices/system/clocksource/clocksource0/current_clocksource",
-    "board": "/proc/device-tree/model",
+    "rmem_max": "proc/sys/net/core/rmem_max",
+    "wmem_max": "proc/sys/net/core/wmem_max",
+    "governor": "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor",
+    "clock_source": "sys/devices/system/clocksource/clocksource0/current_clocksource",
+    "board": "proc/device-tree/model",
 }
+
+
+KIND = ("model", "gpu", "cpu", "cores")
+"""What a board is known by: device tree, GPU, CPU, and how many cores may be used."""
+STATE = ("power_mode", "governor")
+"""What makes one board faster or slower."""
 
 
 def collect(packages: Iterable[str] = ()) -> dict[str, Any]:
     """Read the environment, and the versions of these packages besides."""
+    machine = Machine()
+    with nvml() as (lib, cards):
+        gpus = [known for card in cards if (known := identity(lib, card))]
     facts: dict[str, Any] = {
         "s2a_bench": __version__,
         "host": platform.node(),
@@ -49,45 +59,59 @@ def collect(packages: Iterable[str] = ()) -> dict[str, Any]:
         "kernel": platform.release(),
         "machine": platform.machine(),
         "python": platform.python_version(),
-        "cpu": _cpu_model(),
+        "cpu": _cpu_model(machine.read("proc/cpuinfo") or ""),
         "cores": os.cpu_count(),
         "affinity": sorted(os.sched_getaffinity(0)),
         "load": [round(value, 2) for value in os.getloadavg()],
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
-        "packages": {name: found for name in sorted({*PACKAGES, *packages}) if (found := _version(name))},
+        "packages": {name: found for name in sorted({*PACKAGES, *packages}) if (found := installed(name))},
         "ros": {name: os.environ[name] for name in ROS_VARIABLES if name in os.environ},
-        "gpus": _gpus(),
-        "power_mode": (current_power_mode(Machine()) or ("",))[0],
+        "gpus": gpus,
+        "power_mode": (current_power_mode(machine) or ("",))[0],
     }
     for name, path in KERNEL_FACTS.items():
-        text = _read(path)
-        if text:
+        if text := machine.read(path):
             facts[name] = int(text) if text.isdecimal() else text
     return {name: value for name, value in facts.items() if value not in (None, "", [])}
 
 
-def _gpus() -> list[dict[str, Any]]:
-    """Name the NVIDIA GPUs with their driver."""
-    with nvml() as (lib, gpus):
-        return [facts for gpu in gpus if (facts := identity(lib, gpu))]
+def _cpu_model(cpuinfo: str) -> str:
+    named = (line for line in cpuinfo.splitlines() if line.startswith(("model name", "Model")))
+    return next(named, "").partition(":")[2].strip()
 
 
-def _read(path: str) -> str:
-    try:
-        return Path(path).read_text().strip("\0\n ")
-    except OSError:
-        return ""
+def board_facts() -> dict[str, Any]:
+    """Read device-tree model, GPU, CPU, cores, memory, power mode and governor."""
+    known = collect()
+    facts = {
+        "model": known.get("board"),
+        "gpu": next((gpu.get("name") for gpu in known.get("gpus", [])), None),
+        "cpu": known.get("cpu"),
+        "cores": len(os.sched_getaffinity(0)),
+        **{name: known.get(name) for name in ("memory_bytes", "power_mode", "governor")},
+    }
+    return {key: value for key, value in facts.items() if value}
 
 
-def _cpu_model() -> str:
-    for line in _read("/proc/cpuinfo").splitlines():
-        if line.startswith(("model name", "Model")):
-            return line.partition(":")[2].strip()
-    return ""
+def matches(profile: Profile, board: Mapping[str, Any]) -> bool:
+    """Return whether everything that a profile says of its kind of board holds for this one."""
+    named = {key: value for key, value in profile.facts.get("board", {}).items() if key in KIND}
+    return bool(named) and all(_same(key, value, board.get(key)) for key, value in named.items())
 
 
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
+def differences(profile: Profile, board: Mapping[str, Any]) -> list[str]:
+    """Say in which state the profile's board was and this one is not, as far as both are known."""
+    then = profile.facts.get("board", {})
+    return [
+        f"{key.replace('_', ' ')} was {then[key]}, is {board[key]}"
+        for key in STATE
+        if key in then and key in board and then[key] != board[key]
+    ]
+
+
+def _same(key: str, wanted: Any, found: Any) -> bool:
+    """Compare one fact; a device tree adds words as "Developer Kit" to a board's name, a GPU's next word is another."""
+    if not isinstance(wanted, str) or not isinstance(found, str):
+        return bool(wanted == found)
+    words, here = (re.sub(r"^nvidia\s+", "", text.lower()).split() for text in (wanted, found))
+    return words == (here[: len(words)] if key == "model" else here)

@@ -1,7 +1,7 @@
-"""Settings that make a process of the harness measure more evenly, all recorded in the manifest.
+"""Processes of the harness: settings by which they measure more evenly, and children that never outlive their parent.
 
-They are for processes of our own: the command line and the servers allow them, a program that uses the library has to
-ask for them. Where they are not allowed nothing is changed.
+Settings are recorded in the manifest. They are for processes of our own: the command line and the servers allow them, a
+program that uses the library has to ask for them. Where they are not allowed nothing is changed.
 """
 
 from __future__ import annotations
@@ -9,9 +9,16 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import signal
+import subprocess
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from threading import Thread, current_thread, main_thread
+from typing import Any, Final
 
+PR_SET_PDEATHSIG: Final = 1
+_prctl = ctypes.CDLL(None).prctl
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
 M_ARENA_MAX = -8
@@ -78,3 +85,42 @@ def limit_threads() -> None:
     import cv2
 
     cv2.setNumThreads(1)
+
+
+def end_with_parent(number: signal.Signals = signal.SIGKILL) -> None:
+    """Have the kernel end this process when the thread that started it is gone, however it went."""
+    _prctl(PR_SET_PDEATHSIG, number)
+
+
+def start_child(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
+    """Start a program that the kernel kills, stopped or not, when this process is gone; options are those of `Popen`.
+
+    The kernel acts when the *thread* that started the program ends. Away from the main thread a thread of its own
+    starts it therefore, and stays until the program has ended.
+    """
+    parent = os.getpid()
+
+    def tie() -> None:
+        end_with_parent()
+        if os.getppid() != parent:  # it ended before the kernel was told
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def start() -> subprocess.Popen[bytes]:
+        return subprocess.Popen(command, preexec_fn=tie, **options)  # noqa: PLW1509, S603 - two calls into C; ours
+
+    if current_thread() is main_thread():
+        return start()
+    started: Future[subprocess.Popen[bytes]] = Future()
+
+    def start_and_stay() -> None:
+        try:
+            child = start()
+        except BaseException as error:  # noqa: BLE001 - it is the caller's
+            started.set_exception(error)
+            return
+        started.set_result(child)
+        with suppress(ChildProcessError):  # whoever has the child has seen it end
+            os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+
+    Thread(target=start_and_stay, name="starter", daemon=True).start()
+    return started.result()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import string
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import product
 
 from s2a_bench.errors import UsageError
-from s2a_bench.plan.codes import line_codes, stream_codes
 from s2a_bench.plan.formats import Format, Tokenize, spelled
 from s2a_bench.plan.skillset import SkillSet
 from s2a_bench.plan.wordings import Calls, Codes, Letters, Words
@@ -16,6 +18,8 @@ GRANULARITIES = (6, 4, 2, 1)
 
 _FILLERS = ("-", "~", "_", ".")
 """Words without meaning that make a call longer; which of them cost a token is the tokenizer's business."""
+
+_ONE = string.ascii_uppercase + string.ascii_lowercase + string.digits + string.punctuation
 
 
 def choose_format(skills: SkillSet, tokens_per_skill: int, tokenize: Tokenize, n_skills: int = 8) -> Format:
@@ -64,17 +68,12 @@ def _stream(skills: SkillSet, tokenize: Tokenize) -> Format:
 
 def _wordings(skills: SkillSet, tokenize: Tokenize) -> Iterator[Format]:
     """Yield the formats without fillers, the most readable first."""
-    for numbered in (True, False):
-        yield spelled(skills, Calls(), numbered=numbered)
-    for numbered in (True, False):
-        yield spelled(skills, Words(), numbered=numbered)
-    try:
-        letters = Letters(skills)
-    except ValueError:
-        pass  # too many words for one letter each
-    else:
+    wordings: list[Calls] = [Calls(), Words()]
+    with suppress(ValueError):  # too many words for one letter each
+        wordings.append(Letters(skills))
+    for wording in wordings:
         for numbered in (True, False):
-            yield spelled(skills, letters, numbered=numbered)
+            yield spelled(skills, wording, numbered=numbered)
     codes = line_codes(len(skills.calls), tokenize)
     if codes:
         yield spelled(skills, Codes(dict(zip(skills.calls, codes, strict=True))), numbered=False)
@@ -128,3 +127,50 @@ def _holds(chosen: Format, target: int, tokenize: Tokenize, n_skills: int) -> bo
         return False
     row = "".join(chosen.line(1 + index % n_skills, text) for index, text in enumerate(chosen.texts))
     return len(tokenize(row)) == target * len(chosen.texts)
+
+
+def line_codes(count: int, tokenize: Tokenize) -> list[str] | None:
+    """Return ``count`` texts that cost two tokens with the end of a line; None where there are not that many."""
+    for length in (1, 2):
+        found = [text for text in _candidates(length) if len(tokenize(f"{text}\n")) == 2]  # noqa: PLR2004
+        if len(found) >= count:
+            return found[:count]
+    return None
+
+
+def stream_codes(count: int, tokenize: Tokenize) -> list[str]:
+    """Return up to ``count`` texts of one token each; fewer where the vocabulary has no more.
+
+    They need no delimiter: all have the same length, so that no code begins another, and any two of them in a row are
+    still the two tokens. A blank before each keeps letters from merging where the tokenizer has words for them;
+    tokenizers of bytes have no such tokens, but do not merge either.
+    """
+    best: list[str] = []
+    for blank, length in product((" ", ""), (1, 2)):
+        found = _apart(count, tokenize, (blank + text for text in _candidates(length)))
+        if len(found) == count:
+            return found
+        best = max(best, found, key=len)
+    return best
+
+
+def _apart(count: int, tokenize: Tokenize, candidates: Iterator[str]) -> list[str]:
+    """Take candidates one by one if they are single tokens that do not merge with one already taken."""
+    found: dict[str, int] = {}
+    for text in candidates:
+        own = tokenize(text)
+        if len(own) != 1 or own[0] in found.values():
+            continue
+        row, ids = [text, text], [*own, *own]
+        for other, token in found.items():
+            row += [other, text]
+            ids += [token, *own]
+        if tokenize("".join(row)) == ids:
+            found[text] = own[0]
+        if len(found) == count:
+            break
+    return list(found)
+
+
+def _candidates(length: int) -> Iterator[str]:
+    return iter(_ONE) if length == 1 else map("".join, product(string.ascii_letters, repeat=length))

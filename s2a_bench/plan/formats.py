@@ -1,4 +1,4 @@
-"""An output format: the exact text that stands for each call, and what it costs in tokens, counted."""
+"""An output format: the text that stands for each call, what it costs in tokens, and the prompt that asks for it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 from s2a_bench.plan.skillset import Call, SkillSet
-from s2a_bench.plan.wordings import Calls, Wording, normalise
+from s2a_bench.plan.wordings import Calls, normalise
 
 Tokenize: TypeAlias = Callable[[str], list[int]]
 """A model's own tokenizer: text to token ids, nothing added (`s2a_bench.inference.tokenizer` has llama.cpp's)."""
@@ -22,11 +22,6 @@ class Cost:
     mean: float
     most: int
 
-    @property
-    def exact(self) -> bool:
-        """Return whether every call costs the same."""
-        return self.least == self.most
-
 
 @dataclass(frozen=True)
 class Format:
@@ -37,7 +32,7 @@ class Format:
 
     name: str
     skills: SkillSet
-    wording: Wording
+    wording: Calls
     texts: tuple[str, ...]
     numbered: bool = False
     delimiter: str = "\n"
@@ -79,7 +74,7 @@ class Format:
         return [len(tokenize(line)) for number in numbers for line in self.lines(number)]
 
 
-def spelled(skills: SkillSet, wording: Wording, *, numbered: bool) -> Format:
+def spelled(skills: SkillSet, wording: Calls, *, numbered: bool) -> Format:
     """Return a format that spells calls in a wording, without fillers."""
     name = f"numbered {wording.name}" if numbered else wording.name
     return Format(name, skills, wording, tuple(map(wording.spell, skills.calls)), numbered)
@@ -88,3 +83,34 @@ def spelled(skills: SkillSet, wording: Wording, *, numbered: bool) -> Format:
 def paper_format(skills: SkillSet) -> Format:
     """Return the paper's format (section IV-E): numbered calls, one a line; its cost is what it is."""
     return spelled(skills, Calls(), numbered=True)
+
+
+def prompt(format_: Format, n_skills: int, task: str = "") -> str:
+    """Return what to ask the model; ``task`` is what the robot should do, in the user's words.
+
+    The sentences are the paper's; vocabularies and the number of skills are added, as the grammar holds the model to
+    them. Where a call is not written as the skills are listed, every call follows with its code.
+    """
+    skills = format_.skills
+    coded = any(normalise(text) != normalise(str(call)) for text, call in zip(format_.texts, skills.calls, strict=True))
+    codes = [f"{text.strip()} = {call}" for text, call in zip(format_.texts, skills.calls, strict=True)]
+    lines = [
+        f"You are a {skills.role}.",
+        f"Skills: {', '.join(skill.signature for skill in skills.skills)}.",
+        *(f"{name}: {', '.join(map(str, values))}." for name, values in skills.vocabularies.items()),
+        *(["Codes:", *codes] if coded else []),
+        f"Rules: Output only {_what(format_, coded=coded)}.",
+        f"Output exactly {n_skills} of them.",
+        "Do not output any explanation.",
+        *([f"Task: {task}"] if task else []),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _what(format_: Format, *, coded: bool) -> str:
+    """Name what should be written, in the paper's words where they hold."""
+    if not format_.delimiter:
+        return f"codes in one line, such as {''.join(format_.texts[:2]).strip()}"
+    numbered = "numbered " if format_.numbered else ""
+    example = f" such as {format_.line(1, format_.texts[0]).strip()}" if coded else ""
+    return f"{numbered}{'codes' if coded else 'skill calls'}{example}, one per line"

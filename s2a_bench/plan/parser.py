@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import codecs
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from s2a_bench.plan.formats import Format
 from s2a_bench.plan.skillset import Call
@@ -61,7 +61,7 @@ class Parser:
     def __init__(self, format_: Format) -> None:
         self._format = format_
         self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
-        self._reader: _Reader = _Lines(format_) if format_.delimiter else _Codes(format_)
+        self._reader = _Lines(format_) if format_.delimiter else _Codes(format_)
         self._skills = self._lines = 0
         self._chunk = -1
         self._closed = False
@@ -86,7 +86,6 @@ class Parser:
         return self._events(self._reader.read(self._decoder.decode(b"", final=True)) + self._reader.end())
 
     def _events(self, found: list[_Found]) -> list[Event]:
-        """Give what was found its numbers."""
         events: list[Event] = []
         for result in found:
             if isinstance(result, int):
@@ -94,13 +93,12 @@ class Parser:
                 events.append(SkillParsed(self._skills, call, self._lines, self._chunk))
                 self._skills += 1
             else:
-                events.append(BadLine(result.problem, result.text, result.why, self._lines, self._chunk))
+                events.append(BadLine(*result, self._lines, self._chunk))
             self._lines += 1
         return events
 
 
-@dataclass(frozen=True, slots=True)
-class _Bad:
+class _Bad(NamedTuple):
     problem: Problem
     text: str
     why: str
@@ -108,12 +106,6 @@ class _Bad:
 
 _Found: TypeAlias = int | _Bad
 """A place in ``skills.calls``, or why there is none."""
-
-
-class _Reader(Protocol):
-    def read(self, text: str) -> list[_Found]: ...
-
-    def end(self) -> list[_Found]: ...
 
 
 class _Lines:
@@ -157,7 +149,6 @@ class _Lines:
         return [_Bad("too-long", cut, f"more than {self._limit} characters without the end of a line")]
 
     def _finish(self) -> list[_Found]:
-        """Look up the line that has ended."""
         line, self._line, self._skipping = self._line.strip(), "", False
         return [_look_up(line, self._format)] if line else []
 
@@ -220,7 +211,6 @@ def _look_up(line: str, format_: Format) -> _Found:
 
 
 def _explain(text: str, line: str, format_: Format) -> _Bad:
-    """Return why a text is no call."""
     wording = format_.wording
     fields = wording.fields(text)
     if not fields:

@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterable, Mapping
 from decimal import Decimal
 from importlib.resources import files
-from pathlib import Path
 from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.plan.skillset import Argument, Durations, Gap, Skill, SkillSet, Value
+from s2a_bench.text import read_text
 from s2a_bench.toml_file import Line, TomlTable, parse
 
 SKILL_SETS = ("household", "driving")
@@ -150,7 +150,7 @@ def load_skills(choice: str) -> SkillSet:
     if not choice.endswith(".toml"):
         raise UsageError(f"`skills`: '{choice}' is none of {', '.join(SKILL_SETS)}, and no path of a .toml file")
     try:
-        text = Path(choice).read_text("utf-8")
+        text = read_text(choice)
     except OSError as error:
         raise UsageError(f"`skills`: cannot read {choice} ({error.strerror or error})") from error
     except UnicodeDecodeError as error:

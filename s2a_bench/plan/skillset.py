@@ -61,7 +61,6 @@ class Call:
 
     @property
     def arguments(self) -> dict[str, Value]:
-        """Return the values by the arguments' names."""
         return {argument.name: value for argument, value in zip(self.skill.arguments, self.values, strict=True)}
 
     def __str__(self) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import string
 from collections.abc import Iterable, Mapping
-from typing import Protocol
 
 from s2a_bench.plan.skillset import Call, Skill, SkillSet, Value
 
@@ -20,53 +19,29 @@ def normalise(line: str) -> str:
     return _BLANKS_AT_MARKS.sub(r"\1", " ".join(line.split()))
 
 
-class Wording(Protocol):
-    """How a call is spelled."""
+class Calls:
+    """How a call is spelled; here as the paper does, ``place(cup, table)``, and otherwise in subclasses."""
 
-    name: str
-    glue: str
+    name = "calls"
+    glue = " "
     """What stands between words, and before a filler."""
-    terse: int
+    terse = 0
     """0: plain words; more: further from them, so that a reader needs a list of all calls to know what is meant."""
 
     def spell(self, call: Call) -> str:
         """Return a call's text, without number, filler and delimiter."""
-        ...
+        return str(call)
 
     def head(self, skill: Skill) -> str | None:
         """Return what stands for the skill itself; None where one text stands for the whole call."""
-        ...
-
-    def value(self, vocabulary: str, value: Value) -> str:
-        """Return what stands for a value."""
-        ...
-
-    def fields(self, line: str) -> list[str] | None:
-        """Take a normalised line apart: head, values, fillers; None where it does not have this form."""
-        ...
-
-
-class Calls:
-    """The paper's: ``place(cup, table)``."""
-
-    name = "calls"
-    glue = " "
-    terse = 0
-
-    def spell(self, call: Call) -> str:
-        """Write it as the paper does."""
-        return str(call)
-
-    def head(self, skill: Skill) -> str:
-        """Return the skill's name."""
         return skill.name
 
     def value(self, vocabulary: str, value: Value) -> str:  # noqa: ARG002 the same in every vocabulary
-        """Return the value as text."""
+        """Return what stands for a value."""
         return str(value)
 
     def fields(self, line: str) -> list[str] | None:
-        """Split at brackets and commas."""
+        """Take a normalised line apart: head, values, fillers; None where it does not have this form."""
         match = _CALL.fullmatch(line)
         if match is None:
             return None
@@ -79,16 +54,14 @@ class Words(Calls):
     name = "words"
 
     def spell(self, call: Call) -> str:
-        """Write skill and values with blanks between."""
         return " ".join([call.skill.name, *map(str, call.values)])
 
-    def fields(self, line: str) -> list[str] | None:
-        """Split at blanks."""
+    def fields(self, line: str) -> list[str]:
         return line.split()
 
 
-class Letters:
-    """One letter for the skill and one for each value: ``pct``."""
+class Letters(Calls):
+    """One letter for the skill and one for each value, unique within its vocabulary: ``pct``."""
 
     name = "letters"
     glue = ""
@@ -103,27 +76,20 @@ class Letters:
         self._values = {name: _initials(values) for name, values in skills.vocabularies.items()}
 
     def spell(self, call: Call) -> str:
-        """Write the letters without anything between."""
-        values = (
-            self.value(argument.vocabulary, value)
-            for argument, value in zip(call.skill.arguments, call.values, strict=True)
-        )
-        return self.head(call.skill) + "".join(values)
+        pairs = zip(call.skill.arguments, call.values, strict=True)
+        return self.head(call.skill) + "".join(self.value(argument.vocabulary, value) for argument, value in pairs)
 
     def head(self, skill: Skill) -> str:
-        """Return the skill's letter."""
         return self._heads[skill.name]
 
     def value(self, vocabulary: str, value: Value) -> str:
-        """Return the value's letter, which is unique within its vocabulary only."""
         return self._values[vocabulary][value]
 
-    def fields(self, line: str) -> list[str] | None:
-        """Split between letters."""
+    def fields(self, line: str) -> list[str]:
         return list(line)
 
 
-class Codes:
+class Codes(Calls):
     """One text for a call with all its arguments: ``A``."""
 
     name = "codes"
@@ -134,19 +100,12 @@ class Codes:
         self._codes = codes
 
     def spell(self, call: Call) -> str:
-        """Return the call's code."""
         return self._codes[call]
 
-    def head(self, skill: Skill) -> str | None:  # noqa: ARG002 see the protocol
-        """Return None: a code has no part that stands for the skill."""
-        return None
+    def head(self, skill: Skill) -> None:
+        """Return None: no part of a code stands for the skill."""
 
-    def value(self, vocabulary: str, value: Value) -> str:
-        """Raise: a code has no part that stands for a value."""
-        raise LookupError(f"{vocabulary} {value}")
-
-    def fields(self, line: str) -> list[str] | None:
-        """Leave it whole."""
+    def fields(self, line: str) -> list[str]:
         return [line]
 
 

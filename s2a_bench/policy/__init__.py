@@ -8,17 +8,20 @@ times in seconds from the request.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Final, Protocol, TypeAlias
 
 from s2a_bench.registry import Registry
+from s2a_bench.stats.seeds import Verbatim
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    Floats: TypeAlias = NDArray[np.float64]
+    from s2a_bench.policy.estimator import GapPrior
+
+Floats: TypeAlias = "NDArray[np.float64]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,16 @@ class PlanShape:
     safe_start_s: float | None = None
     """S0, which nobody knows before the last token: given in studies only, for s2a-clairvoyant."""
 
+    @property
+    def key(self) -> Verbatim:
+        """Return what draws for such plans follow from."""
+        of = self.expected
+        return Verbatim(
+            f"PlanShape(n_skills={self.n_skills!r}, tokens_per_skill={self.tokens_per_skill!r}, "
+            f"expected=Timing(nominal_s={of.nominal_s!r}, least_s={of.least_s!r}, most_s={of.most_s!r}), "
+            f"expected_cv={self.expected_cv!r}, safe_start_s={self.safe_start_s!r})"
+        )
+
 
 class Stepper(Protocol):
     """One policy following one plan. Times never decrease from call to call.
@@ -65,15 +78,12 @@ class Stepper(Protocol):
 
     def token(self, at_s: float) -> None:
         """Learn that a token arrived."""
-        ...
 
     def fragment(self, at_s: float, timing: Timing) -> None:
         """Learn that the next skill has been parsed."""
-        ...
 
     def end(self, at_s: float) -> None:
         """Learn that the stream has ended: no skill will follow."""
-        ...
 
     def decide(self, now_s: float) -> Start | float:
         """Return what to do while no skill runs: start the next one, or when to ask again (inf: on an event).
@@ -81,7 +91,6 @@ class Stepper(Protocol):
         It is asked again at that time, and before it at every token, fragment and end. After a Start the policy takes
         the skill as started at ``now_s``; it is asked again when that has ended, held on or not.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,20 +119,53 @@ class Schedule:
 class Policy(Protocol):
     """A rule for acting; a subclass of this one gets `schedule` from its stepper."""
 
+    stalls: ClassVar[bool] = True
+    """Whether a robot that has begun may have to wait for a skill."""
+    learns: ClassVar[bool] = False
+    """Whether it goes by a prior and a lambda that are learned from other plans: `informed` returns it with them."""
+
     @property
     def name(self) -> str:
         """Return its name, as in POLICIES."""
-        ...
+
+    @property
+    def prior(self) -> GapPrior:
+        """Return what it expects of the gaps between tokens before the first."""
+        from s2a_bench.policy.estimator import VAGUE
+
+        return VAGUE
+
+    @property
+    def caution(self) -> float | None:
+        """Return its lambda: a plan that does not stall at one does not at a greater one; None: has none yet."""
+        return None
+
+    @property
+    def foreseeing(self) -> Policy:
+        """Return what does the same as it where all arrivals are known and tokens come evenly."""
+        return self
+
+    def informed(self, prior: GapPrior | None = None, caution: float | None = None) -> Policy:  # noqa: ARG002
+        """Return it with what was learned; None leaves what it has."""
+        return self
 
     def stepper(self, shape: PlanShape) -> Stepper:
         """Follow one plan as it arrives."""
-        ...
 
     def schedule(self, plans: Plans) -> Schedule:
         """Decide for many plans at once; step by step they need ``shape``, raises ValueError without."""
         from s2a_bench.policy.stepping import schedule
 
         return schedule(self, plans)
+
+    def schedules(self, plans: Plans, cautions: Sequence[float]) -> Schedule:
+        """Decide with each lambda: arrays of shape (N, lambdas, M)."""
+        import numpy as np
+
+        found = [self.informed(caution=caution).schedule(plans) for caution in cautions]
+        return Schedule(
+            np.stack([each.start_s for each in found], axis=1), np.stack([each.duration_s for each in found], axis=1)
+        )
 
 
 POLICIES: Final[Registry[Callable[..., Policy]]] = Registry(
@@ -134,13 +176,18 @@ POLICIES: Final[Registry[Callable[..., Policy]]] = Registry(
         "wait-then-act": "s2a_bench.policy.wait_then_act:WaitThenAct",
         "stream-to-act": "s2a_bench.policy.stream_to_act:StreamToAct",
         "stream-to-act-early": "s2a_bench.policy.stream_to_act:EarlyStart",
-        "s2a-clairvoyant": "s2a_bench.policy.clairvoyant:Clairvoyant",
+        "s2a-clairvoyant": "s2a_bench.policy.wait_then_act:Clairvoyant",
         "s2a-mean": "s2a_bench.policy.stream_to_act:MeanStart",
-        "s2a-quantile": "s2a_bench.policy.stream_to_act:QuantileStart",
-        "s2a-robust": "s2a_bench.policy.robust:RobustStart",
     },
 )
 """What builds each policy from its parameters, which all have defaults; names starting with s2a- are for study."""
+
+ONLINE: Final = "stream-to-act"
+"""The rule that the paper proposes and a robot can run."""
+COMPARED: Final = ("naive", "wait-then-act", ONLINE)
+"""What commands compare unless told."""
+CAUTION: Final = 2.33
+"""lambda until it is calibrated: the normal distribution's 99 % quantile."""
 
 
 def policy(written: str) -> Policy:

@@ -1,17 +1,15 @@
-"""When fragments arrive: at a steady rate, or from random gaps between tokens."""
+"""When fragments arrive, at a steady rate or from random gaps between tokens, and the plans that they make."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from s2a_bench.boards.gaps import Gaps
-    from s2a_bench.policy import Floats
+from s2a_bench.boards.gaps import Gaps
+from s2a_bench.policy import Floats, Plans, PlanShape
 
 
 def uniform(prompt_s: ArrayLike, tokens_per_skill: ArrayLike, tokens_per_s: ArrayLike, n_skills: int) -> Floats:
@@ -36,3 +34,28 @@ def tokens(gaps: Gaps, prompt_s: ArrayLike, count: int, plans: int, rng: np.rand
 def fragments(token_s: Floats, tokens_per_skill: int) -> Floats:
     """Take the tokens that complete a skill, every ``tokens_per_skill``-th: (N L, M) -> (N, M), a view."""
     return token_s[tokens_per_skill - 1 :: tokens_per_skill]
+
+
+def with_skills(token_s: Floats, shape: PlanShape, rng: np.random.Generator) -> Plans:
+    """Make plans of tokens, shape (N L, M), by drawing each skill's duration: uniform around the expected one."""
+    half = shape.expected_cv * 3**0.5
+    factor = rng.uniform(1 - half, 1 + half, (shape.n_skills, token_s.shape[1]))
+    return Plans(
+        arrival_s=fragments(token_s, int(shape.tokens_per_skill)),
+        nominal_s=factor * shape.expected.nominal_s,
+        least_s=factor * shape.expected.least_s,
+        most_s=factor * shape.expected.most_s,
+        token_s=token_s,
+        shape=shape,
+    )
+
+
+def recorded_plans(recordings: Sequence[ArrayLike], shape: PlanShape, rng: np.random.Generator) -> Plans:
+    """Make one plan of each recorded answer: when its tokens arrived, in s from the request.
+
+    Takes the first N L tokens and leaves shorter recordings out. Parts of one answer share its rate and would not be
+    exchangeable with further answers, so that a long one makes one plan too.
+    """
+    count = shape.n_skills * int(shape.tokens_per_skill)
+    long_enough = [np.asarray(token_s, dtype=np.float64)[:count] for token_s in recordings if np.size(token_s) >= count]
+    return with_skills(np.stack(long_enough, axis=1) if long_enough else np.empty((count, 0)), shape, rng)

@@ -15,12 +15,13 @@ bursts, a burst is no change.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from s2a_bench.policy import Floats
 from s2a_bench.policy.estimator import GapPrior, posterior
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
 
 WINDOW: Final = 8
 SURPRISE: Final = 4.0
@@ -31,9 +32,6 @@ class Watch:
     """Follows the tokens of M plans at once, one token of each at a time."""
 
     def __init__(self, prior: GapPrior, plans: int = 1) -> None:
-        """Begin with what is known before the first token."""
-        import numpy as np
-
         self._prior = prior
         self._token = prior.token_cv**2
         self._prior_s = np.full(plans, prior.mean_s)
@@ -45,15 +43,14 @@ class Watch:
         self.slow = np.zeros(plans, dtype=np.bool_)
         """Whether each plan has slowed down, and not become as fast again."""
 
-    def token(self, at_s: Floats) -> None:
-        """Learn that the next token arrived, shape (M,)."""
-        import numpy as np
-
+    def token(self, at_s: ArrayLike) -> None:
+        """Learn that the next token arrived: one time, or of shape (M,)."""
+        at_s = np.atleast_1d(np.asarray(at_s, dtype=np.float64))
         self._recent_s[1:] = self._recent_s[:-1].copy()
         self._recent_s[0] = at_s
         self._tokens += 1
         if self._tokens == 1:
-            self._began_s = self._first_s = np.array(at_s)
+            self._began_s = self._first_s = at_s.copy()
             return
         self._gaps += 1
         size = np.arange(1.0, WINDOW + 1)[:, np.newaxis]
@@ -87,8 +84,6 @@ class Watch:
 
 def learned_along(prior: GapPrior, token_s: Floats) -> tuple[Floats, Floats]:
     """Return what is learned after each token, two arrays of the shape of ``token_s``, (tokens, M)."""
-    import numpy as np
-
     watch = Watch(prior, token_s.shape[1])
     mean_s, variance = np.empty((2, *token_s.shape))
     for row, at_s in enumerate(token_s):

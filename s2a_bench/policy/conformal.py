@@ -26,14 +26,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, get_args
 
 from s2a_bench.errors import UsageError
-from s2a_bench.policy import Plans, Policy
-from s2a_bench.policy.stream_to_act import StreamToAct
+from s2a_bench.policy import Floats, Plans, Policy
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-    from s2a_bench.policy import Floats
 
 EPSILON: Final = 0.01
 """Share of plans that may stall."""
@@ -76,7 +73,7 @@ class Calibration:
     guarantee: Guarantee = "high-confidence"
 
 
-def scores(policy: StreamToAct, plans: Plans) -> Floats:
+def scores(policy: Policy, plans: Plans) -> Floats:
     """Return each plan's score, shape (M,): the least caution of GRID from which on it does not stall, else infinity.
 
     Tries the greatest caution first; a plan that has stalled is done.
@@ -88,7 +85,7 @@ def scores(policy: StreamToAct, plans: Plans) -> Floats:
     left = np.arange(count)
     above = math.inf
     for caution in reversed(GRID):
-        stalls = stalled(replace(policy, caution=caution), take(plans, left))
+        stalls = stalled(policy.informed(caution=caution), take(plans, left))
         score[left[stalls]] = above
         left, above = left[~stalls], caution
         if not left.size:
@@ -113,7 +110,7 @@ def coarse(plans: int, epsilon: float = EPSILON) -> bool:
 
 
 def calibrate(
-    policy: StreamToAct, plans: Plans, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence"
+    policy: Policy, plans: Plans, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence"
 ) -> Calibration:
     """Find lambda for P(any stall) <= ``epsilon`` from recorded plans; see the module's head.
 
@@ -164,7 +161,6 @@ class Tracker:
     """
 
     def __init__(self, score: Iterable[float], epsilon: float = EPSILON, *, step: float = 0.002) -> None:
-        """Begin with the scores of a calibration."""
         first = tuple(score)
         if not first:
             raise ValueError("tracking begins with the scores of a calibration")
@@ -231,15 +227,8 @@ def stalled(policy: Policy, plans: Plans) -> NDArray[np.bool_]:
 def take(plans: Plans, columns: NDArray[np.intp]) -> Plans:
     """Take some of the plans."""
 
-    def cut(rows: Floats) -> Floats:
-        return rows if rows.shape[1] == 1 else rows[:, columns]
+    def cut(rows: Floats | None) -> Any:
+        return rows if rows is None or rows.shape[1] == 1 else rows[:, columns]
 
-    tokens = None if plans.token_s is None else cut(plans.token_s)
-    return replace(
-        plans,
-        arrival_s=cut(plans.arrival_s),
-        nominal_s=cut(plans.nominal_s),
-        least_s=cut(plans.least_s),
-        most_s=cut(plans.most_s),
-        token_s=tokens,
-    )
+    names = ("arrival_s", "nominal_s", "least_s", "most_s", "token_s")
+    return replace(plans, **{name: cut(getattr(plans, name)) for name in names})

@@ -13,16 +13,11 @@ variance a token that *sums* of gaps have: larger than that of single gaps where
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
+from typing import Any, Final, TypeVar
 
 from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Floats: TypeAlias = NDArray[np.float64]
+from s2a_bench.policy import Floats
 
 Number = TypeVar("Number", float, "Floats")
 """One plan's value, or an array of many plans' values."""
@@ -45,7 +40,6 @@ class GapPrior:
     """sigma / mu: square root of a long sum's variance a token, over the mean."""
 
     def __post_init__(self) -> None:
-        """Refuse what is no prior."""
         for name in ("mean_s", "plan_cv", "token_cv"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise UsageError(f"prior: {name} = {getattr(self, name):g} should be above 0 and finite")

@@ -1,29 +1,25 @@
-"""What naive, wait-then-act and clairvoyant stream-to-act make of millions of plans, in one pass without schedules.
+"""Naive, wait-then-act and clairvoyant stream-to-act over millions of plans, in one pass; where naive never stalls.
 
-By T1 the three differ only in when they begin, so that a few numbers a plan say it all:
-
-| policy | start | end | stalls |
-|---|---|---|---|
-| naive | t_1 | S0 + P_N | where t_i - P_{i-1} exceeds all before it; S0 - t_1 in all |
-| wait-then-act | t_N | t_N + P_N | none |
-| s2a-clairvoyant | S0 | S0 + P_N | none |
+By T1 the three differ only in when they begin, so that a few numbers a plan say it all. Naive is stall-free iff S0 =
+t_1; at steady rate and equal durations T that is L / R <= T, the paper's figure 2 over tokens per skill L and rate R.
+The paper draws that line for T_min, but naive runs skills at T_nom: both are worth drawing.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from s2a_bench.boards.gaps import Gaps
+from s2a_bench.policy import Floats
+from s2a_bench.policy.arrivals import fragments, tokens
 from s2a_bench.policy.schedule import align, chunks
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from s2a_bench.policy import Floats
-
-    Counts: TypeAlias = NDArray[np.int32]
+Counts: TypeAlias = NDArray[np.int32]
+Flags: TypeAlias = NDArray[np.bool_]
 
 TOLERANCE_S = 0.02
 """A stall that makes the robot stop and go is longer than this (POLICY section 1)."""
@@ -81,3 +77,49 @@ def evaluate(arrival_s: Floats, duration_s: Floats, tolerance_s: float = TOLERAN
         safe[part] = begin
         stalls[part] += count
     return Evaluation(first, safe, last, safe + work, last + work, stalls, safe - first, longest)
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """The same axes for the analytic and the simulated region: L down (K,), R across (J,)."""
+
+    tokens_per_skill: tuple[int, ...]
+    tokens_per_s: tuple[float, ...]
+
+
+def slowest_rate(tokens_per_skill: ArrayLike, duration_s: float) -> Floats:
+    """Return the line R = L / T, in tokens/s: naive is stall-free at this rate and above."""
+    return np.asarray(tokens_per_skill, dtype=np.float64) / duration_s
+
+
+def analytic(grid: Grid, duration_s: float) -> Flags:
+    """Return where steady arrivals are stall-free, shape (K, J): L / R <= T."""
+    rates: Floats = np.array(grid.tokens_per_s, dtype=np.float64)
+    return slowest_rate(grid.tokens_per_skill, duration_s)[:, np.newaxis] <= rates
+
+
+def simulate(
+    grid: Grid,
+    gaps: Gaps,
+    *,
+    n_skills: int,
+    duration_s: float,
+    plans: int,
+    rng: np.random.Generator,
+    tolerance_s: float = TOLERANCE_S,
+) -> Floats:
+    """Return P(a naive plan stalls), shape (K, J), over random plans: a share, with sd <= 0.5 / sqrt(plans).
+
+    ``gaps`` gives the shape of the jitter; its gaps are scaled to each rate. One set of draws serves the whole grid, so
+    neighbouring cells differ by what they are, not by luck. The prompt's time shifts every arrival alike and so has no
+    part in it.
+    """
+    longest = max(grid.tokens_per_skill)
+    at = tokens(gaps, 0.0, longest * n_skills, plans, rng) / gaps.mean_s
+    share = np.empty((len(grid.tokens_per_skill), len(grid.tokens_per_s)))
+    for row, per_skill in enumerate(grid.tokens_per_skill):
+        unit = fragments(at[: per_skill * n_skills], per_skill)
+        for column, rate in enumerate(grid.tokens_per_s):
+            stalls = evaluate(unit / rate, np.full((n_skills, 1), duration_s), tolerance_s).naive_stalls
+            share[row, column] = np.count_nonzero(stalls) / plans
+    return share

@@ -5,27 +5,22 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
-from s2a_bench.policy import Plans, PlanShape, Schedule, Start, Timing
+from s2a_bench.policy import Plans, PlanShape, Policy, Schedule, Start, Stepper, Timing
 from s2a_bench.policy.schedule import work_conserving
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Stepper
 
 
 @dataclass(frozen=True, slots=True)
-class Naive:
+class Naive(Policy):
     """s_1 = t_1 and s_i = max(t_i, e_{i-1}) at nominal durations (the paper's naive streaming, section IV-F)."""
 
     name: ClassVar[str] = "naive"
 
     def schedule(self, plans: Plans) -> Schedule:
-        """Decide for many plans at once."""
         return Schedule(work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0]), plans.nominal_s)
 
     def stepper(self, shape: PlanShape) -> Stepper:  # noqa: ARG002 - naive looks at nothing but what has arrived
-        """Follow one plan as it arrives."""
         return Queue()
 
 
@@ -39,14 +34,12 @@ class Queue:
         """Ignore it."""
 
     def fragment(self, at_s: float, timing: Timing) -> None:  # noqa: ARG002 - it may start at once
-        """Queue the skill."""
         self.waiting.append(timing)
 
     def end(self, at_s: float) -> None:
         """Ignore it."""
 
     def decide(self, now_s: float) -> Start | float:  # noqa: ARG002 - now, if there is something to start
-        """Start the next skill, or wait for one."""
         if not self.waiting:
             return math.inf
         nominal_s = self.waiting.popleft().nominal_s

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
-from s2a_bench.policy import Plans, PlanShape, Schedule
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from s2a_bench.policy import Floats, Plans, PlanShape, Schedule
 from s2a_bench.policy.changes import learned_along
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.schedule import align, hold
 from s2a_bench.policy.stream_to_act import FAVOURABLE, Rule
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import ArrayLike, NDArray
-
-    from s2a_bench.policy import Floats
-
-    Ints: TypeAlias = NDArray[np.intp]
+Ints: TypeAlias = NDArray[np.intp]
 
 
 def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, rule: Rule) -> Schedule:
@@ -26,8 +23,6 @@ def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, rule: Rule) -> S
 
     Plans need ``token_s`` and ``shape``; raises ValueError without. The stream ends with its last token or fragment.
     """
-    import numpy as np
-
     if plans.token_s is None or plans.shape is None:
         raise ValueError("an online policy learns from tokens: plans need token_s and shape")
     arrival_s, nominal_s, least_s, most_s = align(plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s)
@@ -55,8 +50,6 @@ def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, rule: Rule) -> S
 
 def _sums_before(duration_s: Floats) -> Floats:
     """Return the sums over the skills before each skill, and over all: shape (N + 1, M)."""
-    import numpy as np
-
     return np.vstack([np.zeros(duration_s.shape[1]), np.cumsum(duration_s, axis=0)])
 
 
@@ -65,8 +58,6 @@ class _Stream:
 
     def __init__(self, token_s: Floats, arrival_s: Floats) -> None:
         """Merge tokens and fragments; at the same instant tokens come first, since fragments are made of them."""
-        import numpy as np
-
         both = np.concatenate([token_s, arrival_s])
         order = np.argsort(both, axis=0, kind="stable")
         is_token = order < len(token_s)
@@ -93,8 +84,6 @@ class _Known:
 
     def view(self, stream: _Stream, plans: Ints, event: Ints) -> _View:
         """See some of the plans as they are after one of their events each."""
-        import numpy as np
-
         tokens, parsed = stream.tokens[event, plans], stream.parsed[event, plans]
         last_s = stream.token_s[np.maximum(tokens, 1) - 1, plans]
         if self.learned is None:
@@ -129,8 +118,6 @@ class _View:
 
         Both grow evenly from skill to skill, so that the next skill or the last one decides.
         """
-        import numpy as np
-
         at_s = np.full(self.plans.shape, -np.inf)
         for unknown in (np.zeros_like(self.next_in), np.maximum(self.missing - 1.0, 0.0)):
             tokens = self.next_in + unknown * self.known.shape.tokens_per_skill
@@ -142,8 +129,6 @@ class _View:
 
     def cautious_start_s(self, known_s: Floats, unknown_s: float, caution: Floats) -> Floats:
         """Return the same for the cautious forecasts, each plan with a lambda of its own."""
-        import numpy as np
-
         forecast_s, overdue_s = self._forecasts(unknown_s, caution)
         budget_s = known_s + self.unknown * unknown_s
         each_s = self.last_s + forecast_s - budget_s
@@ -152,15 +137,12 @@ class _View:
 
     def demand(self, now_s: Floats, known_s: Floats, unknown_s: float) -> Floats:
         """Return the largest (cautious forecast - now) / (durations until then); -inf where nothing is missing."""
-        import numpy as np
-
         forecast_s, overdue_s = self._forecasts(unknown_s, self.caution)
         until_s = np.maximum(self.last_s + forecast_s, now_s + overdue_s) - now_s
         return self._worst(until_s / (known_s + self.unknown * unknown_s))
 
     @property
     def caution(self) -> Floats:
-        """Return each plan's lambda."""
         return self.known.caution[self.plans]
 
     def _forecasts(self, unknown_s: float, caution: Floats) -> tuple[Floats, Floats]:
@@ -170,8 +152,6 @@ class _View:
         return self._forecast(tokens, skills, caution), self._forecast(tokens - 1, skills, caution)
 
     def _forecast(self, tokens: Floats, skills: Floats, caution: Floats) -> Floats:
-        import numpy as np
-
         gaps = tokens * self.known.prior.token_cv**2 + tokens**2 * self.variance
         noise = np.sqrt(self.mean_s**2 * gaps + skills)
         # No noise stays none, with infinite caution too.
@@ -179,17 +159,10 @@ class _View:
         return tokens * self.mean_s + noise
 
     def _worst(self, each: Floats) -> Floats:
-        """Take the largest over the missing skills."""
-        import numpy as np
-
-        worst: Floats = each.max(axis=0, initial=-np.inf, where=self.unknown < self.missing)
-        return worst
+        return np.asarray(each.max(axis=0, initial=-np.inf, where=self.unknown < self.missing))
 
 
 def _first_start(known: _Known, stream: _Stream, nominal_sum: Floats, most_sum: Floats) -> Floats:
-    """Return when each plan starts, shape (M,)."""
-    import numpy as np
-
     rule, expected = known.rule, known.shape.expected
 
     def at_s(event: int, live: Ints, until_s: Floats) -> Floats:
@@ -215,8 +188,6 @@ def _first_start(known: _Known, stream: _Stream, nominal_sum: Floats, most_sum: 
 
 def _resume(known: _Known, stream: _Stream, now_s: Floats, most_sum: Floats, skill: int) -> Floats:
     """Return when the skill of that number starts: later than now where no forecast can be met."""
-    import numpy as np
-
     unknown_s = known.shape.expected.most_s
     plans, view = _seen(known, stream, now_s)
     most_s = most_sum[view.parsed, plans] - most_sum[skill, plans]
@@ -237,8 +208,6 @@ def _first(stream: _Stream, plans: Ints, from_s: Floats, at_s: Callable[[int, In
 
     ``at_s`` is told event, plans and when their next event is.
     """
-    import numpy as np
-
     start_s: Floats = np.maximum(stream.event_s[-1, plans], from_s)
     waiting = np.arange(plans.size)
     for event in range(len(stream.event_s) - 1):
@@ -258,8 +227,6 @@ def _first(stream: _Stream, plans: Ints, from_s: Floats, at_s: Callable[[int, In
 
 def _seen(known: _Known, stream: _Stream, now_s: Floats) -> tuple[Ints, _View]:
     """Return the plans of which something is still to come, as they are now."""
-    import numpy as np
-
     plans = np.flatnonzero(now_s < stream.event_s[-1])
     event = (stream.event_s[:, plans] <= now_s[plans]).sum(axis=0) - 1
     return plans, known.view(stream, plans, event)
@@ -267,8 +234,6 @@ def _seen(known: _Known, stream: _Stream, now_s: Floats) -> tuple[Ints, _View]:
 
 def _demand(known: _Known, stream: _Stream, now_s: Floats, nominal_sum: Floats, skill: int) -> Floats:
     """Return each plan's demand when the skill of that number (from 0) starts; -inf once all has come."""
-    import numpy as np
-
     demand = np.full(now_s.shape, -np.inf)
     plans, view = _seen(known, stream, now_s)
     known_s = nominal_sum[view.parsed, plans] - nominal_sum[skill, plans]

@@ -59,7 +59,6 @@ def _value(type_: Any, text: str, what: str, known: str) -> Any:
 
 
 def _types(made_by: Callable[..., object]) -> dict[str, Any]:
-    """Return each parameter's type, as annotated."""
     parameters = _parameters(made_by)
     hints = get_type_hints(made_by, include_extras=True) if parameters else {}
     return {field.name: hints[field.name] for field in parameters}

@@ -11,16 +11,11 @@ With t_i the arrival of fragment i, and P_i, M_i, Q_i the sums of the nominal, l
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from s2a_bench.policy import Plans, Schedule
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from s2a_bench.policy import Floats
+from s2a_bench.policy import Floats, Plans, Schedule
 
 CHUNK = 16_384
 """Plans per pass: a row is 128 KiB, and the few rows in use fit a core's L2 cache."""
@@ -34,8 +29,7 @@ def chunks(plans: int) -> Iterator[slice]:
 
 def align(*arrays: ArrayLike) -> tuple[Floats, ...]:
     """Broadcast arrays against one another as float64 of shape (N, M); the results are views, not to be written to."""
-    views: tuple[Floats, ...] = np.broadcast_arrays(*(np.asarray(array, dtype=np.float64) for array in arrays))
-    return views
+    return np.broadcast_arrays(*(np.asarray(array, dtype=np.float64) for array in arrays))
 
 
 def safe_start(arrival_s: Floats, duration_s: Floats) -> Floats:
@@ -60,8 +54,7 @@ def safe_start(arrival_s: Floats, duration_s: Floats) -> Floats:
 def least_end(arrival_s: Floats, least_s: Floats) -> Floats:
     """Return E_lo = max_i (t_i + M_N - M_{i-1}), shape (M,): no schedule ends earlier (T2)."""
     arrival_s, least_s = align(arrival_s, least_s)
-    end: Floats = safe_start(arrival_s, least_s) + least_s.sum(axis=0)
-    return end
+    return np.asarray(safe_start(arrival_s, least_s) + least_s.sum(axis=0))
 
 
 def work_conserving(arrival_s: Floats, duration_s: Floats, first_s: ArrayLike) -> Floats:

@@ -9,13 +9,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import TYPE_CHECKING
 
-from s2a_bench.policy import Plans, Policy, Schedule, Start, Timing
+import numpy as np
 
-if TYPE_CHECKING:
-    from s2a_bench.policy import Stepper
-
+from s2a_bench.policy import Plans, Policy, Schedule, Start, Stepper, Timing
 
 ROUNDING_S = 1e-9
 
@@ -50,7 +47,6 @@ class _Robot:
     ended: bool = False
 
     def hear(self, now_s: float, events: list[tuple[int, int]]) -> None:
-        """Tell the stepper what happened."""
         for kind, place in events:
             if kind == 0:
                 self.stepper.token(now_s)
@@ -127,8 +123,6 @@ def step(policy: Policy, plans: Plans, column: int = 0, *, missing: int = 0) -> 
 
 def schedule(policy: Policy, plans: Plans) -> Schedule:
     """Decide for many plans, one after another; raises ValueError where the stepper does not start every skill."""
-    import numpy as np
-
     start_s, duration_s = np.empty((2, *np.broadcast_shapes(plans.arrival_s.shape, plans.nominal_s.shape)))
     for column in range(start_s.shape[1]):
         starts, durations = step(policy, plans, column)

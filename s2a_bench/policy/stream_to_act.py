@@ -26,20 +26,19 @@ The stepper here is plain arithmetic on one plan; `online.schedule` does the sam
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, ClassVar, TypeAlias
 
 from pydantic import Field
 
-from s2a_bench.policy import Plans, PlanShape, Schedule, Start, Timing
+from s2a_bench.policy import CAUTION, Plans, PlanShape, Policy, Schedule, Start, Stepper, Timing
 from s2a_bench.policy.estimator import VAGUE, GapPrior, Number
+from s2a_bench.policy.wait_then_act import Clairvoyant
 
 if TYPE_CHECKING:
-    from s2a_bench.policy import Floats, Stepper
     from s2a_bench.policy.changes import Watch
 
-CAUTION = 2.33
-"""lambda until it is calibrated: the normal distribution's 99 % quantile."""
 FAVOURABLE = 2.0
 """Standard deviations by which a favourable forecast is earlier than the mean."""
 Caution: TypeAlias = Annotated[float, Field(ge=0)]
@@ -67,10 +66,11 @@ class Rule:
 
 
 @dataclass(frozen=True, slots=True)
-class StreamToAct:
+class StreamToAct(Policy):
     """The online rule; ``prior`` comes from the hardware profile, ``caution`` (lambda) from `conformal.calibrate`."""
 
     name: ClassVar[str] = "stream-to-act"
+    learns: ClassVar[bool] = True
 
     prior: GapPrior = VAGUE
     caution: Caution | None = None
@@ -79,13 +79,30 @@ class StreamToAct:
     """Whether a change of the rate within the plan is looked for."""
 
     def schedule(self, plans: Plans) -> Schedule:
-        """Decide for many plans at once; they need ``token_s`` and ``shape``."""
         from s2a_bench.policy.online import schedule
 
         return schedule(self.prior, self._lambda, plans, self.rule)
 
+    def schedules(self, plans: Plans, cautions: Sequence[float]) -> Schedule:
+        import numpy as np
+
+        from s2a_bench.policy.conformal import take
+        from s2a_bench.policy.online import schedule
+
+        count = plans.arrival_s.shape[1]
+        copies = take(plans, np.tile(np.arange(count), len(cautions)))
+        found = schedule(self.prior, np.repeat(cautions, count), copies, self.rule)
+        shape = (-1, len(cautions), count)
+        return Schedule(found.start_s.reshape(shape), found.duration_s.reshape(shape))
+
+    def informed(self, prior: GapPrior | None = None, caution: float | None = None) -> StreamToAct:
+        return replace(self, prior=prior or self.prior, caution=self.caution if caution is None else caution)
+
+    @property
+    def foreseeing(self) -> Policy:
+        return Clairvoyant()
+
     def stepper(self, shape: PlanShape) -> Stepper:
-        """Follow one plan as it arrives."""
         watch = None
         if self.detect:
             from s2a_bench.policy.changes import Watch
@@ -95,7 +112,6 @@ class StreamToAct:
 
     @property
     def rule(self) -> Rule:
-        """Return which variant this is."""
         return Rule(detect=self.detect)
 
     @property
@@ -114,8 +130,11 @@ class EarlyStart(StreamToAct):
     start_caution: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
 
     @property
+    def foreseeing(self) -> Policy:
+        return self
+
+    @property
     def rule(self) -> Rule:
-        """Return which variant this is."""
         return Rule(spend=self.spend, within=self.within, start_caution=self.start_caution, detect=self.detect)
 
 
@@ -129,21 +148,6 @@ class MeanStart(StreamToAct):
 
     @property
     def rule(self) -> Rule:
-        """Return which variant this is."""
-        return Rule(elastic=False, detect=self.detect)
-
-
-@dataclass(frozen=True, slots=True)
-class QuantileStart(StreamToAct):
-    """For study: start when the cautious forecast meets the nominal durations, never stretch."""
-
-    name: ClassVar[str] = "s2a-quantile"
-
-    caution: Caution | None = CAUTION
-
-    @property
-    def rule(self) -> Rule:
-        """Return which variant this is."""
         return Rule(elastic=False, detect=self.detect)
 
 
@@ -170,24 +174,21 @@ class OnlineStepper:
     """When the next skill would start had all skills run at their nominal durations; NaN before the first start."""
 
     def token(self, at_s: float) -> None:
-        """Learn a gap."""
         if not self.tokens:
             self.first_token_s = at_s
         self.tokens += 1
         self.since_fragment += 1
         self.last_token_s = at_s
         if self.watch is not None:
-            self.watch.token(_one(at_s))
+            self.watch.token(at_s)
 
     def fragment(self, at_s: float, timing: Timing) -> None:
-        """Queue a skill."""
         if not self.tokens:
             self.first_token_s = self.last_token_s = at_s
         self.since_fragment = 0
         self.parsed.append(timing)
 
     def end(self, at_s: float) -> None:  # noqa: ARG002 - whenever it comes, nothing is missing any more
-        """Expect no more skills."""
         self.ended = True
 
     def decide(self, now_s: float) -> Start | float:
@@ -277,9 +278,3 @@ class OnlineStepper:
         late_s = now_s - self.due_s
         least = min(max(1 - late_s / timing.nominal_s, timing.least_s / timing.nominal_s), 1.0)
         return min(max(demand, least), timing.most_s / timing.nominal_s)
-
-
-def _one(value: float) -> Floats:
-    import numpy as np
-
-    return np.array([value])

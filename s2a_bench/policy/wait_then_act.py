@@ -1,53 +1,79 @@
-"""wait-then-act: start when the whole plan has arrived."""
+"""wait-then-act and s2a-clairvoyant: wait until the whole plan has arrived, or until S0; then what naive does."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
-from s2a_bench.policy import Plans, PlanShape, Schedule, Start, Timing
+from s2a_bench.errors import UsageError
+from s2a_bench.policy import Plans, PlanShape, Policy, Schedule, Start, Stepper, Timing
 from s2a_bench.policy.naive import Queue
-from s2a_bench.policy.schedule import work_conserving
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Stepper
+from s2a_bench.policy.schedule import safe_start, work_conserving
 
 
 @dataclass(frozen=True, slots=True)
-class WaitThenAct:
+class WaitThenAct(Policy):
     """s_1 = t_N, then back to back at nominal durations: it never stalls, and starts last."""
 
     name: ClassVar[str] = "wait-then-act"
+    stalls: ClassVar[bool] = False
 
     def schedule(self, plans: Plans) -> Schedule:
-        """Decide for many plans at once."""
         return Schedule(work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[-1]), plans.nominal_s)
 
     def stepper(self, shape: PlanShape) -> Stepper:
-        """Follow one plan as it arrives."""
         return WaitingStepper(shape.n_skills)
 
 
-@dataclass(slots=True)
-class WaitingStepper:
+class WaitingStepper(Queue):
     """Count the skills; the plan is whole when all have arrived, or when the stream ends before."""
 
-    missing: int
-    queue: Queue = field(default_factory=Queue)
-
-    def token(self, at_s: float) -> None:
-        """Ignore it."""
+    def __init__(self, missing: int) -> None:
+        super().__init__()
+        self.missing = missing
 
     def fragment(self, at_s: float, timing: Timing) -> None:
-        """Queue the skill."""
         self.missing -= 1
-        self.queue.fragment(at_s, timing)
+        super().fragment(at_s, timing)
 
     def end(self, at_s: float) -> None:  # noqa: ARG002 - whenever it comes, the plan is whole
-        """Stop waiting for more."""
         self.missing = 0
 
     def decide(self, now_s: float) -> Start | float:
-        """Start the next skill once the plan is whole."""
-        return math.inf if self.missing > 0 else self.queue.decide(now_s)
+        return math.inf if self.missing > 0 else super().decide(now_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Clairvoyant(Policy):
+    """Stream-to-act as the paper defines it, which needs to know every arrival: no stalls, and naive's end.
+
+    s_1 = S0 = max_i (t_i - P_{i-1}), then back to back at nominal durations.
+    """
+
+    name: ClassVar[str] = "s2a-clairvoyant"
+    stalls: ClassVar[bool] = False
+
+    def schedule(self, plans: Plans) -> Schedule:
+        first_s = safe_start(plans.arrival_s, plans.nominal_s)
+        return Schedule(work_conserving(plans.arrival_s, plans.nominal_s, first_s), plans.nominal_s)
+
+    def stepper(self, shape: PlanShape) -> Stepper:
+        """Follow one plan as it arrives; raises UsageError where ``shape`` does not tell S0."""
+        if shape.safe_start_s is None:
+            raise UsageError(
+                "`policy`: s2a-clairvoyant needs to know when every skill will arrive, so it runs on recorded or "
+                "modelled arrivals only; stream-to-act is what a robot can run"
+            )
+        return ClairvoyantStepper(shape.safe_start_s)
+
+
+class ClairvoyantStepper(Queue):
+    """Wait for S0, then start whatever has arrived."""
+
+    def __init__(self, start_s: float) -> None:
+        super().__init__()
+        self.start_s = start_s
+
+    def decide(self, now_s: float) -> Start | float:
+        return self.start_s if now_s < self.start_s else super().decide(now_s)

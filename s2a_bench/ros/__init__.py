@@ -51,6 +51,9 @@ class Publisher(Protocol):
 class Subscription(Protocol):
     """Receives messages of one type from one topic, on the thread that calls `take`."""
 
+    topic: str
+    """Its absolute ROS name, after remapping."""
+
     def take(self, timeout_s: float) -> Any | None:
         """Wait for the next message and return it packed; None on timeout or after `interrupt`."""
         ...
@@ -65,6 +68,10 @@ class Subscription(Protocol):
 
     def matched(self) -> int:
         """Count the publishers that reach this subscription."""
+        ...
+
+    def publishers(self) -> int:
+        """Count the publishers of the topic, those too whose QoS does not fit; callable from any thread."""
         ...
 
 
@@ -174,10 +181,8 @@ class ActionClient(Protocol):
 class ServerGoal(Protocol):
     """A goal on the server, callable from any thread; TransportError for a step its state does not allow."""
 
-    @property
-    def id(self) -> bytes:
-        """The goal's 16 bytes."""
-        ...
+    id: bytes
+    """Its 16 bytes."""
 
     @property
     def size_bytes(self) -> int:
@@ -209,17 +214,11 @@ class ServerGoal(Protocol):
         """Start; False if a cancel came first (then end it with `canceled`)."""
         ...
 
-    def feedback(self, message: Any) -> None:
-        """Pack and publish one feedback."""
-        ...
+    def feedback(self, message: Any) -> None: ...
 
-    def succeed(self, result: Any) -> None:
-        """End the goal as SUCCEEDED."""
-        ...
+    def succeed(self, result: Any) -> None: ...
 
-    def abort(self, result: Any) -> None:
-        """End the goal as ABORTED."""
-        ...
+    def abort(self, result: Any) -> None: ...
 
     def canceled(self, result: Any) -> None:
         """End the goal as CANCELED; only after a cancel was requested."""
@@ -274,9 +273,7 @@ class Middleware(Protocol):
         """
         ...
 
-    def service_client(self, name: str, type_name: str) -> ServiceClient:
-        """Call the service ``/x``."""
-        ...
+    def service_client(self, name: str, type_name: str) -> ServiceClient: ...
 
     def action_client(self, name: str, type_name: str, version: str = "6.0") -> ActionClient:
         """Call the action ``/x`` of ROS type ``pkg/action/Name``; ``version`` as in `messages.VERSIONS`."""

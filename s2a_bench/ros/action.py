@@ -1,18 +1,29 @@
-"""What a ROS 2 action server remembers and decides: goal states, cancelling, results that expire. No I/O, no clock.
+"""ROS 2 actions on whatever carries three services and two topics: goal states, the client, the server.
 
-After rcl_action: ``goal_state_machine.c``, ``action_server.c`` (rcl_action_process_cancel_request).
+A middleware makes the endpoints, takes what arrives and says where a body begins; here is the rest. `Goals` does no I/O
+and has no clock. After rcl_action: ``goal_state_machine.c``, ``action_server.c`` (rcl_action_process_cancel_request).
 """
 
 from __future__ import annotations
 
+import logging
+import os
 import struct
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 from itertools import islice
-from typing import Any
+from threading import RLock, Thread
+from typing import Any, Final, Generic
 
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import ALL_GOALS
+from s2a_bench.ros import ALL_GOALS, Accepted, ActionEvent, CancelResponse, Feedback, QoS, Rejected, Result
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.service import AT_ONCE, Asker, Caller, Service, Waits, appeared
 
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
 STATUS_ARRAY = "action_msgs/msg/GoalStatusArray"
@@ -50,11 +61,20 @@ NEXT: dict[Status, frozenset[Status]] = {
 }
 """The goal state machine: status -> the statuses that may follow."""
 
-LISTED_ENDED = 64
+FEEDBACK_QOS: Final = QoS(depth=1000)
+"""Deeper than ROS's 10: what was lost of a burst can be sent again."""
+STATUS_QOS: Final = QoS(depth=1, latched=True)
+HOUSEKEEPING_NS: Final = 500_000_000
+WAITING_AT_MOST: Final = 1000
+"""So many requests for one goal's result are remembered; more are not answered."""
+LISTED_ENDED: Final = 64
 """The status array lists all live goals and so many of the latest that ended."""
-
-STATUS_ENTRY = struct.Struct("<16s3xiIb")
+FEEDBACK_ID: Final = slice(4, 20)
+"""Where feedback has its goal's id in CDR."""
+STATUS_ENTRY: Final = struct.Struct("<16s3xiIb")
 """One GoalStatus in little-endian CDR: goal id, seconds, nanoseconds, status; the first goal id needs no padding."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
@@ -72,7 +92,6 @@ class Goals:
     """The goals of one action server. Not thread-safe: the owner locks."""
 
     def __init__(self, result_timeout_ns: int) -> None:
-        """Remember ended goals for ``result_timeout_ns``."""
         self._timeout_ns = result_timeout_ns
         self._offered: set[bytes] = set()
         self._live: dict[bytes, Goal] = {}
@@ -97,11 +116,9 @@ class Goals:
         self._live[goal_id] = Goal(goal_id, stamp_ns)
 
     def find(self, goal_id: bytes) -> Goal | None:
-        """Return a goal that is remembered."""
         return self._live.get(goal_id) or self._ended.get(goal_id)
 
     def status(self, goal_id: bytes) -> Status:
-        """Return a goal's status, UNKNOWN if it is not remembered."""
         goal = self.find(goal_id)
         return goal.status if goal else Status.UNKNOWN
 
@@ -160,3 +177,330 @@ def status_array(goals: list[Goal]) -> bytearray:
     padding = 3 if goals else 0
     head = struct.pack("<4BI", 0, 1, 0, padding, len(goals))
     return bytearray(head + entries[:16] + entries[19:] + bytes(padding))
+
+
+def _goal_info(goal_id: bytes, stamp_ns: int) -> Any:
+    return ros.message("action_msgs/msg/GoalInfo", goal_id=ros.uuid(goal_id), stamp=ros.stamp(stamp_ns))
+
+
+class AskingAction:
+    """Events are taken on the consuming thread; sending and cancelling may happen on any."""
+
+    def __init__(
+        self,
+        type_name: str,
+        version: str,
+        services: tuple[Asker, Asker, Asker],
+        feedback: Callable[[], Iterable[memoryview]],
+        topics: Iterable[Callable[[], int]],
+        waiter: Waits,
+    ) -> None:
+        """Call the services of goals, results and cancels; ``feedback`` takes what has arrived, `AT_ONCE` at most.
+
+        ``topics`` say whether the server's feedback and status are there.
+        """
+        self._type, self._version = type_name, version
+        self._goals, self._results, self._cancels = services
+        self._body_at = self._goals.body_at
+        self._present = *topics, *(service.matched for service in services)
+        self._feedback, self._waiter = feedback, waiter
+        self._active: set[bytes] = set()
+        self._ended: deque[tuple[bytes, memoryview]] = deque()
+        """Results whose feedback is not all taken."""
+        self._events: deque[ActionEvent] = deque()
+        self.interrupt = waiter.interrupt
+
+    def wait_for_server(self, timeout_s: float) -> bool:
+        return appeared(self.server_present, timeout_s, lambda: self._waiter.interrupted)
+
+    def server_present(self) -> bool:
+        return all(present() for present in self._present)
+
+    def other_dds(self) -> str:
+        return ""
+
+    def server_version(self) -> str | None:
+        """Compare the type hash of the server's goal reader with those of the versions we know."""
+        announced = self._goals.peer_type_hash()
+        if not announced:
+            return None
+        if announced == ros.type_hash(self._goals.hashed_type, self._version):
+            return self._version
+        if version := ros.version_of(self._goals.hashed_type, announced):
+            return version
+        raise TransportError(
+            f"the server's {self._type} has type hash {announced}: its llama_msgs is none of {', '.join(ros.VERSIONS)}"
+        )
+
+    def pack(self, goal: Any) -> bytearray:
+        """Serialise the whole request; header and goal id are filled in by `send`."""
+        request = ros.typestore(self._version).types[self._goals.request_type]
+        return self._goals.pack(request(goal_id=ros.uuid(bytes(16)), goal=goal))
+
+    def send(self, packed: bytearray, goal_id: bytes | None = None) -> bytes:
+        goal_id = goal_id or os.urandom(16)
+        packed[self._body_at : self._body_at + 16] = goal_id
+        self._active.add(goal_id)
+        self._goals.call(packed, goal_id)
+        return goal_id
+
+    def cancel(self, goal_id: bytes, stamp_ns: int = 0) -> None:
+        request = ros.default(self._cancels.request_type, self._version, goal_info=_goal_info(goal_id, stamp_ns))
+        self._cancels.call(self._cancels.pack(request), goal_id)
+
+    def get_result(self, goal_id: bytes) -> None:
+        request = ros.default(self._results.request_type, self._version, goal_id=ros.uuid(goal_id))
+        self._results.call(self._results.pack(request), goal_id)
+
+    def next_event(self, timeout_s: float) -> ActionEvent | None:
+        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        while not self._waiter.interrupted:
+            if not self._events:
+                self._collect()
+            if self._events:
+                return self._events.popleft()
+            if not self._waiter.wait_until(deadline_ns):
+                return None
+        return None
+
+    def _collect(self) -> None:
+        """Turn all that has arrived into events.
+
+        The server sends acceptance, feedback, result, through different writers. What was sent last is taken first:
+        whatever preceded it has then arrived too, and goes before it into the queue.
+        """
+        self._ended.extend(self._replies(self._results))
+        cancels = list(self._replies(self._cancels))
+        feedback = [(bytes(packed[FEEDBACK_ID]), packed) for packed in self._feedback()]
+        for goal_id, packed in self._replies(self._goals):
+            if packed[self._body_at]:
+                self.get_result(goal_id)
+                self._events.append(Accepted(goal_id))
+            else:
+                self._active.discard(goal_id)
+                self._events.append(Rejected(goal_id))
+        self._events.extend(Feedback(goal_id, packed) for goal_id, packed in feedback if goal_id in self._active)
+        self._events.extend(self._cancel_response(goal_id, packed) for goal_id, packed in cancels)
+        while self._ended and len(feedback) < AT_ONCE:  # else there may be more that preceded a result
+            goal_id, packed = self._ended.popleft()
+            self._active.discard(goal_id)
+            self._events.append(Result(goal_id, packed[self._body_at], packed))
+
+    def _replies(self, service: Asker) -> Iterator[tuple[bytes, memoryview]]:
+        for goal_id, packed in service.replies():
+            if packed is not None and len(packed) > self._body_at:
+                yield goal_id, packed
+
+    def _cancel_response(self, goal_id: bytes, packed: memoryview) -> CancelResponse:
+        """Read an answer to `cancel`; one that cannot be read counts as a refusal."""
+        try:
+            response = self._cancels.unpack(packed)
+        except TransportError:
+            return CancelResponse(goal_id, CancelCode.REJECTED, ())
+        canceling = tuple(info.goal_id.uuid.tobytes() for info in response.goals_canceling)
+        return CancelResponse(goal_id, response.return_code, canceling)
+
+    def unpack_feedback(self, packed: memoryview) -> Any:
+        return ros.deserialise(packed, self._type + "_FeedbackMessage", self._version).feedback
+
+    def unpack_result(self, packed: memoryview) -> Any:
+        return self._results.unpack(packed).result
+
+
+class ServedGoal(Generic[Caller]):
+    """One goal; its server does the work under a lock."""
+
+    def __init__(self, server: ServedAction[Caller], goal_id: bytes, packed: memoryview, caller: Caller) -> None:
+        self._server, self._packed, self._caller = server, packed, caller
+        self.id, self.size_bytes = goal_id, len(packed)
+        self.accept = partial(server.decide, goal_id, caller, accepted=True)
+        self.reject = partial(server.decide, goal_id, caller, accepted=False)
+        self.executing = partial(server.execute, goal_id)
+        self.feedback = partial(server.publish_feedback, goal_id)
+        self.succeed = partial(server.end, goal_id, Status.SUCCEEDED)
+        self.abort = partial(server.end, goal_id, Status.ABORTED)
+        self.canceled = partial(server.end, goal_id, Status.CANCELED)
+
+    @property
+    def cancel_requested(self) -> bool:
+        return self._server.status(self.id) == Status.CANCELING
+
+    def other_version(self) -> str:
+        """Compare the type hash that its client announces, where the middleware can tell which client it is."""
+        service = self._server.send_goal
+        announced = self._server.announced(self._caller)
+        if announced in {"", ros.type_hash(service.request_type, self._server.version)}:
+            return ""
+        return ros.version_of(service.request_type, announced) or f"of type hash {announced}"
+
+    def unpack(self) -> Any:
+        return self._server.send_goal.unpack(self._packed).goal
+
+
+class ServedAction(Generic[Caller]):
+    """Goals are taken on the consuming thread; a service thread answers cancels and results, and expires them."""
+
+    def __init__(
+        self,
+        name: str,
+        type_name: str,
+        result_timeout_s: float,
+        version: str,
+        services: tuple[Service[Caller], Service[Caller], Service[Caller]],
+        senders: tuple[Callable[[bytearray], None], Callable[[bytearray], None]],
+        waiters: tuple[Waits, Waits],
+    ) -> None:
+        """Serve the action ``/name`` with the services of goals, results and cancels, and start the service thread.
+
+        ``senders`` publish CDR as feedback and status; ``waiters`` wake for goals, and for the other two services.
+        """
+        self._name, self.version = name, version
+        self.send_goal, self._get_result, self._cancel = services
+        self._send_feedback, self._send_status = senders
+        self._goal_waiter, self._service_waiter = waiters
+        self._feedback_type = type_name + "_FeedbackMessage"
+        self._goals = Goals(int(result_timeout_s * 1e9))
+        self._waiting: dict[bytes, list[Caller]] = {}
+        """Goal -> whom to answer when it ends."""
+        self._unknown = self._pack_result(Status.UNKNOWN, ros.default(type_name + "_Result", version))
+        self._lock = RLock()
+        self.interrupt = self._goal_waiter.interrupt
+        self._thread = Thread(target=self._serve, name=f"action {name}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self.interrupt()
+        self._service_waiter.interrupt()
+        self._thread.join()
+
+    def next_goal(self, timeout_s: float) -> ServedGoal[Caller] | None:
+        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        id_ends = self.send_goal.body_at + 16
+        while not self._goal_waiter.interrupted:
+            taken = next(self.send_goal.arrived(), None)
+            if taken is None:
+                if not self._goal_waiter.wait_until(deadline_ns):
+                    return None
+                continue
+            packed, caller = taken
+            if not self._understood(caller):
+                continue
+            if len(packed) < id_ends:
+                self.send_goal.drop(caller)
+                _log.warning("%s: dropped a goal request of %d bytes, too short for an id", self._name, len(packed))
+            elif (goal := self._offered(bytes(packed[id_ends - 16 : id_ends]), packed, caller)) is not None:
+                return goal
+        return None
+
+    def _serve(self) -> None:
+        while not self._service_waiter.interrupted:
+            self._answer(self._cancel, self._answer_cancel)
+            self._answer(self._get_result, self._answer_result)
+            with self._lock:
+                self._goals.expire(now_ns())
+            self._look_around()
+            self._service_waiter.wait_until(now_ns() + HOUSEKEEPING_NS)
+
+    def _understood(self, caller: Caller) -> bool:  # noqa: ARG002 - for middlewares that know
+        """Return whether a client's requests can be read."""
+        return True
+
+    def _look_around(self) -> None:
+        """Do what a middleware's class does twice a second."""
+
+    def announced(self, caller: Caller) -> str:  # noqa: ARG002 - for middlewares that know
+        """Return the type hash of goals that a client announces; "" where that is not known."""
+        return ""
+
+    def status(self, goal_id: bytes) -> Status:
+        with self._lock:
+            return self._goals.status(goal_id)
+
+    def _offered(self, goal_id: bytes, packed: memoryview, caller: Caller) -> ServedGoal[Caller] | None:
+        """Return a goal that waits for a decision; None for one whose id is taken, which is rejected."""
+        with self._lock:
+            new = self._goals.offer(goal_id)
+        if new:
+            return ServedGoal(self, goal_id, packed, caller)
+        _log.warning("%s: rejected a goal whose id %s is taken", self._name, goal_id.hex())
+        self._reply(goal_id, caller, accepted=False, stamp_ns=0)
+        return None
+
+    def decide(self, goal_id: bytes, caller: Caller, *, accepted: bool) -> None:
+        """Accept or reject a goal: store it, tell the client, publish the status."""
+        stamp_ns = time.time_ns()  # ROS time, as rclpy stamps
+        with self._lock:
+            if accepted:
+                self._goals.accept(goal_id, stamp_ns)
+            else:
+                self._goals.reject(goal_id)
+        self._reply(goal_id, caller, accepted=accepted, stamp_ns=stamp_ns)
+        if accepted:
+            with self._lock:
+                self._publish_status()
+
+    def _reply(self, goal_id: bytes, caller: Caller, *, accepted: bool, stamp_ns: int) -> None:
+        if not self.send_goal.reaches(caller):
+            _log.warning("%s: the client of goal %s has left", self._name, goal_id.hex())
+            return
+        response = ros.default(self.send_goal.reply_type, self.version, accepted=accepted, stamp=ros.stamp(stamp_ns))
+        self.send_goal.respond(self.send_goal.pack(response), caller)
+
+    def execute(self, goal_id: bytes) -> bool:
+        with self._lock:
+            if self._goals.status(goal_id) == Status.CANCELING:
+                return False
+            self._goals.move(goal_id, Status.EXECUTING)
+            self._publish_status()
+            return True
+
+    def publish_feedback(self, goal_id: bytes, feedback: Any) -> None:
+        message = ros.default(self._feedback_type, self.version, goal_id=ros.uuid(goal_id), feedback=feedback)
+        self._send_feedback(ros.serialise(message, self._feedback_type, self.version))
+
+    def end(self, goal_id: bytes, status: Status, result: Any) -> None:
+        """End a goal: publish the status, then answer who waits for the result."""
+        packed = self._pack_result(status, result)
+        with self._lock:
+            self._goals.end(goal_id, status, packed, now_ns())
+            self._publish_status()
+            for caller in self._waiting.pop(goal_id, []):
+                self._get_result.respond(packed, caller)
+
+    def _pack_result(self, status: Status, result: Any) -> bytearray:
+        """Serialise a result reply once for all who ask."""
+        response = ros.typestore(self.version).types[self._get_result.reply_type]
+        return self._get_result.pack(response(status=int(status), result=result))
+
+    def _publish_status(self) -> None:
+        self._send_status(status_array(self._goals.listed()))
+
+    def _answer(self, service: Service[Caller], answer: Callable[[Any, Caller], None]) -> None:
+        """Answer the requests that have arrived; what cannot be read is dropped."""
+        for packed, caller in service.arrived():
+            try:
+                request = service.unpack(packed)
+                if service.reaches(caller):
+                    with self._lock:
+                        answer(request, caller)
+            except Exception as error:  # noqa: BLE001 - one thread answers all: the next request may fare better
+                _log.warning("%s: dropped a request: %s", self._name, error or type(error).__name__)
+
+    def _answer_result(self, request: Any, caller: Caller) -> None:
+        """Send a result, or remember who wants it; a goal nobody knows has status 0 and an empty result."""
+        goal_id = request.goal_id.uuid.tobytes()
+        goal = self._goals.find(goal_id)
+        if goal is None or goal.result is not None:
+            self._get_result.respond(self._unknown if goal is None else goal.result, caller)
+        elif len(waiting := self._waiting.setdefault(goal_id, [])) < WAITING_AT_MOST:
+            waiting.append(caller)
+
+    def _answer_cancel(self, request: Any, caller: Caller) -> None:
+        info = request.goal_info
+        code, chosen = self._goals.cancel(info.goal_id.uuid.tobytes(), ros.stamp_of(info))
+        canceling = [_goal_info(goal.id, goal.stamp_ns) for goal in chosen]
+        reply_type = self._cancel.reply_type
+        response = ros.default(reply_type, self.version, return_code=int(code), goals_canceling=canceling)
+        self._cancel.respond(self._cancel.pack(response), caller)
+        if chosen:
+            self._publish_status()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import atexit
+import logging
 import os
 from collections.abc import Callable
 from importlib.metadata import version as package_version
 from threading import Lock
 from typing import Any
+from weakref import WeakKeyDictionary
 
+import numpy as np
 from cyclonedds.core import DDSException
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.qos import Policy, Qos
@@ -16,28 +19,78 @@ from cyclonedds.qos import Policy, Qos
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.action import CANCEL_GOAL, FEEDBACK_QOS, STATUS_ARRAY, STATUS_QOS, AskingAction, ServedAction
 from s2a_bench.ros.config import configuration
-from s2a_bench.ros.cyclone_client import CycloneActionClient
-from s2a_bench.ros.cyclone_server import CycloneActionServer
-from s2a_bench.ros.cyclone_service import CycloneServiceClient, CycloneServices
 from s2a_bench.ros.dds import RawReader, RawWriter, Waiter, dds_qos
-from s2a_bench.ros.graph import NodeAnnouncement
+from s2a_bench.ros.dds_service import Caller, ServiceClient, ServiceServer
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise, type_hash
+from s2a_bench.ros.remap import check_node_name
+from s2a_bench.ros.service import READER_QOS, Calling, Services
+
+PARTICIPANT_ENTITIES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
+NODE_ENTITIES = "rmw_dds_common/msg/NodeEntitiesInfo"
+GID = "rmw_dds_common/msg/Gid"
+
+_log = logging.getLogger(__name__)
 
 
-def _topic_qos(qos: QoS, type_name: str) -> Qos:
-    return dds_qos(qos, f"typehash={type_hash(type_name)};")
+def _gid(guid: bytes) -> Any:
+    """Make a Gid of a DDS GUID; Humble's has 8 bytes more."""
+    gid = ros.default(GID)
+    gid.data[: len(guid)] = np.frombuffer(guid, np.uint8)
+    return gid
+
+
+class NodeAnnouncement:
+    """One node of one participant and all its endpoints; callable from any thread."""
+
+    def __init__(self, participant: DomainParticipant, node_name: str) -> None:
+        """Announce ``node_name`` (``/namespace/name``) without endpoints; raises UsageError for what is no name."""
+        check_node_name(node_name)
+        namespace, _, self._name = node_name.rpartition("/")
+        self._namespace = namespace or "/"
+        self._participant = _gid(participant.get_guid().bytes)
+        self._gids: WeakKeyDictionary[RawReader | RawWriter, Any] = WeakKeyDictionary()
+        self._lock = Lock()
+        qos = _topic_qos(QoS(depth=1, latched=True), PARTICIPANT_ENTITIES)
+        self._writer = RawWriter(participant, "ros_discovery_info", PARTICIPANT_ENTITIES, qos)
+        self.add()
+
+    def add(self, *endpoints: RawReader | RawWriter) -> None:
+        """Add endpoints and publish the whole again, less those that are no longer used."""
+        with self._lock:
+            self._gids.update((endpoint, _gid(endpoint.entity.get_guid().bytes)) for endpoint in endpoints)
+            node = ros.message(
+                NODE_ENTITIES,
+                node_namespace=self._namespace,
+                node_name=self._name,
+                reader_gid_seq=[gid for endpoint, gid in self._gids.items() if isinstance(endpoint, RawReader)],
+                writer_gid_seq=[gid for endpoint, gid in self._gids.items() if isinstance(endpoint, RawWriter)],
+            )
+            info = ros.message(PARTICIPANT_ENTITIES, gid=self._participant, node_entities_info_seq=[node])
+            self._writer.send(ros.serialise(info, PARTICIPANT_ENTITIES))
+
+
+def _topic_qos(qos: QoS, type_name: str, version: str = DEFAULT_VERSION) -> Qos:
+    return dds_qos(qos, f"typehash={type_hash(type_name, version)};")
+
+
+def _reader(
+    participant: DomainParticipant, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION
+) -> RawReader:
+    return RawReader(participant, "rt" + topic, type_name, _topic_qos(qos, type_name, version))
 
 
 class _CyclonePublisher(RawWriter):
     """Sends messages to a ROS topic."""
 
-    def __init__(self, participant: DomainParticipant, topic: str, type_name: str, qos: QoS) -> None:
-        super().__init__(participant, "rt" + topic, type_name, _topic_qos(qos, type_name))
-        self._type_name = type_name
+    def __init__(
+        self, participant: DomainParticipant, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION
+    ) -> None:
+        super().__init__(participant, "rt" + topic, type_name, _topic_qos(qos, type_name, version))
 
     def pack(self, message: Any) -> bytearray:
-        """Serialise to CDR."""
         return serialise(message, self._type_name)
 
 
@@ -45,14 +98,13 @@ class _CycloneSubscription:
     """Receives messages from a ROS topic, on the consuming thread."""
 
     def __init__(self, participant: DomainParticipant, topic: str, type_name: str, qos: QoS) -> None:
-        self._type_name = type_name
-        self.reader = RawReader(participant, "rt" + topic, type_name, _topic_qos(qos, type_name))
+        self.topic, self._type_name = topic, type_name
+        self.reader = _reader(participant, topic, type_name, qos)
         self._waiter = Waiter(participant, [self.reader])
         self.interrupt = self._waiter.interrupt
-        self.matched = self.reader.matched
+        self.matched, self.publishers = self.reader.matched, self.reader.publishers
 
     def take(self, timeout_s: float) -> memoryview | None:
-        """Return the next sample's CDR, lent by Cyclone."""
         deadline_ns = now_ns() + int(timeout_s * 1e9)
         while not self._waiter.interrupted:
             packed = self.reader.take()
@@ -61,8 +113,68 @@ class _CycloneSubscription:
         return None
 
     def unpack(self, packed: memoryview) -> Any:
-        """Deserialise; arrays are views of the lent sample."""
         return deserialise(packed, self._type_name)
+
+
+class CycloneActionClient(AskingAction):
+    """Waits for all readers at once."""
+
+    _goals: ServiceClient
+
+    def __init__(self, participant: DomainParticipant, name: str, type_name: str, version: str) -> None:
+        prefix = name + "/_action/"
+        feedback = _reader(participant, prefix + "feedback", type_name + "_FeedbackMessage", READER_QOS, version)
+        status = _reader(participant, prefix + "status", STATUS_ARRAY, STATUS_QOS)
+        """Not read: a goal's status comes with its result. ROS tools expect a client to subscribe."""
+        # Readers are announced in order: a server that knows the reply readers below knows the feedback reader too.
+        goals = ServiceClient(participant, prefix + "send_goal", type_name + "_SendGoal", version)
+        results = ServiceClient(participant, prefix + "get_result", type_name + "_GetResult", version)
+        cancels = ServiceClient(participant, prefix + "cancel_goal", CANCEL_GOAL, version)
+        waiter = Waiter(participant, [goals.reader, results.reader, cancels.reader, feedback])
+        topics = feedback.matched, status.matched
+        super().__init__(type_name, version, (goals, results, cancels), feedback.arrived, topics, waiter)
+        self.ends = (*goals.ends, *results.ends, *cancels.ends, feedback, status)
+
+    def other_dds(self) -> str:
+        return self._goals.other_dds()
+
+
+class CycloneActionServer(ServedAction[Caller]):
+    """Looks at what a client announces."""
+
+    send_goal: ServiceServer
+
+    def __init__(
+        self, participant: DomainParticipant, name: str, type_name: str, result_timeout_s: float, version: str
+    ) -> None:
+        prefix = name + "/_action/"
+        goals = ServiceServer(participant, prefix + "send_goal", type_name + "_SendGoal", version)
+        results = ServiceServer(participant, prefix + "get_result", type_name + "_GetResult", version)
+        cancels = ServiceServer(participant, prefix + "cancel_goal", CANCEL_GOAL, version)
+        feedback_type = type_name + "_FeedbackMessage"
+        feedback = _CyclonePublisher(participant, prefix + "feedback", feedback_type, FEEDBACK_QOS, version)
+        status = _CyclonePublisher(participant, prefix + "status", STATUS_ARRAY, STATUS_QOS)
+        self._told: set[str] = set()
+        self.ends = (*goals.ends, *results.ends, *cancels.ends, feedback, status)
+        waiters = Waiter(participant, [goals.reader]), Waiter(participant, [results.reader, cancels.reader])
+        services, senders = (goals, results, cancels), (feedback.send, status.send)
+        super().__init__(name, type_name, result_timeout_s, version, services, senders, waiters)
+
+    def announced(self, caller: Caller) -> str:
+        return self.send_goal.client(caller)[1]
+
+    def _understood(self, caller: Caller) -> bool:
+        """Log once that a client is there whose requests cannot be read, and which will hear nothing."""
+        other, _ = self.send_goal.client(caller)
+        if other and other not in self._told:
+            self._told.add(other)
+            _log.warning(
+                "%s: a client on %s waits in vain, as its services have another form on the wire: start it with "
+                "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or serve in a sourced ROS 2 of its RMW (--middleware rclpy)",
+                self._name,
+                other,
+            )
+        return not other
 
 
 _domains: dict[int, tuple[Domain, str]] = {}
@@ -99,50 +211,48 @@ class CycloneMiddleware:
                 "or check CYCLONEDDS_URI"
             ) from error
         self._servers: list[CycloneActionServer] = []
-        self._services: CycloneServices | None = None
+        self._requests = Waiter(self._participant, [])
+        self._services: Services[Caller] | None = None
         atexit.register(self.close)
         self._node = NodeAnnouncement(self._participant, node_name)
 
     def publisher(self, topic: str, type_name: str, qos: QoS) -> _CyclonePublisher:
-        """Create a writer on ``rt<topic>``."""
         publisher = _CyclonePublisher(self._joined(), topic, type_name, qos)
         self._node.add(publisher)
         return publisher
 
     def subscription(self, topic: str, type_name: str, qos: QoS) -> _CycloneSubscription:
-        """Create a reader on ``rt<topic>``."""
         subscription = _CycloneSubscription(self._joined(), topic, type_name, qos)
         self._node.add(subscription.reader)
         return subscription
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Create a service; the first starts the thread that answers all."""
-        self._services = self._services or CycloneServices(self._joined())
-        self._node.add(*self._services.offer(name, type_name, answer, qos).ends())
+        server = ServiceServer(self._joined(), name, type_name, DEFAULT_VERSION, qos)
+        self._services = self._services or Services(self._requests)
+        self._services.offer(name, server, answer)
+        self._requests.watch(server.reader)
+        self._node.add(*server.ends)
 
-    def service_client(self, name: str, type_name: str) -> CycloneServiceClient:
-        """Create a client's two endpoints."""
-        client = CycloneServiceClient(self._joined(), name, type_name)
-        self._node.add(*client.ends())
-        return client
+    def service_client(self, name: str, type_name: str) -> Calling:
+        client = ServiceClient(self._joined(), name, type_name, DEFAULT_VERSION)
+        self._node.add(*client.ends)
+        return Calling(name, client, Waiter(self._joined(), [client.reader]))
 
     def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> CycloneActionClient:
-        """Create a client's eight endpoints."""
         client = CycloneActionClient(self._joined(), name, type_name, version)
-        self._node.add(*client.endpoints())
+        self._node.add(*client.ends)
         return client
 
     def action_server(
         self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = ""
     ) -> CycloneActionServer:
-        """Create a server's eight endpoints and its service thread."""
         server = CycloneActionServer(self._joined(), name, type_name, result_timeout_s, version or DEFAULT_VERSION)
         self._servers.append(server)
-        self._node.add(*server.endpoints())
+        self._node.add(*server.ends)
         return server
 
     def describe(self) -> dict[str, str | int]:
-        """Return which Cyclone, which domain, and the whole configuration."""
         return {
             "middleware": "cyclonedds",
             "version": package_version("cyclonedds"),

@@ -13,10 +13,11 @@ import types
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import islice
 from typing import Any
 
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import (
     DDSException,
     GuardCondition,
@@ -37,22 +38,17 @@ from cyclonedds.topic import Topic
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS
-from s2a_bench.ros.action_client import AT_ONCE
 from s2a_bench.ros.messages import dds_type_name
-from s2a_bench.ros.waiting import WAIT_SLICE_NS
+from s2a_bench.ros.service import AT_ONCE, WAIT_SLICE_NS
 
 FOREVER_NS = 2**63 - 1
+WRITERS_AT_MOST = 4096
+"""So many writers of a domain are looked through."""
 ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
 
 
-class _Outgoing(ct.Structure):
-    """What the raw sertype takes as a sample: a buffer of CDR and its length."""
-
-    _fields_ = (("buffer", ct.c_void_p), ("size", ct.c_size_t))
-
-
-class _Slice(ct.Structure):
-    """Cyclone's ``ddsrt_iovec_t``."""
+class _Buffer(ct.Structure):
+    """Bytes and their number: a sample of the raw sertype, and Cyclone's ``ddsrt_iovec_t``."""
 
     _fields_ = (("base", ct.c_void_p), ("size", ct.c_size_t))
 
@@ -61,18 +57,16 @@ class _Slice(ct.Structure):
 def _library() -> ct.CDLL:
     """Load libddsc under a handle of our own: argtypes are shared per handle, and cyclonedds sets its own."""
     library = ct.CDLL(DDS._dll_handle._name)  # noqa: SLF001 - the one place that knows which libddsc is loaded
-    library.dds_write.argtypes = [ct.c_int32, ct.c_void_p]
-    library.dds_write.restype = ct.c_int32
-    library.dds_takecdr.argtypes = [ct.c_int32, ct.c_void_p, ct.c_uint32, ct.c_void_p, ct.c_uint32]
-    library.dds_takecdr.restype = ct.c_int32
-    library.ddsi_serdata_size.argtypes = [ct.c_void_p]
-    library.ddsi_serdata_size.restype = ct.c_uint32
-    library.ddsi_serdata_to_ser_ref.argtypes = [ct.c_void_p, ct.c_size_t, ct.c_size_t, ct.c_void_p]
-    library.ddsi_serdata_to_ser_ref.restype = ct.c_void_p
-    library.ddsi_serdata_to_ser_unref.argtypes = [ct.c_void_p, ct.c_void_p]
-    library.ddsi_serdata_to_ser_unref.restype = None
-    library.ddsi_serdata_unref.argtypes = [ct.c_void_p]
-    library.ddsi_serdata_unref.restype = None
+    for name, result, *arguments in (
+        ("dds_write", ct.c_int32, ct.c_int32, ct.c_void_p),
+        ("dds_takecdr", ct.c_int32, ct.c_int32, ct.c_void_p, ct.c_uint32, ct.c_void_p, ct.c_uint32),
+        ("ddsi_serdata_size", ct.c_uint32, ct.c_void_p),
+        ("ddsi_serdata_to_ser_ref", ct.c_void_p, ct.c_void_p, ct.c_size_t, ct.c_size_t, ct.c_void_p),
+        ("ddsi_serdata_to_ser_unref", None, ct.c_void_p, ct.c_void_p),
+        ("ddsi_serdata_unref", None, ct.c_void_p),
+    ):
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
     return library
 
 
@@ -83,12 +77,11 @@ class _Loan:
 
     def __init__(self, serdata: int) -> None:
         self._serdata = serdata
-        self._slice = _Slice()
+        self._slice = _Buffer()
         size = _library().ddsi_serdata_size(serdata)
         self._referenced = _library().ddsi_serdata_to_ser_ref(serdata, 0, size, ct.byref(self._slice))
 
     def view(self) -> memoryview:
-        """Return the sample's CDR, header included, read-only."""
         array = (ct.c_ubyte * self._slice.size).from_address(self._slice.base)
         array.loan = self  # ties the loan's life to the view's
         return memoryview(array).cast("B").toreadonly()
@@ -140,13 +133,6 @@ def user_data(endpoint: Any) -> dict[str, str]:
     return dict(item.split("=", 1) for item in text.split(";") if "=" in item)
 
 
-def _matched(ask: Callable[[], list[int]]) -> list[int]:
-    """Return handles of matched endpoints; cyclonedds asks how many first, and fails where one more has come since."""
-    while True:
-        with suppress(IndexError):
-            return ask()
-
-
 def _known(ask: Callable[[int], Any], handle: int) -> Any:
     """Return what is known of a peer, None if it has left, even while its quality of service was being read."""
     try:
@@ -157,45 +143,56 @@ def _known(ask: Callable[[int], Any], handle: int) -> Any:
         raise
 
 
-class RawWriter:
+class _Endpoint:
+    """What is known of the peers that a DataReader or DataWriter is matched with."""
+
+    def __init__(self, entity: Any, handles: Callable[[], list[int]], known: Callable[[int], Any]) -> None:
+        self.entity = entity
+        self._reference = entity._ref  # noqa: SLF001 - the handle ctypes needs
+        self._handles, self._known = handles, known
+
+    def peers(self) -> list[int]:
+        """Return the handles of matched peers; cyclonedds counts first, and fails where one more has come since."""
+        while True:
+            with suppress(IndexError):
+                return self._handles()
+
+    def matched(self) -> int:
+        return len(self.peers())
+
+    def endpoint(self, handle: int) -> Any:
+        """Return what is known of one matched peer, a DcpsEndpoint; None if it has left."""
+        return _known(self._known, handle)
+
+    def endpoints(self) -> Iterator[Any]:
+        return (endpoint for endpoint in map(self.endpoint, self.peers()) if endpoint is not None)
+
+
+class RawWriter(_Endpoint):
     """A DataWriter that sends ready CDR; callable from any thread."""
 
     def __init__(self, participant: DomainParticipant, topic: str, type_name: str, qos: Qos) -> None:
         """Create the writer on a DDS topic name, prefix included."""
         self._type_name = type_name
-        self.entity = DataWriter(participant, Topic(participant, topic, _raw_type(type_name)), qos=qos)
-        self._reference = self.entity._ref  # noqa: SLF001 - the handle ctypes needs
+        entity = DataWriter(participant, Topic(participant, topic, _raw_type(type_name)), qos=qos)
+        super().__init__(entity, entity.get_matched_subscriptions, entity.get_matched_subscription_data)
         self._write = _library().dds_write
 
     def send(self, packed: bytearray) -> None:
         """Write without holding the GIL; Cyclone copies the buffer."""
-        outgoing = _Outgoing(ct.addressof(ct.c_char.from_buffer(packed)), len(packed))
+        outgoing = _Buffer(ct.addressof(ct.c_char.from_buffer(packed)), len(packed))
         if code := self._write(self._reference, ct.byref(outgoing)):
             raise TransportError(f"DDS write of {self._type_name} failed: {DDSException(code)}")
 
-    def matched(self) -> int:
-        """Count matched readers."""
-        return len(_matched(self.entity.get_matched_subscriptions))
 
-    def endpoints(self) -> Iterator[Any]:
-        """Yield what is known of each matched reader, a DcpsEndpoint."""
-        for handle in _matched(self.entity.get_matched_subscriptions):
-            if (endpoint := _known(self.entity.get_matched_subscription_data, handle)) is not None:
-                yield endpoint
-
-    def peers(self) -> Iterator[dict[str, str]]:
-        """Yield what each matched reader announces in USER_DATA."""
-        return map(user_data, self.endpoints())
-
-
-class RawReader:
+class RawReader(_Endpoint):
     """A DataReader that lends the received CDR; one thread at a time takes."""
 
     def __init__(self, participant: DomainParticipant, topic: str, type_name: str, qos: Qos) -> None:
         """Create the reader on a DDS topic name, prefix included."""
-        self._type_name = type_name
-        self.entity = DataReader(participant, Topic(participant, topic, _raw_type(type_name)), qos=qos)
-        self._reference = self.entity._ref  # noqa: SLF001 - the handle ctypes needs
+        self._type_name, self._topic, self._participant = type_name, topic, participant
+        entity = DataReader(participant, Topic(participant, topic, _raw_type(type_name)), qos=qos)
+        super().__init__(entity, entity.get_matched_publications, entity.get_matched_publication_data)
         self._serdata = ct.c_void_p()
         self._info = dds_c_t.sample_info()
         self._take = _library().dds_takecdr
@@ -220,30 +217,18 @@ class RawReader:
         """Return the handle of the writer whose sample was taken last."""
         return int(self._info.publication_handle)
 
-    def matched(self) -> int:
-        """Count matched writers."""
-        return len(self.senders())
+    def publishers(self) -> int:
+        """Count the topic's writers: where the QoS of one did not fit, by looking through those of the domain."""
+        if not self.entity.get_requested_incompatible_qos_status().total_count:
+            return self.matched()
+        return sum(writer.topic_name == self._topic for writer in self._writers())
 
-    def senders(self) -> list[int]:
-        """Return the handles of matched writers."""
-        return _matched(self.entity.get_matched_publications)
-
-    def endpoint(self, handle: int) -> Any:
-        """Return what is known of one matched writer, a DcpsEndpoint; None if it has left."""
-        return _known(self.entity.get_matched_publication_data, handle)
-
-    def endpoints(self) -> Iterator[Any]:
-        """Yield what is known of each matched writer."""
-        return (endpoint for endpoint in map(self.endpoint, self.senders()) if endpoint is not None)
-
-    def peers(self) -> Iterator[dict[str, str]]:
-        """Yield what each matched writer announces in USER_DATA."""
-        return map(user_data, self.endpoints())
-
-    def peer(self, handle: int) -> dict[str, str] | None:
-        """Return what one matched writer announces in USER_DATA; None if it has left."""
-        endpoint = self.endpoint(handle)
-        return None if endpoint is None else user_data(endpoint)
+    @cached_property
+    def _writers(self) -> Callable[[], list[Any]]:
+        """Returns the writers of the domain; the reader is kept, as Cyclone gives back no memory of one."""
+        reader = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        alive = ReadCondition(reader, ViewState.Any | SampleState.Any | InstanceState.Alive)
+        return lambda: reader.read(WRITERS_AT_MOST, alive)
 
 
 class Waiter:
@@ -266,7 +251,6 @@ class Waiter:
         self._waitset.attach(condition)
 
     def wait_until(self, deadline_ns: int) -> bool:
-        """Return after data, a time slice or an interrupt; False once the deadline or an interrupt has come."""
         left_ns = deadline_ns - now_ns()
         if left_ns <= 0 or self.interrupted:
             return False
@@ -274,6 +258,5 @@ class Waiter:
         return not self.interrupted
 
     def interrupt(self) -> None:
-        """End a wait under way and every later one; callable from any thread."""
         self.interrupted = True
         self._guard.set(True)

@@ -12,26 +12,23 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
 from threading import Lock
+from types import SimpleNamespace
 from typing import Any
 
 from cyclonedds.domain import DomainParticipant
 
 from s2a_bench.clock import now_ns
-from s2a_bench.ros import QoS
+from s2a_bench.ros import SERVICE_QOS, QoS
 from s2a_bench.ros.dds import RawReader, RawWriter, dds_qos, other_dds, user_data
 from s2a_bench.ros.messages import deserialise, serialise, type_hash
+from s2a_bench.ros.service import READER_QOS
 
 HEADER = struct.Struct("<Qq")
 """guid of the client and number of its request, after the 4 bytes of CDR header."""
 HEADER_AT = 4
-BODY_AT = 20
 
-REQUEST_QOS = QoS(depth=10)
-"""What ROS's services have; a request may hold pictures."""
 REPLY_QOS = QoS(depth=1000)
 """Deeper than ROS's 10: all clients' replies share one writer, and one that was lost on the way can be sent again."""
-READER_QOS = QoS(depth=0)
-"""Our readers keep all, whatever ROS does: history is local, and a burst overruns ROS's default of 10."""
 
 REPLY_READER_TIMEOUT_NS = 100_000_000
 REPLY_READER_POLL_S = 0.01
@@ -47,15 +44,6 @@ def endpoint_id(prefix: bytes, number: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Peer:
-    """What a client's writer announces; "" is not known."""
-
-    other_dds: str = ""
-    """Of which DDS it is, where its services have another form than ours."""
-    type_hash: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class Caller:
     """Who asked: the writer of a request, and the request's header, under which its reply goes."""
 
@@ -66,6 +54,8 @@ class Caller:
 class _End:
     """What client and server have in common."""
 
+    body_at = HEADER_AT + HEADER.size
+
     def __init__(
         self,
         participant: DomainParticipant,
@@ -75,7 +65,7 @@ class _End:
         role: tuple[str, str],
         qos: QoS | None = None,
     ) -> None:
-        """Create both endpoints; ``qos`` is that of both, None that of an action's services."""
+        """Create both endpoints of the service ``/name``; without ``qos`` they have that of an action's."""
         own, self._peer_key = role
         self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
         self._version = version
@@ -86,33 +76,36 @@ class _End:
         def told(type_name: str) -> str:
             return f"{own}={identity};typehash={type_hash(type_name, version)};"
 
-        writer_qos = qos or (REQUEST_QOS if sent is request else REPLY_QOS)
+        writer_qos = qos or (SERVICE_QOS if sent is request else REPLY_QOS)
         self.writer = RawWriter(participant, *sent, dds_qos(writer_qos, told(sent[1])))
         self.reader = RawReader(participant, *received, dds_qos(qos or READER_QOS, told(received[1])))
+        self.ends = self.writer, self.reader
+        self._sent_wire, self._received_wire = sent[1] + "__wire", received[1] + "__wire"
 
     def matched(self) -> bool:
-        """Return whether both endpoints of one peer are matched."""
-        ids = [{peer[self._peer_key] for peer in end.peers() if self._peer_key in peer} for end in self.ends()]
-        return bool(ids[0] & ids[1])
-
-    def ends(self) -> tuple[RawWriter, RawReader]:
-        """Return both endpoints."""
-        return self.writer, self.reader
+        ids = [{announced.get(self._peer_key) for announced in map(user_data, end.endpoints())} for end in self.ends]
+        return bool((ids[0] & ids[1]) - {None})
 
     def other_dds(self) -> str:
         """Return the DDS of a peer whose services have another form than `rmw_cyclonedds_cpp`'s, "" without one."""
-        return next((name for end in self.ends() for endpoint in end.endpoints() if (name := other_dds(endpoint))), "")
+        return next((name for end in self.ends for endpoint in end.endpoints() if (name := other_dds(endpoint))), "")
 
     def peer_type_hash(self) -> str:
-        """Return the type hash a peer announces for what it reads; empty without one."""
-        return next((peer["typehash"] for peer in self.writer.peers() if "typehash" in peer), "")
+        hashes = (user_data(endpoint).get("typehash", "") for endpoint in self.writer.endpoints())
+        return next(filter(None, hashes), "")
+
+    def pack(self, body: Any) -> bytearray:
+        """Serialise a body behind a header that is filled in when it is sent."""
+        return serialise(SimpleNamespace(guid=0, seq=0, body=body), self._sent_wire, self._version)
+
+    def unpack(self, packed: memoryview) -> Any:
+        return deserialise(packed, self._received_wire, self._version).body
 
 
 class ServiceClient(_End):
     """Sends requests and finds the replies that are its own."""
 
     def __init__(self, participant: DomainParticipant, name: str, type_name: str, version: str) -> None:
-        """Create both endpoints of the service ``/name``."""
         super().__init__(participant, name, type_name, version, ("clientid", "serviceid"))
         self.hashed_type = self.request_type
         self._guid = self.writer.entity.get_instance_handle() % 2**64
@@ -120,31 +113,21 @@ class ServiceClient(_End):
         self._pending: dict[int, bytes] = {}
         self._lock = Lock()
 
-    def pack(self, body: Any) -> bytearray:
-        """Serialise a request; `call` fills its header in."""
-        wire = self.request_type + "__wire"
-        return serialise(_Wire(0, 0, body), wire, self._version)
-
-    def call(self, packed: bytearray, goal_id: bytes) -> None:
-        """Send a request that concerns ``goal_id``."""
+    def call(self, packed: bytearray, key: bytes) -> None:
         with self._lock:
             number = next(self._numbers)
-            self._pending[number] = goal_id
+            self._pending[number] = key
             HEADER.pack_into(packed, HEADER_AT, self._guid, number)
             self.writer.send(packed)
 
     def replies(self) -> Iterator[tuple[bytes, memoryview]]:
-        """Take what has arrived, a bounded number, and yield the replies to requests of ours: (goal id, CDR)."""
+        """Take what has arrived, a bounded number, and yield the replies to requests of ours: (key, CDR)."""
         for packed in self.reader.arrived():
-            if len(packed) <= BODY_AT:
+            if len(packed) <= self.body_at:
                 continue
             guid, number = HEADER.unpack_from(packed, HEADER_AT)
-            if guid == self._guid and (goal_id := self._pending.pop(number, None)) is not None:
-                yield goal_id, packed
-
-    def unpack(self, packed: memoryview) -> Any:
-        """Deserialise a reply's body; raises TransportError."""
-        return deserialise(packed, self.reply_type + "__wire", self._version).body
+            if guid == self._guid and (key := self._pending.pop(number, None)) is not None:
+                yield key, packed
 
 
 class ServiceServer(_End):
@@ -153,74 +136,52 @@ class ServiceServer(_End):
     def __init__(
         self, participant: DomainParticipant, name: str, type_name: str, version: str, qos: QoS | None = None
     ) -> None:
-        """Create both endpoints of the service ``/name``; ``qos`` as for `_End`."""
         super().__init__(participant, name, type_name, version, ("serviceid", "clientid"), qos)
         self._reachable: set[int] = set()
-        self._clients: dict[int, Peer] = {}
+        self._clients: dict[int, tuple[str, str]] = {}
 
-    def pack(self, body: Any) -> bytearray:
-        """Serialise a reply; `reply` fills its header in."""
-        return serialise(_Wire(0, 0, body), self.reply_type + "__wire", self._version)
-
-    def reply(self, packed: bytearray, header: tuple[int, int]) -> None:
-        """Send a reply under the header of its request."""
-        HEADER.pack_into(packed, HEADER_AT, *header)
-        self.writer.send(packed)
-
-    def caller(self, packed: memoryview) -> Caller:
-        """Return who sent the request that was taken last; of one that is too short for a header, nobody's."""
-        header = HEADER.unpack_from(packed, HEADER_AT) if len(packed) >= BODY_AT else (0, 0)
-        return Caller(self.reader.sender(), header)
+    def arrived(self) -> Iterator[tuple[memoryview, Caller]]:
+        """Take what has arrived, a bounded number; of what is too short for a header, the header is zero."""
+        for packed in self.reader.arrived():
+            header = HEADER.unpack_from(packed, HEADER_AT) if len(packed) >= self.body_at else (0, 0)
+            yield packed, Caller(self.reader.sender(), header)
 
     def respond(self, packed: bytearray, caller: Caller) -> None:
-        """Send a reply to who asked."""
-        self.reply(packed, caller.header)
+        HEADER.pack_into(packed, HEADER_AT, *caller.header)
+        self.writer.send(packed)
 
-    def reaches(self, caller: Caller) -> bool:
-        """Wait until replies reach who asked."""
-        return self.await_client(caller.sender)
+    def drop(self, caller: Caller) -> None:
+        """Nothing is kept of it."""
 
-    def unpack(self, packed: memoryview) -> Any:
-        """Deserialise a request's body; raises TransportError."""
-        return deserialise(packed, self.request_type + "__wire", self._version).body
-
-    def client(self, sender: int) -> Peer:
-        """Return what the writer ``sender`` announced, asked once: it stays as it is; nothing if it has left."""
-        found = self._clients.get(sender)
+    def client(self, caller: Caller) -> tuple[str, str]:
+        """Return a client's other DDS and the type hash it announces, asked once: they stay; "" is not known."""
+        found = self._clients.get(caller.sender)
         if found is None:
-            endpoint = self.reader.endpoint(sender)
+            endpoint = self.reader.endpoint(caller.sender)
             if endpoint is None:
-                return Peer()
+                return "", ""
             if len(self._clients) >= REMEMBERED_CLIENTS:
                 self._clients.clear()
-            found = self._clients[sender] = Peer(other_dds(endpoint), user_data(endpoint).get("typehash", ""))
+            found = other_dds(endpoint), user_data(endpoint).get("typehash", "")
+            self._clients[caller.sender] = found
         return found
 
-    def await_client(self, sender: int) -> bool:
-        """Wait, 100 ms at most, until replies reach the client whose request came from writer ``sender``.
+    def reaches(self, caller: Caller) -> bool:
+        """Wait, 100 ms at most, until replies reach the client.
 
         A reply is volatile: sent before the client's reader is matched, it is lost. False if the client has left.
         """
-        if sender in self._reachable:
+        if caller.sender in self._reachable:
             return True
         deadline_ns = now_ns() + REPLY_READER_TIMEOUT_NS
-        while (peer := self.reader.peer(sender)) is not None:
-            client = peer.get("clientid")
-            if client is None or any(reader.get("clientid") == client for reader in self.writer.peers()):
+        while (endpoint := self.reader.endpoint(caller.sender)) is not None:
+            client = user_data(endpoint).get("clientid")
+            if client is None or any(user_data(each).get("clientid") == client for each in self.writer.endpoints()):
                 if len(self._reachable) >= REMEMBERED_CLIENTS:
-                    self._reachable.intersection_update(self.reader.senders())
-                self._reachable.add(sender)
+                    self._reachable.intersection_update(self.reader.peers())
+                self._reachable.add(caller.sender)
                 return True
             if now_ns() > deadline_ns:
                 return True  # as rmw_cyclonedds: send, whoever may hear it
             time.sleep(REPLY_READER_POLL_S)
         return False
-
-
-class _Wire:
-    """A body behind its header, as the ``__wire`` types want it."""
-
-    __slots__ = ("body", "guid", "seq")
-
-    def __init__(self, guid: int, seq: int, body: Any) -> None:
-        self.guid, self.seq, self.body = guid, seq, body

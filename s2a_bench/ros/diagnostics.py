@@ -1,20 +1,28 @@
-"""``diagnostic_msgs/msg/DiagnosticArray``: how a node is, for ROS's aggregators and monitors."""
+"""What a node says of itself: how it is, on ``/diagnostics``, for aggregators and monitors; its log, on ``/rosout``."""
 
 from __future__ import annotations
 
+import logging
 import platform
+import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Final
 
-from s2a_bench.ros import QoS
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import Middleware, QoS
 from s2a_bench.ros import messages as ros
 
 ARRAY: Final = "diagnostic_msgs/msg/DiagnosticArray"
 TOPIC: Final = "/diagnostics"
 DIAGNOSTICS_QOS: Final = QoS(depth=1)
 """That of ROS's diagnostic_updater."""
+LOG: Final = "rcl_interfaces/msg/Log"
+ROSOUT_QOS: Final = QoS(depth=1000, latched=True, lifespan_s=10.0)
+"""ROS's ``rcl_qos_profile_rosout_default``."""
+LONGEST: Final = 4096
+"""Letters of a message; what follows is cut off, as texts of strangers may be in it."""
 
 
 class Level(IntEnum):
@@ -56,3 +64,39 @@ def diagnostic_array(node_name: str, findings: Iterable[Finding], stamp_ns: int)
             for finding in findings
         ],
     )
+
+
+class Rosout(logging.Handler):
+    """Publishes what is logged, under the node's name."""
+
+    def __init__(self, middleware: Middleware, node_name: str) -> None:
+        """Create the topic; a node ``/namespace/name`` logs as ``namespace.name``."""
+        super().__init__()
+        self._name = node_name.strip("/").replace("/", ".")
+        self._publisher = middleware.publisher("/rosout", LOG, ROSOUT_QOS)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Publish one record; a middleware that is closed says nothing any more."""
+        try:
+            self._publisher.send(self._publisher.pack(log_message(record, self._name)))
+        except TransportError:
+            self.handleError(record)
+
+
+def log_message(record: logging.LogRecord, name: str) -> Any:
+    """Turn a record into a message; ROS's levels are Python's, and its stamp is ROS time."""
+    return ros.default(
+        LOG,
+        stamp=ros.stamp(time.time_ns()),
+        level=min(max(record.levelno // 10 * 10, logging.DEBUG), logging.CRITICAL),
+        name=name,
+        msg=_text(record.getMessage()),
+        file=record.pathname,
+        function=record.funcName or "",
+        line=record.lineno,
+    )
+
+
+def _text(said: str) -> str:
+    """Return what CDR can hold of a text: no NUL, no half of a surrogate pair."""
+    return said[:LONGEST].replace("\0", "\ufffd").encode("utf-8", "replace").decode()

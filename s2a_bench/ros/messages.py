@@ -1,29 +1,53 @@
 """ROS 2 message classes, their CDR, and the frames of this project as ``sensor_msgs`` images.
 
-Types and CDR are rosbags'; this module registers ``s2a_msgs``, ``llama_msgs`` and what actions need, and keeps the
-traps of serialising in one place.
+Types and CDR are rosbags'; this module reads the interface files (.msg, .srv, .action) of ``s2a_msgs``, ``llama_msgs``
+and what actions need, adds the types ROS derives from them, and keeps the traps of serialising in one place.
+
+A service gives ``X_Request`` and ``X_Response``; an action gives goal, result and feedback, the two services around
+them and the feedback message. Beside each request and response stands ``...__wire``: the body behind the header
+``uint64 guid, int64 seq`` with which rmw_cyclonedds sends it. ``X`` and ``X_Event`` are never sent: the hash of a
+service, which rmw_zenoh has in its keys, is that of ``X``.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import sys
-from collections.abc import Iterable
-from functools import cache
+from collections.abc import Iterable, Iterator
+from functools import cache, partial
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.msg import MSGParser, make_typesdict
 
 from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.ros.definitions import Defaults, char_as_uint8, read_package
 from s2a_bench.types import Frame, Pixels
 
 if TYPE_CHECKING:
+    if sys.version_info >= (3, 11):
+        from importlib.resources.abc import Traversable
+    else:
+        from importlib.abc import Traversable
     from rosbags.typesys.store import Typestore
+
+Description: TypeAlias = "tuple[Nodetype, Any]"
+Fields: TypeAlias = "list[tuple[str, Description]]"
+Definition: TypeAlias = "tuple[list[Any], Fields]"
+"""Constants and fields of a type, what rosbags' type store registers."""
+Defaults: TypeAlias = "dict[str, dict[str, Any]]"
+"""ROS type name -> field -> the default its interface file gives."""
+
+SECTION_ENDS = re.compile(r"^[ \t]*---[ \t]*$", re.MULTILINE)
+PARTS = {
+    "msg": ("",),
+    "srv": ("_Request", "_Response"),
+    "action": ("_Goal", "_Result", "_Feedback"),
+}
+"""Kind of interface file -> the suffixes of the types between its ``---`` lines."""
 
 CDR_HEADER = 4
 REQUEST = "s2a_msgs/msg/Request"
@@ -48,7 +72,6 @@ CHROMA_BELOW = frozenset({"nv12", "nv21"})
 DEPTH = frozenset({"16UC1", "32FC1"})
 """Encodings of distances (REP 118)."""
 
-
 VERSIONS = {"6.0": "llama_msgs-6.0.9", "4.4": "llama_msgs-4.4.1"}
 """Version of llama_msgs -> its folder in ``interfaces``; one type store knows one version."""
 DEFAULT_VERSION = "6.0"
@@ -56,6 +79,67 @@ SHOWN = 64
 """Letters of an encoding that came from outside, in an error."""
 ZEROS: dict[str, Any] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
 """The zero of each basic type that is not an integer."""
+
+
+def read_package(folder: Traversable, package: str) -> tuple[dict[str, Definition], Defaults]:
+    """Read ``folder/{msg,srv,action}/*`` as the interfaces of ``package``."""
+    definitions: dict[str, Definition] = {}
+    defaults: Defaults = {}
+    for kind, suffixes in PARTS.items():
+        if not (folder / kind).is_dir():
+            continue
+        for entry in sorted((folder / kind).iterdir(), key=lambda entry: entry.name):
+            if not entry.name.endswith("." + kind):
+                continue
+            name = f"{package}/{kind}/{entry.name.removesuffix('.' + kind)}"
+            for suffix, text in zip(suffixes, SECTION_ENDS.split(entry.read_text()), strict=True):
+                definitions[name + suffix], defaults[name + suffix] = _parse(text, package)
+            definitions.update(_derived(name, kind))
+    return definitions, defaults
+
+
+def _parse(text: str, package: str) -> tuple[Definition, dict[str, Any]]:
+    """Parse one section; under ``msg/``, because rosbags resolves bare names beside the type's own."""
+    (parsed,) = MSGParser(f"MSG: {package}/msg/Section\n{text}").specification()
+    (definition,) = make_typesdict([parsed]).values()
+    return definition, {field.name: field.value for field in parsed.fields if field.value is not None}
+
+
+def _derived(name: str, kind: str) -> Iterator[tuple[str, Definition]]:
+    services = [name] if kind == "srv" else []
+    if kind == "action":
+        services = [name + "_SendGoal", name + "_GetResult"]
+        goal_id = "unique_identifier_msgs/msg/UUID"
+        yield name + "_SendGoal_Request", _definition(goal_id=goal_id, goal=name + "_Goal")
+        yield name + "_SendGoal_Response", _definition(accepted="bool", stamp="builtin_interfaces/msg/Time")
+        yield name + "_GetResult_Request", _definition(goal_id=goal_id)
+        yield name + "_GetResult_Response", _definition(status="int8", result=name + "_Result")
+        yield name + "_FeedbackMessage", _definition(goal_id=goal_id, feedback=name + "_Feedback")
+    for service in services:
+        request, response, event = (service + part for part in ("_Request", "_Response", "_Event"))
+        for half in (request, response):
+            yield half + "__wire", _definition(guid="uint64", seq="int64", body=half)
+        _, info = _definition(info="service_msgs/msg/ServiceEventInfo")
+        at_most_one = [(Nodetype.SEQUENCE, ((Nodetype.NAME, half), 1)) for half in (request, response)]
+        yield event, ([], [*info, ("request", at_most_one[0]), ("response", at_most_one[1])])
+        yield service, _definition(request_message=request, response_message=response, event_message=event)
+
+
+def _definition(**kinds: str) -> Definition:
+    """Define a type whose fields are basic types and messages."""
+    fields = kinds.items()
+    return [], [(name, (Nodetype.NAME, kind) if "/" in kind else (Nodetype.BASE, (kind, 0))) for name, kind in fields]
+
+
+def char_as_uint8(description: Description) -> Description:
+    """Replace ``char`` by the ``uint8`` that ROS 2 takes it for, in type hashes too."""
+    node, detail = description
+    if node == Nodetype.BASE:
+        return (node, ("uint8", 0)) if detail[0] == "char" else description
+    if node == Nodetype.NAME:
+        return description
+    inner, count = detail
+    return (node, (char_as_uint8(inner), count))
 
 
 @cache
@@ -108,7 +192,6 @@ def default(type_name: str, version: str = DEFAULT_VERSION, /, **fields: Any) ->
 
 
 def _zero(description: Any, version: str) -> Any:
-    """Return what ROS initialises a field without a default to."""
     node, detail = description
     if node == Nodetype.BASE:
         return ZEROS.get(detail[0], 0)
@@ -144,14 +227,14 @@ def type_hash(type_name: str, version: str = DEFAULT_VERSION) -> str:
     return str(typestore(version).hash_rihs01(type_name))
 
 
-def serialise(value: Any, type_name: str, version: str = DEFAULT_VERSION) -> bytearray:
-    """Write a message as little-endian CDR (XCDR1), padded to a multiple of 4 as Cyclone DDS sends it.
+def serialise(value: Any, type_name: str, version: str = DEFAULT_VERSION, *, padded: bool = True) -> bytearray:
+    """Write a message as little-endian CDR (XCDR1), ``padded`` to a multiple of 4 as Cyclone DDS sends it.
 
     The buffer is zeroed first because rosbags skips NULs and padding. Header ``00 01 00 pp``, pp = bytes of padding.
     """
     store = typestore(version)
-    size = _size(value, type_name, version)
-    padding = -size % 4
+    size = serialised_bytes(value, type_name, version)
+    padding = -size % 4 if padded else 0
     buffer = bytearray(size + padding)
     buffer[1], buffer[3] = 1, padding
     store.get_msgdef(type_name).serialize_cdr_le(memoryview(buffer)[CDR_HEADER:], 0, value, store)
@@ -159,12 +242,7 @@ def serialise(value: Any, type_name: str, version: str = DEFAULT_VERSION) -> byt
 
 
 def serialised_bytes(value: Any, type_name: str, version: str = DEFAULT_VERSION) -> int:
-    """Return how many bytes `serialise` would write."""
-    size = _size(value, type_name, version)
-    return size + -size % 4
-
-
-def _size(value: Any, type_name: str, version: str) -> int:
+    """Return how many bytes `serialise` would write, padding left out."""
     store = typestore(version)
     return CDR_HEADER + int(store.get_msgdef(type_name).getsize_cdr(0, value, store))
 
@@ -177,19 +255,15 @@ def deserialise(cdr: memoryview, type_name: str, version: str = DEFAULT_VERSION)
         raise TransportError(f"received bytes that are no {type_name}: {error}") from error
 
 
-def int64_array(values: Iterable[int]) -> NDArray[Any]:
-    """Make what rosbags wants for an ``int64[]`` field."""
-    return np.fromiter(values, np.int64)
+int64_array = partial(np.fromiter, dtype=np.int64)
+float64_array = partial(np.fromiter, dtype=np.float64)
+float32_array = partial(np.fromiter, dtype=np.float32)
+"""Make what rosbags wants for an array field of that type."""
 
 
-def float64_array(values: Iterable[float]) -> NDArray[Any]:
-    """Make what rosbags wants for a ``float64[]`` field."""
-    return np.fromiter(values, np.float64)
-
-
-def float32_array(values: Iterable[float]) -> NDArray[Any]:
-    """Make what rosbags wants for a ``float32[]`` field."""
-    return np.fromiter(values, np.float32)
+def uuid(goal_id: bytes) -> Any:
+    """Build a unique_identifier_msgs/UUID."""
+    return message("unique_identifier_msgs/msg/UUID", uuid=np.frombuffer(goal_id, np.uint8))
 
 
 def stamp(stamp_ns: int) -> Any:

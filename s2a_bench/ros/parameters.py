@@ -45,6 +45,12 @@ FIELDS: Final = {kind: f"{kind.name.lower()}_value" for kind in Type if kind}
 TYPES: Final[dict[type, Type]] = {bool: Type.BOOL, int: Type.INTEGER, float: Type.DOUBLE, str: Type.STRING}
 """Type of our options -> type in ROS; what is neither is text, None is not set."""
 
+RANGES: Final = {
+    Type.INTEGER: ("integer_range", "rcl_interfaces/msg/IntegerRange", int),
+    Type.DOUBLE: ("floating_point_range", "rcl_interfaces/msg/FloatingPointRange", float),
+}
+"""Type -> the field of ParameterDescriptor that holds its range, the range's type, and ours."""
+
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
@@ -79,7 +85,6 @@ def of_options(options: Options, names: Iterable[str], live: Iterable[str] = ())
 
 
 def _bound(metadata: Iterable[Any], *names: str) -> float | None:
-    """Return the bound that a field's metadata has under one of ``names``."""
     return next((float(getattr(each, name)) for each in metadata for name in names if hasattr(each, name)), None)
 
 
@@ -152,10 +157,10 @@ class Parameters:
         return ros.default(SERVICE + "GetParameterTypes_Response", types=types)
 
     def _list(self, request: Any) -> Any:
-        prefixes, depth = _bounded(request.prefixes), int(request.depth)
-        names = [name for name in self._declared if _listed(name, prefixes, depth)]
-        found = {name.rpartition(".")[0]: None for name in names if "." in name}
-        result = ros.default("rcl_interfaces/msg/ListParametersResult", names=names, prefixes=list(found))
+        """Names have no dots, so one level: a prefix is a whole name."""
+        prefixes = _bounded(request.prefixes)
+        names = [name for name in self._declared if not len(prefixes) or name in prefixes]
+        result = ros.default("rcl_interfaces/msg/ListParametersResult", names=names)
         return ros.default(SERVICE + "ListParameters_Response", result=result)
 
     def _set(self, request: Any) -> Any:
@@ -167,7 +172,6 @@ class Parameters:
         return ros.default(SERVICE + "SetParametersAtomically_Response", result=result)
 
     def _tried(self, parameters: Sequence[Any]) -> Any:
-        """Set all or none, and return a SetParametersResult."""
         try:
             with self._lock:
                 wanted = {each.name: self._allowed(each) for each in parameters}
@@ -202,14 +206,6 @@ def _named(name: str, value: Any) -> Any:
     return ros.default(PARAMETER, name=name, value=value_message(value))
 
 
-def _listed(name: str, prefixes: Sequence[str], depth: int) -> bool:
-    """Whether ListParameters means a name: levels are separated by dots, and depth 0 is all of them."""
-    if not prefixes:
-        return not depth or name.count(".") < depth
-    below = (name[len(prefix) + 1 :] for prefix in prefixes if name.startswith(prefix + "."))
-    return name in prefixes or any(not depth or rest.count(".") < depth for rest in below)
-
-
 def _descriptor(declared: Parameter) -> Any:
     kind = type_of(declared.value)
     fields: dict[str, Any] = {
@@ -219,12 +215,8 @@ def _descriptor(declared: Parameter) -> Any:
         "read_only": not declared.live,
         "dynamic_typing": declared.value is None,
     }
-    if declared.least is not None and declared.most is not None and kind in {Type.INTEGER, Type.DOUBLE}:
-        whole = kind is Type.INTEGER
-        range_type = "IntegerRange" if whole else "FloatingPointRange"
-        number = int if whole else float
-        bounds = {"from_value": number(declared.least), "to_value": number(declared.most), "step": number(0)}
-        fields[f"{'integer' if whole else 'floating_point'}_range"] = [
-            ros.default(f"rcl_interfaces/msg/{range_type}", **bounds)
-        ]
+    if declared.least is not None and declared.most is not None and kind in RANGES:
+        field, range_type, number = RANGES[kind]
+        bounds = {"from_value": number(declared.least), "to_value": number(declared.most)}
+        fields[field] = [ros.default(range_type, **bounds)]
     return ros.default(DESCRIPTOR, **fields)

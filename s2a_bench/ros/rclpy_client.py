@@ -25,10 +25,9 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import Accepted, ActionEvent, CancelResponse, Feedback, QoS, Rejected, Result
 from s2a_bench.ros.messages import serialised_bytes
-from s2a_bench.ros.rclpy_node import SpinningNode, qos_profile
+from s2a_bench.ros.rclpy_node import SpinningNode, Unserved, for_waitable, qos_profile, run_now
 from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
-from s2a_bench.ros.rclpy_waiter import Unserved, for_waitable, run_now
-from s2a_bench.ros.waiting import appeared
+from s2a_bench.ros.service import appeared
 
 AT_ONCE = 10_000
 """A server may send feedback faster than we take it; an answer has fewer pieces."""
@@ -74,7 +73,6 @@ class RclpyActionClient:
     """Events are taken on the consuming thread; sending and cancelling may happen on any."""
 
     def __init__(self, node: SpinningNode, name: str, type_name: str, version: str) -> None:
-        """Create the client of the action ``/name``."""
         self._node, self._type, self._version = node, type_name, version
         self._action = interface_class(type_name)
         self._installed = installed_version(self._action, type_name)
@@ -102,7 +100,6 @@ class RclpyActionClient:
         self._client.destroy()
 
     def next_event(self, timeout_s: float) -> ActionEvent | None:
-        """Wait on this thread; None on timeout or after `interrupt`."""
         deadline_ns = now_ns() + int(timeout_s * 1e9)
         more = True
         with self._waiter.consuming():
@@ -118,11 +115,9 @@ class RclpyActionClient:
                 run_now(self._client.execute(self._client.take_data()))
 
     def wait_for_server(self, timeout_s: float) -> bool:
-        """Look whether it is matched."""
         return appeared(self.server_present, timeout_s, lambda: self._waiter.interrupted)
 
     def server_present(self) -> bool:
-        """Ask rclpy, for its client and for ours."""
         return not self._node.closed and bool(self._client.server_is_ready() and self._canceller.service_is_ready())
 
     def other_dds(self) -> str:
@@ -134,14 +129,13 @@ class RclpyActionClient:
         return self._installed
 
     def pack(self, goal: Any) -> _Packed:
-        """Fill a goal of the generated class."""
         if self._version != self._installed:
             raise TransportError(f"this workspace has llama_msgs {self._installed}, not {self._version}")
         told = self._type + "_Goal", self._version
-        return _Packed(to_ros(goal, self._action.Goal, *told), serialised_bytes(goal, *told))
+        size = serialised_bytes(goal, *told)
+        return _Packed(to_ros(goal, self._action.Goal, *told), size + -size % 4)  # as `serialise` pads it
 
     def send(self, packed: _Packed, goal_id: bytes | None = None) -> bytes:
-        """Send the goal."""
         self._node.check_open()
         goal_id = goal_id or os.urandom(16)
         with self.lock:
@@ -159,7 +153,6 @@ class RclpyActionClient:
             self._results.append((goal_id, handle.get_result_async()))
 
     def cancel(self, goal_id: bytes, stamp_ns: int = 0) -> None:
-        """Call the cancel service."""
         self._node.check_open()
         request = self._cancel_goal.Request()
         request.goal_info.goal_id.uuid = list(goal_id)
@@ -195,11 +188,9 @@ class RclpyActionClient:
         self._events.extend(events)
 
     def unpack_feedback(self, packed: Any) -> Any:
-        """Turn into the rosbags class."""
         return from_ros(packed, self._type + "_Feedback", self._version)
 
     def unpack_result(self, packed: Any) -> Any:
-        """Turn into the rosbags class."""
         return from_ros(packed, self._type + "_Result", self._version)
 
 
@@ -211,6 +202,5 @@ def _settled(asked: list[tuple[bytes, Any]]) -> Iterator[tuple[bytes, Any]]:
 
 
 def _cancel_response(goal_id: bytes, response: Any) -> CancelResponse:
-    """Read an answer to `cancel`."""
     canceling = tuple(bytes(info.goal_id.uuid) for info in response.goals_canceling)
     return CancelResponse(goal_id, response.return_code, canceling)

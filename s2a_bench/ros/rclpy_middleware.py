@@ -1,7 +1,8 @@
 """The middleware on rclpy, for a sourced ROS 2 environment: Jazzy or Humble, whatever DDS its rmw brings.
 
 Topics carry ready CDR through rclpy's raw publish and raw subscriptions, so packing and sending stay apart as with
-Cyclone, and no generated message class is filled. The workspace must know the types all the same.
+Cyclone, and no generated message class is filled. The workspace must know the types all the same. Services convert by
+CDR, on the executor's thread.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 import atexit
 import os
 from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NoAnswer
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as package_version
 from typing import Any
@@ -20,11 +23,46 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
 from s2a_bench.ros.rclpy_client import RclpyActionClient
-from s2a_bench.ros.rclpy_node import SpinningNode, qos_profile
+from s2a_bench.ros.rclpy_node import ONE_SUBSCRIPTION, SpinningNode, Unserved, Waiter, qos_profile
 from s2a_bench.ros.rclpy_server import RclpyActionServer
-from s2a_bench.ros.rclpy_service import RclpyServiceClient, offer
-from s2a_bench.ros.rclpy_types import message_class
-from s2a_bench.ros.rclpy_waiter import ONE_SUBSCRIPTION, Unserved, Waiter
+from s2a_bench.ros.rclpy_types import from_ros, interface_class, message_class, to_ros
+from s2a_bench.ros.service import appeared
+
+
+def offer(node: SpinningNode, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS) -> None:
+    """Create a service of the node; a request for which ``answer`` raises is logged by the node, and not answered."""
+    cls = interface_class(type_name)
+
+    def callback(request: Any, _response: Any) -> Any:
+        response = answer(from_ros(request, type_name + "_Request", DEFAULT_VERSION))
+        return to_ros(response, cls.Response, type_name + "_Response", DEFAULT_VERSION)
+
+    node.node.create_service(cls, name, callback, qos_profile=qos_profile(qos))
+
+
+class RclpyServiceClient:
+    """Calls one service and waits for the answer."""
+
+    def __init__(self, node: SpinningNode, name: str, type_name: str) -> None:
+        self._node, self._name, self._type_name = node, name, type_name
+        self._class = interface_class(type_name)
+        self._client = node.node.create_client(self._class, name)
+
+    def call(self, request: Any, timeout_s: float) -> Any:
+        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        if not appeared(self._client.service_is_ready, timeout_s, lambda: self._node.closed):
+            self._node.check_open()
+            raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
+        outcome: Future[Any] = Future()
+        asked = self._client.call_async(
+            to_ros(request, self._class.Request, self._type_name + "_Request", DEFAULT_VERSION)
+        )
+        asked.add_done_callback(lambda done: outcome.set_result(done.result()))
+        try:
+            response = outcome.result(max(0.0, (deadline_ns - now_ns()) / 1e9))
+        except NoAnswer as error:
+            raise TransportError(f"the service {self._name} did not answer in {timeout_s:g} s") from error
+        return from_ros(response, self._type_name + "_Response", DEFAULT_VERSION)
 
 
 class _RclpyPublisher:
@@ -40,7 +78,6 @@ class _RclpyPublisher:
         return bytes(serialise(message, self._type_name))
 
     def send(self, packed: bytes) -> None:
-        """Publish raw."""
         self._node.check_open()
         try:
             self._publisher.publish(packed)
@@ -48,7 +85,6 @@ class _RclpyPublisher:
             raise TransportError(f"rclpy could not publish on {self._publisher.topic_name}: {error}") from error
 
     def matched(self) -> int:
-        """Ask rclpy."""
         return 0 if self._node.closed else int(self._publisher.get_subscription_count())
 
 
@@ -56,7 +92,7 @@ class _RclpySubscription:
     """Takes messages on the consuming thread; rmw's history, of the QoS's depth, holds what was not taken."""
 
     def __init__(self, node: SpinningNode, topic: str, type_name: str, qos: QoS) -> None:
-        self._node, self._topic, self._type_name = node, topic, type_name
+        self._node, self.topic, self._type_name = node, topic, type_name
         self._class = message_class(type_name)
         self._subscription = node.node.create_subscription(
             self._class, topic, lambda _: None, qos_profile(qos), callback_group=Unserved(), raw=True
@@ -68,7 +104,6 @@ class _RclpySubscription:
         self.interrupt, self.close = self._waiter.interrupt, self._waiter.close
 
     def take(self, timeout_s: float) -> bytes | None:
-        """Take the next message's CDR."""
         deadline_ns = now_ns() + int(timeout_s * 1e9)
         with self._waiter.consuming():
             more = True
@@ -81,12 +116,13 @@ class _RclpySubscription:
         return None
 
     def unpack(self, packed: bytes) -> Any:
-        """Deserialise; arrays are views of the bytes that rclpy gave."""
         return deserialise(memoryview(packed), self._type_name)
 
-    def matched(self) -> int:
-        """Count the topic's publishers, those of another QoS too: Humble's subscriptions do not know theirs."""
-        return 0 if self._node.closed else int(self._node.node.count_publishers(self._topic))
+    def publishers(self) -> int:
+        return 0 if self._node.closed else int(self._node.node.count_publishers(self.topic))
+
+    matched = publishers
+    """Humble's subscriptions do not know which of them reach it."""
 
 
 class RclpyMiddleware:
@@ -100,25 +136,20 @@ class RclpyMiddleware:
         atexit.register(self.close)
 
     def publisher(self, topic: str, type_name: str, qos: QoS) -> _RclpyPublisher:
-        """Create a publisher."""
         return _RclpyPublisher(self._open(), topic, type_name, qos)
 
     def subscription(self, topic: str, type_name: str, qos: QoS) -> _RclpySubscription:
-        """Create a raw subscription."""
         subscription = _RclpySubscription(self._open(), topic, type_name, qos)
         self._close.append(subscription.close)
         return subscription
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
-        """Create a service."""
         offer(self._open(), name, type_name, answer, qos)
 
     def service_client(self, name: str, type_name: str) -> RclpyServiceClient:
-        """Create a client."""
         return RclpyServiceClient(self._open(), name, type_name)
 
     def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> RclpyActionClient:
-        """Create an action client."""
         client = RclpyActionClient(self._open(), name, type_name, version)
         self._close.append(client.close)
         return client
@@ -126,13 +157,11 @@ class RclpyMiddleware:
     def action_server(
         self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = ""
     ) -> RclpyActionServer:
-        """Create an action server."""
         server = RclpyActionServer(self._open(), name, type_name, result_timeout_s, version)
         self._close.append(server.close)
         return server
 
     def describe(self) -> dict[str, str | int]:
-        """Return which rclpy on which rmw."""
         distribution = os.environ.get("ROS_DISTRO", "")
         try:
             version = package_version("rclpy")

@@ -1,23 +1,32 @@
-"""What all of rclpy's endpoints here share: a node that a thread spins.
+"""What all of rclpy's endpoints here share: a node that a thread spins, and waiting for one entity without it.
 
-The thread serves services and the answers to cancels; topics and actions have consumers that wait for themselves
-(`rclpy_waiter`). One SingleThreadedExecutor a node: no callback here ever blocks.
+The thread serves services and the answers to cancels. One SingleThreadedExecutor a node: no callback here ever blocks.
+Topics and actions have consumers that wait for themselves, as `rclpy.wait_for_message` does, because an executor makes
+its lists anew for each event and hands what came to another thread, which costs more than the message itself. Their
+entity is in a callback group that never executes, so that executors pass it by, and its consumer waits in a wait set of
+its own. Wait sets are no public part of rclpy; Humble's and Jazzy's are the same.
 """
 
 from __future__ import annotations
 
 import logging
-from threading import Event, Thread
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from threading import Event, Lock, Thread
 from typing import Any
 
 import rclpy
+from rclpy.callback_groups import CallbackGroup
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS
+from s2a_bench.ros.service import WAIT_SLICE_NS
 
 _log = logging.getLogger(__name__)
 
@@ -61,7 +70,6 @@ class SpinningNode:
 
     @property
     def closed(self) -> bool:
-        """Whether `close` was called."""
         return self._closing.is_set()
 
     def _spin(self) -> None:
@@ -82,7 +90,6 @@ class SpinningNode:
         self._executor.create_task(lambda: None)  # ends spin_once, which then finds it
 
     def check_open(self) -> None:
-        """Raise TransportError once closed."""
         if self.closed:
             raise TransportError("the middleware is closed")
 
@@ -97,3 +104,89 @@ class SpinningNode:
         self._executor.shutdown()
         self.node.destroy_node()
         self.context.try_shutdown()
+
+
+ONE_SUBSCRIPTION = (1, 0, 0, 0, 0, 0)
+"""Subscriptions, guard conditions, timers, clients, services and events of a wait set."""
+
+
+class Unserved(CallbackGroup):  # type: ignore[misc]
+    """A group whose entities no executor waits for or serves."""
+
+    def can_execute(self, entity: Any) -> bool:
+        del entity
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        del entity
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        """Nothing has begun."""
+
+
+class Waiter:
+    """Waits for one entity; one thread at a time, inside `consuming`."""
+
+    def __init__(self, node: Any, entity: Any, counts: Sequence[int], add: Callable[[Any], None]) -> None:
+        """``entity`` is held as a context while it is waited for; ``add`` puts its ``counts`` into a wait set."""
+        subscriptions, guards, *others = counts
+        self._entity, self._add = entity, add
+        self._guard = node.create_guard_condition(lambda: None, callback_group=Unserved())
+        self.wait_set = rclpy_implementation.WaitSet(subscriptions, guards + 1, *others, node.context.handle)
+        self.busy = Lock()
+        self.interrupted = False
+
+    def wait_until(self, deadline_ns: int) -> bool:
+        """Look once, wait for the entity, a time slice or `wake`; False once the deadline or an interrupt has come."""
+        left_ns = max(0, deadline_ns - now_ns())
+        if self.interrupted:
+            return False
+        with self._entity:
+            self.wait_set.clear_entities()
+            self._add(self.wait_set)
+            self.wait_set.add_guard_condition(self._guard.handle)
+            self.wait_set.wait(min(left_ns, WAIT_SLICE_NS))
+        return left_ns > 0 and not self.interrupted
+
+    def wake(self) -> None:
+        """End a wait under way, or the next one; callable from any thread, after the node has gone too."""
+        with suppress(RuntimeError):  # InvalidHandle
+            self._guard.trigger()
+
+    def interrupt(self) -> None:
+        self.interrupted = True
+        self.wake()
+
+    @contextmanager
+    def consuming(self) -> Iterator[None]:
+        """Hold ``busy``; raises TransportError where rclpy fails."""
+        with self.busy:
+            try:
+                yield
+            except RuntimeError as error:  # rclpy's RCLError and InvalidHandle are RuntimeErrors
+                raise TransportError(f"rclpy: {error}") from error
+
+    def close(self) -> None:
+        """Interrupt, and return when nobody waits any more."""
+        self.interrupt()
+        with self.busy:
+            pass
+
+
+def for_waitable(node: Any, waitable: Any) -> Waiter:
+    """Return what waits for a waitable of rclpy, such as an action's client or server."""
+    of = waitable.get_num_entities()
+    names = ("subscriptions", "guard_conditions", "timers", "clients", "services", "events")
+    counts = [getattr(of, f"num_{name}") for name in names]
+    return Waiter(node, waitable, counts, waitable.add_to_wait_set)
+
+
+def run_now(coroutine: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine of rclpy's that calls nothing but plain functions, and so never suspends."""
+    try:
+        coroutine.send(None)
+    except StopIteration:
+        return
+    coroutine.close()
+    raise RuntimeError("a coroutine of rclpy waits for something")

@@ -13,6 +13,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partialmethod
 from inspect import signature
 from threading import Condition, Lock, RLock, Thread
 from typing import Any
@@ -21,16 +22,12 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import MissingInterface, TransportError
-from s2a_bench.ros import QoS
-from s2a_bench.ros.action import NEXT, Status
+from s2a_bench.ros.action import FEEDBACK_QOS, NEXT, Status
 from s2a_bench.ros.llama import images_of
-from s2a_bench.ros.rclpy_node import SpinningNode, qos_profile
+from s2a_bench.ros.rclpy_node import SpinningNode, Unserved, for_waitable, qos_profile, run_now
 from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
-from s2a_bench.ros.rclpy_waiter import Unserved, for_waitable, run_now
-from s2a_bench.ros.waiting import WAIT_SLICE_NS
+from s2a_bench.ros.service import WAIT_SLICE_NS
 
-FEEDBACK_QOS = QoS(depth=1000)
-"""As with Cyclone: deeper than ROS's 10."""
 PAUSE_S = 0.1
 """After a failure: a wait that fails does so at once."""
 ENDS = {Status.SUCCEEDED: "succeed", Status.ABORTED: "abort", Status.CANCELED: "canceled"}
@@ -56,7 +53,6 @@ class RclpyServerGoal:
 
     @property
     def cancel_requested(self) -> bool:
-        """Ask rclpy."""
         return self._status() == Status.CANCELING
 
     def other_version(self) -> str:
@@ -64,19 +60,15 @@ class RclpyServerGoal:
         return ""
 
     def unpack(self) -> Any:
-        """Turn into the rosbags class."""
         return self._server.convert_goal(self._request[1].goal)
 
     def accept(self) -> None:
-        """Let rclpy store the goal and reply."""
         self._handle = self._server.decide(self._request, accepted=True)
 
     def reject(self) -> None:
-        """Let rclpy reply."""
         self._server.decide(self._request, accepted=False)
 
     def executing(self) -> bool:
-        """Publish EXECUTING unless a cancel came first."""
         if self.cancel_requested:
             return False
         self._check(Status.EXECUTING)
@@ -87,28 +79,14 @@ class RclpyServerGoal:
         return not self.cancel_requested
 
     def feedback(self, message: Any) -> None:
-        """Publish on the feedback topic."""
         if self._handle is None:
             raise TransportError(f"goal {self.id.hex()} was not accepted: no feedback can be sent")
         self._server.publish_feedback(self._handle, message)
-
-    def succeed(self, result: Any) -> None:
-        """End as SUCCEEDED."""
-        self._end(Status.SUCCEEDED, result)
-
-    def abort(self, result: Any) -> None:
-        """End as ABORTED."""
-        self._end(Status.ABORTED, result)
-
-    def canceled(self, result: Any) -> None:
-        """End as CANCELED."""
-        self._end(Status.CANCELED, result)
 
     def _status(self) -> Status:
         return Status.UNKNOWN if self._handle is None else Status(self._handle.status)
 
     def _check(self, status: Status) -> None:
-        """Raise TransportError for a step that the state machine does not allow."""
         present = self._status()
         if self._handle is None or status not in NEXT[present]:
             raise TransportError(f"goal {self.id.hex()} is {present.name} and cannot become {status.name}")
@@ -116,6 +94,10 @@ class RclpyServerGoal:
     def _end(self, status: Status, result: Any) -> None:
         self._check(status)
         self._server.end(self._handle, status, result)
+
+    succeed = partialmethod(_end, Status.SUCCEEDED)
+    abort = partialmethod(_end, Status.ABORTED)
+    canceled = partialmethod(_end, Status.CANCELED)
 
 
 class _PullingServer(ActionServer):  # type: ignore[misc]
@@ -235,13 +217,11 @@ class RclpyActionServer:
         return True
 
     def next_goal(self, timeout_s: float) -> RclpyServerGoal | None:
-        """Wait for the next; None on timeout or after `interrupt`."""
         with self._came:
             self._came.wait_for(lambda: self._goals or self._interrupted, timeout_s)
             return None if self._interrupted or not self._goals else self._goals.popleft()
 
     def interrupt(self) -> None:
-        """Make a blocked `next_goal`, and every later one, return None."""
         with self._came:
             self._interrupted = True
             self._came.notify_all()
@@ -258,11 +238,9 @@ class RclpyActionServer:
         return self._server.decide(request, verdict)
 
     def convert_goal(self, goal: Any) -> Any:
-        """Turn a goal into the rosbags class."""
         return from_ros(goal, self._type + "_Goal", self.version)
 
     def publish_feedback(self, handle: Any, feedback: Any) -> None:
-        """Publish feedback on a goal, on the calling thread."""
         message = to_ros(feedback, self._action.Feedback, self._type + "_Feedback", self.version)
         try:
             handle.publish_feedback(message)
@@ -270,7 +248,6 @@ class RclpyActionServer:
             raise TransportError(f"rclpy could not publish feedback: {error}") from error
 
     def end(self, handle: Any, status: Status, result: Any) -> None:
-        """End a goal on the calling thread."""
         message = to_ros(result, self._action.Result, self._type + "_Result", self.version)
         self._node.check_open()
         self._server.end(handle, getattr(handle, ENDS[status]), message)

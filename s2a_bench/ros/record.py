@@ -9,11 +9,11 @@ holds the interpreter's lock for a millisecond per VGA image, as long as what is
 from __future__ import annotations
 
 import shutil
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock, RLock, Thread
-from typing import Any, NamedTuple
+from typing import Any
 
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
@@ -38,22 +38,12 @@ PLAYED_QOS = Qos(
 )
 """How ``ros2 bag play`` offers every topic: ROS 2's default profile."""
 
+Cdr = bytes | bytearray | memoryview
 BACKLOG_BYTES = 256 * 2**20
 """With so much CDR unwritten, `Recorder.write` writes it down itself rather than filling the memory."""
 
 
-class _Item(NamedTuple):
-    """One message that waits to be written; ``data`` is CDR or a message still to be serialised."""
-
-    topic: str
-    type_name: str
-    data: Any
-    stamp_ns: int
-    size: int
-    raw: bool
-
-
-class Recorder:
+class Recorder(AbstractContextManager["Recorder"]):
     """A recording; ``run.mcap`` makes that one file, any other name the folder that ``ros2 bag record`` makes.
 
     The single file is written in ``run.mcap.recording/`` and moved when it is complete. Without a single message it
@@ -75,7 +65,8 @@ class Recorder:
         except (OSError, WriterError) as error:
             raise StoreError(f"`record`: cannot write {path}: {error}") from error
         self._connections: dict[tuple[str, str], Any] = {}
-        self._queue: SimpleQueue[_Item] = SimpleQueue()
+        self._queue: SimpleQueue[tuple[str, str, Any, int]] = SimpleQueue()
+        """Topic, type, CDR or a message still to be serialised, stamp."""
         self._more: SimpleQueue[bool] = SimpleQueue()
         self._backlog = 0
         self._counting = Lock()
@@ -97,12 +88,10 @@ class Recorder:
             raise StoreError(f"`record`: {self.path} is closed")
         if self._failure is not None:
             raise self._failure
-        raw = isinstance(cdr_or_message, bytes | bytearray | memoryview)
-        size = len(cdr_or_message) if raw else getattr(getattr(cdr_or_message, "data", None), "nbytes", 0)
         with self._counting:
-            self._backlog += size
+            self._backlog += _size(cdr_or_message)
             full = self._backlog > BACKLOG_BYTES
-        self._queue.put(_Item(topic, type_name, cdr_or_message, stamp_ns, size, raw))
+        self._queue.put((topic, type_name, cdr_or_message, stamp_ns))
         if self._thread is not None:
             self._more.put(True)
         if full:
@@ -113,7 +102,7 @@ class Recorder:
         with self._writing:
             with suppress(Empty):
                 while self._failure is None:
-                    self._write_down(self._queue.get_nowait())
+                    self._write_down(*self._queue.get_nowait())
             if self._failure is not None:
                 raise self._failure
 
@@ -136,9 +125,6 @@ class Recorder:
         finally:
             self._writer.abort()  # lets go of the file where closing did not get that far
 
-    def __enter__(self) -> Recorder:  # noqa: PYI034 - Self is typing's since 3.11
-        return self
-
     def __exit__(self, *_: object) -> None:
         """Finish the file however the run ended: what was recorded up to an error is worth keeping."""
         self.close()
@@ -149,18 +135,17 @@ class Recorder:
             with suppress(StoreError):
                 self.flush()
 
-    def _write_down(self, item: _Item) -> None:
+    def _write_down(self, topic: str, type_name: str, data: Any, stamp_ns: int) -> None:
         """Hand one message to rosbags, keeping the first failure."""
         with self._counting:
-            self._backlog -= item.size
+            self._backlog -= _size(data)
         try:
-            key = (item.topic, item.type_name)
-            connection = self._connections.get(key)
-            if connection is None:
-                connection = self._writer.add_connection(*key, typestore=typestore(), offered_qos_profiles=[PLAYED_QOS])
-                self._connections[key] = connection
-            data = serialise(item.data, item.type_name) if not item.raw else item.data
-            self._writer.write(connection, item.stamp_ns, data)
+            if (key := (topic, type_name)) not in self._connections:
+                self._connections[key] = self._writer.add_connection(
+                    *key, typestore=typestore(), offered_qos_profiles=[PLAYED_QOS]
+                )
+            cdr = data if isinstance(data, Cdr) else serialise(data, type_name)
+            self._writer.write(self._connections[key], stamp_ns, cdr)
         except Exception as error:  # noqa: BLE001 - an unknown type, a foreign message, a full disk: each ends it
             self._failure = self._failed(error)
 
@@ -171,3 +156,10 @@ class Recorder:
             f"`record`: writing {self.path} failed: {error or type(error).__name__}; "
             f"what was written is in {place} (`mcap recover` makes a damaged file readable)"
         )
+
+
+def _size(cdr_or_message: Any) -> int:
+    """Return the bytes of CDR; of a message those of its data."""
+    if isinstance(cdr_or_message, Cdr):
+        return len(cdr_or_message)
+    return int(getattr(getattr(cdr_or_message, "data", None), "nbytes", 0))

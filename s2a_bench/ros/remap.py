@@ -7,21 +7,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Final
+from typing import Final, TypeVar
 
-from s2a_bench.ros import (
-    SERVICE_QOS,
-    ActionClient,
-    ActionServer,
-    Middleware,
-    Publisher,
-    QoS,
-    ServiceClient,
-    Subscription,
-)
+from s2a_bench.errors import UsageError
+from s2a_bench.ros import Middleware
 
+T = TypeVar("T")
 NAME: Final = r"(?:~/|/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*"
 RULE: Final = re.compile(f"({NAME}):=({NAME})")
+NODE_NAME: Final = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
+
+
+def check_node_name(name: str) -> None:
+    """Raise UsageError for what is no name of a node."""
+    if not NODE_NAME.fullmatch(name):
+        raise UsageError(f"node name '{name}': write it as /name or /namespace/name, letters, digits and _")
 
 
 def expanded(name: str, node_name: str) -> str:
@@ -45,34 +45,11 @@ class Remapped:
 
     def __init__(self, middleware: Middleware, names: Mapping[str, str]) -> None:
         """Replace the keys of ``names`` by their values."""
-        self._middleware, self._names = middleware, names
+
+        def renamed(make: Callable[..., T]) -> Callable[..., T]:
+            return lambda name, *how, **more: make(names.get(name, name), *how, **more)
+
+        self.publisher, self.subscription = renamed(middleware.publisher), renamed(middleware.subscription)
+        self.service, self.service_client = renamed(middleware.service), renamed(middleware.service_client)
+        self.action_client, self.action_server = renamed(middleware.action_client), renamed(middleware.action_server)
         self.describe, self.close = middleware.describe, middleware.close
-
-    def _name(self, name: str) -> str:
-        return self._names.get(name, name)
-
-    def publisher(self, topic: str, type_name: str, qos: QoS) -> Publisher:
-        """Publish on what stands for ``topic``."""
-        return self._middleware.publisher(self._name(topic), type_name, qos)
-
-    def subscription(self, topic: str, type_name: str, qos: QoS) -> Subscription:
-        """Subscribe to what stands for ``topic``."""
-        return self._middleware.subscription(self._name(topic), type_name, qos)
-
-    def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
-        """Offer a service under what stands for ``name``."""
-        self._middleware.service(self._name(name), type_name, answer, qos)
-
-    def service_client(self, name: str, type_name: str) -> ServiceClient:
-        """Call what stands for ``name``."""
-        return self._middleware.service_client(self._name(name), type_name)
-
-    def action_client(self, name: str, type_name: str, version: str = "6.0") -> ActionClient:
-        """Call what stands for ``name``."""
-        return self._middleware.action_client(self._name(name), type_name, version)
-
-    def action_server(
-        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = ""
-    ) -> ActionServer:
-        """Offer an action under what stands for ``name``."""
-        return self._middleware.action_server(self._name(name), type_name, result_timeout_s, version)

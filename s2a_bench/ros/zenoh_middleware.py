@@ -1,8 +1,9 @@
-"""The middleware on Zenoh from PyPI, in the keys, attachments and tokens of rmw_zenoh."""
+"""The middleware on Zenoh from PyPI, in the keys, attachments and tokens of rmw_zenoh; its actions and services."""
 
 from __future__ import annotations
 
 import atexit
+import logging
 from collections.abc import Callable
 from importlib.metadata import version as package_version
 from typing import Any
@@ -11,13 +12,64 @@ import zenoh
 
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros import zenoh_names as names
+from s2a_bench.ros.action import CANCEL_GOAL, FEEDBACK_QOS, STATUS_ARRAY, STATUS_QOS, AskingAction, ServedAction
 from s2a_bench.ros.messages import DEFAULT_VERSION
 from s2a_bench.ros.router import Router
-from s2a_bench.ros.zenoh_action import ZenohActionClient, ZenohActionServer
-from s2a_bench.ros.zenoh_node import Node
-from s2a_bench.ros.zenoh_service import ZenohServiceClient, ZenohServices
-from s2a_bench.ros.zenoh_session import open_session
-from s2a_bench.ros.zenoh_topic import ZenohPublisher, ZenohSubscription
+from s2a_bench.ros.service import READER_QOS, Calling, Services
+from s2a_bench.ros.zenoh_endpoints import Asked, ServiceClient, ServiceServer, ZenohPublisher, ZenohSubscription
+from s2a_bench.ros.zenoh_node import Bell, Node, open_session
+
+_log = logging.getLogger(__name__)
+
+
+class ZenohActionClient(AskingAction):
+    """Waits for whatever arrives first."""
+
+    def __init__(self, node: Node, name: str, type_name: str, version: str) -> None:
+        prefix, bell = name + "/_action/", Bell()
+        feedback = ZenohSubscription(
+            node, prefix + "feedback", type_name + "_FeedbackMessage", READER_QOS, version, bell
+        )
+        status = ZenohSubscription(node, prefix + "status", STATUS_ARRAY, STATUS_QOS)
+        """Not read: a goal's status comes with its result. ROS tools expect a client to subscribe."""
+        goals = ServiceClient(node, prefix + "send_goal", type_name + "_SendGoal", version, bell)
+        results = ServiceClient(node, prefix + "get_result", type_name + "_GetResult", version, bell)
+        cancels = ServiceClient(node, prefix + "cancel_goal", CANCEL_GOAL, version, bell)
+        topics = feedback.announced, status.announced
+        super().__init__(type_name, version, (goals, results, cancels), feedback.arrived, topics, bell)
+
+
+class ZenohActionServer(ServedAction[Asked]):
+    """Looks at who else is there."""
+
+    send_goal: ServiceServer
+
+    def __init__(self, node: Node, name: str, type_name: str, result_timeout_s: float, version: str) -> None:
+        prefix, for_goals, for_others = name + "/_action/", Bell(), Bell()
+        feedback = ZenohPublisher(node, prefix + "feedback", type_name + "_FeedbackMessage", FEEDBACK_QOS, version)
+        status = ZenohPublisher(node, prefix + "status", STATUS_ARRAY, STATUS_QOS)
+        results = ServiceServer(node, prefix + "get_result", type_name + "_GetResult", version, for_others)
+        cancels = ServiceServer(node, prefix + "cancel_goal", CANCEL_GOAL, version, for_others)
+        goals = ServiceServer(node, prefix + "send_goal", type_name + "_SendGoal", version, for_goals, most_bytes=0)
+        self._node = node
+        self._told: set[str] = set()
+        services, senders, bells = (goals, results, cancels), (feedback.send, status.send), (for_goals, for_others)
+        super().__init__(name, type_name, result_timeout_s, version, services, senders, bells)
+
+    def _look_around(self) -> None:
+        """Log once that a client of another version is there: its goals have another key, and reach nobody."""
+        for hashed in self._node.peers(names.CLIENT, self.send_goal.seen.entity):
+            if hashed not in self._told and hashed != self.send_goal.seen.entity.type_hash and len(self._told) < 100:  # noqa: PLR2004
+                self._told.add(hashed)
+                other = ros.version_of(self.send_goal.type_name, hashed) or f"of type hash {hashed[:100]}"
+                _log.warning(
+                    "%s: a client waits in vain: it speaks llama_msgs %s, this server %s (--llama-msgs)",
+                    self._name,
+                    other,
+                    self.version,
+                )
 
 
 class ZenohMiddleware:
@@ -29,7 +81,8 @@ class ZenohMiddleware:
         self._session: zenoh.Session | None = open_session(router.endpoint, host=router.host, tuning=tuning)
         atexit.register(self.close)
         self._servers: list[ZenohActionServer] = []
-        self._services: ZenohServices | None = None
+        self._bell = Bell()
+        self._services: Services[Asked] | None = None
         try:
             self._node = Node(self._session, domain_id, node_name)
         except BaseException:
@@ -41,32 +94,29 @@ class ZenohMiddleware:
         return ZenohPublisher(self._joined(), topic, type_name, qos)
 
     def subscription(self, topic: str, type_name: str, qos: QoS) -> ZenohSubscription:
-        """Create a subscription."""
         return ZenohSubscription(self._joined(), topic, type_name, qos)
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Create a service; the first starts the thread that answers all."""
-        self._services = self._services or ZenohServices(self._joined())
-        self._services.offer(name, type_name, answer, qos)
+        server = ServiceServer(self._joined(), name, type_name, DEFAULT_VERSION, self._bell, qos)
+        self._services = self._services or Services(self._bell)
+        self._services.offer(name, server, answer)
 
-    def service_client(self, name: str, type_name: str) -> ZenohServiceClient:
-        """Create a client."""
-        return ZenohServiceClient(self._joined(), name, type_name)
+    def service_client(self, name: str, type_name: str) -> Calling:
+        client = ServiceClient(self._joined(), name, type_name, DEFAULT_VERSION, bell := Bell())
+        return Calling(name, client, bell)
 
     def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> ZenohActionClient:
-        """Create a client."""
         return ZenohActionClient(self._joined(), name, type_name, version)
 
     def action_server(
         self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = ""
     ) -> ZenohActionServer:
-        """Create a server and its service thread."""
         server = ZenohActionServer(self._joined(), name, type_name, result_timeout_s, version or DEFAULT_VERSION)
         self._servers.append(server)
         return server
 
     def describe(self) -> dict[str, str | int]:
-        """Return which Zenoh, which domain, and who is the router."""
         return {
             "middleware": "zenoh",
             "version": package_version("eclipse-zenoh"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
+import time
 from dataclasses import dataclass
 from typing import Final
 
@@ -38,15 +39,10 @@ class Entity:
 
     kind: str
     name: str
-    """With % for /."""
+    """With % for /; the root namespace is one %."""
     type_name: str
     """As ``sensor_msgs::msg::dds_::Image_``."""
     type_hash: str
-
-
-def mangled(name: str) -> str:
-    """Return a name as a token has it; the root namespace is one %."""
-    return name.replace("/", "%")
 
 
 def wire_hash(type_name: str, version: str) -> str:
@@ -81,7 +77,7 @@ def endpoint_token(domain_id: int, session: str, number: int, node_name: str, en
 
 def _token(domain_id: int, session: str, number: int, kind: str, node_name: str) -> str:
     namespace, _, name = node_name.rpartition("/")
-    return f"{ADMIN}/{domain_id}/{session}/0/{number}/{kind}/%/{mangled(namespace or '/')}/{name}"
+    return f"{ADMIN}/{domain_id}/{session}/0/{number}/{kind}/%/{(namespace or '/').replace('/', '%')}/{name}"
 
 
 def entity_of(token: str) -> Entity | None:
@@ -96,6 +92,11 @@ def entity_of(token: str) -> Entity | None:
 def gid_of(token: str) -> bytes:
     """Return an endpoint's gid: XXH3-128 of its token, the low half first."""
     return int.to_bytes(xxhash.xxh3_128_intdigest(token.encode()), 16, "little")
+
+
+def attachment(sequence: int, gid: bytes) -> bytes:
+    """Return the attachment of a message that is sent now; of a reply, that of its request but for the time."""
+    return ATTACHMENT.pack(sequence, time.time_ns(), len(gid), gid)
 
 
 def attached(data: bytes) -> tuple[int, int, bytes]:

@@ -1,29 +1,96 @@
-"""Our node among those of rmw_zenoh: the tokens by which it and its endpoints are seen, and those of all others."""
+"""Our node among those of rmw_zenoh: its session, the tokens by which all are seen, and inboxes of what has arrived.
+
+rmw_zenoh's nodes meet at a router. A server of ours that finds none is one itself: its session listens on loopback, so
+nothing but the link is between it and its clients. Scouting by multicast is off, and clients listen on nothing.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import count
-from threading import Lock
-from typing import Any, Final
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import count, islice
+from threading import Condition, Lock
+from typing import Any, Final, Generic, TypeVar
 
 import zenoh
 
-from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.ros import QoS
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import QoS, Tuning
 from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.messages import dds_type_name
-from s2a_bench.ros.zenoh_session import told
+from s2a_bench.ros.remap import check_node_name
+from s2a_bench.ros.router import endpoint_of
+from s2a_bench.ros.service import AT_ONCE, WAIT_SLICE_NS
 
-NODE_NAME: Final = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
+PLACE: Final = re.compile(r"!?\s+at /\S+")
+MESSAGE_BYTES: Final = 128 << 20
+"""A larger message is dropped as it comes in."""
+RECEIVE_BYTES: Final = 1 << 20
+"""Read at once, where Zenoh reads 64 KiB: 640x480 raw arrives in .24 ms instead of .36 (medians, two cores)."""
+BATCHES: Final = 16
+"""Of 64 KiB wait to be sent, where Zenoh has room for 2: whoever sends a picture of 640x480 goes on at once."""
+OPEN_MS: Final = 5000
+"""So long a router may take to say what it is."""
+SEND_US: Final = 5_000_000
+"""A peer that reads nothing for so long is hung up on."""
 SEEN_AT_MOST: Final = 65_536
 """So many endpoints of others are counted."""
+HELD_BYTES: Final = 256 << 20
+"""What waits in one inbox may be so large; what comes then is dropped."""
+EACH_BYTES: Final = 1024
+"""What each item costs beside its bytes."""
 
+Item = TypeVar("Item")
 _log = logging.getLogger(__name__)
+
+
+def open_session(endpoint: str, *, host: bool, tuning: Tuning = "tuned") -> zenoh.Session:
+    """Connect to the router at ``endpoint``, or be it; raises TransportError."""
+    endpoint_of(endpoint)
+    settings: dict[str, Any] = {
+        "mode": "router" if host else "client",
+        "listen/endpoints": [endpoint] if host else [],
+        "connect/endpoints": [] if host else [endpoint],
+        "connect/timeout_ms": 0,
+        "connect/exit_on_failure": True,
+        "scouting/multicast/enabled": False,
+        "scouting/delay": 0,  # half a second, in which a router looks for others
+        "timestamping/enabled": True,  # latched topics are told apart by it
+        "transport/shared_memory/enabled": False,  # as rmw_zenoh: a process that is killed leaves 16 MiB behind
+        "transport/link/rx/max_message_size": MESSAGE_BYTES,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": SEND_US,
+        "transport/unicast/open_timeout": OPEN_MS,
+        "transport/unicast/accept_timeout": OPEN_MS,
+    }
+    if tuning == "tuned":
+        settings["transport/link/rx/buffer_size"] = RECEIVE_BYTES
+        settings["transport/link/tx/queue/size/data"] = BATCHES
+    config = zenoh.Config()
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        what = f"cannot be the Zenoh router at {endpoint}" if host else f"no Zenoh router answers at {endpoint}"
+        way = (
+            "choose another port with `router`"
+            if host
+            else "start one (ros2 run rmw_zenoh_cpp rmw_zenohd, or s2a-bench serve ros --middleware zenoh), "
+            "or name it with `router`"
+        )
+        raise TransportError(f"{what} ({told(error)}): {way}") from error
+
+
+def told(error: zenoh.ZError) -> str:
+    """Return what Zenoh says, less the places in its sources where it says so."""
+    return PLACE.sub("", str(error))[:200]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +98,13 @@ class Seen:
     """An endpoint of ours as others see it; it is gone when this is no longer used."""
 
     entity: names.Entity
-    key: str
-    """Under which its messages travel."""
     gid: bytes
     token: zenoh.LivelinessToken
+    _numbers: Iterator[int] = field(default_factory=lambda: count(1))
+
+    def attachment(self) -> bytes:
+        """Return what goes with the next message."""
+        return names.attachment(next(self._numbers), self.gid)
 
 
 class Node:
@@ -42,8 +112,7 @@ class Node:
 
     def __init__(self, session: zenoh.Session, domain_id: int, name: str) -> None:
         """Announce the node ``/namespace/name`` and listen for all others; raises UsageError for what is no name."""
-        if not NODE_NAME.fullmatch(name):
-            raise UsageError(f"node name '{name}': write it as /name or /namespace/name, letters, digits and _")
+        check_node_name(name)
         self.session, self.domain_id, self._name = session, domain_id, name
         self._id = str(session.zid())
         self._numbers = count(1)
@@ -58,24 +127,28 @@ class Node:
                 f"{names.ADMIN}/{domain_id}/**", direct(self._heard), history=True
             )
 
-    def entity(self, kind: str, name: str, type_name: str, version: str) -> names.Entity:
-        """Return what the token of an endpoint ``/name`` of ROS type ``pkg/kind/Name`` tells."""
-        hashed = names.wire_hash(type_name, version)
-        return names.Entity(kind, names.mangled(name), dds_type_name(type_name), hashed)
+    def key(self, name: str, type_name: str, version: str) -> str:
+        """Return the key under which messages of a topic or service ``/name`` travel."""
+        return names.key(self.domain_id, name, type_name, names.wire_hash(type_name, version))
 
     def announce(self, kind: str, name: str, type_name: str, version: str, qos: QoS) -> Seen:
-        """Let others see an endpoint, which is ready."""
-        entity = self.entity(kind, name, type_name, version)
+        """Let others see an endpoint ``/name`` of ROS type ``pkg/kind/Name``, which is ready."""
+        hashed = names.wire_hash(type_name, version)
+        entity = names.Entity(kind, name.replace("/", "%"), dds_type_name(type_name), hashed)
         token = names.endpoint_token(self.domain_id, self._id, next(self._numbers), self._name, entity, qos)
-        key = names.key(self.domain_id, name, type_name, entity.type_hash)
         with refusals(name):
-            return Seen(entity, key, names.gid_of(token), self._liveliness.declare_token(token))
+            return Seen(entity, names.gid_of(token), self._liveliness.declare_token(token))
 
     def peers(self, kind: str, entity: names.Entity) -> Iterator[str]:
         """Yield the type hashes of the endpoints of a kind that have the name and type of ``entity``."""
         with self._lock:
             known = [*self._known.get((kind, entity.name), {}).values()]
         return (each.type_hash for each in known if each.type_name == entity.type_name)
+
+    def named(self, kind: str, entity: names.Entity) -> int:
+        """Count the endpoints of a kind that have the name of ``entity``."""
+        with self._lock:
+            return len(self._known.get((kind, entity.name), {}))
 
     def matching(self, kind: str, entity: names.Entity) -> int:
         """Count the endpoints of a kind to which ``entity`` speaks, or which speak to it."""
@@ -103,21 +176,13 @@ class Node:
                 del self._known[at]
 
 
-class refusals:  # noqa: N801 - as contextlib's
+@contextmanager
+def refusals(what: str) -> Iterator[None]:
     """Turn what Zenoh refuses into TransportError."""
-
-    __slots__ = ("_what",)
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-
-    def __enter__(self) -> None:
-        """Begin."""
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Translate."""
-        if isinstance(error, zenoh.ZError):
-            raise TransportError(f"Zenoh: {self._what}: {told(error)}") from error
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise TransportError(f"Zenoh: {what}: {told(error)}") from error
 
 
 def direct(callback: Any) -> Any:
@@ -131,3 +196,72 @@ def give_way() -> None:
     Linux wakes it beside its waker. Without this the first of 32 tokens left after the last: .75 ms instead of .25.
     """
     os.sched_yield()
+
+
+class Bell:
+    """Wakes the thread that empties some inboxes."""
+
+    def __init__(self) -> None:
+        self.condition = Condition()
+        self.interrupted = False
+        self._rung = False
+
+    def ring(self) -> None:
+        """Wake who waits; with the condition held."""
+        self._rung = True
+        self.condition.notify()
+
+    def wait_until(self, deadline_ns: int) -> bool:
+        with self.condition:
+            left_ns = deadline_ns - now_ns()
+            if left_ns <= 0 or self.interrupted:
+                return False
+            if not self._rung:
+                self.condition.wait(min(left_ns, WAIT_SLICE_NS) / 1e9)
+            self._rung = False
+            return not self.interrupted
+
+    def interrupt(self) -> None:
+        with self.condition:
+            self.interrupted = True
+            self.condition.notify_all()
+
+
+class Inbox(Generic[Item]):
+    """What has come in for one endpoint: the last ``depth`` items, all for 0."""
+
+    def __init__(self, name: str, bell: Bell, depth: int = 0, most_bytes: int = 0) -> None:
+        """Start empty; it has room for `HELD_BYTES`, or as many as told."""
+        self._name, self._bell, self._depth = name, bell, depth
+        self._most = most_bytes or HELD_BYTES
+        self._items: deque[tuple[Item, int]] = deque()
+        self._bytes, self._told = 0, False
+
+    def put(self, item: Item, size: int) -> bool:
+        """Add an item and wake who waits; False if it found no room."""
+        size += EACH_BYTES
+        with self._bell.condition:
+            if self._depth and len(self._items) >= self._depth:
+                self._pop()
+            if full := self._bytes + size > self._most:
+                told, self._told = self._told, True
+            else:
+                self._items.append((item, size))
+                self._bytes += size
+            self._bell.ring()
+        if full and not told:
+            _log.warning("%s: messages are dropped: %d MiB wait to be taken", self._name, self._most >> 20)
+        return not full
+
+    def take(self) -> Item | None:
+        """Return the oldest item, without waiting."""
+        with self._bell.condition:
+            return self._pop() if self._items else None
+
+    def arrived(self) -> Iterator[Item]:
+        return islice(iter(self.take, None), AT_ONCE)
+
+    def _pop(self) -> Item:
+        item, size = self._items.popleft()
+        self._bytes -= size
+        return item

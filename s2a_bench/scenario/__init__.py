@@ -8,15 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, ClassVar, Final, Protocol
 
 from s2a_bench.errors import UsageError
+from s2a_bench.policy import Floats
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-    from s2a_bench.policy import Floats
 
 LEAD, EGO, REAR = 0, 1, 2
 ROLES: Final = ("lead", "ego", "rear")
@@ -35,6 +34,10 @@ class State:
     lateral_m: Floats
     """From the middle of the lane in which all start, to the left."""
 
+    def keep(self, columns: NDArray[np.int64]) -> State:
+        """Return some of the roll-outs."""
+        return State(self.position_m[:, columns], self.speed_mps[:, columns], self.lateral_m[:, columns])
+
 
 @dataclass(frozen=True, slots=True)
 class Command:
@@ -49,37 +52,22 @@ class Command:
 class Simulator(Protocol):
     """A world of three cars."""
 
-    @property
-    def name(self) -> str:
-        """Return its name, as in SIMULATORS."""
-        ...
-
-    @property
-    def step_s(self) -> float:
-        """Return how long one step is."""
-        ...
-
-    @property
-    def steers(self) -> bool:
-        """Return whether cars can leave their lane."""
-        ...
-
-    @property
-    def most(self) -> int | None:
-        """Return how many roll-outs it runs in lock step; None: as many as wanted."""
-        ...
+    name: ClassVar[str]
+    """As in SIMULATORS."""
+    steers: ClassVar[bool]
+    """Whether cars can leave their lane."""
+    most: ClassVar[int | None]
+    """How many roll-outs it runs in lock step; None: as many as wanted."""
+    step_s: float
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         """Begin anew with cars in one lane, arrays of shape (3, M)."""
-        ...
 
     def step(self, command: Command) -> State:
         """Let one step pass; cars brake to a stop, never backwards."""
-        ...
 
     def close(self) -> None:
         """Let go of what the world holds; it can be called twice."""
-        ...
 
 
 SIMULATORS: dict[str, str] = {

@@ -8,16 +8,14 @@ left to the embedded simulator. The server's settings are put back at the end.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.errors import SimulatorError, UsageError
+from s2a_bench.policy import Floats
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES, Command, State
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
 
 STEP_S: Final = 0.02
 """CARLA wants a tenth of a second at most; the finer the step, the longer a roll-out takes."""
@@ -96,7 +94,6 @@ class Carla:
             self._before = None
 
     def _tick(self) -> None:
-        """Send the speeds and wait for the server."""
         for car, actor in self._cars.items():
             speed = float(self._speed[car])
             along = actor.get_transform().get_forward_vector()
@@ -119,7 +116,6 @@ class Carla:
         return State(position, speed, lateral)
 
     def _spawn(self, car: int, start: Any, ahead_m: float) -> Any:
-        """Put a car on the lane, so far ahead of the waypoint."""
         blueprint = self._world.get_blueprint_library().find(BLUEPRINT)
         blueprint.set_attribute("role_name", ROLES[car])
         place = start.next(ahead_m)[0].transform
@@ -130,26 +126,23 @@ class Carla:
         return actor
 
     def _straight(self) -> Any:
-        """Find a waypoint with a straight lane ahead."""
         world_map = self._world.get_map()
         for spawn in world_map.get_spawn_points():
             first = world_map.get_waypoint(spawn.location)
-            here, straight = first, True
+            here = first
             for _ in range(int(STRAIGHT_M / LOOK_M)):
                 ahead = here.next(LOOK_M)
                 turn = ahead and ahead[0].transform.rotation.yaw - first.transform.rotation.yaw
                 if not ahead or abs((turn + 180) % 360 - 180) > MOST_TURN_DEG:
-                    straight = False
                     break
                 here = ahead[0]
-            if straight:
+            else:
                 return first
         raise SimulatorError(
             f"CARLA: this map has no straight lane of {STRAIGHT_M:g} m at a spawn point; load another, as Town04"
         )
 
     def _remove_cars(self) -> None:
-        """Destroy what we spawned."""
         for actor in self._cars.values():
             actor.destroy()
         self._cars = {}

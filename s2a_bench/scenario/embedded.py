@@ -1,20 +1,27 @@
-"""The embedded simulator: highway-env's kinematic bicycles on its road, driven by our accelerations.
+"""The embedded simulator: highway-env's kinematic bicycles on a straight road, driven by our accelerations.
 
 highway-env integrates with explicit Euler steps and steers by its own lane controller. Pictures: `ccrb.render`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
 from s2a_bench import extras
+from s2a_bench.policy import Floats
 from s2a_bench.scenario import EGO, LEAD, REAR, STEP_S, Command, State
-from s2a_bench.scenario.roads import LENGTHS, MIDDLE_M, build_road, centre, lane_index
 
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
+ROAD_M: Final = 5000.0
+BEHIND_M: Final = 500.0
+LANE_WIDTH_M: Final = 4.0
+LANES: Final = {0: 1, 1: 0}
+"""Our lane, 0 where all start and 1 to its left -> highway-env's, which counts from the left."""
+MIDDLE_M: Final = LANE_WIDTH_M * LANES[0]
+"""Where our lane's middle lies on highway-env's y axis, which points to the right."""
+LENGTHS: Final = {LEAD: 1.0, EGO: 0.0, REAR: -1.0}
+"""By how many car lengths a centre lies ahead of our positions, which are bumper to bumper."""
 
 
 class Embedded:
@@ -30,7 +37,6 @@ class Embedded:
         self._cars: dict[int, Any] = {}
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
-        """Begin anew on an empty road."""
         controlled = extras.require("highway_env.vehicle.controller", "ccrb").ControlledVehicle
         free = extras.require("highway_env.vehicle.kinematics", "ccrb").Vehicle
         road = build_road()
@@ -56,13 +62,29 @@ class Embedded:
         return self._state()
 
     def close(self) -> None:
-        """Forget the road."""
         self._cars = {}
 
     def _state(self) -> State:
-        """Read the vehicles."""
-        cars = [self._cars[car] for car in (LEAD, EGO, REAR)]
-        position = [[vehicle.position[0] - LENGTHS[car] * vehicle.LENGTH] for car, vehicle in enumerate(cars)]
-        speed = [[vehicle.speed] for vehicle in cars]
-        lateral = [[MIDDLE_M - vehicle.position[1]] for vehicle in cars]
+        position = [[vehicle.position[0] - LENGTHS[car] * vehicle.LENGTH] for car, vehicle in self._cars.items()]
+        speed = [[vehicle.speed] for vehicle in self._cars.values()]
+        lateral = [[MIDDLE_M - vehicle.position[1]] for vehicle in self._cars.values()]
         return State(np.array(position), np.array(speed), np.array(lateral))
+
+
+def build_road() -> Any:
+    """Make the road; raises MissingExtra without highway-env."""
+    made_of = extras.require("highway_env.road.road", "ccrb")
+    straight = made_of.RoadNetwork.straight_road_network
+    network = straight(len(LANES), start=-BEHIND_M, length=ROAD_M + BEHIND_M, speed_limit=50.0)
+    # A fixed source of randomness: nothing on this road draws from it, but without one it would be seeded anew.
+    return made_of.Road(network, np_random=np.random.RandomState(0), record_history=False)
+
+
+def centre(car: int, position_m: float, lateral_m: float, length_m: float) -> Floats:
+    """Return highway-env's coordinates of a car, in m."""
+    return np.array([position_m + LENGTHS[car] * length_m, MIDDLE_M - lateral_m])
+
+
+def lane_index(lane: int) -> tuple[str, str, int]:
+    """Return highway-env's name of a lane."""
+    return ("0", "1", LANES[lane])

@@ -1,18 +1,31 @@
-"""A bare integrator along the lane, as many roll-outs in lock step as wanted: for phase diagrams and random studies."""
+"""M roll-outs in lock step: their memory, and a bare integrator along the lane, for phase diagrams and studies."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from s2a_bench.policy import Floats
 from s2a_bench.scenario import STEP_S, Command, State
-from s2a_bench.scenario.lockstep import LockStep
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
-    from s2a_bench.policy import Floats
+class LockStep:
+    """Something that remembers: each of its arrays has the roll-outs along its last axis; those decided drop out."""
+
+    def keep(self, columns: NDArray[np.int64]) -> None:
+        """Go on with these roll-outs only."""
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(self, name, value[..., columns])
+            elif isinstance(value, LockStep):
+                value.keep(columns)
+
+
+def each(number: ArrayLike, rollouts: int) -> Floats:
+    """Return a number for each of M roll-outs, shape (M,), of one or of as many."""
+    return np.broadcast_to(np.asarray(number, dtype=np.float64), (rollouts,))
 
 
 class Longitudinal(LockStep):
@@ -27,7 +40,6 @@ class Longitudinal(LockStep):
         self._state = State(np.empty((3, 0)), np.empty((3, 0)), np.empty((3, 0)))
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
-        """Begin anew."""
         self._state = State(position_m.astype(float), speed_mps.astype(float), np.zeros(position_m.shape))
         return self._state
 
@@ -40,9 +52,7 @@ class Longitudinal(LockStep):
         return self._state
 
     def keep(self, columns: NDArray[np.int64]) -> None:
-        """Go on with these roll-outs only."""
-        now = self._state
-        self._state = State(now.position_m[:, columns], now.speed_mps[:, columns], now.lateral_m[:, columns])
+        self._state = self._state.keep(columns)
 
     def close(self) -> None:
         """Hold nothing."""

@@ -37,6 +37,10 @@ class Ratio:
     launches: int = 1
     launch_sd: float | None = None
 
+    @property
+    def ci95(self) -> tuple[float, float] | None:
+        return None if self.low is None or self.high is None else (self.low, self.high)
+
 
 def summarise(values: Iterable[float]) -> Summary:
     """Summarise values; percentiles interpolate linearly (Hyndman and Fan, type 7). Raises ValueError for none."""

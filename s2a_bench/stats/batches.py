@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, TypeAlias, final
+from typing import Final, TypeAlias, final
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import NDArray
 
-    Floats: TypeAlias = NDArray[np.float64]
-
-Rows: TypeAlias = "Sequence[Floats]"
+Floats: TypeAlias = NDArray[np.float64]
+Rows: TypeAlias = Sequence[Floats]
 """The values of one launch in order of time: one array a request (its one value, or the gaps of its tokens)."""
 
 STATISTICS: Final[Mapping[str, float | None]] = {"median": 0.5, "mean": None, "p90": 0.9, "p99": 0.99}
@@ -40,8 +38,6 @@ class Launch:
 
     def __init__(self, rows: Rows) -> None:
         """Cut the rows into `BATCHES` batches, fewer where there are fewer rows; no row is empty."""
-        import numpy as np
-
         self.n_rows = len(rows)
         self.batches = [
             np.concatenate([rows[place] for place in places])
@@ -55,7 +51,6 @@ class Launch:
         self.levels = np.array([row[0] if len(row) == 1 else np.median(row) for row in rows])
 
     def allows(self, statistic: str) -> bool:
-        """Return whether there are enough values for an interval."""
         quantile = STATISTICS[statistic] or 0.0
         return self.n_rows >= FEWEST_ROWS and (
             statistic == "median" or round(len(self.values) * (1 - quantile), 6) >= FEWEST_BEYOND
@@ -63,8 +58,6 @@ class Launch:
 
     def statistic(self, name: str) -> float:
         """Return the statistic of all values; percentiles interpolate linearly, as in `stats.summarise`."""
-        import numpy as np
-
         quantile = STATISTICS[name]
         return float(self.values.mean() if quantile is None else np.quantile(self.values, quantile))
 
@@ -74,9 +67,6 @@ class Launch:
         return rng.multinomial(n, [1 / n] * n, size=_RESAMPLES)
 
     def replicate(self, name: str, drawn: NDArray[np.int64]) -> Floats:
-        """Return the statistic of every resample."""
-        import numpy as np
-
         quantile = STATISTICS[name]
         sizes = drawn @ self.counts[-1]
         if quantile is None:
@@ -88,8 +78,6 @@ class Launch:
 
     def _ranked(self, drawn: NDArray[np.int64], ranks: Floats) -> Floats:
         """Return the value of a rank, from 0, in every resample, by bisection of the sorted values."""
-        import numpy as np
-
         low = np.zeros(len(drawn), dtype=np.int64)
         high = np.full(len(drawn), len(self.values) - 1)
         while (low < high).any():

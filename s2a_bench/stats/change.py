@@ -1,26 +1,59 @@
-"""Whether a statistic changed between two sides of a comparison: effect sizes, their intervals, and one test."""
+"""Whether a statistic changed between two sides: effect sizes with intervals, one test, and what it could have seen."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench.stats import Ratio
-from s2a_bench.stats.batches import FEWEST_ROWS, Launch, Memory, Rows
-from s2a_bench.stats.power import Noise
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Floats: TypeAlias = NDArray[np.float64]
+from s2a_bench.stats.batches import FEWEST_ROWS, Floats, Launch, Memory, Rows
 
 Middle: TypeAlias = Literal["median", "mean"]
 
-Blocks: TypeAlias = "Mapping[int, Sequence[float]]"
+Blocks: TypeAlias = Mapping[int, Sequence[float]]
 """The values of a cell in one launch, by block."""
+
+POWER: Final = 0.8
+"""The share of repeats in which the smallest change that counts as seen is found (Cohen 1988)."""
+
+_MOST: Final = 50.0
+"""Logarithm beyond which a ratio is not worth telling from infinity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """The standard error of a change with its degrees of freedom: of a logarithm, or as a share of the baseline."""
+
+    error: float
+    freedom: float
+    logarithmic: bool = True
+
+    def detectable(self, level: float, *, falls: bool = False, power: float = POWER) -> float:
+        """Return the smallest rise (or fall), as a share of the baseline, that a two-sided t test finds so often."""
+        from scipy import special, stats
+
+        if not self.error:
+            return 0.0
+        critical = float(stats.t.isf(level / 2, self.freedom))
+        shift = float(special.nctdtrinc(self.freedom, 1 - power, critical)) * self.error
+        if not self.logarithmic:
+            return shift
+        return -math.expm1(-shift) if falls else math.expm1(min(shift, _MOST))
+
+    def power(self, change: float, level: float) -> float:
+        """Return how often the test finds a change of this share."""
+        from scipy import stats
+
+        shift = math.log1p(change) if self.logarithmic else change
+        if not self.error:
+            return float(shift != 0)
+        critical = float(stats.t.isf(level / 2, self.freedom))
+        return float(stats.nct.sf(critical, self.freedom, abs(shift) / self.error))
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +118,6 @@ def change_between(
       (a bootstrap of batches, n - 1 degrees of freedom). So neighbours that are alike, or a slow trend, widen the
       interval. What differs only from launch to launch is not in it.
     """
-    import numpy as np
-
     rng = np.random.default_rng(seed)
     launches = [[Launch(rows) for rows in side] for side in (baseline, other)]
     draws = [side[0].draw(rng) if len(side) == 1 else None for side in launches]
@@ -123,7 +154,6 @@ def ratio_of_launches(
     One launch: `ratio_of_blocks`. Several: the geometric mean of their ratios, with the interval of Student's t on the
     logarithms, so that whatever differs from launch to launch is in it.
     """
-    import numpy as np
     from scipy import stats
 
     both = [launch for launch in sorted(above) if above[launch] and below.get(launch)]
@@ -148,8 +178,6 @@ def ratio_of_blocks(above: Blocks, below: Blocks, seed: int, statistic: Middle =
 
     None where a cell has no values.
     """
-    import numpy as np
-
     if not above or not below:
         return None
     rows = [[np.asarray(cell[block], dtype=np.float64) for block in sorted(cell)] for cell in (below, above)]
@@ -178,9 +206,6 @@ class _Side:
 
     @classmethod
     def of(cls, launches: Sequence[Launch], statistic: str, drawn: NDArray[np.int64] | None, exact: bool) -> _Side:
-        """Compute them; no resamples where there are too few values for an interval."""
-        import numpy as np
-
         first = launches[0]
         points = np.array([launch.statistic(statistic) for launch in launches])
         copies = first.replicate(statistic, drawn) if drawn is not None and first.allows(statistic) else None
@@ -192,9 +217,6 @@ class _Side:
         return all((values > 0).all() for values in (self.points, self.copies) if values is not None)
 
     def log(self) -> _Side:
-        """Return the same on the logarithmic scale."""
-        import numpy as np
-
         copies = None if self.copies is None else np.log(self.copies)
         levels = np.log(np.maximum(self.levels, np.finfo(np.float64).tiny))  # single rows may be zero; ranks count
         return _Side(np.log(self.points), copies, levels, self.exact)
@@ -206,7 +228,6 @@ class _Side:
 
     @property
     def mean(self) -> float:
-        """Return the mean over the launches."""
         return float(self.points.mean())
 
     @property
@@ -258,7 +279,6 @@ class _Test:
 
     @classmethod
     def of(cls, below: _Side, above: _Side, confidence: float, paired: bool) -> _Test:
-        """Test the second side against the first."""
         from scipy import stats
 
         sides = [above.less(below)] if paired else [below, above]
@@ -281,8 +301,6 @@ def _superiority(
     sides: Sequence[Sequence[Launch]], draws: Sequence[NDArray[np.int64] | None], confidence: float
 ) -> Ratio:
     """Return P(other > baseline) + P(equal) / 2, with a percentile interval over the batches of two single launches."""
-    import numpy as np
-
     below, above = ([batch for launch in side for batch in launch.batches] for side in sides)
     wins = np.array([[_wins(one, np.sort(two)) for two in below] for one in above])
     pairs = np.outer([len(one) for one in above], [len(two) for two in below])
@@ -298,6 +316,4 @@ def _superiority(
 
 def _wins(values: Floats, ordered: Floats) -> float:
     """Count the pairs in which the value is the larger one, ties half."""
-    import numpy as np
-
     return float(sum(np.searchsorted(ordered, values, side).sum() for side in ("left", "right"))) / 2

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+import numpy as np
 
-    Floats = NDArray[np.float64]
+from s2a_bench.stats.batches import Floats
 
 DRAWS: Final = 1000
 SURE: Final = 0.95
@@ -45,14 +43,11 @@ class Line:
     draws: Floats
 
     def at(self, x: float) -> float:
-        """Return y."""
         return self.fixed.value + self.slope.value * x
 
 
 def fit_line(groups: Sequence[tuple[float, Floats]], seed: int = 0) -> Line | None:
     """Fit a line through groups of (x, values of y above 0); None where they have fewer than two different x."""
-    import numpy as np
-
     groups = [(x, values) for x, values in groups if values.size]
     x = np.array([x for x, _ in groups])
     if len(set(x.tolist())) < 2:  # noqa: PLR2004 - a line needs two
@@ -80,7 +75,6 @@ def fit_line(groups: Sequence[tuple[float, Floats]], seed: int = 0) -> Line | No
 
 def crossing(one: Line, other: Line) -> Estimate | None:
     """Return the x above 0 at which two lines cross; None where they do not, or fewer than 95 % of the draws do."""
-    import numpy as np
 
     def meet(fixed: Floats, slope: Floats) -> Floats:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -100,8 +94,6 @@ def crossing(one: Line, other: Line) -> Estimate | None:
 
 def _fit(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Fit y (groups, fits) with weights 1 / y^2; return fixed and slope, each (fits,)."""
-    import numpy as np
-
     x, weights = x[:, None], 1 / np.square(y)
     total, first, second = (np.sum(weights * x**power, 0) for power in range(3))
     sum_y, sum_xy = np.sum(weights * y, 0), np.sum(weights * x * y, 0)

@@ -1,4 +1,4 @@
-r"""Tables on disk: a CSV that grows by whole records, and the Parquet file made from it.
+r"""Tables on disk: a CSV that grows by whole records, the Parquet file made from it, and what is said of a full disk.
 
 A record goes to the kernel in one write, so a killed process loses at most the record under way. A record ends
 at a line feed with an even number of quotation marks before it (RFC 4180, with ``\n``); what follows the last
@@ -8,19 +8,22 @@ such line feed is torn and is dropped when read. An empty field is null, in text
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from errno import EIO
+from errno import EDQUOT, EIO, ENOSPC
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.errors import MissingExtra, StoreError
-from s2a_bench.store.room import why
 from s2a_bench.store.schema import Kind, Row, Table, Value
 
 if TYPE_CHECKING:
     import pandas as pd
+
+RESERVE: Final = ".reserve"
+RESERVE_BYTES: Final = 256 * 1024
+"""Kept in a run folder while it is written, so that a run that fills its disk can still say so in its manifest."""
 
 
 class CsvFile:
@@ -69,17 +72,19 @@ def _field(value: Value) -> str:
         return ""
     if isinstance(value, bool):
         return "true" if value else "false"
-    text = str(value)
-    if any(mark in text for mark in ',"\r\n'):
-        return '"' + text.replace('"', '""') + '"'
-    return text
+    text = str(value).replace('"', '""')
+    return f'"{text}"' if any(mark in text for mark in ',"\r\n') else text
 
 
-@contextmanager
-def _loading(path: Path) -> Iterator[None]:
-    """Raise MissingExtra where pyarrow does not load, as one that wants another NumPy does not."""
+ROWS: Final = 10_000_000
+"""The most rows of a Parquet file that are read, by its footer: a few bytes can stand for any number of equal rows."""
+
+
+def _arrow(path: Path) -> tuple[Any, Any, Any]:
+    """Return pyarrow, its CSV and its Parquet; raises MissingExtra where it does not load, as for another NumPy."""
     try:
-        yield
+        import pyarrow as pa
+        from pyarrow import csv, parquet
     except (ImportError, AttributeError, RuntimeError) as error:
         why = str(error).strip().splitlines()[:1]
         raise MissingExtra(
@@ -87,43 +92,38 @@ def _loading(path: Path) -> Iterator[None]:
             f"files in {path.parent} are whole and the rest can be made of them; beside NumPy 1, as ROS wants it, "
             "pip install -c constraints-ros-jazzy.txt pyarrow"
         ) from error
+    return pa, csv, parquet
 
 
 def count_rows(path: Path) -> int:
     """Count the rows of a table's Parquet or CSV file without reading their values."""
     if path.suffix == ".parquet":
-        with _loading(path):
-            from pyarrow import parquet
-
-        return int(parquet.read_metadata(path).num_rows)
-    quotes = records = 0
-    for line in whole_records(path.read_bytes()).split(b"\n")[:-1]:
-        quotes += line.count(b'"')
-        records += quotes % 2 == 0
-    return max(records - 1, 0)
+        return int(_arrow(path)[2].read_metadata(path).num_rows)
+    return max(sum(1 for _ in _ends(path.read_bytes())) - 1, 0)
 
 
 def whole_records(data: bytes) -> bytes:
     """Return the data up to the end of its last whole record."""
-    end = position = quotes = 0
+    return data[: max(_ends(data), default=0)]
+
+
+def _ends(data: bytes) -> Iterator[int]:
+    """Yield where each whole record ends."""
+    position = quotes = 0
     for line in data.split(b"\n")[:-1]:
         position += len(line) + 1
         quotes += line.count(b'"')
         if quotes % 2 == 0:
-            end = position
-    return data[:end]
+            yield position
 
 
 def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
     """Read a table's CSV as a ``pyarrow.Table``, without its torn end; a file that is not there is an empty table.
 
-    A column that an older run does not have is null throughout.
+    A column that it does not have is null throughout: schema 1 may gain columns.
     """
-    with _loading(path):
-        import pyarrow as pa
-        from pyarrow import csv
-
-    schema = _arrow_schema(columns)
+    pa, csv, _ = _arrow(path)
+    schema = _schema(pa, columns)
     data = whole_records(path.read_bytes()) if path.exists() else b""
     if not data:
         return schema.empty_table()
@@ -150,9 +150,7 @@ def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
 
 def write_parquet(path: Path, table: Any) -> None:
     """Write a ``pyarrow.Table``; the file appears whole or not at all."""
-    with _loading(path):
-        from pyarrow import parquet
-
+    _, _, parquet = _arrow(path)
     part = path.with_suffix(".part")
     try:
         parquet.write_table(table, part)
@@ -165,14 +163,13 @@ def write_parquet(path: Path, table: Any) -> None:
 
 def read_parquet(path: Path, columns: dict[str, Kind]) -> Any:
     """Read a table's Parquet file as a ``pyarrow.Table``."""
-    with _loading(path):
-        import pyarrow as pa
-        from pyarrow import parquet
-
+    pa, _, parquet = _arrow(path)
+    schema = _schema(pa, columns)
     try:
-        schema = _arrow_schema(columns)
+        if (rows := count_rows(path)) > ROWS:
+            raise StoreError(f"{path} has {rows} rows; at most {ROWS} are read; remove it to read the CSV")
         found = parquet.read_table(path)
-        for name in columns.keys() - set(found.column_names):  # an older run
+        for name in columns.keys() - set(found.column_names):  # schema 1 may gain columns
             found = found.append_column(name, pa.nulls(len(found), schema.field(name).type))
         return found.select(list(columns)).cast(schema)
     except (OSError, pa.ArrowException, ValueError) as error:
@@ -189,9 +186,34 @@ def to_pandas(table: Any) -> pd.DataFrame:
     return frame
 
 
-def _arrow_schema(columns: dict[str, Kind]) -> Any:
-    """Return the ``pyarrow.Schema`` of a table."""
-    import pyarrow as pa
-
+def _schema(pa: Any, columns: dict[str, Kind]) -> Any:
     types = {"string": pa.string(), "int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_()}
     return pa.schema([(name, types[kind]) for name, kind in columns.items()])
+
+
+def why(error: OSError, path: Path) -> str:
+    """Return why a path could not be written; where there was no room, on which file system."""
+    said = error.strerror or str(error)
+    if error.errno not in {ENOSPC, EDQUOT}:
+        return said
+    mount = next(place for place in (path.resolve(), *path.resolve().parents) if os.path.ismount(place))
+    try:
+        free = f", {shutil.disk_usage(mount).free:,} bytes free"
+    except OSError:
+        free = ""
+    return f"{said} (file system {mount}{free}; make room, or choose another `output`)"
+
+
+def reserve(folder: Path) -> None:
+    """Keep room in a folder; on a file system that has none the run ends here, before anything is measured."""
+    with (folder / RESERVE).open("wb") as file:
+        file.write(bytes(RESERVE_BYTES))  # not only allocated: some file systems promise more than they have
+
+
+def release(folder: Path) -> bool:
+    """Give the room back; return whether there was any."""
+    try:
+        (folder / RESERVE).unlink()
+    except FileNotFoundError:
+        return False
+    return True

@@ -11,11 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from s2a_bench.errors import StoreError
 from s2a_bench.secrets import struck
-from s2a_bench.store.room import why
+from s2a_bench.store.files import why
 from s2a_bench.store.schema import SCHEMA
 
 NAME = "manifest.json"
@@ -23,6 +25,61 @@ SWEEP: Final = "sweep"
 """The command of a sweep, whose folder holds runs."""
 MAX_BYTES: Final = 64 * 2**20
 """Of a manifest; a sweep's of 100,000 cells is far below."""
+
+
+Facts = dict[str, Any]
+"""Of whoever measures, by name."""
+
+
+class _Shape(BaseModel):
+    """Base of what a manifest's objects hold at least; whoever measures adds facts."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+
+class _Environment(_Shape):
+    gpus: list[Facts] | None = None
+    packages: Facts = {}
+    affinity: list[int] = []
+
+
+class _Warning(_Shape):
+    code: str
+    message: str = ""
+    advice: str = ""
+
+
+class _Manifest(_Shape):
+    """What readers of every run go by; a key may be absent, as each experiment writes what it has."""
+
+    command: str
+    state: Literal["running", "finished", "interrupted", "failed"]
+    argv: list[str] = []
+    host: str = ""
+    error: str | None = None
+    started: str = ""
+    finished: str | None = None
+    configuration: Facts = {}
+    environment: _Environment = Field(_Environment())
+    seeds: Facts = {}
+    warnings: list[_Warning] = []
+    stages: dict[str, str] = {}
+    servers: dict[str, Facts] = {}
+    model: Facts | None = None
+    tuning: Facts | None = None
+
+
+class _SweepConfiguration(_Shape):
+    command: str
+    hash: str = ""
+    cells: int = 0
+    boards: list[str] | None = None
+
+
+class _SweepManifest(_Manifest):
+    configuration: _SweepConfiguration  # type: ignore[assignment]
+    boards: Facts = {}
+    machines: Facts = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +91,6 @@ class RunWarning:
     advice: Annotated[str, {"minLength": 1}]
 
     def to_manifest(self) -> dict[str, str]:
-        """Return it as plain data."""
         return {"code": self.code, "message": self.message, "advice": self.advice}
 
 
@@ -115,7 +171,18 @@ def read(folder: Path) -> dict[str, Any]:
         raise StoreError(
             f"{path} has schema {reprlib.repr(schema)}, this s2a-bench reads {SCHEMA!r}; use the version that wrote it"
         )
-    from s2a_bench.store.shape import check
-
-    check(manifest, path)
+    _check(manifest, path)
     return dict(manifest)
+
+
+def _check(manifest: Mapping[str, Any], path: Path) -> None:
+    """Raise StoreError naming the first key that is missing or wrong."""
+    try:
+        (_SweepManifest if manifest.get("command") == SWEEP else _Manifest).model_validate(manifest)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in first["loc"])
+        wrong = "is missing"
+        if first["type"] != "missing":
+            wrong = first["msg"].replace("Input", reprlib.repr(first["input"]), 1)
+        raise StoreError(f"{path} is damaged: {reprlib.repr(key.lstrip('.'))[1:-1]}: {wrong}") from None

@@ -1,4 +1,4 @@
-"""The rows of requests: samples, tokens, and the frames of a stream.
+"""The rows of requests: samples, tokens, the frames of a stream, and the skills of plans.
 
 A row's own fields are what was observed; *derived* columns are computed from its chain of marks by `trace.budget`,
 never typed a second time. A stage that the chain does not have is null, never zero; where the request failed every
@@ -7,7 +7,7 @@ derived column is null.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -20,11 +20,10 @@ class SampleRow:
     """One request: which cell, where in the run, its whole chain of marks, and what is known besides.
 
     ``cell`` is what is compared, e.g. ``http/as-deployed``. ``payload`` is what travels: raw, yuyv, jpeg,
-    jpeg-preencoded or png, nothing for loopback; folders that older versions wrote say bgr for raw and compressed
-    for jpeg over ROS. An empty ``error`` means that the request succeeded. ``frame_age_ns`` is the frame's age when
-    inference starts. ``rgb_source`` is a checksum of the RGB that a reference conversion of the source frame gives,
-    ``rgb_engine`` of the RGB at the engine; null where unknown, as behind a black box. ``launch`` counts the sets of
-    servers from 0, ``block`` on over all of them; folders from before `launches` have null.
+    jpeg-preencoded or png, nothing for loopback. An empty ``error`` means that the request succeeded.
+    ``frame_age_ns`` is the frame's age when inference starts. ``rgb_source`` is a checksum of the RGB that a reference
+    conversion of the source frame gives, ``rgb_engine`` of the RGB at the engine; null where unknown, as behind a
+    black box. ``launch`` counts the sets of servers from 0, ``block`` on over all of them.
     """
 
     cell: str
@@ -79,6 +78,29 @@ class FrameRow:
     used_by: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class SkillRow:
+    """One skill of a plan: when its fragment was complete, when it ran; ``stall_ns`` is the stall before it.
+
+    Times count from the request. ``text`` is the call, empty where no model wrote one. ``due_ns``, of skills that were
+    really executed, is when the reason to start was there; it is null where times were computed.
+    """
+
+    cell: str
+    request_id: str
+    plan: int
+    index: int
+    text: str
+    arrival_ns: int
+    start_ns: int
+    end_ns: int
+    stall_ns: int
+    nominal_ns: int
+    least_ns: int
+    most_ns: int
+    due_ns: int | None = None
+
+
 def _stage_values(spent: Budget) -> dict[str, Value]:
     return {f"{stage}_ns": duration for stage, duration in spent.stages_ns.items()}
 
@@ -92,15 +114,7 @@ def _derive_sample(row: SampleRow) -> dict[str, Value]:
     if row.error or not any(stage in FIRST_TOKEN for stage, _ in row.marks):
         return {}
     spent = budget(row.marks)
-    return {
-        **_stage_values(spent),
-        "e2e_ns": spent.e2e_ns,
-        "e2e_without_inference_ns": spent.e2e_without_inference_ns,
-        "e2e_without_model_ns": _without_model_ns(row, spent),
-        "ttft_ns": spent.e2e_ns - spent.stages_ns.get("capture", 0),
-        "residual_ns": spent.residual_ns,
-        "residual_share": spent.residual_share,
-    }
+    return {**_stage_values(spent), **{name: of(row, spent) for name, (_, of) in _OF_SAMPLE.items()}}
 
 
 def _without_model_ns(row: SampleRow, spent: Budget) -> int | None:
@@ -109,6 +123,17 @@ def _without_model_ns(row: SampleRow, spent: Budget) -> int | None:
         return spent.e2e_without_model_ns
     told_ms = row.server_prompt_ms
     return spent.e2e_ns - round(told_ms * 1e6) if told_ms and 0 < told_ms * 1e6 <= spent.e2e_ns else None
+
+
+_OF_SAMPLE: Final[Mapping[str, tuple[Kind, Callable[[SampleRow, Budget], Value]]]] = {
+    "e2e_ns": ("int64", lambda _, spent: spent.e2e_ns),
+    "e2e_without_inference_ns": ("int64", lambda _, spent: spent.e2e_without_inference_ns),
+    "e2e_without_model_ns": ("int64", _without_model_ns),
+    "ttft_ns": ("int64", lambda _, spent: spent.e2e_ns - spent.stages_ns.get("capture", 0)),
+    "residual_ns": ("int64", lambda _, spent: spent.residual_ns),
+    "residual_share": ("float64", lambda _, spent: spent.residual_share),
+}
+"""What is derived of a request besides its stages; `ttft_ns` counts from the prompt, which stream mode begins with."""
 
 
 def _derive_frame(row: FrameRow) -> dict[str, Value]:
@@ -128,19 +153,25 @@ TOKENS: Final[Table[TokenRow]] = Table("tokens", TokenRow)
 """One row a token."""
 
 
-def samples_table(stages: Mapping[str, str]) -> Table[SampleRow]:
-    """Return the table with one row a request, and a column for each of a run's stages.
+def _derive_skill(row: SkillRow) -> dict[str, Value]:
+    """Compute how long a skill lay ready, its duration over the nominal one, and how late the robot had the order."""
+    stretch = (row.end_ns - row.start_ns) / row.nominal_ns if row.nominal_ns else None
+    jitter_ns = None if row.due_ns is None else row.start_ns - row.due_ns
+    return {"queue_wait_ns": row.start_ns - row.arrival_ns, "stretch": stretch, "start_jitter_ns": jitter_ns}
 
-    `ttft_ns` counts from the prompt: e2e without `capture` (which stream mode does not have).
-    """
-    derived: dict[str, Kind] = {
-        "e2e_ns": "int64",
-        "e2e_without_inference_ns": "int64",
-        "e2e_without_model_ns": "int64",
-        "ttft_ns": "int64",
-        "residual_ns": "int64",
-        "residual_share": "float64",
-    }
+
+SKILLS: Final[Table[SkillRow]] = Table(
+    "skills",
+    SkillRow,
+    {"queue_wait_ns": "int64", "stretch": "float64", "start_jitter_ns": "int64"},
+    _derive_skill,
+)
+"""One row a skill."""
+
+
+def samples_table(stages: Mapping[str, str]) -> Table[SampleRow]:
+    """Return the table with one row a request, and a column for each of a run's stages."""
+    derived = {name: kind for name, (kind, _) in _OF_SAMPLE.items()}
     return Table("samples", SampleRow, _columns(stages) | derived, _derive_sample)
 
 
@@ -155,28 +186,3 @@ def frames_table(stages: Mapping[str, str]) -> Table[FrameRow]:
 
 def _columns(stages: Mapping[str, str]) -> dict[str, Kind]:
     return {f"{stage}_ns": "int64" for stage in stages}
-
-
-EARLIER_STAGES: Final[dict[str, str]] = {
-    "capture": "capture",
-    "convert": "encode",
-    "image_encode": "encode",
-    "base64_encode": "encode",
-    "json_pack": "pack",
-    "cdr_pack": "pack",
-    "connect": "network",
-    "network": "network",
-    "accept": "network",
-    "ingest": "ingest",
-    "json_parse": "parse",
-    "cdr_parse": "parse",
-    "base64_decode": "decode",
-    "image_decode": "decode",
-    "yuv_decode": "decode",
-    "channel_swap": "decode",
-    "queue": "queue",
-    "inference": "inference",
-    "server": "server",
-    "return": "return",
-}
-"""The stages of a folder whose manifest does not have them, as every run had before transports declared their own."""

@@ -7,7 +7,7 @@ import re
 import socket
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from itertools import count
@@ -18,17 +18,18 @@ from typing import TYPE_CHECKING, Any, final
 from s2a_bench.errors import MissingExtra, StoreError
 from s2a_bench.provenance import Origins
 from s2a_bench.store import manifest as manifests
-from s2a_bench.store.files import CsvFile, count_rows, read_csv, read_parquet, to_pandas, write_parquet
-from s2a_bench.store.requests import (
-    EARLIER_STAGES,
-    TOKENS,
-    FrameRow,
-    SampleRow,
-    TokenRow,
-    frames_table,
-    samples_table,
+from s2a_bench.store.files import (
+    CsvFile,
+    count_rows,
+    read_csv,
+    read_parquet,
+    release,
+    reserve,
+    to_pandas,
+    why,
+    write_parquet,
 )
-from s2a_bench.store.room import release, reserve, why
+from s2a_bench.store.requests import TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
 from s2a_bench.store.schema import PROVENANCE, SCHEMA, Row, Table
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ STATES = ("running", "finished", "interrupted", "failed")
 
 
 @final
-class RunWriter:
+class RunWriter(AbstractContextManager["RunWriter"]):
     """Writes one run folder. Use as a context manager; not thread-safe.
 
     Leaving the block finishes the run: "finished", "interrupted" on KeyboardInterrupt, "failed" on any other
@@ -59,7 +60,7 @@ class RunWriter:
             raise StoreError(f"cannot write into {path}: {why(error, path)}") from error
         manifests.write(path, manifest)
         self._files: dict[str, tuple[Table[Any], CsvFile]] = {}
-        stages = manifest.get("stages", EARLIER_STAGES)
+        stages = manifest.get("stages", {})
         self._samples, self._frames = samples_table(stages), frames_table(stages)
 
     @classmethod
@@ -136,15 +137,12 @@ class RunWriter:
         return self._codes[cell]
 
     def sample(self, row: SampleRow) -> None:
-        """Append one sample."""
         self.append(self._samples, [row])
 
     def tokens(self, rows: Iterable[TokenRow]) -> None:
-        """Append the tokens of one request."""
         self.append(TOKENS, rows)
 
     def frame(self, row: FrameRow) -> None:
-        """Append one frame of a stream."""
         self.append(self._frames, [row])
 
     def update(self, **facts: Any) -> None:
@@ -180,9 +178,6 @@ class RunWriter:
             # The state is written even where there is no room for Parquet, or Ctrl-C comes a second time.
             self.update(state=state, error=error, finished=manifests.utc_now())
 
-    def __enter__(self) -> RunWriter:
-        return self
-
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -215,7 +210,6 @@ class Run:
 
     @property
     def origins(self) -> Origins:
-        """Return where its numbers come from."""
         return Origins.of_manifest(self.manifest)
 
     @property
@@ -234,14 +228,12 @@ class Run:
     @property
     def stages(self) -> dict[str, str]:
         """Stage -> group of the run's transports, in the order of the path."""
-        found: dict[str, str] = self.manifest.get("stages", EARLIER_STAGES)
-        return found
+        return dict(self.manifest.get("stages", {}))
 
     @property
     def facts(self) -> dict[str, dict[str, str]]:
-        """Fact -> unit and meaning, of all that may be told of a request; empty in folders that do not say."""
-        found: dict[str, dict[str, str]] = self.manifest.get("facts", {})
-        return found
+        """Fact -> unit and meaning, of all that may be told of a request."""
+        return dict(self.manifest.get("facts", {}))
 
     @property
     def samples(self) -> pd.DataFrame:
@@ -250,7 +242,6 @@ class Run:
 
     @property
     def tokens(self) -> pd.DataFrame:
-        """One row a token."""
         return self.table(TOKENS)
 
     @property
@@ -294,9 +285,7 @@ def _make_unique(root: Path, stem: str) -> Path:
         raise PermissionError(13, "permission denied", str(root))
     for number in count(1):
         path = root / (stem if number == 1 else f"{stem}-{number}")
-        try:
+        with suppress(FileExistsError):
             path.mkdir()
-        except FileExistsError:
-            continue
-        return path
+            return path
     raise AssertionError  # count() does not end

@@ -1,17 +1,18 @@
 """What a table of a run folder is: rows of a dataclass, whose fields are the columns, and columns derived from them.
 
-Who measures declares its own tables, beside what it measures; nothing here knows any of them.
+Who measures declares its own tables, beside what it measures; nothing here knows any of them. Between what numbers lie
+stands in the annotations of rows and of the cells of ``--json``; docs/schema follows from that.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, make_dataclass
 from functools import cached_property
 from types import NoneType
-from typing import Any, Final, Generic, Literal, TypeAlias, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
 from s2a_bench.secrets import struck
 
@@ -69,7 +70,6 @@ INT64: Final = range(-(1 << 63), 1 << 63)
 
 
 def _stored(value: Any) -> Value:
-    """Turn a field into what the files hold."""
     if isinstance(value, (list, dict)):
         return json.dumps(_sound(value), separators=(",", ":"), ensure_ascii=False)
     return _sound(value)  # type: ignore[no-any-return]
@@ -93,3 +93,42 @@ def _kind(hint: Any) -> Kind:
     plain = next((arg for arg in get_args(hint) if arg is not NoneType), hint) if NoneType in get_args(hint) else hint
     kinds: dict[Any, Kind] = {int: "int64", float: "float64", bool: "bool"}
     return kinds.get(plain, "string")
+
+
+class Facts(dict[str, Any]):
+    """What an annotation says of a field, in the words of JSON Schema; hashable, so that ``| None`` may follow."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(tuple(self))
+
+
+Count = Annotated[int, Facts(minimum=0)]
+Many = Annotated[int, Facts(minimum=1)]
+NonNegative = Annotated[float, Facts(minimum=0)]
+Positive = Annotated[float, Facts(exclusiveMinimum=0)]
+Fraction = Annotated[float, Facts(minimum=0, maximum=1)]
+
+
+def about(description: str) -> Facts:
+    """Return what an annotation says of a field for people."""
+    return Facts(description=description)
+
+
+def with_fields(
+    name: str, about: str, base: type, fields: Mapping[str, Any], own: Mapping[str, Any] | None = None
+) -> Any:
+    """Return a dataclass with more fields than its base, then ``own`` ones, which have no default.
+
+    What one of the ``fields`` may lack is None, its default: an absent key of ``--json``.
+    """
+    made: list[Any] = [
+        (key, hint, field(default=None)) if _may_lack(hint) else (key, hint) for key, hint in fields.items()
+    ]
+    made += (own or {}).items()
+    return make_dataclass(
+        name, made, bases=(base,), namespace={"__doc__": about}, frozen=True, slots=True, kw_only=True
+    )
+
+
+def _may_lack(hint: Any) -> bool:
+    return NoneType in get_args(get_args(hint)[0] if get_origin(hint) is Annotated else hint)

@@ -17,8 +17,6 @@ from s2a_bench.store.schema import Table
 if TYPE_CHECKING:
     import pandas as pd
 
-COMMAND = SWEEP
-
 
 @dataclass(frozen=True, slots=True)
 class CellRow:
@@ -76,7 +74,7 @@ class Sweep:
 
 def is_sweep(manifest: dict[str, Any]) -> bool:
     """Return whether a run folder is a sweep's."""
-    return bool(manifest.get("command") == COMMAND)
+    return bool(manifest.get("command") == SWEEP)
 
 
 def read_sweep(path: Path) -> Sweep:

@@ -6,11 +6,19 @@ settings, its own run folder holds the data. `Workers` is the seam where cells r
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Any, Final, Literal, Protocol, TypeAlias
+
+from s2a_bench.errors import UsageError
+from s2a_bench.options import Names, Options, option
+from s2a_bench.store.run import read_run
+from s2a_bench.sweep.file import find_sweep
 
 Flag: TypeAlias = Literal["value", "switch", "toggle", "argument"]
 """A switch is given or not; a toggle has its opposite too, as --animation and --no-animation."""
@@ -44,13 +52,15 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name the setting."""
         return f"{self.number:04d}"
 
     @property
     def key(self) -> tuple[str, int]:
-        """Tell it from every other cell of its sweep."""
         return self.name, self.repeat
+
+    @property
+    def label(self) -> str:
+        return f"{self.name}-r{self.repeat}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +74,11 @@ class Outcome:
     """The environment that its run folder names."""
 
 
-class Workers(Protocol):
+class Workers(AbstractContextManager["Workers"], Protocol):
     """Where cells run. Use as a context manager; leaving it early ends what is under way."""
 
-    @property
-    def width(self) -> int:
-        """Return how many virtual cells run at once."""
-        ...
+    width: int
+    """How many virtual cells run at once."""
 
     def submit(self, cell: Cell, folder: Path) -> Future[Any]:
         """Start a cell, or queue it; ``folder`` does not exist yet."""
@@ -80,13 +88,56 @@ class Workers(Protocol):
         """Return how a cell went whose future is done; its run folder then is below ``folder``."""
         ...
 
-    def __enter__(self) -> Workers: ...  # noqa: PYI034 - Self is typing's since 3.11
-
-    def __exit__(self, *_: object) -> None: ...
-
 
 WORKERS: dict[str, str] = {
-    "here": "s2a_bench.sweep.here:Here",
+    "here": "s2a_bench.sweep.perform:Here",
     "ray": "s2a_bench.sweep.on_ray:OnRay",
 }
 """Name -> what runs cells."""
+
+
+COPY: Final = "sweep.toml"
+"""The sweep file as it was, in the sweep's folder."""
+
+
+class SweepConfig(Options):
+    """A sweep to start, or one to go on with."""
+
+    file: str = option(
+        "", "sweep file (TOML), or the name of one: paper, quick, transports; not needed with --resume", argument=True
+    )
+    resume: Path | None = option(None, "folder of a sweep that was interrupted: run what it has not run yet")
+    retry_failed: bool = option(False, "with --resume: run the cells that failed once more")
+    dry_run: bool = option(False, "print the cells and how long they will take, and run nothing")
+    trust_file: bool = option(
+        False, "run a file that names programs, URLs off this machine, or keys for a URL: only one that you have read"
+    )
+    board: Names = option((), "what this machine is in the file's 'board' axis; several with commas")
+    ray: str = option("", "run on a Ray cluster: its ADDRESS, auto, or local (a cluster of this machine)")
+    jobs: int = option(0, "virtual cells at once on this machine; 0: one a core", ge=0)
+    output: Path = option(Path("results"), "folder for the sweep's folder")
+
+    def check(self) -> None:
+        """Refuse what makes no sense together; raises UsageError naming the fields."""
+        if self.retry_failed and self.resume is None:
+            raise UsageError("`retry_failed`: name the sweep's folder with `resume`")
+        if self.board and self.ray:
+            raise UsageError("`board` and `ray` are two things: on Ray every node offers its own boards")
+        if not self.file and self.resume is None:
+            raise UsageError("name a sweep file, or the folder of a sweep with `resume`")
+
+    @property
+    def source(self) -> Path:
+        """Return the sweep file; raises UsageError where none has that name."""
+        return self.resume / COPY if self.resume and not self.file else find_sweep(self.file)
+
+    @cached_property
+    def boards(self) -> tuple[str, ...] | None:
+        """Return what this machine is called, now or when the sweep began; None where Ray knows. Raises StoreError."""
+        if self.ray or self.board or self.resume is None:
+            return None if self.ray else self.board
+        return tuple(read_run(self.resume).manifest["configuration"].get("boards") or ())
+
+    @property
+    def width(self) -> int:
+        return self.jobs or len(os.sched_getaffinity(0))

@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from s2a_bench.store.manifest import plain
 from s2a_bench.store.schema import SCHEMA
+from s2a_bench.store.sweep import Sweep
+from s2a_bench.sweep import Cell
+from s2a_bench.sweep.run import Expected
 from s2a_bench.writers.as_json import frame
-
-if TYPE_CHECKING:
-    from s2a_bench.store.sweep import Sweep
-    from s2a_bench.sweep import Cell
-    from s2a_bench.sweep.timing import Expected
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +50,6 @@ class SweptCell(_Setting):
 
 def plan_json(cells: Sequence[Cell], expected: Expected, environment: dict[str, Any]) -> dict[str, Any]:
     """Return what would run as the ``--json`` object."""
-    time = {"source": expected.source}
     planned = [
         PlannedCell(
             cell=cell.name,
@@ -67,7 +64,7 @@ def plan_json(cells: Sequence[Cell], expected: Expected, environment: dict[str, 
         "schema": SCHEMA,
         "command": "sweep",
         "environment": environment,
-        "expected": time if expected.seconds is None else {"s": expected.seconds, **time},
+        "expected": ({} if expected.seconds is None else {"s": expected.seconds}) | {"source": expected.source},
         "cells": plain(planned),
         "ratios": [],
         "warnings": [],

@@ -1,18 +1,56 @@
-"""The sweep file: strict TOML, every key known, every complaint one line that names file and key."""
+"""The sweep file: strict TOML, every complaint one line that names file and key; its axes as settings, its rounds."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
-from typing import Annotated, Any
+from random import Random
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 from pydantic import Field
 
-from s2a_bench.boards.search import search_path
+from s2a_bench.boards.profile import search_path
 from s2a_bench.errors import UsageError
-from s2a_bench.sweep.grid import Setting, expand
+from s2a_bench.text import read_text
 from s2a_bench.toml_file import TomlTable, like, parse
+
+Axes: TypeAlias = Mapping[str, Sequence[Any]]
+Setting: TypeAlias = dict[str, Any]
+Item = TypeVar("Item")
+
+
+def expand(grid: Axes, zipped: Axes, excluded: Sequence[Mapping[str, Any]] = ()) -> list[Setting]:
+    """List every setting: each combination of the grid with each row of the zipped axes, which are of one length.
+
+    A setting is left out where it agrees with every key of an exclude; a list there stands for any of its values.
+    """
+    rows = [dict(zip(zipped, row, strict=True)) for row in zip(*zipped.values(), strict=True)] if zipped else [{}]
+    whole = [dict(zip(grid, point, strict=True)) | row for point in product(*grid.values()) for row in rows]
+    return [setting for setting in whole if not any(_agrees(setting, pattern) for pattern in excluded)]
+
+
+def rounds(items: Sequence[Item], repeats: int, seed: int) -> Iterator[tuple[int, Item]]:
+    """Yield all items once, then all again: repeats are far apart, so that a machine's drift meets all alike.
+
+    Each round has a random order of its own, from the seed. Repeats count from 1.
+    """
+    for repeat in range(1, repeats + 1):
+        order = list(items)
+        Random(f"{seed}/{repeat}").shuffle(order)  # noqa: S311 - an order, no secret
+        for item in order:
+            yield repeat, item
+
+
+def _agrees(setting: Setting, pattern: Mapping[str, Any]) -> bool:
+    """Return whether every key of the pattern has, or lists, the setting's value."""
+    return all(key in setting and setting[key] in _listed(value) for key, value in pattern.items())
+
+
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
 
 BOARD = "board"
 """The key that is no flag: the machine that a cell needs."""
@@ -69,7 +107,7 @@ class _File(TomlTable):
 def read_sweep_file(path: Path) -> SweepFile:
     """Read and expand a sweep file; raises UsageError naming the file and the key."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"cannot read the sweep file {path}: {error}") from error
     file = parse(_File, text, str(path))
@@ -96,7 +134,6 @@ def _check_keys(path: Path, tables: dict[str, dict[str, Any]]) -> None:
 
 
 def _check_cells(path: Path, settings: tuple[Setting, ...], repeats: int) -> None:
-    """Refuse none, too many, and the same one twice."""
     if not settings:
         raise UsageError(f"{path}: exclude: nothing is left; take one of them out")
     if len(settings) * repeats > MOST_CELLS:
@@ -106,11 +143,10 @@ def _check_cells(path: Path, settings: tuple[Setting, ...], repeats: int) -> Non
 
 
 def _check_excludes(path: Path, excluded: list[dict[str, Any]], axes: dict[str, list[Any]]) -> None:
-    """Refuse what names no axis, or no value of one."""
     for pattern in excluded:
         for key, value in pattern.items():
             if key not in axes:
                 raise UsageError(f"{path}: exclude.{key}: it is no axis{like(key, axes)}")
-            for each in value if isinstance(value, list) else [value]:
+            for each in _listed(value):
                 if each not in axes[key]:
                     raise UsageError(f"{path}: exclude.{key}: {each!r} is no value of that axis")

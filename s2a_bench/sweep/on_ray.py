@@ -55,9 +55,8 @@ class OnRay:
         self._remote = ray.remote(max_retries=TRIES)(packed)
 
     def submit(self, cell: Cell, folder: Path) -> Future[Packed]:  # noqa: ARG002 - it is unpacked later
-        """Give a cell to the cluster."""
         wants = {} if cell.virtual else {"resources": {resource(cell.board): 1}}
-        ref = self._remote.options(name=f"{cell.name}-r{cell.repeat}", **wants).remote(cell, self._entry)
+        ref = self._remote.options(name=cell.label, **wants).remote(cell, self._entry)
         self._refs.add(ref)
         future: Future[Packed] = ref.future()
         future.add_done_callback(lambda _: self._refs.discard(ref))
@@ -102,7 +101,6 @@ def connect(address: str, jobs: int) -> Any:
 
 
 def _check(plan: Plan, resources: Mapping[str, float]) -> None:
-    """Refuse cells that no node could take."""
     missing = [board for board in plan.boards if not resources.get(resource(board))]
     if missing:
         offered = ", ".join(name.partition(":")[2] for name in resources if name.startswith("board:"))

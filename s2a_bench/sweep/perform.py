@@ -1,4 +1,4 @@
-"""One cell carried out, on whatever machine this is: in this process where it is virtual, else in one of its own."""
+"""One cell carried out, in this process where it is virtual, else in one of its own; and many on this machine."""
 
 from __future__ import annotations
 
@@ -6,18 +6,22 @@ import io
 import signal
 import subprocess
 import sys
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stderr, redirect_stdout
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, Final
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import S2AError, StoreError
-from s2a_bench.exits import how_it_ended
-from s2a_bench.machine.children import end_with_parent
+from s2a_bench.errors import S2AError, StoreError, how_it_ended
 from s2a_bench.machine.environment import collect
+from s2a_bench.machine.tuning import end_with_parent
 from s2a_bench.store import manifest as manifests
+from s2a_bench.store.manifest import utc_now
 from s2a_bench.sweep import Cell, Outcome
+from s2a_bench.sweep.plan import Plan
 
 LOG: Final = "stderr.txt"
 
@@ -86,3 +90,54 @@ def _outside(argv: list[str], log: Path) -> str:
 
 def _stop_with_parent() -> None:
     end_with_parent(signal.SIGTERM)
+
+
+DIED = "the worker process died under it (out of memory?)"
+
+
+class Here:
+    """Two pools of processes, so that a cell that crashes or takes all memory does not take the sweep along."""
+
+    def __init__(self, entry: str, _address: str, _plan: Plan, jobs: int) -> None:
+        self.width = jobs
+        self._entry = entry
+        self._others = set(active_children())
+        self._pools: dict[bool, ProcessPoolExecutor] = {}
+
+    def submit(self, cell: Cell, folder: Path) -> Future[Outcome]:
+        try:
+            return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
+        except BrokenProcessPool:  # an earlier cell broke it
+            del self._pools[cell.virtual]
+            return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
+
+    def collect(self, future: Future[Outcome], folder: Path) -> Outcome:  # noqa: ARG002 - it lies there already
+        try:
+            return future.result()
+        except BrokenProcessPool:
+            return Outcome(DIED, 0.0, utc_now(), collect())
+
+    def _pool(self, virtual: bool) -> ProcessPoolExecutor:
+        if virtual not in self._pools:
+            self._pools[virtual] = ProcessPoolExecutor(
+                self.width if virtual else 1, mp_context=get_context("spawn"), initializer=prepare
+            )
+        return self._pools[virtual]
+
+    def __enter__(self) -> Here:  # noqa: PYI034 - Self is typing's since 3.11
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Close the pools; after an interruption end what they are doing."""
+        for pool in self._pools.values():
+            pool.shutdown(wait=kind is None, cancel_futures=True)
+        if kind is not None:
+            for child in set(active_children()) - self._others:
+                child.terminate()  # a measured cell's process sees it, and closes its run folder
+                child.join()
+
+
+def prepare() -> None:
+    """Prepare a worker: Ctrl-C is the sweep's to handle, and nothing outlives it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()

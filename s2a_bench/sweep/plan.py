@@ -9,11 +9,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from s2a_bench.boards.search import find_profile
+from s2a_bench.boards.profile import find_profile
 from s2a_bench.errors import UsageError
 from s2a_bench.sweep import Cell, Command
-from s2a_bench.sweep.file import BOARD, OWN, SweepFile
-from s2a_bench.sweep.grid import Setting, rounds
+from s2a_bench.sweep.file import BOARD, OWN, Setting, SweepFile, rounds
 from s2a_bench.toml_file import like
 
 HASHED_WHOLE = 1 << 20
@@ -37,7 +36,6 @@ class Plan:
 
     @property
     def boards(self) -> tuple[str, ...]:
-        """Name the machines that cells need."""
         return tuple(dict.fromkeys(cell.board for cell in self.cells if cell.board))
 
 
@@ -68,7 +66,6 @@ def plan_sweep(file: SweepFile, command: Command, boards: Collection[str] | None
 
 
 def _check_keys(file: SweepFile, command: Command, setting: Setting) -> None:
-    """Refuse what is no flag, and values of the wrong kind."""
     for key, value in setting.items():
         if key == BOARD:
             if not isinstance(value, str) or not value:
@@ -120,13 +117,20 @@ def _files(setting: Setting) -> Iterator[Path]:
             if key == "profile" and text:
                 yield find_profile(text.strip())
                 continue
-            path = Path(text.strip().removeprefix("@").rpartition(":")[2])
-            if path.is_file():
+            if path := _named_file(text.strip()):
                 yield path
 
 
+def _named_file(text: str) -> Path | None:
+    """Return the file that a text names, as ``PATH``, ``@PATH`` or ``video:PATH``, if there is one."""
+    path = Path(text.removeprefix("@").rpartition(":")[2])
+    try:
+        return path if path.is_file() else None
+    except OSError:  # too long for a path: a prompt
+        return None
+
+
 def _content(path: Path) -> list[Any]:
-    """Describe a file so that a change shows."""
     facts = path.stat()
     if facts.st_size <= HASHED_WHOLE:
         return [path.name, sha256(path.read_bytes()).hexdigest()]

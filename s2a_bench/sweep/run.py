@@ -1,4 +1,4 @@
-"""The sweep itself: cells run once, each is on disk with its row before the next is counted, and it can go on later."""
+"""The sweep itself: each cell is on disk with its row before the next counts; going on later; the time to expect."""
 
 from __future__ import annotations
 
@@ -9,24 +9,22 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.machine import environment
+from s2a_bench.progress import Progress
+from s2a_bench.store.manifest import SWEEP
 from s2a_bench.store.run import RunWriter, read_run
-from s2a_bench.store.sweep import CELLS, COMMAND, CellRow, is_sweep
-from s2a_bench.sweep import Cell, Outcome, Workers
-from s2a_bench.sweep.machine import KIND, difference, facts_of
+from s2a_bench.store.sweep import CELLS, CellRow, Sweep, is_sweep, read_sweep
+from s2a_bench.sweep import COPY, Cell, Outcome, Workers
 from s2a_bench.sweep.perform import run_folder
 from s2a_bench.sweep.plan import Plan
 
-if TYPE_CHECKING:
-    from s2a_bench.progress import Progress
-
-COPY = "sweep.toml"
-"""The sweep file as it was, in the sweep's folder."""
 UNDER_WAY = ".under-way"
 """Cells that are running; what a killed sweep leaves there is the work that is lost."""
 
@@ -48,7 +46,7 @@ def start_sweep(plan: Plan, source: Path, output: Path, boards: Sequence[str] | 
         "machines": {},
         "boards": {},
     }
-    writer = RunWriter.create(output, COMMAND, facts, (CELLS,))
+    writer = RunWriter.create(output, SWEEP, facts, (CELLS,))
     (writer.path / COPY).write_bytes(source.read_bytes())
     return writer
 
@@ -106,11 +104,9 @@ class SweepRun:
 
     @property
     def failed(self) -> int:
-        """Count the cells whose latest attempt failed."""
         return sum(state == "failed" for _, state in self._latest.values())
 
     def pending(self, *, retry_failed: bool) -> list[Cell]:
-        """List the cells that have still to run, in their order."""
         return pending(self._plan, self._rows, retry_failed=retry_failed)
 
     def work(self, cells: Sequence[Cell], workers: Workers) -> None:
@@ -125,7 +121,6 @@ class SweepRun:
         self._drain({"": virtual}, {"": workers.width}, workers, 0)
 
     def finish(self) -> None:
-        """Write how the sweep ended."""
         shutil.rmtree(self._writer.path / UNDER_WAY, ignore_errors=True)
         failed = self.failed
         text = f"{failed} of {len(self._plan.cells)} cells failed" if failed else None
@@ -141,9 +136,8 @@ class SweepRun:
                 free = width[lane] - sum(name == lane for name, _, _ in running.values())
                 while waiting and free > 0 and ready_ns[lane] <= now:
                     cell, free = waiting.popleft(), free - 1
-                    folder = self._writer.path / UNDER_WAY / f"{cell.name}-r{cell.repeat}"
-                    which = "cells" if cell.virtual else f"{cell.name}-r{cell.repeat}"
-                    self._progress.stage(f"{self._plan.command} {which}")
+                    folder = self._writer.path / UNDER_WAY / cell.label
+                    self._progress.stage(f"{self._plan.command} {'cells' if cell.virtual else cell.label}")
                     running[workers.submit(cell, folder)] = lane, cell, folder
             rests = [ready_ns[lane] for lane, waiting in lanes.items() if waiting and ready_ns[lane] > now]
             if not running:
@@ -161,7 +155,7 @@ class SweepRun:
         host = str(outcome.machine.get("host", ""))
         error = outcome.error or self._stranger(cell, outcome)
         found = run_folder(folder) if folder.exists() else None
-        kept = self._writer.path / "cells" / (f"{cell.name}-r{cell.repeat}" + (f"-{attempt}" if attempt > 1 else ""))
+        kept = self._writer.path / "cells" / (cell.label + (f"-{attempt}" if attempt > 1 else ""))
         if found is not None:
             kept.parent.mkdir(exist_ok=True)
             shutil.rmtree(kept, ignore_errors=True)  # moved, but killed before its row: it counts as not done
@@ -202,3 +196,85 @@ class SweepRun:
             self._writer.update(boards={cell.board: json.loads(json.dumps(kind))})
         other = difference(kind, boards[cell.board])
         return f"{cell.board} is another machine than before: {other}" if other else ""
+
+
+KIND = ("s2a_bench", "machine", "board", "cpu", "cores", "gpus", "power_mode")
+"""Facts of `bench.environment` that two boards of one kind share."""
+IDENTITY = ("host", *KIND)
+"""Those that tell one machine from any other."""
+
+
+def facts_of(environment: dict[str, Any], names: tuple[str, ...] = IDENTITY) -> dict[str, Any]:
+    """Pick the facts that identify a machine; an unreadable one is absent."""
+    return {name: environment[name] for name in names if name in environment}
+
+
+def difference(now: dict[str, Any], then: dict[str, Any]) -> str:
+    """Say in words what differs; nothing where all is the same."""
+    names = [name for name in IDENTITY if now.get(name) != then.get(name)]
+    return ", ".join(f"{name} is {_plain(now.get(name))}, was {_plain(then.get(name))}" for name in names)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list):
+        return " + ".join(str(each.get("name", each)) for each in value)
+    return "unknown" if value is None else str(value)
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """A time to expect, and where it is from; None: not known."""
+
+    seconds: float | None
+    source: str
+
+
+def earlier(output: Path, command: str) -> list[Sweep]:
+    """Find sweeps of a command on this machine below a folder, the newest first."""
+    here = facts_of(environment.collect())
+    found = []
+    for folder in sorted(output.glob("*-sweep-*"), reverse=True):
+        try:
+            sweep = read_sweep(folder)
+        except StoreError:
+            continue
+        asked = sweep.manifest["configuration"].get("command")
+        if asked == command and not difference(here, facts_of(sweep.manifest["environment"])):
+            found.append(sweep)
+    return found
+
+
+def expect(cells: Sequence[Cell], rest_s: float, width: int, sweeps: Sequence[Sweep], workers: Workers) -> Expected:
+    """Return how long cells will take, by the times of the same cells, of the same command, or of the first."""
+    for sweep in sweeps:
+        done = sweep.cells[sweep.cells["state"] == "finished"]
+        if len(done):
+            times = {str(name): float(value) for name, value in done.groupby("config_hash")["wall_s"].median().items()}
+            typical = float(done["wall_s"].median())
+            known = sum(cell.config_hash in times for cell in cells)
+            source = f"as {known} of these cells took in {sweep.path}"
+            if known < len(cells):
+                source += f", {typical:.1f} s for each of the others"
+            spent = [(cell, times.get(cell.config_hash, typical)) for cell in cells]
+            return Expected(_total(spent, rest_s, width), source)
+    first = next((cell for cell in cells if cell.virtual), None)
+    if first is None:
+        return Expected(None, "no sweep of this command has run here; once a cell is done, the time left is shown")
+    with TemporaryDirectory(prefix="s2a-bench-sweep-") as place, workers:
+        turns = [
+            workers.collect(workers.submit(first, folder), folder).wall_s
+            for folder in (Path(place) / "first", Path(place) / "second")
+        ]
+    source = f"cell {first.name} was run for it and took {turns[1]:.2f} s, not counting the first time"
+    start_s = turns[0] - turns[1]
+    return Expected(_total([(cell, turns[1]) for cell in cells], rest_s, width) + max(start_s, 0), source)
+
+
+def _total(spent: Sequence[tuple[Cell, float]], rest_s: float, width: int) -> float:
+    """Add up: measured cells one after another on their board, boards side by side, then virtual ones."""
+    boards: dict[str, float] = {}
+    for cell, seconds in spent:
+        if not cell.virtual:
+            boards[cell.board] = boards.get(cell.board, -rest_s) + seconds + rest_s
+    virtual = [seconds for cell, seconds in spent if cell.virtual]
+    return max(boards.values(), default=0.0) + sum(virtual) / min(width, max(len(virtual), 1))

@@ -19,8 +19,6 @@ that its docstring names:
 | frame source | `frame_source.FrameSourceSuite` | ``make_source``: open it with this width and height |
 | policy | `policy.PolicySuite` | ``policy`` |
 | mode of acting on chunks | `mode.ModeSuite` | ``mode`` |
-| middleware | `middleware.MiddlewareSuite`, `action.ActionSuite` | ``join``: another participant of the same domain |
-| simulator | `simulator.SimulatorSuite` | ``world`` |
 
 `VirtualClock` jumps where a real one sleeps; `NullProgress` keeps what a run says. The suites need pytest, those of
 policies and modes hypothesis too.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import EngineError
-from s2a_bench.inference import Engine, told_by
+from s2a_bench.inference import Engine, declared
 from s2a_bench.types import Frame, Request, Token
 
 
@@ -79,7 +79,7 @@ class EngineSuite:
 
     def test_every_fact_that_it_tells_is_declared(self, engine: Engine) -> None:
         ask(engine, images=(rgb_frame(),))
-        told = told_by(str(engine.describe()["engine"]))
+        told = declared(str(engine.describe()["engine"])).tells
         assert set(engine.facts) <= set(told)
         assert all(fact.about for fact in told)
 

@@ -25,10 +25,6 @@ class FrameSourceSuite:
     """
 
     @pytest.fixture
-    def make_source(self) -> MakeSource:
-        raise NotImplementedError
-
-    @pytest.fixture
     def source(self, make_source: MakeSource) -> Iterator[FrameSource]:
         source = make_source(*SIZES[0])
         yield source

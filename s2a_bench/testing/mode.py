@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.policy.chunks import MODES, Mode, Setting
-from s2a_bench.policy.chunks.stepping import step
+from s2a_bench.policy.chunks.cycles import step
 
 shared = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

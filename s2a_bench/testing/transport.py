@@ -94,7 +94,7 @@ def wiring(
 ) -> Wiring[Any]:
     """What a client or server of a pipeline's name is told, in a test; a black box is where its options say."""
     pipeline = one_pipeline(name, **options)
-    address = address or pipeline.transport.foreign(pipeline.options)
+    address = address or pipeline.options.external_address
     return pipeline.wiring(address, timeout_s=timeout_s, deadline_s=deadline_s, max_tokens=max_tokens)
 
 
@@ -152,7 +152,7 @@ class TransportSuite:
 
     def handler(self, told: Wiring[Any], words: Sequence[str]) -> Recorder:
         """A handler that answers with words, or where those cannot travel with as many actions."""
-        if TOKENS in TRANSPORTS[told.transport].answers(told.variant, told.options):
+        if TOKENS in told.capabilities.answer_kinds:
             return Recorder(words)
         return Recorder([[place / 8, -place] for place in range(len(words))])
 
@@ -164,8 +164,8 @@ class TransportSuite:
         assert set(transport.stages.values()) <= set(GROUPS)
         assert not transport.stages.keys() & STAGES.keys()
 
-    def test_its_looks_are_of_its_variants(self, transport: Transport[Any]) -> None:
-        assert transport.looks.keys() <= set(transport.variants or ("",))
+    def test_its_styles_are_of_its_variants(self, transport: Transport[Any]) -> None:
+        assert transport.style.keys() <= set(transport.variants or ("",))
 
     def test_every_option_is_documented_and_unknown_ones_are_refused(self, transport: Transport[Any]) -> None:
         fields = transport.options.model_fields
@@ -183,15 +183,9 @@ class TransportSuite:
 
     def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect, told: Wiring[Any]) -> None:
         self._needs(TOKENS, told)
-        client = connect(Recorder(["go", "_to(", "キッチン", ")\n", ""]))
-        tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),)))
-        assert [(token.index, token.text, token.id) for token in tokens] == [
-            (0, "go", 7),
-            (1, "_to(", 8),
-            (2, "キッチン", 9),
-            (3, ")\n", 10),
-            (4, "", 11),
-        ]
+        words = ["go", "_to(", "キッチン", ")\n", ""]
+        tokens, _ = ask(connect(Recorder(words)), Request("a", "plan", (yuyv_frame(),)))
+        assert tokens == [Token(index, text, 7 + index) for index, text in enumerate(words)]
 
     def test_actions_arrive_in_order_with_every_bit(self, connect: Connect, told: Wiring[Any]) -> None:
         self._needs(ACTIONS, told)
@@ -207,7 +201,7 @@ class TransportSuite:
         assert trace.chain()[-1][0] == "return"
 
     def test_several_pictures_and_the_state_reach_the_handler(self, connect: Connect, told: Wiring[Any]) -> None:
-        if not TRANSPORTS[told.transport].takes_state(told.variant, told.options):
+        if not told.capabilities.accepts_state:
             pytest.skip(f"{told.transport}/{told.variant} carries no observations of policies")
         handler = self.handler(told, ["x"])
         state = (0.5, -1.25, 3.0)
@@ -219,7 +213,7 @@ class TransportSuite:
 
     @staticmethod
     def _needs(kind: str, told: Wiring[Any]) -> None:
-        if kind not in TRANSPORTS[told.transport].answers(told.variant, told.options):
+        if kind not in told.capabilities.answer_kinds:
             pytest.skip(f"{told.transport}/{told.variant} does not carry {kind}")
 
     def test_every_field_of_a_request_reaches_the_handler(self, connect: Connect, told: Wiring[Any]) -> None:
@@ -268,12 +262,10 @@ class TransportSuite:
         assert trace.remote.token_ns == sorted(trace.remote.token_ns)
         assert trace.facts[PROMPT_N] == 12.0
 
-    def test_every_fact_that_it_tells_is_declared(
-        self, connect: Connect, transport: Transport[Any], told: Wiring[Any]
-    ) -> None:
+    def test_every_fact_that_it_tells_is_declared(self, connect: Connect, told: Wiring[Any]) -> None:
         _, trace = ask(connect(self.handler(told, ["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
-        assert set(trace.facts) <= {*transport.told(told.options), PROMPT_N}  # which the handler tells
-        assert all(fact.about for fact in transport.told(told.options))
+        assert set(trace.facts) <= {*told.capabilities.facts, PROMPT_N}  # which the handler tells
+        assert all(fact.about for fact in told.capabilities.facts)
 
     def test_an_engine_that_refuses_fails_this_request_only(self, connect: Connect, told: Wiring[Any]) -> None:
         handler = self.handler(told, ["x"])

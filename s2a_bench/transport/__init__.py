@@ -3,14 +3,17 @@
 To add a transport, write a package with a module like this, and offer its instance as an entry point of the group
 ``s2a_bench.transports``; nothing in this repository changes::
 
-    class ToyOptions(Options):                      # transport/options.py
+    from s2a_bench.options import option
+    from s2a_bench.transport import SERVER, Options, Transport
+
+    class ToyOptions(Options):
         port: int = option(0, "port; 0: any free one", ge=0, le=65535, side=SERVER)
 
     class Toy(Transport[ToyOptions]):
         name, options = "toy", ToyOptions           # --transport 'toy?port=7000', serve toy
         payloads = ("raw",)                         # the first is the default
         stages = {"frame_length": "pack"}           # marked by its client or server, beside those of trace.STAGES
-        tells = (PAYLOAD_BYTES,)                    # the numbers beside the marks, those of its own as facts.Fact(...)
+        facts = (PAYLOAD_BYTES,)                    # the numbers beside the marks, those of its own as facts.Fact(...)
 
         def client(self, wiring, alive):
             from toy.client import ToyClient        # what is heavy is imported here
@@ -30,13 +33,16 @@ To add a transport, write a package with a module like this, and offer its insta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar
 
+from pydantic import AfterValidator
+
+from s2a_bench import options as base
 from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
 from s2a_bench.transport.limits import LIMITS, Limits
@@ -44,10 +50,96 @@ from s2a_bench.transport.limits import LIMITS, Limits
 if TYPE_CHECKING:
     from s2a_bench.facts import Fact
     from s2a_bench.trace import Trace
-    from s2a_bench.transport.options import Options
     from s2a_bench.types import Frame, Piece, Request
 
-O = TypeVar("O", bound="Options")  # noqa: E741 - the one type variable here
+PAYLOADS: Final = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
+"""How a picture travels: ``bgr8`` pixels, the camera's own YUYV, JPEG, a JPEG that was at hand before, PNG."""
+
+LOSSLESS: Final = frozenset({"", "raw", "yuyv", "png"})
+"""Payloads after which the engine sees the camera's very pixels; "" where nothing travels."""
+
+SERVER: Final = "server"
+"""``side`` of an option that the server's process is told too: cells that differ in it get servers of their own."""
+
+SERVING: Final = "serving"
+"""``side`` of such an option that is a flag of `serve` only; a run has it in the name of a pipeline."""
+
+EXTERNAL: Final = "external"
+"""``side`` of an option that, when set, is the address of a server that runs already and is not ours."""
+
+PROGRAM: Final = "program"
+"""``side`` of an option that, when set, names somebody else's server for the run to start: see `Options.program`."""
+
+
+def _known(payload: str) -> str:
+    if payload and payload not in PAYLOADS:
+        raise ValueError(f"'{payload}' is none of {', '.join(PAYLOADS)}")
+    return payload
+
+
+Payload = Annotated[str, AfterValidator(_known)]
+"""One of `PAYLOADS`, or nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """Somebody else's server that a run starts on its own model files: its kind, the program, its port (0: any)."""
+
+    kind: str
+    path: Path
+    port: int
+
+
+class Options(base.Options):
+    """What every transport can be told; a transport without options of its own uses this class.
+
+    An option is the client's business unless its ``side`` says something else.
+    """
+
+    SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {}
+    """Values that options have in `serve` unless told."""
+    NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = ()
+    """Options that `serve` takes in the pipeline's name, its file or ``--ros-args``, and has no flag for."""
+
+    payload: Payload = base.option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: the transport's own]")
+
+    @classmethod
+    def of_sides(cls, *sides: str) -> list[str]:
+        """Return the options of one of these sides, "" the client's."""
+        fields = cls.model_fields.items()
+        return [name for name, field in fields if str(base.extra_of(field).get("side", "")) in sides]
+
+    @property
+    def external(self) -> str:
+        """Return the option that says that the server is not ours, or nothing."""
+        return next((name for name in self.of_sides(EXTERNAL, PROGRAM) if getattr(self, name)), "")
+
+    @property
+    def external_address(self) -> str:
+        """Return the address of a server that runs already, or nothing."""
+        return next((getattr(self, name) for name in self.of_sides(EXTERNAL)), "")
+
+    @property
+    def program(self) -> Program | None:
+        """Return somebody else's server that the run should start, if that is wanted."""
+        return None
+
+    @property
+    def tuned(self) -> bool:
+        """Whether processes keep large blocks of memory for the next picture, and what else makes it faster."""
+        return True
+
+    @property
+    def against_loss(self) -> str:
+        """Return what to do where pictures or messages are lost on the way."""
+        return "look at the network"
+
+    def addresses(self) -> Iterable[str]:
+        """Return what a new server of ours may bind: the first that no other has, else the last."""
+        return ("",)
+
+
+O = TypeVar("O", bound=Options)  # noqa: E741 - the one type variable here
 
 TOKENS: Final = "tokens"
 ACTIONS: Final = "actions"
@@ -80,14 +172,14 @@ class Client(Protocol):
 
     @property
     def camera(self) -> CameraSink | None:
-        """None where the newest frame goes with the prompt instead."""
+        """None where the newest frame goes with the prompt instead. The first use may wait for the server."""
         ...
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Send a request with its frames as captured, yield pieces as they arrive, mark every stage.
 
         After the last piece ``trace.remote`` holds the server's marks. Raises RequestFailed when the server
-        refuses or breaks off, or goes beyond what `transport.bounds` allows, ServerDied when it is gone.
+        refuses or breaks off, or goes beyond what `transport.limits` allows, ServerDied when it is gone.
         """
         ...
 
@@ -148,6 +240,11 @@ class Wiring(Generic[O]):
         told |= {"timeout_s": self.timeout_s, "deadline_s": self.deadline_s, "max_tokens": self.max_tokens}
         return {**told, "options": self.options.model_dump(mode="json"), "limits": self.limits.to_manifest()}
 
+    @property
+    def capabilities(self) -> Capabilities[O]:
+        """Return what the pipeline can carry."""
+        return TRANSPORTS[self.transport].capabilities(Choice(self.options, self.variant))
+
     def deadline_of(self, max_tokens: int) -> float:
         """Return the seconds that an answer of so many tokens may take: as told, else generous for that many."""
         return self.deadline_s or self.timeout_s + TOKEN_S * max_tokens
@@ -160,12 +257,44 @@ class Wiring(Generic[O]):
 
 
 @dataclass(frozen=True, slots=True)
-class Program:
-    """Somebody else's server that a run starts on its own model files: its kind, the program, its port (0: any)."""
+class Choice(Generic[O]):
+    """What is chosen of a transport, by the name of a pipeline and the settings of a run."""
 
-    kind: str
-    path: Path
-    port: int
+    options: O
+    variant: str = ""
+    variants: Sequence[str] = ()
+    """Those that a flag chooses."""
+    mode: str = ""
+    engine: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities(Generic[O]):
+    """What a choice can carry."""
+
+    options: O
+    """As they hold for the variant."""
+    payloads: tuple[str, ...]
+    """How pictures can travel, the default first."""
+    answer_kinds: tuple[str, ...]
+    """What answers can be made of: tokens, actions."""
+    accepts_state: bool
+    """Whether a request can carry the robot's state."""
+    facts: Sequence[Fact]
+    """Those that may be told, by somebody else's server too."""
+    server: str = ""
+    """Which of the transport's servers answers the variant."""
+
+
+@dataclass(frozen=True, slots=True)
+class Urls:
+    """The URLs that name a server of a transport's kind which is not ours; its option `url` takes them."""
+
+    schemes: tuple[str, ...] = ()
+    examine: str = ""
+    """``module:function`` of what `doctor --url` looks at, see `transport.dangers`."""
+    cache_hits: str = ""
+    """``module:function`` that returns counter -> hits of its caches that the server of a wiring has counted so far."""
 
 
 class Transport(Generic[O]):
@@ -178,13 +307,17 @@ class Transport(Generic[O]):
     """What follows its name, as ``http/binary``; the first is measured unless told."""
     payloads: ClassVar[tuple[str, ...]] = ()
     """How pictures can travel, the default first; nothing where they do not travel at all."""
+    answer_kinds: ClassVar[tuple[str, ...]] = (TOKENS,)
+    """What answers can be made of: tokens, actions."""
+    accepts_state: ClassVar[bool] = False
+    """Whether a request can carry the robot's state."""
     stages: ClassVar[Mapping[str, str]] = {}
     """Stage -> group (one of `trace.GROUPS`), those of `trace.STAGES` left out."""
-    tells: ClassVar[Sequence[Fact]] = ()
-    """The facts that its client and server tell, those of the handler left out."""
+    facts: ClassVar[Sequence[Fact]] = ()
+    """Those that its client and server tell, without those of the handler."""
     order: ClassVar[float] = 50
     """How its cells sort among others."""
-    looks: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    style: ClassVar[Mapping[str, tuple[str, str]]] = {}
     """Variant ("" for none) -> colour and line style, in every figure."""
     compared_with: ClassVar[tuple[str, ...]] = ("loopback",)
     """The transports by whose cells its own are divided."""
@@ -192,20 +325,11 @@ class Transport(Generic[O]):
     """Python packages whose versions belong beside its results."""
     checks: ClassVar[Mapping[str, str]] = {}
     """Code -> ``module:function`` of the doctor's checks that are about it."""
-    watches_udp: ClassVar[bool] = False
-    """Whether UDP packets that the machine drops during a run are a reason for doubt."""
-    for_policies: ClassVar[bool] = False
-    """Whether its own server and client carry actions as well as tokens, and the robot's state."""
+    udp_checks: ClassVar[tuple[str, ...]] = ()
+    """Codes of those that matter before a run with large pictures, where it sends UDP packets, which can be lost."""
     in_process: ClassVar[bool] = False
     """Whether its server is a thread of the client's process."""
-    schemes: ClassVar[tuple[str, ...]] = ()
-    """Of the URLs, ``scheme://...``, that name a server of its kind which is not ours; its option `url` takes them."""
-    examines: ClassVar[str] = ""
-    """``module:function`` of what `doctor --url` looks at, see `transport.dangers`."""
-    elsewhere: ClassVar[tuple[str, ...]] = ()
-    """Options that, when set, name a server that is not ours."""
-    serving: ClassVar[Mapping[str, Any]] = {}
-    """Values that options have in `serve` unless told."""
+    urls: ClassVar[Urls] = Urls()
 
     def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:
         """Connect to the server at ``wiring.address``; ``alive`` tells whether its process still runs."""
@@ -215,68 +339,20 @@ class Transport(Generic[O]):
         """Bind a server, ready to `serve`; raises PortInUse or TransportError."""
         raise NotImplementedError
 
-    def measured(self, options: O, chosen: Sequence[str], engine: str) -> Sequence[str]:  # noqa: ARG002 - for subclasses
-        """Return the variants to measure where the pipeline names none; ``chosen`` is what a flag says."""
-        return chosen or self.variants[:1] or ("",)
+    def measured(self, choice: Choice[O]) -> Sequence[str]:
+        """Return the variants to measure where the pipeline names none."""
+        return choice.variants or self.variants[:1] or ("",)
 
-    def of_variant(self, variant: str, options: O) -> O:  # noqa: ARG002 - for subclasses
-        """Return the options as they hold for one variant."""
-        return options
+    def capabilities(self, choice: Choice[O]) -> Capabilities[O]:
+        """Return what a variant can carry with its options."""
+        return Capabilities(choice.options, self.payloads, self.answer_kinds, self.accepts_state, self.facts)
 
-    def travels(self, variant: str, options: O) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
-        """Return how pictures can travel over a variant, the default first."""
-        return self.payloads
+    def require(self, choice: Choice[O]) -> None:
+        """Raise UsageError for options that do not go together with the rest of a choice, or with this machine."""
 
-    def answers(self, variant: str, options: O) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
-        """Return what answers over a variant can be made of: tokens, actions."""
-        return (TOKENS, ACTIONS) if self.for_policies and not self.foreign_by(options) else (TOKENS,)
-
-    def takes_state(self, variant: str, options: O) -> bool:  # noqa: ARG002 - for subclasses
-        """Whether a request over a variant can carry the robot's state."""
-        return self.for_policies and not self.foreign_by(options)
-
-    def told(self, options: O) -> Sequence[Fact]:  # noqa: ARG002 - for subclasses
-        """Return the facts that may be told with these options, by somebody else's server too."""
-        return self.tells
-
-    def check(self, variant: str, options: O, *, mode: str, engine: str) -> None:
-        """Raise UsageError for options that do not go together with the variant or with a run's settings."""
-
-    def tuned(self, options: O) -> bool:  # noqa: ARG002 - for subclasses
-        """Whether processes keep large blocks of memory for the next picture, and what else makes it faster."""
-        return True
-
-    def foreign_by(self, options: O) -> str:
-        """Return the option that says that the server is not ours, or nothing."""
-        return next((name for name in self.elsewhere if getattr(options, name)), "")
-
-    def foreign(self, options: O) -> str:  # noqa: ARG002 - for subclasses
-        """Return the address of a server that somebody else runs, or nothing."""
-        return ""
-
-    def cache_hits(self, wiring: Wiring[O]) -> Mapping[str, float]:  # noqa: ARG002 - for subclasses
-        """Return counter -> hits of its caches that a server has counted so far, as far as it tells; asked twice."""
-        return {}
-
-    def program(self, options: O) -> Program | None:  # noqa: ARG002 - for subclasses
-        """Return somebody else's server that the run should start, if that is wanted."""
-        return None
-
-    def bind(self, options: O, taken: Sequence[str]) -> str:  # noqa: ARG002 - for subclasses
-        """Return what a new server of ours should bind, when others of this transport have ``taken`` theirs."""
-        return ""
-
-    def before_run(self, width: int, height: int) -> tuple[str, ...]:  # noqa: ARG002 - for subclasses
-        """Return the codes of its checks that matter before a run with pictures of this size in pixels."""
-        return ()
-
-    def against_loss(self, options: O) -> str:  # noqa: ARG002 - for subclasses
-        """Return what to do where pictures or messages are lost on the way."""
-        return "look at the network"
-
-    def ready(self, wiring: Wiring[O], address: str) -> str:
-        """Return what `serve` says once the server is bound."""
-        return f"serving {wiring.transport} at {address}"
+    def ready(self, wiring: Wiring[O]) -> str:
+        """Return what `serve` says once the server is bound, at ``wiring.address``."""
+        return f"serving {wiring.transport} at {wiring.address}"
 
 
 TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
@@ -294,9 +370,10 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
 """Name -> what is said about it."""
 
 
-class _Undeclared(Transport[Any]):
+class _Undeclared(Transport[Options]):
     """What is assumed of a transport of an old run whose package is not here."""
 
+    options = Options
     order = inf
 
 
@@ -312,7 +389,7 @@ def declared(name: str) -> Transport[Any]:
 def named_by(url: str) -> str:
     """Return the transport that a URL's scheme names; ``http`` where none does, whose options say what is wrong."""
     scheme = url.partition("://")[0].lower()
-    return next((name for name, each in TRANSPORTS.loaded() if scheme in each.schemes), "http")
+    return next((name for name, each in TRANSPORTS.loaded() if scheme in each.urls.schemes), "http")
 
 
 def open_client(wiring: Wiring[Any], alive: Callable[[], bool] = lambda: True) -> Client:

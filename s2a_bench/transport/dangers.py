@@ -1,6 +1,6 @@
 """`doctor --url`: what a server that somebody else runs does that is dangerous, without asking it to do anything.
 
-Each transport that has URLs examines what answers there (`Transport.examines`); what all of them share is here, and
+Each transport that has URLs examines what answers there (`Urls.examine`); what all of them share is here, and
 gRPC, of which there is no transport: lerobot's policy server speaks it.
 """
 
@@ -14,12 +14,12 @@ from pkgutil import resolve_name
 from typing import Final, TypeAlias
 from urllib.parse import SplitResult, urlsplit
 
-from s2a_bench.errors import UsageError
+from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.transport import TRANSPORTS
 
 Examine: TypeAlias = Callable[[SplitResult], Iterator[Finding]]
-"""Yields findings about the server at a URL that names a host; raises OSError or RequestFailed where none answers."""
+"""Yields findings about the server at a URL that names a host; raises OSError or TransportError where none answers."""
 
 PATIENCE_S: Final = 5.0
 GRPC: Final = "grpc"
@@ -34,7 +34,12 @@ ENCRYPTED: Final = frozenset({"https", "wss"})
 
 def examine(url: str) -> list[Finding]:
     """Return what is found at a URL; raises UsageError for one of no known kind."""
-    known = {scheme: each.examines for _, each in TRANSPORTS.loaded() for scheme in each.schemes if each.examines}
+    known = {
+        scheme: each.urls.examine
+        for _, each in TRANSPORTS.loaded()
+        for scheme in each.urls.schemes
+        if each.urls.examine
+    }
     try:
         parts = urlsplit(url)
         host, _ = parts.hostname, parts.port
@@ -47,7 +52,7 @@ def examine(url: str) -> list[Finding]:
     findings = [in_plain_text(parts)]
     try:
         findings += own(parts)
-    except OSError as error:
+    except (OSError, TransportError) as error:
         findings.append(
             Finding("server", "error", f"{host} does not answer: {shown(str(error))}", "start it, or name another")
         )

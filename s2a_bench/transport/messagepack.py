@@ -1,4 +1,4 @@
-"""MessagePack from outside: a bounded number of plain values, and what a protocol makes of its maps.
+"""MessagePack from outside: a bounded number of plain values, and what a protocol makes of its maps, arrays first.
 
 Bytes become nothing but numbers, texts, bytes, lists and dictionaries; no extension type is read, msgpack's own time
 stamps included.
@@ -7,14 +7,21 @@ stamps included.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from math import prod
+from typing import Any, Final
 
 import msgpack
+import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench.errors import RequestFailed
+from s2a_bench.transport.limits import VALUES
 
-LIST, MAP, VALUES = 4096, 1024, 1 << 16
-"""The most elements of a list, keys of a map, and elements and keys of a whole message; arrays are one each."""
+LIST, MAP = 4096, 1024
+"""The most elements of a list, and keys of a map; arrays of numbers are one value each."""
+
+DIMENSIONS: Final = 8
+"""The most of an array."""
 
 
 def unpacked(data: Any, of_map: Callable[[dict[Any, Any]], Any]) -> Any:
@@ -22,41 +29,42 @@ def unpacked(data: Any, of_map: Callable[[dict[Any, Any]], Any]) -> Any:
 
     What ``of_map`` refuses it says with a ValueError or a RequestFailed.
     """
-    reader = _Reader(of_map)
+    left = VALUES
+
+    def counted(value: Any) -> Any:
+        nonlocal left
+        left -= len(value) + 1
+        if left < 0:
+            raise ValueError(f"it has more than {VALUES} values")
+        return value
+
     try:
         return msgpack.unpackb(
             data,
-            object_hook=reader.map,
-            list_hook=reader.list,
+            object_hook=lambda value: of_map(counted(value)),
+            list_hook=counted,
             ext_hook=_no_extension,
             max_array_len=LIST,
             max_map_len=MAP,
             max_ext_len=0,  # time stamps never come to the hook, and empty ones pass this
         )
-    except (ValueError, TypeError, OverflowError, RecursionError) as error:  # msgpack's own are ValueErrors
+    except (RequestFailed, ValueError, TypeError, OverflowError, RecursionError) as error:  # msgpack's: ValueErrors
         raise RequestFailed(f"{len(data)} bytes that are no message: {str(error) or type(error).__name__}") from error
-
-
-class _Reader:
-    """The hooks of one message, which count what it has."""
-
-    def __init__(self, of_map: Callable[[dict[Any, Any]], Any]) -> None:
-        self._of_map = of_map
-        self._left = VALUES
-
-    def list(self, value: list[Any]) -> list[Any]:
-        self._count(len(value))
-        return value
-
-    def map(self, value: dict[Any, Any]) -> Any:
-        self._count(len(value))
-        return self._of_map(value)
-
-    def _count(self, number: int) -> None:
-        self._left -= number + 1
-        if self._left < 0:
-            raise ValueError(f"it has more than {VALUES} values")
 
 
 def _no_extension(code: int, _: bytes) -> Any:
     raise ValueError(f"an extension of type {code}, which nobody knows")
+
+
+def array_in(data: Any, shape: Any, dtype: np.dtype[Any], start: int = 0, *, fortran: bool = False) -> NDArray[Any]:
+    """Return the read-only array whose elements begin at ``start`` of some bytes; raises RequestFailed for no such."""
+    if not isinstance(data, bytes):
+        raise RequestFailed(f"an array whose data is {type(data).__name__}, not bytes")
+    axes: list[Any] = list(shape) if isinstance(shape, (list, tuple)) else [None]
+    if len(axes) > DIMENSIONS or not all(type(axis) is int and axis >= 0 for axis in axes):
+        raise RequestFailed(f"an array whose shape is none: {str(shape)[:80]}")
+    size = len(data) - start
+    if prod(axes) * dtype.itemsize != size:
+        raise RequestFailed(f"an array of shape {tuple(axes)} and type {dtype} in {size} bytes")
+    flat = np.frombuffer(data, dtype, offset=start) if size else np.empty(0, dtype)
+    return flat.reshape(axes[::-1]).T if fortran else flat.reshape(axes)

@@ -11,6 +11,8 @@ A list of arrays becomes one array with one more axis in front: ``[["{image}"]]`
 ``["{image:0}", "{image:1}"]`` is (2, H, W, 3), while ``[["{prompt}"]]`` stays a list of lists of text. A key that ends
 with ``?`` is left out, without the mark, where the request lacks a picture or the numbers that its value wants. All
 else stands for itself. The files beside this module, in ``templates``, are known by name.
+
+`PolicyTransport` is what transports to servers that are told by such a template have in common.
 """
 
 from __future__ import annotations
@@ -20,18 +22,21 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, NoReturn, TypeAlias
+from typing import Annotated, Any, ClassVar, Final, NoReturn, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator
 
-from s2a_bench import toml_file
+from s2a_bench import extras, toml_file
 from s2a_bench.errors import RequestFailed, UsageError
+from s2a_bench.text import read_text
+from s2a_bench.transport import ACTIONS, Capabilities, Choice, Transport
+from s2a_bench.transport.listening import ListeningOptions, read_key
 from s2a_bench.types import Pixels, Vector
 
 HERE: Final = Path(__file__).with_name("templates")
 DEFAULT: Final = "openpi"
-FILE_BYTES, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
+FILE_LETTERS, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
 """The most that a template has: bytes, values, dictionaries and lists within each other, pictures."""
 WHOLE: Final = range(-(1 << 63), 1 << 64)
 """What MessagePack has room for."""
@@ -203,13 +208,9 @@ def template_of(told: str) -> Template:
     if not path.suffix:
         raise UsageError(f"`template`: '{told}' is none of {', '.join(known)}, nor a TOML or JSON file")
     try:
-        with path.open("rb") as file:
-            data = file.read(FILE_BYTES + 1)
-        text = data.decode()
+        text = read_text(path, FILE_LETTERS)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise UsageError(f"`template`: cannot read {told}: {error}") from error
-    if len(data) > FILE_BYTES:
-        raise UsageError(f"`template`: {told} has more than {FILE_BYTES} bytes")
     return Template(_loads(text, told) if path.suffix == ".json" else toml_file.loads(text, told), told)
 
 
@@ -243,3 +244,37 @@ def _readable(told: str) -> str:
 
 TemplateName = Annotated[str, AfterValidator(_readable)]
 """Name or path of a template that can be read."""
+
+
+class PolicyOptions(ListeningOptions):
+    """How a policy server is reached, and what it is told."""
+
+    @property
+    def template_name(self) -> str:
+        """Return the name or the path of the template."""
+        raise NotImplementedError
+
+
+P = TypeVar("P", bound=PolicyOptions)
+
+
+class PolicyTransport(Transport[P]):
+    """Observations go up as MessagePack, a chunk of actions comes back."""
+
+    payloads: ClassVar[tuple[str, ...]] = ("raw", "jpeg", "jpeg-preencoded", "png")
+    answer_kinds = (ACTIONS,)
+    stages: ClassVar[Mapping[str, str]] = {"msgpack_pack": "pack", "msgpack_parse": "parse"}
+    modules: ClassVar[tuple[str, ...]]
+    """What the extra of its name brings, by the names under which they are imported."""
+
+    def capabilities(self, choice: Choice[P]) -> Capabilities[P]:
+        """Return what a policy takes: pixels, unless its template says that it decodes files."""
+        options, template = choice.options, template_of(choice.options.template_name)
+        pixels = self.payloads[:1] if options.url else self.payloads
+        payloads = self.payloads[1:] if template.encoded else pixels
+        return Capabilities(options, payloads, self.answer_kinds, template.takes_state, self.facts)
+
+    def require(self, choice: Choice[P]) -> None:
+        """Refuse a key that is not there; raises MissingExtra too."""
+        extras.need(self.name, *self.modules)
+        read_key(choice.options.api_key_env)

@@ -4,6 +4,10 @@ Policies name their keys as they like. So every array of uint8 is a picture, (H,
 any axes of batch and time in front, or (n,) the bytes of a JPEG or PNG, as bytes are, with axes of 1 in front; every
 number with a fraction, or array of such, is part of the state; the prompt is the text under ``prompt``, else the first
 text there is. All in the order of the keys. Whole numbers and truths are ignored.
+
+What our clients and servers add to a policy server's protocol is here, too: between them alone, never sent to anybody
+else's. A request has the key `OWN` with its fields that no observation has, and so has the message with the server's
+marks. How the two know each other, and when the marks travel, is each protocol's own.
 """
 
 from __future__ import annotations
@@ -14,15 +18,16 @@ from typing import Any, Final
 import numpy as np
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.trace import Trace
+from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport.chunks import state_of
-from s2a_bench.transport.limits import Limits, check_pixels, text
+from s2a_bench.transport.limits import SEEDS, Limits, check_pixels, text, whole_number
 from s2a_bench.transport.pictures import decoded
-from s2a_bench.types import Frame
+from s2a_bench.types import Frame, Request
 
 PICTURES: Final = 64
 NUMBERS: Final = 4096
 """The most of one request: pictures, and numbers of the state."""
+OWN: Final = "s2a"
 PROMPT: Final = "prompt"
 DEPTH: Final = 32
 COLOURS: Final = 3
@@ -69,7 +74,6 @@ def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
 
 
 def _pictures(key: str, value: Any, trace: Trace, limits: Limits) -> Sequence[Frame]:
-    """Return the pictures of one array."""
     data = value if isinstance(value, bytes) else value.reshape(-1)
     if data is value or value.ndim == 1 or (len(data) == value.shape[-1] and len(data) != COLOURS):
         if not len(data):
@@ -89,3 +93,45 @@ def _pictures(key: str, value: Any, trace: Trace, limits: Limits) -> Sequence[Fr
         raise RequestFailed(f"{key}: {len(several)} pictures; at most {PICTURES} are taken")
     planes = several if last else np.ascontiguousarray(np.moveaxis(several, 1, -1))
     return [Frame(-1, 0, width, height, "rgb8", picture) for picture in planes]
+
+
+def parameters(request: Request) -> dict[str, Any]:
+    """Return the fields of a request that no observation has."""
+    told = {"id": request.id, "max_tokens": request.max_tokens, "seed": request.seed, "grammar": request.grammar}
+    return {name: value for name, value in told.items() if value}
+
+
+def told_in(message: Any) -> dict[Any, Any] | None:
+    """Take what our client added out of a message, None from anybody else's."""
+    told = message.pop(OWN, None) if isinstance(message, dict) else None
+    if told is not None and not isinstance(told, dict):
+        raise RequestFailed(f"{OWN} should be a map")
+    return told
+
+
+def request_of(observation: Any, told: dict[Any, Any] | None, trace: Trace, limits: Limits) -> Request:
+    """Read an observation and what our client added, decode its pictures; raises RequestFailed."""
+    told = told or {}
+    images, state, prompt = observed(observation, trace, limits)
+    return Request(
+        id=text("id", told.get("id")) or "observation-0",
+        prompt=prompt,
+        images=images,
+        max_tokens=whole_number("max_tokens", told.get("max_tokens"), 1, limits.answer_tokens, limits.answer_tokens),
+        grammar=text("grammar", told.get("grammar")),
+        seed=whole_number("seed", told.get("seed"), 0, SEEDS, 0),
+        state=state,
+    )
+
+
+def remote_message(remote: Remote) -> dict[str, Any]:
+    """Return what carries a server's marks."""
+    return {OWN: remote.to_json()}
+
+
+def remote_of(message: Any) -> Remote:
+    """Read a server's marks; raises RequestFailed for what can be none."""
+    try:
+        return Remote.of_json(message[OWN])
+    except (LookupError, TypeError, ValueError) as error:
+        raise RequestFailed(f"what should be the server's marks is none: {error!r}") from error

@@ -3,18 +3,34 @@
 ``http`` stands for the variants that flags choose, ``http/binary`` for one, ``ros/topic?payload=yuyv`` for one with an
 option of its own. A cell's *canonical* name has the variant, leaves out options that are what they would be without
 being named, and sorts the others. Values are percent-encoded where they need to be (RFC 3986): a comma is ``%2C``.
+Where a command says so a name may hold options of the engine too, which come last: ``loopback?flash_attention=on``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import parse_qsl, quote
 
 from s2a_bench.errors import UsageError
-from s2a_bench.transport import ACTIONS, TOKENS, TRANSPORTS, Transport, Wiring
-from s2a_bench.transport.options import Options, checked, server_side, text_of
+from s2a_bench.options import extra_of
+from s2a_bench.transport import (
+    ACTIONS,
+    EXTERNAL,
+    PROGRAM,
+    SERVER,
+    SERVING,
+    TOKENS,
+    TRANSPORTS,
+    Capabilities,
+    Choice,
+    Options,
+    Transport,
+    Wiring,
+)
+
+O = TypeVar("O", bound=Options)  # noqa: E741 - the one type variable here
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +42,8 @@ class Pipeline:
     transport: Transport[Any]
     variant: str
     options: Options
+    engine: tuple[tuple[str, str], ...] = ()
+    """Options of the engine, with their values, that only this cell's has."""
 
     @property
     def payload(self) -> str:
@@ -35,17 +53,26 @@ class Pipeline:
     @property
     def black_box(self) -> bool:
         """Whether the server is not ours."""
-        return bool(self.transport.foreign_by(self.options))
+        return bool(self.options.external)
+
+    @property
+    def capabilities(self) -> Capabilities[Any]:
+        """Return what it can carry."""
+        return self.transport.capabilities(Choice(self.options, self.variant))
 
     @property
     def server(self) -> tuple[object, ...]:
         """Return what cells must have in common to share a server."""
-        return (self.transport.name, *server_side(self.options))
+        ours = "" if self.black_box else self.capabilities.server
+        told = self.options.of_sides(SERVER, SERVING, EXTERNAL, PROGRAM)
+        return (self.transport.name, ours, *((name, getattr(self.options, name)) for name in told), *self.engine)
 
-    @property
-    def answers(self) -> tuple[str, ...]:
-        """Return what its answers can be made of."""
-        return self.transport.answers(self.variant, self.options)
+    def risks(self) -> Iterator[tuple[str, str, str]]:
+        """Yield those of the options in its name, as `Options.risks` does."""
+        fields = type(self.options).model_fields
+        for name, value in _parse(self.name).options.items():
+            if name in fields and (risk := str(extra_of(fields[name]).get("risk", ""))):
+                yield name, risk, value
 
     def wiring(self, address: str = "", **told: Any) -> Wiring[Any]:
         """Return what its client, or its server, is told."""
@@ -77,17 +104,19 @@ def pipelines(
     options: Mapping[str, Mapping[str, Any]] | None = None,
     variants: Mapping[str, Sequence[str]] | None = None,
     engine: str = "",
+    of_engine: Collection[str] = (),
 ) -> list[Pipeline]:
     """Return the pipelines that names stand for, each once; raises UsageError.
 
     ``options`` (transport -> option -> value) and ``variants`` (transport -> variants) hold what flags give, for names
     that do not say it themselves. A ``payload`` under the transport "" is for all that can carry it. ``engine`` is what
-    answers, where variants that are measured by default depend on that.
+    answers, where variants that are measured by default depend on that; ``of_engine`` are options of it that names may
+    hold as well.
     """
     given = {name: dict(values) for name, values in (options or {}).items()}
     found: dict[str, Pipeline] = {}
     for text in names:
-        for pipeline in _standing_for(_parse(text), given, variants or {}, engine):
+        for pipeline in _standing_for(_parse(text), given, variants or {}, engine, of_engine):
             found.setdefault(pipeline.name, pipeline)
     return list(found.values())
 
@@ -97,12 +126,17 @@ def answer_over(asked: str, compared: Sequence[Pipeline]) -> str:
 
     Where that is left open (``auto``) it is tokens, actions if one of the pipelines carries nothing else.
     """
-    alone = {kind: next((each.name for each in compared if each.answers == (kind,)), "") for kind in (TOKENS, ACTIONS)}
+    alone = {kind: carries_alone(kind, compared) for kind in (TOKENS, ACTIONS)}
     answer = (ACTIONS if alone[ACTIONS] else TOKENS) if asked == "auto" else asked
     if stuck := alone[TOKENS if answer == ACTIONS else ACTIONS]:
         other = f", and {alone[ACTIONS]} nothing else" if answer == ACTIONS and alone[ACTIONS] else ""
         raise UsageError(f"`answer`: {stuck} does not carry {answer}{other}; measure it in a run of its own")
     return answer
+
+
+def carries_alone(kind: str, compared: Sequence[Pipeline]) -> str:
+    """Return the first pipeline whose answers can be made of nothing else, "" without one."""
+    return next((each.name for each in compared if each.capabilities.answer_kinds == (kind,)), "")
 
 
 def first_variants() -> dict[str, tuple[str, ...]]:
@@ -119,23 +153,36 @@ def one_pipeline(text: str, **options: Any) -> Pipeline:
 
 
 def _standing_for(
-    named: _Named, given: Mapping[str, Mapping[str, Any]], chosen: Mapping[str, Sequence[str]], engine: str = ""
+    named: _Named,
+    given: Mapping[str, Mapping[str, Any]],
+    chosen: Mapping[str, Sequence[str]],
+    engine: str = "",
+    of_engine: Collection[str] = (),
 ) -> Iterator[Pipeline]:
-    """Yield a pipeline a variant."""
     transport = TRANSPORTS[named.transport]
     flags = {**given.get("", {}), **given.get(transport.name, {})}
-    plain = checked(transport.options, flags, transport.name)
-    asked = checked(transport.options, {**flags, **named.options}, transport.name)
-    variants = [named.variant] if named.variant else transport.measured(asked, chosen.get(transport.name, ()), engine)
+    told = {name: value for name, value in named.options.items() if name not in of_engine}
+    own = tuple(sorted(named.options.items() - told.items()))
+    plain = _checked(transport.options, flags, transport.name)
+    asked = _checked(transport.options, {**flags, **told}, transport.name)
+    choice = Choice(asked, variants=chosen.get(transport.name, ()), engine=engine)
+    variants = [named.variant] if named.variant else transport.measured(choice)
     for variant in variants:
         if variant not in (transport.variants or ("",)):
             known = ", ".join(transport.variants) or "none: it has no variants"
             field = "transport" if named.variant else transport.name
             raise UsageError(f"`{field}`: '{variant}' is none of {transport.name}'s {known}")
-        can = transport.travels(variant, asked)
-        default, filled = (_filled(options, can) for options in (plain, asked))
-        name = _canonical(transport, variant, filled, default)
-        yield Pipeline(name, transport, variant, transport.of_variant(variant, filled))
+        can = transport.capabilities(Choice(asked, variant))
+        default, filled, holding = (_filled(options, can.payloads) for options in (plain, asked, can.options))
+        yield Pipeline(_canonical(transport, variant, filled, default, own), transport, variant, holding, own)
+
+
+def _checked(model: type[O], values: Mapping[str, Any], owner: str) -> O:
+    """Make a model of values, texts included; raises UsageError, naming what is wrong and what there is."""
+    for name in values:
+        if name not in model.model_fields:
+            raise UsageError(f"`transport`: {owner} has no option '{name}'; it has {', '.join(model.model_fields)}")
+    return model(**values)
 
 
 def _filled(options: Options, can: Sequence[str]) -> Options:
@@ -144,7 +191,7 @@ def _filled(options: Options, can: Sequence[str]) -> Options:
 
 def require_payload(pipeline: Pipeline) -> None:
     """Raise UsageError where a picture cannot travel as it should."""
-    can = pipeline.transport.travels(pipeline.variant, pipeline.options)
+    can = pipeline.capabilities.payloads
     if pipeline.payload and pipeline.payload not in can:
         path = pipeline.name.partition("?")[0]
         raise UsageError(
@@ -153,11 +200,19 @@ def require_payload(pipeline: Pipeline) -> None:
         )
 
 
-def _canonical(transport: Transport[Any], variant: str, options: Options, default: Options) -> str:
-    """Write the name of a cell."""
+def _canonical(
+    transport: Transport[Any], variant: str, options: Options, default: Options, own: Iterable[tuple[str, str]]
+) -> str:
+    """Write the name of a cell, the engine's ``own`` options last."""
     path = f"{transport.name}/{variant}" if variant else transport.name
-    said = {name: getattr(options, name) for name in sorted(type(options).model_fields)}
-    query = "&".join(
-        f"{name}={quote(text_of(value), safe='/:@')}" for name, value in said.items() if value != getattr(default, name)
-    )
+    said = [(name, getattr(options, name)) for name in sorted(type(options).model_fields)]
+    named = [*((name, value) for name, value in said if value != getattr(default, name)), *own]
+    query = "&".join(f"{name}={quote(_text(value), safe='/:@')}" for name, value in named)
     return f"{path}?{query}" if query else path
+
+
+def _text(value: Any) -> str:
+    """Return a value as it stands in a pipeline's name."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, make_dataclass
-from types import NoneType
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from s2a_bench.stats import Ratio, summary_of
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import SCHEMA
+from s2a_bench.store.schema import SCHEMA, with_fields
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,28 +57,20 @@ def cell_of_row(
     row: type,
     *,
     without: Sequence[str],
-    own: Mapping[str, Any],
+    own: Mapping[str, Any] | None = None,
 ) -> type:
-    """Return the class of a cell with the fields of a row, ``without`` some, and some of its ``own``.
+    """Return the class of a cell with the fields of a row, ``without`` some, and with some of its ``own``.
 
     What a row may lack is an absent key.
     """
     hints = {key: hint for key, hint in get_type_hints(row, include_extras=True).items() if key not in without}
-    made: list[Any] = [
-        (key, hint, field(default=None)) if _may_lack(hint) else (key, hint) for key, hint in hints.items()
-    ]
-    return make_dataclass(name, [*made, *own.items()], namespace={"__doc__": about}, frozen=True, kw_only=True)
-
-
-def _may_lack(hint: Any) -> bool:
-    """Whether a type allows None."""
-    return NoneType in get_args(get_args(hint)[0] if get_origin(hint) is Annotated else hint)
+    made: type = with_fields(name, about, object, hints, own)
+    return made
 
 
 def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
     """Return one ratio of the object."""
-    interval = None if ratio.low is None or ratio.high is None else (ratio.low, ratio.high)
-    return present(RatioJson(metric, of, to, ratio.value, interval, ratio.launches, ratio.launch_sd))
+    return present(RatioJson(metric, of, to, ratio.value, ratio.ci95, ratio.launches, ratio.launch_sd))
 
 
 def summaries(metrics: Iterable[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:

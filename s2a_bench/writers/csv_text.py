@@ -1,29 +1,35 @@
-"""Rows as CSV, every digit kept, each with the provenance of its numbers."""
+"""The tables of a run as files; those for programs as CSV, every digit kept, each row with its numbers' provenance."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from s2a_bench.errors import StoreError
+from s2a_bench.store.files import why
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.text import visible
+from s2a_bench.writers.latex import to_latex
+from s2a_bench.writers.tables import TextTable, to_markdown
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from s2a_bench.provenance import Origins
     from s2a_bench.stats import Summary
+    from s2a_bench.store.run import Run
 
 SUMMARY = ("n", "median", "mean", "sd", "p90", "p99")
 """The columns of a summary, in the order of every table."""
 
 
-def summary_values(summary: Summary) -> tuple[object, ...]:
-    """Return a summary's values in the order of `SUMMARY`."""
-    return tuple(getattr(summary, name) for name in SUMMARY)
+summary_values: Callable[[Summary], tuple[object, ...]] = attrgetter(*SUMMARY)
+"""A summary's values in the order of `SUMMARY`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +41,6 @@ class CsvTable:
 
     @classmethod
     def of(cls, header: Iterable[str], rows: Iterable[Iterable[object]]) -> CsvTable:
-        """Keep a table's rows."""
         return cls(tuple(header), [tuple(row) for row in rows])
 
     @classmethod
@@ -69,3 +74,18 @@ def _inert(value: object) -> object:
     except ValueError:
         return f"'{value}"
     return value
+
+
+def write_texts(run: Run, tables: Mapping[str, TextTable], csvs: Mapping[str, CsvTable]) -> list[Path]:
+    """Write ``tables/``: each table as .md and .tex, and those for programs under their names; raises StoreError."""
+    texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
+    texts |= {f"{name}.tex": to_latex(table) for name, table in tables.items()}
+    texts |= {name: table.text(run.origins) for name, table in csvs.items()}
+    folder = run.path / "tables"
+    try:
+        folder.mkdir(exist_ok=True)
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"cannot write {folder}: {why(error, folder)}; the samples are kept") from error
+    return [folder / name for name in texts]

@@ -1,17 +1,18 @@
 r"""Text tables as LaTeX for papers: booktabs rules, and numbers set by siunitx.
 
-A column whose entries are all plain numbers, with or without a deviation, becomes an ``S`` column, aligned at the
-decimal marker; in others every number stands in ``\num``. The packages are those of
-`PREAMBLE`.
+`to_latex` needs booktabs alone. For `to_siunitx`, whose packages `PREAMBLE` names, a column whose entries are all
+plain numbers, with or without a deviation, becomes an ``S`` column, aligned at the decimal marker; in others every
+number stands in ``\num``.
 """
 
 from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
+from s2a_bench.text import one_line
 from s2a_bench.writers.tables import ABSENT, TextTable
 
 _PLAIN: Final = re.compile(r"[-+]?\d+(?:\.\d+)?(?: ± \d+(?:\.\d+)?)?")
@@ -54,6 +55,20 @@ PREAMBLE: Final = r"""\documentclass[a4paper,landscape]{article}
 \sisetup{separate-uncertainty=true,retain-explicit-plus=true}
 """
 """What the tables need, and a page wide enough for them."""
+
+
+def to_latex(table: TextTable) -> str:
+    """Write a table as a LaTeX ``tabular`` for the package booktabs; title and notes are comments.
+
+    Where its numbers come from stands as its last line, which is printed with it.
+    """
+    lines = [f"% {one_line(note)}" for note in (table.title, *table.footer)]
+    lines += [f"\\begin{{tabular}}{{{'l' * table.left}{'r' * (len(table.header) - table.left)}}}", "\\toprule"]
+    lines += [_row(map(escape, table.header)), "\\midrule"]
+    for place, row in enumerate(table.rows):
+        lines += [*(["\\midrule"] if place in table.rules else []), _row(map(escape, row))]
+    origin = f"\\par{{\\footnotesize {escape(table.provenance)}}}"
+    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", origin]) + "\n"
 
 
 def to_siunitx(table: TextTable, widths: Sequence[str] = (), *, long: bool = False) -> str:
@@ -116,7 +131,6 @@ def _sign(char: str) -> str:
 
 
 def _kind(column: Sequence[str], *, names: bool, width: str) -> str:
-    """Choose a column's type."""
     if width:
         return f">{{\\raggedright\\arraybackslash}}p{{{width}}}"
     if names:
@@ -135,7 +149,6 @@ def _kind(column: Sequence[str], *, names: bool, width: str) -> str:
 
 
 def _entry(text: str, kind: str, *, names: bool) -> str:
-    """Write one entry for a column of its type."""
     if kind.startswith("S"):
         return "{--}" if text == ABSENT else _plain(text)
     if names or kind != "r":
@@ -152,5 +165,6 @@ def _plain(number: str) -> str:
     return number.replace("±", r"\pm")
 
 
-def _row(entries: Sequence[str]) -> str:
+def _row(entries: Iterable[str]) -> str:
+    """Join a row; one that opens with a bracket would be read as an option of the rule before it."""
     return " & ".join(f"{{{text}}}" if text.startswith("[") else text for text in entries) + r" \\"

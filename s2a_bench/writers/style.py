@@ -11,6 +11,11 @@ from s2a_bench.transport import declared
 WIDTH_IN: Final = 3.5
 """One column of a two-column paper."""
 
+WIDE_IN: Final = 7.16
+"""Both columns."""
+
+STALL_LOOK: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
+
 GREY: Final = "#BBBBBB"
 """What is not ours: the paper's values."""
 
@@ -41,9 +46,9 @@ def cell_looks(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, str
     with options of their own, and those whose transport is not here.
     """
     looks = {
-        name: declared(transport).looks[variant]
+        name: declared(transport).style[variant]
         for name, (transport, variant) in cells.items()
-        if "?" not in name and variant in declared(transport).looks
+        if "?" not in name and variant in declared(transport).style
     }
     others = [name for name in cells if name not in looks]
     return looks | {name: _OTHER_LOOKS[place % len(_OTHER_LOOKS)] for place, name in enumerate(others)}

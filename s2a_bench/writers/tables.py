@@ -1,14 +1,19 @@
-"""Text tables: their cells as text, rounded to three digits, and the whole as Markdown or LaTeX."""
+"""Text tables: their cells as text, rounded to three digits, and the whole as Markdown or for a terminal."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from s2a_bench.text import one_line
+from s2a_bench.stats import summary_of
+from s2a_bench.text import one_line, visible
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from rich.console import RenderableType
     from typing_extensions import Self
 
     from s2a_bench.stats import Ratio, Summary
@@ -17,8 +22,9 @@ if TYPE_CHECKING:
 ABSENT = "\N{EN DASH}"
 """Stands where a cell does not have a stage or a ratio."""
 
+MEAN_SD = "mean ± sd"
 
-EMULATED, DUMMY, ECHO = "emulated", "dummy weights", "echo engine"
+EMULATED, DUMMY = "emulated", "dummy weights"
 PAPERS, ASSUMED, DRAWN = "paper's claim", "assumption", "drawn, not measured"
 """Labels that several experiments give to their runs."""
 
@@ -30,7 +36,6 @@ class Note(str):
     labels: tuple[str, ...]
 
     def __new__(cls, text: str, *labels: str) -> Self:
-        """Label a text."""
         note = super().__new__(cls, text)
         note.labels = labels
         return note
@@ -56,6 +61,25 @@ class TextTable:
     notes: tuple[str, ...] = ()
     provenance: str = ""
 
+    @classmethod
+    def grouped(
+        cls,
+        title: str,
+        header: Iterable[str],
+        groups: Iterable[Iterable[tuple[str, ...]]],
+        left: int,
+        notes: Iterable[str] = (),
+        *,
+        once: int = 0,
+    ) -> TextTable:
+        """Lay out groups of rows with a line between them, the first ``once`` names in a group's first row alone."""
+        rows: list[tuple[str, ...]] = []
+        rules = set()
+        for group in groups:
+            rules.add(len(rows))
+            rows += [(*([""] * once if place else row[:once]), *row[once:]) for place, row in enumerate(group)]
+        return cls(title, tuple(header), rows, left, frozenset(rules - {0}), tuple(notes))
+
     @property
     def footer(self) -> tuple[str, ...]:
         """Return notes and provenance; raises ValueError where nobody said where the numbers come from."""
@@ -78,6 +102,14 @@ def mean_sd(summary: Summary) -> str:
     """Write mean ± standard deviation with the decimals of the mean."""
     places = _decimals(summary.mean)
     return f"{summary.mean:.{places}f}" + ("" if summary.sd is None else f" ± {summary.sd:.{places}f}")
+
+
+def entries(values: NDArray[np.float64], *statistics: str) -> list[str]:
+    """Write statistics of values, those of `Summary` by their names, or `MEAN_SD`; absent where there are no values."""
+    found = summary_of(values)
+    if found is None:
+        return [ABSENT] * len(statistics)
+    return [mean_sd(found) if name == MEAN_SD else number(getattr(found, name)) for name in statistics]
 
 
 def interval(ratio: Ratio | None) -> str:
@@ -106,37 +138,47 @@ def markdown_text(text: str) -> str:
     return _MARKED.sub(lambda found: f"\\{found[0]}", one_line(text))
 
 
-def to_latex(table: TextTable) -> str:
-    """Write a table as a LaTeX ``tabular`` for the package booktabs; title and notes are comments.
-
-    Where its numbers come from stands as its last line, which is printed with it.
-    """
-    lines = [f"% {one_line(note)}" for note in (table.title, *table.footer)]
-    lines += [f"\\begin{{tabular}}{{{'l' * table.left}{'r' * (len(table.header) - table.left)}}}", "\\toprule"]
-    lines += [_latex_row(table.header), "\\midrule"]
-    for place, row in enumerate(table.rows):
-        lines += [*(["\\midrule"] if place in table.rules else []), _latex_row(row)]
-    origin = f"\\par{{\\footnotesize {_latex(table.provenance)}}}"
-    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", origin]) + "\n"
-
-
 def _decimals(value: float) -> int:
-    """Return how many decimals leave three digits."""
     for places, limit in ((0, 99.95), (1, 9.995), (2, 0.9995)):
         if abs(value) >= limit:
             return places
     return 3
 
 
-def _latex_row(row: tuple[str, ...]) -> str:
-    """Write one row of a LaTeX table."""
-    # A booktabs row that opens with a bracket would be read as an option of the row before it.
-    texts = map(_latex, row)
-    return " & ".join(f"{{{text}}}" if text.startswith("[") else text for text in texts) + " \\\\"
+_WIDTH = 100
+"""Columns of the terminal that is planned for."""
 
 
-def _latex(text: str) -> str:
-    """Write a text so that LaTeX sets it."""
-    from s2a_bench.writers.latex import escape  # it builds on the tables of this module
+def lay_out(table: TextTable) -> RenderableType:
+    """Turn a table into one for the terminal: long headers broken, the gaps narrowed where that makes it fit."""
+    from rich import box
+    from rich.padding import Padding
+    from rich.table import Table
+    from rich.text import Text
 
-    return escape(text)
+    header = [*table.header[: table.left], *(_broken(name) for name in table.header[table.left :])]
+    lines = [[*name.split("\n"), *column] for name, column in zip(header, zip(*table.rows, strict=True), strict=False)]
+    natural = sum(max(map(len, column)) for column in lines)
+    gap = 1 if natural + 2 * (len(lines) - 1) <= _WIDTH else 0
+    shown = Table(
+        title=Text(one_line(table.title)),
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        show_edge=False,
+        padding=(0, gap, 0, 0),
+        pad_edge=False,
+    )
+    for place, name in enumerate(header):
+        shown.add_column(Text(visible(name)), justify="left" if place < table.left else "right", no_wrap=True)
+    for place, row in enumerate(table.rows):
+        if place in table.rules:
+            shown.add_section()
+        shown.add_row(*(Text(one_line(text)) for text in row))
+    return Padding(shown, (0, 0, 1, 0))
+
+
+def _broken(name: str) -> str:
+    if name.startswith("ratio to "):
+        return name.replace("ratio to ", "ratio to\n").replace("?", "?\n")
+    return name.replace("/", "/\n") if " " not in name else name.replace(" infer", "\ninfer")

@@ -19,6 +19,7 @@ import pytest
 
 from s2a_bench.testing.transport import Recorder
 from s2a_bench.types import Request, Token
+from tests.cli.program import program
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, answering
 
@@ -73,11 +74,7 @@ def caching(server: Caching) -> Iterator[str]:
 
 
 def run(url: str, *arguments: str, output: Path) -> dict[str, Any]:
-    command = [sys.executable, "-m", "s2a_bench", "latency", "--transport", "http", "--url", url, *SMALL]
-    done = subprocess.run(
-        [*command, *arguments, "--output", str(output)], capture_output=True, text=True, check=False, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
+    done = program("latency", "--transport", "http", "--url", url, *SMALL, *arguments, "--output", output)
     return {**json.loads(done.stdout), "said": done.stderr}
 
 

@@ -3,37 +3,26 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
 
+from tests.cli.program import called, program, refused
+
 ROOT = Path(__file__).parent.parent.parent
 SCHEMA = json.loads((ROOT / "docs/schema/s2a-bench-compare-1.json").read_text())
-REFERENCE = "results/reference"
-ECHO = f"{REFERENCE}/echo-jpeg"
-RAW = f"{REFERENCE}/echo-raw"
-LLAMA = f"{REFERENCE}/llama-jpeg"
+REFERENCE = ROOT / "results" / "reference"
+ECHO = str(REFERENCE / "echo-jpeg")
+RAW = str(REFERENCE / "echo-raw")
+LLAMA = str(REFERENCE / "llama-jpeg")
 
 
-def run(*arguments: str, code: int = 0, command: str = "compare") -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "s2a_bench", command, *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-        cwd=ROOT,
-        env=os.environ | {"COLUMNS": "100"},
-    )
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
+def run(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    return called("compare", *arguments, code=code)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +35,7 @@ def timelines(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         "drawn-too": ["--profile", "jetson-agx-orin", "--jitter", "lognormal:cv=0.3", "--plans", "60", "--seed", "2"],
     }.items():
         root = tmp_path_factory.mktemp(name)
-        run("--tokens-per-skill", "6", "--output", str(root), *flags, command="timeline")
+        called("timeline", "--tokens-per-skill", "6", "--output", root, *flags)
         folders[name] = str(next(root.iterdir()))
     return folders
 
@@ -102,7 +91,7 @@ def test_drawn_timelines_of_two_seeds_do_not_differ(timelines: dict[str, str]) -
 def test_throughput_is_compared_with_higher_as_better(tmp_path: Path) -> None:
     replay = ("--engine", "replay", "--profile", "rtx-4080", "--transport", "in-process")
     few = ("--runs", "6", "--warmup", "1", "--max-tokens", "8", "--sample-resources", "0")
-    run(*replay, *few, "--output", str(tmp_path), command="throughput")
+    program("throughput", *replay, *few, "--output", tmp_path)
     folder = str(next(tmp_path.iterdir()))
     whole: dict[str, Any] = json.loads(run(folder, folder, "--json").stdout)
     jsonschema.validate(whole, SCHEMA)
@@ -120,7 +109,7 @@ def test_throughput_is_compared_with_higher_as_better(tmp_path: Path) -> None:
         (
             [ECHO, LLAMA],
             1,
-            "the runs are unlike: model engine: echo against llama; --unlike compares them",
+            "the runs are unlike: model engine: echo against llama; provenance engine: echo against llama; ",
         ),
         ([ECHO, ECHO, "--metric", "speed"], 2, "--metric: 'speed' is no metric of these latency runs; there are e2e"),
         ([ECHO, ECHO, "--fail-if", "e2e"], 2, "--fail-if: 'e2e' should look like e2e.median>5%"),
@@ -129,30 +118,16 @@ def test_throughput_is_compared_with_higher_as_better(tmp_path: Path) -> None:
         ([ECHO, ECHO, "--min-effect", "-1"], 2, "--min-effect"),
         ([f"{ECHO},{ECHO}", ECHO], 2, "A: a folder is named twice"),
         ([f"{ECHO},{RAW}", ECHO], 2, "name several launches on both sides, or one on each"),
-        ([ECHO, ECHO, "--output", "README.md"], 1, "--output README.md: "),
+        ([ECHO, ECHO, "--output", __file__], 1, f"--output {__file__}: "),
     ],
 )
 def test_wrong_use_is_one_line(arguments: list[str], code: int, message: str) -> None:
-    done = run(*arguments, code=code)
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error:")]
-    assert message in line
-    assert done.stdout == ""
+    assert message in refused("compare", *arguments, code=code)
 
 
 def test_an_interrupted_run_is_compared_and_told(tmp_path: Path) -> None:
     folder = tmp_path / "killed"
-    shutil.copytree(ROOT / ECHO, folder)
+    shutil.copytree(ECHO, folder)
     manifest = json.loads((folder / "manifest.json").read_text())
     (folder / "manifest.json").write_text(json.dumps(manifest | {"state": "running"}))
     assert f"note [state]: {folder} is running, not finished" in run(ECHO, str(folder)).stderr
-
-
-def test_help_imports_nothing_heavy() -> None:
-    code = (
-        "import sys\nsys.argv = ['s2a-bench', 'compare', '--help']\nfrom s2a_bench.cli import main\n"
-        "try:\n    main()\nfinally:\n    sys.stderr.write(str([n for n in ('pandas', 'scipy') if n in sys.modules]))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)
-    assert (done.returncode, done.stderr) == (0, "[]")
-    for flag in ("metric", "fail-if", "strict", "min-effect", "unlike", "output", "json"):
-        assert f"--{flag}" in done.stdout

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -14,8 +13,9 @@ import httpx
 import jsonschema
 import pytest
 
-from s2a_bench.boards.file import read_profile, to_toml
+from s2a_bench.boards.profile import read_profile, to_toml
 from s2a_bench.store.run import read_run
+from tests.cli.program import called, program, refused
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-profile-1.json").read_text())
 FAST = {
@@ -28,29 +28,16 @@ FAST = {
 }
 
 
-@pytest.fixture
-def home(tmp_path: Path) -> Path:
-    """Make a folder with a profile of its own to work in."""
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Make a folder with a profile of its own, and work in it."""
     (tmp_path / "profiles").mkdir()
     (tmp_path / "profiles" / "fast.toml").write_text(to_toml(FAST))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
     return tmp_path
-
-
-def run(home: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "s2a_bench", *arguments],
-        cwd=home,
-        env=os.environ
-        | {
-            "PYTHONPATH": str(Path(__file__).parent.parent.parent),
-            "XDG_CONFIG_HOME": str(home / "config"),
-            "S2A_BENCH_CACHE": str(home / "cache"),
-        },
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
 
 
 def json_of(done: subprocess.CompletedProcess[str]) -> Any:
@@ -60,15 +47,14 @@ def json_of(done: subprocess.CompletedProcess[str]) -> Any:
     return whole
 
 
-def test_list_names_the_profiles_of_this_folder_and_those_that_ship(home: Path) -> None:
-    done = run(home, "profile", "list")
-    assert done.returncode == 0, done.stderr
+def test_list_names_the_profiles_of_this_folder_and_those_that_ship() -> None:
+    done = called("profile", "list")
     lines = {line.split()[0]: line for line in done.stdout.splitlines()}
     assert list(lines) == ["name", "fast", "jetson-agx-orin", "jetson-orin-nano", "rtx-4080"]
     assert "measured, dummy" in lines["fast"]
     assert "0.0105" in lines["fast"]  # .01 s and a gap of .5 ms
     assert "0.708 (assumed)" in lines["jetson-agx-orin"]
-    found = json_of(run(home, "profile", "list", "--json"))
+    found = json_of(called("profile", "list", "--json"))
     assert found["command"] == "profile list"
     assert [profile["name"] for profile in found["profiles"]] == list(lines)[1:]
     assert [profile["dummy"] for profile in found["profiles"]] == [True, False, False, False]
@@ -76,100 +62,50 @@ def test_list_names_the_profiles_of_this_folder_and_those_that_ship(home: Path) 
 
 def test_a_wrong_file_is_named_and_the_others_are_listed(home: Path) -> None:
     (home / "profiles" / "bad.toml").write_text(to_toml(FAST | {"tokens_per_s": -1}))
-    done = run(home, "profile", "list")
-    assert done.returncode == 0
-    assert done.stderr == "left out: profile profiles/bad.toml: tokens_per_s: -1 should be greater than 0\n"
+    done = called("profile", "list")
+    wrong = "profile profiles/bad.toml: tokens_per_s: -1 should be greater than 0"
+    assert done.stderr == f"left out: {wrong}\n"
     assert "fast" in done.stdout
-    done = run(home, "profile", "show", "bad")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "error: profile profiles/bad.toml: tokens_per_s: -1 should be greater than 0\n"
+    assert refused("profile", "show", "bad") == f"error: {wrong}"
 
 
-def test_show_says_where_numbers_are_from(home: Path) -> None:
-    text = run(home, "profile", "show", "rtx-4080").stdout
+def test_show_says_where_numbers_are_from() -> None:
+    text = called("profile", "show", "rtx-4080").stdout
     assert "RTX 4080, 34.2 tokens/s, first token after 0.0792 s (paper)" in text
     assert "assumed, not from paper data: prompt_s, prompt_cv, rate_cv, gaps" in text
     assert "  gpu: GeForce RTX 4080" in text
-    (shown,) = json_of(run(home, "profile", "show", "profiles/fast.toml", "--json"))["profiles"]
+    (shown,) = json_of(called("profile", "show", "profiles/fast.toml", "--json"))["profiles"]
     assert (shown["tokens_per_s"], shown["gaps"]) == (2000, {"family": "lognormal", "cv": 0.1})
     assert shown["file"] == "profiles/fast.toml"
 
 
 def test_capture_measures_this_machine_which_match_then_finds(home: Path) -> None:
-    none = run(home, "profile", "match")
-    assert none.returncode == 1
+    none = called("profile", "match", code=1)
     assert "no profile is of this board" in none.stdout
-    flags = (
-        "--threads",
-        "1",
-        "--requests",
-        "5",
-        "--warmup",
-        "1",
-        "--tokens",
-        "12",
-        "--size",
-        "64x48",
-        "--prompt",
-        "go",
-    )
-    done = run(home, "profile", "capture", "here", *flags, "--title", "My board", "--json")
-    assert done.returncode == 0, done.stderr
+    flags = ["--threads", "1", "--requests", "5", "--warmup", "1", "--tokens", "12", "--size", "64x48"]
+    done = program("profile", "capture", "here", *flags, "--title", "My board", "--json")
     (made,) = json_of(done)["profiles"]
     assert made["file"] == "profiles/here.toml"
     assert (made["recorded"], made["dummy"], made["title"]) == (55, True, "My board")
     profile = read_profile(home / "profiles" / "here.toml")
     assert profile.facts["model"]["threads"] == 1
     assert len(profile.facts["model"]["model_sha256"]) == 64
-    found = json_of(run(home, "profile", "match", "--json"))
+    found = json_of(called("profile", "match", "--json"))
     assert [profile["name"] for profile in found["profiles"]] == ["here"]
     assert found["profiles"][0]["differences"] == []
-    again = run(home, "profile", "capture", "here", *flags)
-    assert again.returncode == 2
-    assert "profiles/here.toml exists already; give another NAME or --output, or --force" in again.stderr
+    said = refused("profile", "capture", "here", *flags)
+    assert "profiles/here.toml exists already; give another NAME or --output, or --force" in said
 
 
 def test_where_nothing_can_be_written_nothing_is_measured(home: Path) -> None:
     (home / "file").write_text("")
-    done = run(home, "profile", "capture", "here", "--output", "file/profiles")
-    assert done.returncode == 1
-    assert done.stderr == "error: --output: cannot write file/profiles/here.toml: Not a directory\n"
+    said = refused("profile", "capture", "here", "--output", "file/profiles", code=1)
+    assert said == "error: --output: cannot write file/profiles/here.toml: Not a directory"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["profile", "show", "tx1"], "--profile: 'tx1' is none of fast, jetson-agx-orin"),
-        (["profile", "show", "./tx1"], "--profile: there is no file ./tx1"),
-        (["profile", "capture", "../x"], "NAME: '../x' should be a plain file name"),
-        (["profile", "capture", "x", "--tokens", "1"], "--tokens: 1 should be greater than or equal to 2"),
-        (["profile", "capture", "x", "--size", "big"], "--size: 'big' should look like"),
-        (["latency", "--engine", "replay"], "--engine replay needs --profile NAME"),
-        (["latency", "--profile", "fast"], "--profile needs --engine replay; --engine llama answers at its own speed"),
-        (["latency", "--engine", "replay", "--profile", "tx1"], "--profile: 'tx1' is none of"),
-        (["latency", "--engine", "replay", "--profile", "fast", "--gaps", "wild"], "--gaps: 'wild' is none of"),
-        (["latency", "--engine", "replay", "--profile", "fast", "--gaps", "trace"], "profile fast holds no recording"),
-        (
-            ["latency", "--engine", "replay", "--profile", "fast", "--url", "http://x"],
-            "--engine replay needs our own servers; leave out --url",
-        ),
-        (["serve", "http", "--engine", "replay"], "--engine replay needs --profile NAME"),
-        (["serve", "ros", "--profile", "fast"], "--profile needs --engine replay"),
-    ],
-)
-def test_wrong_use_is_one_line_and_code_two(home: Path, arguments: list[str], message: str) -> None:
-    done = run(home, *arguments)
-    assert (done.returncode, done.stdout) == (2, ""), done.stderr
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("error: ")
-    assert message in line
-
-
-def test_a_server_that_replays_says_so(home: Path) -> None:
+def test_a_server_that_replays_says_so() -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "s2a_bench", "serve", "http", "--engine", "replay", "--profile", "fast", "--port", "0"],
-        cwd=home,
-        env=os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent.parent)},
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -186,12 +122,10 @@ def test_a_server_that_replays_says_so(home: Path) -> None:
 
 
 def test_a_replayed_run_is_labelled_emulated_wherever_it_shows(home: Path) -> None:
-    done = run(
-        home,
+    done = program(
         *("latency", "--engine", "replay", "--profile", "fast", "--transport", "loopback", "--size", "64x48"),
         *("--runs", "4", "--warmup", "1", "--max-tokens", "20", "--json"),
     )
-    assert done.returncode == 0, done.stderr
     whole = json.loads(done.stdout)
     (cell,) = whole["cells"]
     assert (cell["engine"], cell["profile"], cell["emulated"]) == ("replay", "fast", True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -13,8 +12,10 @@ from typing import Any
 
 import pytest
 
+import s2a_bench
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing.transport import Recorder
+from tests.cli.program import called, program, refused
 from tests.servers.sockets import serving as serving_socket
 from tests.servers.speakers import Cloud, answering
 
@@ -36,9 +37,7 @@ def serving(*arguments: str) -> Iterator[str]:
 
 def measured(output: Path, *arguments: str) -> tuple[Run, str]:
     """Measure and return the run with what was printed."""
-    command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, *arguments, "--output", str(output)]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    done = program("latency", *SMALL, *arguments, "--output", output)
     (folder,) = output.iterdir()
     return read_run(folder), done.stdout
 
@@ -62,17 +61,9 @@ def test_a_replay_behind_a_url_is_emulated_in_every_place(replayed: tuple[Run, s
         rows = rest.splitlines() if path.suffix == ".csv" else [head + rest]
         assert all("emulated" in row.lower() for row in rows), path
     page = tmp_path / "page.html"
-    command = [sys.executable, "-m", "s2a_bench", "report", str(run.path), "--output", str(page)]
-    subprocess.run(command, check=True, capture_output=True)
+    called("report", run.path, "--output", page)
     assert "EMULATED after rtx-4080" in page.read_text()
-    shown = json.loads(
-        subprocess.run(
-            [sys.executable, "-c", f"import json, s2a_bench as s; print(json.dumps(s.load({str(run.path)!r}).json()))"],
-            check=True,
-            capture_output=True,
-            text=True,
-        ).stdout
-    )
+    shown = s2a_bench.load(run.path).json()
     assert [(cell["engine"], cell["emulated"], cell["profile"]) for cell in shown["cells"]] == [
         ("replay", True, "rtx-4080")
     ]
@@ -80,18 +71,22 @@ def test_a_replay_behind_a_url_is_emulated_in_every_place(replayed: tuple[Run, s
 
 
 def test_it_is_not_compared_with_a_measured_run(replayed: tuple[Run, str], tmp_path: Path) -> None:
-    own, _ = measured(tmp_path, "--transport", "http/as-deployed", "--engine", "echo")
-    command = [sys.executable, "-m", "s2a_bench", "compare", str(own.path), str(replayed[0].path)]
-    refused = subprocess.run(command, check=False, capture_output=True, text=True)
-    assert refused.returncode != 0
-    assert "provenance tokens: measured against emulated" in refused.stderr
+    own, _ = measured(tmp_path, "--transport", "http/as-deployed", "--engine", "echo", "--data-only")
+    said = refused("compare", own.path, replayed[0].path, code=1)
+    assert "provenance tokens: measured against emulated" in said
 
 
 def test_a_replay_behind_an_action_is_emulated_too(tmp_path: Path) -> None:
     namespace = f"/replayed_{os.getpid()}"
     with serving("ros", "--engine", "replay", "--profile", "rtx-4080", "--namespace", namespace) as line:
         assert line
-        action: tuple[Any, ...] = ("--transport", "ros/action", "--action", f"{namespace}/generate_response")
+        action: tuple[Any, ...] = (
+            "--transport",
+            "ros/action",
+            "--action",
+            f"{namespace}/generate_response",
+            "--data-only",
+        )
         run, said = measured(tmp_path, *action)
     assert run.origins.of("ros/action").code == "replay/real/emulated"
     assert set(run.samples["engine"]) == {"replay"}
@@ -100,7 +95,9 @@ def test_a_replay_behind_an_action_is_emulated_too(tmp_path: Path) -> None:
 
 def test_a_server_that_does_not_tell_is_unknown_never_the_default(tmp_path: Path) -> None:
     with serving_socket(answering(Cloud(), Recorder(["x", "y"]))) as url:
-        run, said = measured(tmp_path, "--transport", "http/as-deployed", "--url", url, "--dialect", "openai")
+        run, said = measured(
+            tmp_path, "--transport", "http/as-deployed", "--url", url, "--dialect", "openai", "--data-only"
+        )
     assert set(run.samples["engine"]) == {"unknown"}
     assert not any(origin.known for origin in run.origins.cells.values())
     assert "engine UNKNOWN" in said

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+import shutil
 from pathlib import Path
 
 import pytest
 
-from s2a_bench.experiments.timeline.config import TimelineConfig
 from s2a_bench.experiments.timeline.run import run_timeline
+from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.testing import NullProgress
+from tests.cli.program import called, refused
 
-ROOT = Path(__file__).parent.parent.parent
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -22,16 +24,9 @@ def timeline(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_timeline(config, tmp_path_factory.mktemp("timeline"), NullProgress())
 
 
-def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "s2a_bench", "report", *map(str, arguments)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=200, cwd=cwd, env=environment)
-
-
 def test_a_run_becomes_a_page_in_the_current_folder_and_again(timeline: Path, tmp_path: Path) -> None:
     for _ in range(2):
-        done = run(timeline, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
+        done = called("report", timeline)
         assert done.stdout == "page: report.html\n"
         assert done.stderr == ""
     assert (tmp_path / "report.html").read_text().startswith("<!doctype html>")
@@ -39,8 +34,7 @@ def test_a_run_becomes_a_page_in_the_current_folder_and_again(timeline: Path, tm
 
 def test_what_is_asked_for_is_written_and_nothing_else(timeline: Path, tmp_path: Path) -> None:
     before = sorted(timeline.rglob("*"))
-    done = run(timeline, "--latex", "tex", "--csv", "csv", "--markdown", "all.md", "--against", "paper", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = called("report", timeline, "--latex", "tex", "--csv", "csv", "--markdown", "all.md", "--against", "paper")
     assert done.stdout.startswith("the paper's claims: ")
     assert "24 undecided or not testable, 3 supported, 1 contradicted" in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"tex", "csv", "all.md"}
@@ -49,14 +43,9 @@ def test_what_is_asked_for_is_written_and_nothing_else(timeline: Path, tmp_path:
 
 def test_an_unfinished_run_is_told_on_standard_error(timeline: Path, tmp_path: Path) -> None:
     manifest = (timeline / "manifest.json").read_text()
-    cut = tmp_path / "cut"
-    cut.mkdir()
-    for file in timeline.iterdir():
-        if file.is_file():
-            (cut / file.name).write_bytes(file.read_bytes())
+    cut = shutil.copytree(timeline, tmp_path / "cut")
     (cut / "manifest.json").write_text(manifest.replace('"state": "finished"', '"state": "running"'))
-    done = run(cut, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = called("report", cut)
     assert "warning: timeline on" in done.stderr
     assert "has not finished" in done.stderr
 
@@ -78,16 +67,10 @@ def test_an_unfinished_run_is_told_on_standard_error(timeline: Path, tmp_path: P
 def test_wrong_use_is_one_line(timeline: Path, tmp_path: Path, arguments: list[str], code: int, message: str) -> None:
     (tmp_path / "mine.html").write_text("mine")
     filled = [each.format(here=tmp_path, run=timeline) for each in arguments]
-    done = run(*filled, cwd=tmp_path)
-    assert done.returncode == code
-    (line,) = done.stderr.splitlines()
-    assert message.format(here=tmp_path) in line
+    assert message.format(here=tmp_path) in refused("report", *filled, code=code)
     assert (tmp_path / "mine.html").read_text() == "mine"
 
 
 def test_a_damaged_manifest_is_one_line(timeline: Path, tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text((timeline / "manifest.json").read_text()[:100])
-    done = run(tmp_path, cwd=tmp_path)
-    assert done.returncode == 1
-    assert "manifest.json is damaged" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert "manifest.json is damaged" in refused("report", tmp_path, code=1)

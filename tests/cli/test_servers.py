@@ -17,6 +17,7 @@ import pytest
 from s2a_bench.store.run import read_run
 from s2a_bench.testing.transport import Recorder
 from s2a_bench.types import Token
+from tests.cli.program import program, refused
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, LlamaServer, Ollama, answering
 
@@ -25,12 +26,8 @@ KEY = "sekret-0123456789"
 
 
 def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, *arguments, "--output", str(output)]
     environment = {**os.environ, "MY_KEY": KEY}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, env=environment)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
+    return program("latency", *SMALL, *arguments, "--output", output, code=code, env=environment)
 
 
 def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
@@ -119,20 +116,8 @@ def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: P
 
 def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path) -> None:
     reply = answering(Cloud(), Recorder(["go", "_to", "x"]))
-    command = [
-        sys.executable,
-        "-m",
-        "s2a_bench",
-        "throughput",
-        *SMALL,
-        "--http",
-        "as-deployed",
-        "--output",
-        str(tmp_path),
-    ]
     with serving(reply) as url:
-        done = subprocess.run([*command, "--url", url], capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr
+        done = program("throughput", *SMALL, "--http", "as-deployed", "--url", url, "--output", tmp_path)
     said = " ".join(done.stdout.split())
     assert "http/as-deployed: the server does not tell T_eval, so decode stands in for N / T_eval." in said
     assert "the engine's own figure" not in said
@@ -147,7 +132,7 @@ def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path
     ],
 )
 def test_bad_flags_are_named_before_anything_is_kept(arguments: list[str], says: str, tmp_path: Path) -> None:
-    done = run(*arguments, output=tmp_path / "results", code=2)
-    assert says in done.stderr
-    assert KEY not in done.stderr
+    said = refused("latency", *SMALL, *arguments, "--output", tmp_path / "results")
+    assert says in said
+    assert KEY not in said
     assert not (tmp_path / "results").exists()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from s2a_bench.cli.shortage import shortage
+from s2a_bench.cli import shortage
 from s2a_bench.store.run import read_run
 
 LATENCY = ["latency", "--engine", "echo", "--transport", "http,loopback", "--size", "64x48", "--data-only"]

@@ -15,9 +15,15 @@ import jsonschema
 import pandas as pd
 import pytest
 
+from s2a_bench.boards.profile import read_profile
+from s2a_bench.cli.serve import served_options
+from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.rows import TIMELINES
+from s2a_bench.options import extra_of
 from s2a_bench.store.run import read_run
 from s2a_bench.store.sweep import Sweep, read_sweep
+from s2a_bench.transport import TRANSPORTS
+from tests.cli.program import called, program, refused
 from tests.experiments.test_timeline import recorded_run
 
 ROOT = Path(__file__).parent.parent.parent
@@ -44,11 +50,7 @@ CELLS = 2 * (2 * 3 + 2)
 
 
 def sweep(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "s2a_bench", "sweep", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
+    return program("sweep", *arguments, code=code)
 
 
 def schema() -> dict[str, Any]:
@@ -180,17 +182,15 @@ def test_the_settings_are_columns_beside_the_state(whole: Sweep) -> None:
 def test_a_changed_file_and_another_machine_are_refused_with_one_line(whole: Sweep, tmp_path: Path) -> None:
     changed = tmp_path / "changed.toml"
     changed.write_text(MANY.replace("plans = 200", "plans = 201"))
-    done = sweep(changed, "--resume", whole.path, code=2)
-    assert len(done.stderr.splitlines()) == 1
-    assert "was another one" in done.stderr
+    line = refused("sweep", changed, "--resume", whole.path)
+    assert "was another one" in line
     manifest = json.loads((whole.path / "manifest.json").read_text())
     (tmp_path / "sweep.toml").write_text(MANY)
     manifest["environment"] |= {"cpu": "Z80", "host": "elsewhere"}
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    done = sweep("--resume", tmp_path, code=2)
-    assert len(done.stderr.splitlines()) == 1
-    assert "was elsewhere" in done.stderr
-    assert "was Z80" in done.stderr
+    line = refused("sweep", "--resume", tmp_path)
+    assert "was elsewhere" in line
+    assert "was Z80" in line
 
 
 @pytest.mark.slow
@@ -237,8 +237,8 @@ def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp
 def test_a_setting_that_makes_no_sense_is_told_before_anything_runs(tmp_path: Path) -> None:
     file = tmp_path / "f.toml"
     file.write_text('command = "timeline"\n[grid]\nplans = [1, 5]\n')
-    done = sweep(file, "--output", tmp_path / "results", code=2)
-    assert "plans=5: --plans: without --jitter or --t-nom-cv all plans are the same" in done.stderr
+    line = refused("sweep", file, "--output", tmp_path / "results")
+    assert "plans=5: --plans: without --jitter or --t-nom-cv all plans are the same" in line
     assert not (tmp_path / "results").exists()
 
 
@@ -246,30 +246,30 @@ def test_latencies_are_an_axis_as_numbers_and_as_families(tmp_path: Path) -> Non
     file = tmp_path / "f.toml"
     axis = 'latency = [20, "lognormal:mean_ms=20,cv=.5"]'
     file.write_text(f'command = "latency"\n[settings]\nengine = "echo"\n[grid]\n{axis}\n')
-    lines = sweep(file, "--dry-run", "--output", tmp_path / "results").stdout.splitlines()
+    lines = called("sweep", file, "--dry-run", "--output", tmp_path / "results").stdout.splitlines()
     asked = {line.partition("--latency=")[2].split()[0] for line in lines if "--latency" in line}
     assert asked == {"20", "lognormal:mean_ms=20,cv=.5"}
 
 
 def test_dry_run_prints_cells_and_time_and_leaves_nothing(many: Path) -> None:
     output = many.parent / "results"
-    done = sweep(many, "--dry-run", "--output", output)
+    done = called("sweep", many, "--dry-run", "--output", output)
     lines = done.stdout.splitlines()
     assert sum("s2a-bench timeline" in line for line in lines) == CELLS
     assert [line.split("-r")[1][0] for line in lines[:CELLS]] == ["1"] * (CELLS // 2) + ["2"] * (CELLS // 2)
     assert lines[-2] == f"{CELLS} of {CELLS} cells to run, {CELLS} virtual and 0 measured"
     assert "was run for it and took" in lines[-1]
     assert not output.exists()
-    found = json.loads(sweep(many, "--dry-run", "--json", "--output", output).stdout)
+    found = json.loads(called("sweep", many, "--dry-run", "--json", "--output", output).stdout)
     jsonschema.validate(found, schema())
     assert {cell["state"] for cell in found["cells"]} == {"planned"}
     assert found["expected"]["s"] > 0
 
 
 def test_dry_run_of_measured_cells_says_that_nobody_knows_and_a_killed_sweep_what_is_left(whole: Sweep) -> None:
-    done = sweep("quick", "--dry-run", "--output", whole.path / "nowhere")
+    done = called("sweep", "quick", "--dry-run", "--output", whole.path / "nowhere")
     assert "time to expect: not known: no sweep of this command has run here" in done.stdout
-    done = sweep("--resume", whole.path, "--dry-run")
+    done = called("sweep", "--resume", whole.path, "--dry-run")
     assert f"0 of {CELLS} cells to run" in done.stdout
 
 
@@ -287,23 +287,6 @@ def test_the_papers_sweep_is_36_timelines(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "name a sweep file, or the folder of a sweep with --resume"),
-        (["nothing"], "'nothing' is none of paper, quick, transports, and no path"),
-        (["none.toml"], "cannot read the sweep file none.toml"),
-        (["paper", "--retry-failed"], "--retry-failed: name the sweep's folder with --resume"),
-        (["paper", "--ray", "local", "--board", "x"], "--board and --ray are two things"),
-        (["--resume", "/nowhere"], "/nowhere is no run folder"),
-    ],
-)
-def test_wrong_use_is_one_line(arguments: list[str], message: str) -> None:
-    done = sweep(*arguments, code=1 if "/nowhere" in arguments else 2)
-    assert message in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-
-
-@pytest.mark.parametrize(
     ("text", "message"),
     [
         ('command = "fly"', "command: 'fly' is none of boundary, ccrb, chunks, latency"),
@@ -318,11 +301,86 @@ def test_wrong_use_is_one_line(arguments: list[str], message: str) -> None:
 def test_a_wrong_file_is_one_line_and_leaves_no_folder(text: str, message: str, tmp_path: Path) -> None:
     file, output = tmp_path / "wrong.toml", tmp_path / "results"
     file.write_text(text)
-    done = sweep(file, "--output", output, code=2)
-    assert message in done.stderr
-    assert str(file) in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+    line = refused("sweep", file, "--output", output)
+    assert message in line
+    assert str(file) in line
     assert not output.exists()
+
+
+AWAY = "--url sends requests off this machine"
+RISKY = [
+    ("throughput", 'reference = "{file}"', "--reference runs a program"),
+    ("latency", 'transport = "http"\nllama-server = "{file}"', "--llama-server runs a program"),
+    ("latency", 'transport = "http/llama-server?llama_server={file}"', "--llama-server runs a program"),
+    ("latency", 'transport = "http/llama-server?llama-server={file}"', "--llama-server runs a program"),
+    ("chunks", 'live = true\nengine = "echo"\nrobot = "call?function=os:abort"', "--robot runs a program"),
+    (
+        "timeline",
+        'live = true\nengine = "replay"\nprofile = "rtx-4080"\npolicy = "naive"\nrobot = "call?function=os:abort"',
+        "--robot runs a program",
+    ),
+    ("latency", 'url = "http://127.0.0.1:9"\napi-key-env = "SECRET"', "--api-key-env sends a key"),
+    (
+        "latency",
+        'transport = "http/as-deployed?url=http://127.0.0.1:9&api_key_env=SECRET"',
+        "--api-key-env sends a key",
+    ),
+    ("latency", 'transport = "http?url=http://127.0.0.1:9"\napi-key-env = "SECRET"', "--api-key-env sends a key"),
+    ("chunks", 'live = true\nurl = "ws://127.0.0.1:9"\napi-key-env = "SECRET"', "--api-key-env sends a key"),
+    ("latency", 'url = "http://192.0.2.1:9"\nprompt = "@/sys/devices/pci0000:00/../../../../etc/hostname"', AWAY),
+    ("latency", 'transport = "http?url=http://localhost.example:9&extra_body=@{file}.json"', AWAY),
+    ("timeline", 'live = true\nurl = "http://192.0.2.1:9"\ntask = "@{file}"', AWAY),
+    ("ccrb", 'live = true\ntransport = "http?url=http://192.0.2.1:9"', AWAY),
+    (
+        "latency",
+        'transport = "ros"\nmiddleware = "zenoh"\nrouter = "tcp/192.0.2.1:7447"',
+        "--router sends requests off",
+    ),
+]
+
+
+@pytest.mark.parametrize(("command", "settings", "message"), RISKY)
+def test_a_file_that_runs_programs_or_sends_secrets_is_refused_unless_it_is_trusted(
+    command: str, settings: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SECRET", "sesame-open-the-door")
+    program, ran = tmp_path / "program", tmp_path / "ran"
+    program.write_text(f"#!/bin/sh\ntouch {ran}\n")
+    program.chmod(0o755)
+    (tmp_path / "program.json").write_text("{}")
+    file = tmp_path / "sent.toml"
+    file.write_text(f'command = "{command}"\n[settings]\n{settings.format(file=program)}\n')
+    line = refused("sweep", file, "--output", tmp_path / "results")
+    assert message in line
+    assert line.endswith("read the file, and allow it with --trust-file")
+    assert "sesame" not in line
+    assert not ran.exists()
+    assert not (tmp_path / "results").exists()
+    assert called("sweep", file, "--trust-file", "--dry-run").stdout
+
+
+def test_a_url_on_loopback_and_a_key_of_our_own_servers_need_no_trust(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SECRET", "sesame-open-the-door")
+    file = tmp_path / "plain.toml"
+    for settings in (
+        'url = "http://127.0.0.1:9"\nprompt = "' + "go on " * 99 + '"',
+        'transport = "http"\napi-key-env = "SECRET"',
+    ):
+        file.write_text(f'command = "latency"\n[settings]\n{settings}\n')
+        called("sweep", file, "--dry-run")
+
+
+def test_no_other_file_can_name_a_program_or_a_server(tmp_path: Path) -> None:
+    for _, transport in TRANSPORTS.loaded():  # the keys of serve --config
+        for name in served_options(transport):
+            assert extra_of(transport.options.model_fields[name])["risk"] != "program"
+            assert name != "url"
+    profile = tmp_path / "board.toml"
+    profile.write_text('reference = "/bin/true"\n' + (ROOT / "profiles" / "rtx-4080.toml").read_text())
+    with pytest.raises(UsageError, match="reference: there is no such key"):
+        read_profile(profile)
 
 
 def test_without_ray_the_flag_says_how_to_install_it(tmp_path: Path) -> None:
@@ -338,14 +396,3 @@ def test_without_ray_the_flag_says_how_to_install_it(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "pip install 's2a-bench[ray]'" in done.stderr
-
-
-def test_every_flag_is_explained_and_help_is_light() -> None:
-    code = (
-        "import sys\nfrom s2a_bench.cli import main\nsys.argv = ['s2a-bench', 'sweep', '--help']\ntry:\n    main()\n"
-        "finally:\n    sys.stderr.write(str([n for n in ('numpy', 'pandas', 'ray') if n in sys.modules]))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=WAIT_S)
-    assert done.stderr == "[]"
-    for flag in ("resume", "retry-failed", "dry-run", "board", "ray", "jobs", "output", "json"):
-        assert f"--{flag}" in done.stdout

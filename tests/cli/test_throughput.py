@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
 
-from s2a_bench.experiments.throughput.rows import REFERENCE
+from s2a_bench.experiments.throughput.metrics import REFERENCE
 from s2a_bench.store.run import Run, read_run
+from tests.cli.program import program
 from tests.llama_bench_stand_in import install
 
 ROOT = Path(__file__).parent.parent.parent
@@ -22,18 +22,8 @@ REAL = "S2A_BENCH_LLAMA_BENCH"
 """Names the real llama-bench, for the test that needs it."""
 
 
-def run(*arguments: str, output: Path, code: int = 0, **environment: str) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "s2a_bench", "throughput", *arguments, "--output", str(output)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-        env={**os.environ, **environment},
-    )
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
+def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    return program("throughput", *arguments, "--output", output, code=code)
 
 
 def only_run(output: Path) -> Run:
@@ -100,6 +90,19 @@ def test_the_engines_settings_reach_it_and_the_terminal_shows_all(tmp_path: Path
 
 
 @pytest.mark.slow
+def test_both_ways_of_flash_attention_are_cells_of_one_run(tmp_path: Path) -> None:
+    ways = ["--transport", "in-process,http", "--flash-attention", "off,on"]
+    whole = valid(run(*SMALL, *ways, "--json", output=tmp_path).stdout)
+    names = [f"{path}?flash_attention={way}" for path in ("in-process", "http/as-deployed") for way in ("off", "on")]
+    assert [(cell["cell"], cell["n"], cell["errors"]) for cell in whole["cells"]] == [(name, 2, 0) for name in names]
+    compared = [(ratio["of"], ratio["to"]) for ratio in whole["ratios"]]
+    assert compared == [(names[1], names[0]), (names[2], names[0]), (names[3], names[1])]  # like with like
+    manifest = only_run(tmp_path).manifest
+    assert [server["engine"]["flash_attention"] for server in manifest["servers"].values()] == ["off", "on"]
+    assert "flash_attention" not in manifest["model"]  # it has no one value
+
+
+@pytest.mark.slow
 def test_a_replayed_profile_is_labelled_emulated(tmp_path: Path) -> None:
     done = run(*SMALL, "--max-tokens", "3", "--engine", "replay", "--profile", "rtx-4080", "--json", output=tmp_path)
     (cell,) = valid(done.stdout)["cells"]
@@ -107,41 +110,18 @@ def test_a_replayed_profile_is_labelled_emulated(tmp_path: Path) -> None:
     assert cell["profile"] == "rtx-4080"
 
 
-def test_a_reference_that_fails_ends_the_run_with_one_line_and_keeps_the_samples(tmp_path: Path) -> None:
+def test_a_reference_that_fails_ends_the_run_with_one_line_and_keeps_the_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("S2A_STAND_IN_FAULT", "crash")
     arguments = [*SMALL, "--reference", str(install(tmp_path))]
-    done = run(*arguments, output=tmp_path / "r", code=1, S2A_STAND_IN_FAULT="crash")
+    done = run(*arguments, output=tmp_path / "r", code=1)
     (line,) = (line for line in done.stderr.splitlines() if line.startswith("error:"))
     assert "exit code 1: main: error: failed to load model" in line
     kept = only_run(tmp_path / "r")
     assert kept.manifest["state"] == "failed"
     assert len(kept.samples) == 1
     assert str(kept.path) in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--transport", "pigeon"], "--transport: 'pigeon' is none of http, ros, loopback"),
-        (["--transport", ""], "--transport: name at least one"),
-        (["--kv-type", "q3"], "--kv-type: 'q3' is none of f32, f16, q8_0, q4_0"),
-        (["--kv-type", "q4_0", "--flash-attention", "off"], "--kv-type q4_0 needs flash attention"),
-        (["--flash-attention", "1"], "--flash-attention: '1' is none of auto, on, off"),
-        (["--sampling", "hot"], "--sampling: 'hot' is none of model, greedy"),
-        (["--batch", "1"], "--batch: 1 should be greater than or equal to 32"),
-        (["--engine", "echo"], "--engine echo computes nothing"),
-        (["--max-tokens", "1"], "--max-tokens: a rate needs 2 tokens or more"),
-        (["--reference", "/no/such"], "--reference: /no/such is no program that can be run"),
-        (["--against", "us"], "--against: 'us' should be paper"),
-        (["--url", "http://x"], "--url needs http among --transport"),
-        (["--bogus"], "No such option: --bogus"),
-    ],
-)
-def test_wrong_use_is_one_line_and_code_two(tmp_path: Path, arguments: list[str], message: str) -> None:
-    done = run(*arguments, output=tmp_path / "r", code=2)
-    (line,) = (line for line in done.stderr.splitlines() if line.startswith("error:"))
-    assert message in line
-    assert done.stdout == ""
-    assert not (tmp_path / "r").exists()
 
 
 @pytest.mark.skipif(REAL not in os.environ, reason=f"{REAL} does not name llama.cpp's llama-bench")

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from s2a_bench.experiments.latency.view.against_bytes import against_bytes, crossings, shown
-from s2a_bench.experiments.latency.view.cells import split
+from s2a_bench.experiments.requests import split
 from s2a_bench.store.run import Run
 from s2a_bench.transport import TRANSPORTS
 from s2a_bench.writers.style import _OTHER_LOOKS
@@ -80,5 +80,5 @@ def test_tables_and_figure_say_what_answered(runs: list[Run]) -> None:
 
 
 def test_every_transport_looks_like_no_other() -> None:
-    looks = [look for _, each in TRANSPORTS.loaded() for look in each.looks.values()]
+    looks = [look for _, each in TRANSPORTS.loaded() for look in each.style.values()]
     assert len({*looks, *_OTHER_LOOKS}) == len(looks) + len(_OTHER_LOOKS)

@@ -13,7 +13,7 @@ from scipy.stats import ks_2samp
 from s2a_bench.boards.gaps import Gaps, Lognormal, Quantiles
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import EngineError, StoreError, UsageError
-from s2a_bench.experiments.profile_capture.config import CaptureConfig
+from s2a_bench.experiments.profile_capture import CaptureConfig
 from s2a_bench.experiments.profile_capture.run import (
     Answer,
     answers,
@@ -155,12 +155,10 @@ def test_every_request_is_about_another_picture_with_another_seed() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"name": "a/b"}, "`name`: 'a/b' should be a plain file name"),
         ({"name": ""}, "`name`: '' should be"),
         ({"name": ".hidden"}, "`name`: '.hidden' should be"),
         ({"requests": 0}, "`requests`: 0 should be"),
         ({"warmup": -1}, "`warmup`: -1 should be"),
-        ({"tokens": 1}, "`tokens`: 1 should be"),
         ({"requests": 3, "tokens": 14}, "`requests` 3 of `tokens` 14 make 39 gaps; a profile needs 40"),
     ],
 )

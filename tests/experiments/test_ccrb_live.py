@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,44 +9,31 @@ import jsonschema
 import numpy as np
 import pytest
 
-from s2a_bench.boards.file import to_toml
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import TransportError
-from s2a_bench.experiments.ccrb.asked import Asked
-from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.config import Asked, CcrbConfig
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.ccrb.view.figures import build_scenario
-from s2a_bench.experiments.ccrb.view.outcomes import token_times_s
-from s2a_bench.experiments.ccrb.view.sentences import origin_notes
+from s2a_bench.experiments.ccrb.view.outcomes import origin_notes, token_times_s
 from s2a_bench.experiments.ccrb.view.tables import ccrb_json
-from s2a_bench.experiments.timeline.rows import SKILLS
 from s2a_bench.inference import EngineConfig
 from s2a_bench.scenario.ccrb.options import CcrbOptions
-from s2a_bench.store.requests import TOKENS
+from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.trace import Trace
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Request, Token
+from tests.made_runs import SCHEMA
 
-SCHEMA = json.loads((Path(__file__).parent.parent.parent / "docs" / "schema" / "s2a-bench-1.json").read_text())
 N, L, T_NS = 3, 6, 800_000_000
 REPLAYED = Asked(live=True, transport="loopback", engine=EngineConfig(name="replay"))
-FACTS = {"title": "A board", "origin": "measured", "tokens_per_s": 120.0, "prompt_s": 0.05}
 
 
 def drive(asked: Asked, folder: Path, profile: str = "jetson-agx-orin") -> Run:
     config = CcrbConfig(scenario=CcrbOptions(n_skills=N), tokens_per_skill=L, asked=asked, profile=profile)
     with RunProgress() as progress:
         return read_run(run_ccrb(config, folder, progress))
-
-
-@pytest.fixture
-def fast(tmp_path: Path) -> str:
-    """A board of 120 tokens a second."""
-    path = tmp_path / "fast.toml"
-    path.write_text(to_toml({**FACTS, "gaps": {"family": "constant"}}))
-    return str(path)
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +93,8 @@ def test_the_figure_marks_every_token(paced: Run) -> None:
     assert [len(line.get_xdata()) for line in marks] == [N * L]  # type: ignore[arg-type]
 
 
-def test_a_replayed_profile_stays_emulated(fast: str, tmp_path: Path) -> None:
-    run = drive(REPLAYED, tmp_path / "runs", fast)
+def test_a_replayed_profile_stays_emulated(fast_board: str, tmp_path: Path) -> None:
+    run = drive(REPLAYED, tmp_path / "runs", fast_board)
     assert run.table(ROLLOUTS)["emulated"].all()
     first = origin_notes(run)[0]
     assert first.startswith("EMULATED (replayed) tokens over loopback; car simulated. 1")
@@ -117,7 +103,7 @@ def test_a_replayed_profile_stays_emulated(fast: str, tmp_path: Path) -> None:
 
 
 def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
-    fast: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = LoopbackClient.request
 
@@ -128,18 +114,6 @@ def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
 
     monkeypatch.setattr(LoopbackClient, "request", cut)
     with pytest.raises(TransportError, match=r"loopback: 1 of 3 skills came; .*tokens\.csv has what the model wrote"):
-        drive(REPLAYED, tmp_path / "runs", fast)
+        drive(REPLAYED, tmp_path / "runs", fast_board)
     (folder,) = (tmp_path / "runs").iterdir()
     assert len(read_run(folder).table(TOKENS)) == 2 * L
-
-
-def test_lambda_comes_from_earlier_plans_and_this_one_teaches(fast: str, tmp_path: Path) -> None:
-    file = tmp_path / "machine.json"
-    asked = REPLAYED.but(track_file=file)
-    first = drive(asked, tmp_path / "first", fast)
-    (state,) = json.loads(file.read_text())["policies"].values()
-    assert state["level"] != state["epsilon"]
-    drive(asked, tmp_path / "second", fast)
-    (again,) = json.loads(file.read_text())["policies"].values()
-    assert again["scores"][:-1] == state["scores"][1:]
-    assert first.manifest["configuration"]["live"]["track_file"] == str(file)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -13,26 +12,29 @@ import jsonschema
 import numpy as np
 import pytest
 
-from s2a_bench.boards.file import to_toml
+from s2a_bench.act.call import Motion
 from s2a_bench.errors import EngineError, ServerDied, SourceError, TransportError, UsageError
-from s2a_bench.experiments.timeline.config import TimelineConfig
-from s2a_bench.experiments.timeline.live.asks import asks_of, prior_of
-from s2a_bench.experiments.timeline.live.run import run_live
-from s2a_bench.experiments.timeline.real_time import run_real_time
-from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.experiments.timeline.view.as_json import timelines_json
-from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_of
+from s2a_bench.experiments.timeline.live import run_live
+from s2a_bench.experiments.timeline.rows import TIMELINES
+from s2a_bench.experiments.timeline.run import run_real_time
+from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_json, timelines_of
 from s2a_bench.experiments.timeline.view.figures import timeline_figures
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.harness.feed import RequestFeed
+from s2a_bench.harness.timelines.config import TimelineConfig
+from s2a_bench.harness.timelines.link import asks_of
+from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
+from s2a_bench.policy import Plans
+from s2a_bench.policy.tracking import Tracked
+from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.trace import Trace
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Frame, Request, Token
+from tests.made_runs import SCHEMA
 
-SCHEMA = json.loads((Path(__file__).parent.parent.parent / "docs" / "schema" / "s2a-bench-1.json").read_text())
 THREE = ("naive", "wait-then-act", "stream-to-act")
 
 
@@ -59,28 +61,13 @@ class Watched:
 
 
 @pytest.fixture
-def fast(tmp_path: Path) -> str:
-    """A board of 120 tokens a second."""
-    tables = {
-        "title": "A board",
-        "origin": "measured",
-        "tokens_per_s": 120.0,
-        "prompt_s": 0.05,
-        "gaps": {"family": "constant"},
-    }
-    path = tmp_path / "fast.toml"
-    path.write_text(to_toml(tables))
-    return str(path)
-
-
-@pytest.fixture
-def config(fast: str) -> TimelineConfig:
+def config(fast_board: str) -> TimelineConfig:
     """Eight household skills of 30 ms each, written by a replay: naive has to wait for every one of them."""
     return TimelineConfig(
         live=True,
         transport="loopback",
         engine=EngineConfig(name="replay"),
-        profiles=(fast,),
+        profiles=(fast_board,),
         size=(64, 48),
         timeout_s=30.0,
         t_nom_s=(0.03,),
@@ -128,6 +115,24 @@ def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: Ti
     assert list(timeline_figures(run)) == ["timeline"]
     assert run.samples["warmup"].tolist() == [True, False]
     assert run.manifest["prior"]["mean_s"] == pytest.approx(1 / 120, rel=0.5)
+
+
+acted: list[str] = []
+
+
+def act(motion: Motion) -> None:
+    """Stand in for somebody's robot."""
+    acted.append(str(motion.call))
+    assert motion.wait()
+
+
+def test_a_function_is_called_with_every_skill(config: TimelineConfig, tmp_path: Path) -> None:
+    acted.clear()
+    run, _ = live(config.but(robot=f"call?function={__name__}:act", policies=("naive",)), tmp_path)
+    (cell,) = timelines_of(run)
+    assert acted == list(cell.skills["text"])
+    assert len(acted) == 8
+    assert f"skills are carried out by call?function={__name__}:act" in origin_notes(run, [cell])[0]
 
 
 @pytest.mark.slow
@@ -279,9 +284,13 @@ def test_an_interruption_aborts_the_robots_and_keeps_what_ran(config: TimelineCo
     assert all(scene.records[0].outcome == "aborted" for scene in view.scenes)
 
 
-def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
+def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None:
     played = TimelineConfig(
-        real_time=True, profiles=(fast,), tokens_per_skill=(6, 2), t_nom_s=(0.03,), policies=(*THREE, "s2a-clairvoyant")
+        real_time=True,
+        profiles=(fast_board,),
+        tokens_per_skill=(6, 2),
+        t_nom_s=(0.03,),
+        policies=(*THREE, "s2a-clairvoyant"),
     )
     view = Watched()
     run = read_run(run_real_time(played, tmp_path / "runs", view))
@@ -304,22 +313,14 @@ def test_a_board_is_played_in_real_time(fast: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"policies": ()}, "`policies`: name at least one"),
-        ({"policies": ("eager",)}, "`policy`: 'eager' is none of"),
         ({"policies": ("s2a-clairvoyant",)}, "s2a-clairvoyant needs to know when every skill will arrive"),
         ({"skills": "juggling"}, "`skills`: 'juggling' is none of"),
         ({"plans": 0}, "`plans`: 0 should be greater than or equal to 1"),
-        ({"robot": "kuka"}, "`robot`: 'kuka' is none of timed, ros"),
+        ({"robot": "call", "policies": ("naive",)}, "`robot`: call: function = '' should look like module:name"),
         ({"robot": "ros"}, "`robot`: ros follows one policy at a time"),
         ({"tokens_per_skill": (4,)}, "`engine` replay writes plans of the household skills in 6 tokens a skill"),
         ({"skills": "driving"}, "`engine` replay writes plans of the household skills in 6 tokens a skill"),
         ({"transport": "http,ros"}, "`transport`: 'http,ros' is none of"),
-        ({"engine": EngineConfig(name="echo"), "profiles": ()}, "`engine` echo writes no plans"),
-        ({"engine": EngineConfig(name="replay", pace=5.0)}, "`pace`: `engine` replay has its profile's rate"),
-        (
-            {"engine": EngineConfig(pace=5.0), "profiles": (), "transport": "http", "url": "http://x"},
-            "`pace` needs our own server",
-        ),
     ],
 )
 def test_what_makes_no_sense_is_named(config: TimelineConfig, fields: dict[str, Any], message: str) -> None:
@@ -364,59 +365,46 @@ def test_skills_keep_their_own_durations_unless_they_are_given(config: TimelineC
     assert free.grammar == ""
 
 
-def test_what_lambda_has_learned_goes_on_in_the_next_run(config: TimelineConfig, tmp_path: Path) -> None:
-    file = tmp_path / "machine.json"
-    asked = config.but(policies=("stream-to-act", "stream-to-act?detect=True"), track_file=file, plans=2)
-    first, _ = live(asked, tmp_path / "first")
-    learned = json.loads(file.read_text())
-    assert set(learned["policies"]) == {f"L6/N8/T0.03/{policy}" for policy in asked.policies}
-    state = learned["policies"]["L6/N8/T0.03/stream-to-act"]
-    assert len(state["scores"]) == 400
-    assert state["level"] != state["epsilon"] == 0.01
-    second, _ = live(asked.but(plans=1), tmp_path / "second")
-    again = json.loads(file.read_text())["policies"]["L6/N8/T0.03/stream-to-act"]
-    assert again["prior"] == state["prior"]
-    assert again["scores"][:-1] == state["scores"][1:]
-    assert first.manifest["configuration"]["track_file"] == str(file)
-    assert second.manifest["state"] == "finished"
+@pytest.fixture
+def taught(monkeypatch: pytest.MonkeyPatch) -> list[Tracked]:
+    """Every `Tracked` that learned from a plan, in order."""
+    whole = Tracked.learn
+    found: list[Tracked] = []
+
+    def learn(self: Tracked, plan: Plans, *, stalled: bool) -> None:
+        whole(self, plan, stalled=stalled)
+        found.append(self)
+
+    monkeypatch.setattr(Tracked, "learn", learn)
+    return found
 
 
-def test_lambda_is_followed_in_real_time(fast: str, tmp_path: Path) -> None:
+def test_lambda_is_followed_live_by_each_policy(config: TimelineConfig, taught: list[Tracked], tmp_path: Path) -> None:
+    live(config.but(policies=("stream-to-act", "stream-to-act?detect=True", "naive"), track=True, plans=2), tmp_path)
+    assert [each.made.detect for each in taught] == [False, True] * 2
+    assert taught[:2] == taught[2:]
+    for each in taught[:2]:
+        state = each.state()
+        assert len(state["scores"]) == 400
+        assert state["level"] != state["epsilon"] == 0.01
+
+
+def test_lambda_is_followed_in_real_time(fast_board: str, taught: list[Tracked], tmp_path: Path) -> None:
     config = TimelineConfig(
         real_time=True,
-        profiles=(fast,),
+        profiles=(fast_board,),
         tokens_per_skill=(2,),
         n_skills=(4,),
         t_nom_s=(0.01,),
         jitter="lognormal:cv=0.3",
         policies=("stream-to-act",),
         plans=2,
-        track_file=tmp_path / "machine.json",
+        track=True,
     )
     run = read_run(run_real_time(config, tmp_path / "runs", Watched()))
     assert len(run.table(TIMELINES)) == 2
-    (state,) = json.loads((tmp_path / "machine.json").read_text())["policies"].values()
+    first, again = taught
+    assert first is again
+    state = first.state()
     assert len(state["scores"]) == 400
     assert state["level"] != state["epsilon"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("not json", "name another file"),
-        ("[]", "was not written by --track-file"),
-        ('{"schema": "s2a-bench-tracking/1", "policies": 3}', "was not written by --track-file"),
-        (
-            '{"schema": "s2a-bench-tracking/1", "policies": {"L6/N8/T0.03/stream-to-act": {"scores": []}}}',
-            "holds no state of tracking",
-        ),
-    ],
-)
-def test_a_file_that_tracking_did_not_write_is_refused_and_left(
-    config: TimelineConfig, text: str, message: str, tmp_path: Path
-) -> None:
-    file = tmp_path / "machine.json"
-    file.write_text(text)
-    with pytest.raises(UsageError, match=f"`track_file`: .*{message}"):
-        live(config.but(track_file=file, policies=("stream-to-act",)), tmp_path)
-    assert file.read_text() == text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ from hypothesis import strategies as st
 
 from s2a_bench.errors import EngineError, UsageError
 from s2a_bench.experiments.throughput.config import ThroughputConfig
-from s2a_bench.experiments.throughput.llama_bench import LlamaBench
-from s2a_bench.experiments.throughput.rows import REFERENCE
-from s2a_bench.harness.llama_flags import llama_flags
+from s2a_bench.experiments.throughput.metrics import REFERENCE
+from s2a_bench.experiments.throughput.run import LlamaBench
+from s2a_bench.harness.plan import BlocksPlan, resolve
+from s2a_bench.harness.processes import llama_flags
 from s2a_bench.harness.rounds import run_blocks
 from s2a_bench.harness.session import Place
 from s2a_bench.inference import EngineConfig
@@ -29,8 +31,6 @@ REQUESTS = ThroughputConfig(max_tokens=16)
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"max_tokens": 1}, "`max_tokens`: a rate needs 2 tokens or more"),
-        ({"engine": EngineConfig(name="echo")}, "`engine` echo computes nothing"),
         ({"runs": 0}, "`runs`: 0"),
         (
             {"engine": EngineConfig(sampling="greedy"), "transports": ("http/best-effort?url=http://x",)},
@@ -49,6 +49,7 @@ def test_what_makes_no_sense_is_named(fields: dict[str, Any], message: str) -> N
     [
         ({"grammar": 'root ::= "a"'}, "llama-bench knows no grammar"),
         ({"engine": EngineConfig(name="replay", profile="jetson-orin-nano")}, "leave out `engine` replay"),
+        ({"engine": {"flash_attention": "on,off"}}, "one `flash_attention` at a time"),
     ],
 )
 def test_a_reference_needs_what_llama_bench_can_do(tmp_path: Path, fields: dict[str, Any], message: str) -> None:
@@ -77,6 +78,41 @@ def test_the_engine_llama_server_is_llama_cpps_own_beside_ours() -> None:
         ThroughputConfig(engine={"name": "llamaserver"})
 
 
+def test_several_ways_of_flash_attention_are_cells_with_servers_of_their_own() -> None:
+    config = ThroughputConfig(engine={"flash_attention": "on, off"}, transports="in-process,http/binary")
+    names = [f"{path}?flash_attention={way}" for path in ("loopback", "http/binary") for way in ("on", "off")]
+    assert [cell.name for cell in config.pipelines] == names
+    assert [dict(cell.engine)["flash_attention"] for cell in config.pipelines] == ["on", "off"] * 2
+    assert len({cell.server for cell in config.pipelines}) == 4
+    assert config.but(transports=names).pipelines == config.pipelines
+    assert config.to_manifest()["pipelines"][names[3]]["flash_attention"] == "off"
+    (one,) = ThroughputConfig(engine={"flash_attention": "off"}).pipelines
+    assert (one.name, one.engine) == ("loopback", ())
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"engine": {"flash_attention": "on,of"}}, "`flash_attention`: 'of' is none of auto, on, off"),
+        ({"engine": {"flash_attention": ""}}, "`flash_attention`: '' is none of auto, on, off"),
+        ({"transports": "in-process?flash_attention=x"}, "`flash_attention`: 'x' is none of auto, on, off"),
+        ({"engine": {"flash_attention": "on,off", "kv_type": "q8_0"}}, "`kv_type` q8_0 needs flash attention"),
+        (
+            {"engine": {"flash_attention": "on,off", "name": "replay", "profile": "rtx-4080"}},
+            "`engine` replay knows no flash attention",
+        ),
+        (
+            {"engine": {"flash_attention": "on,off"}, "transports": "http", "url": "http://x"},
+            "`flash_attention`: the server of http/as-deployed?flash_attention=on runs already, as it was set",
+        ),
+    ],
+)
+def test_ways_of_flash_attention_that_cannot_be_are_named(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError) as error:
+        ThroughputConfig(**fields)
+    assert message in str(error.value)
+
+
 @given(st.integers(1, 4), st.integers(0, 2), st.integers(0, 2), st.integers(1, 6), st.integers(0, 99))
 def test_every_block_gives_everyone_one_turn_and_the_others_are_last_at_first(
     n_turns: int, n_others: int, warmup: int, runs: int, seed: int
@@ -85,7 +121,7 @@ def test_every_block_gives_everyone_one_turn_and_the_others_are_last_at_first(
     turns = [lambda place, name=f"turn{i}": seen.append((name, place)) for i in range(n_turns)]
     others = [lambda place, name=f"other{i}": seen.append((name, place)) for i in range(n_others)]
     progress = NullProgress()
-    run_blocks(turns, others, REQUESTS.but(warmup=warmup, runs=runs, seed=seed), progress)
+    run_blocks(turns, others, BlocksPlan(runs, warmup, 1, seed), progress)
     everyone = {f"turn{i}" for i in range(n_turns)} | {f"other{i}" for i in range(n_others)}
     assert progress.expected == progress.done == len(everyone) * (warmup + runs)
     for block in range(warmup + runs):
@@ -94,13 +130,6 @@ def test_every_block_gives_everyone_one_turn_and_the_others_are_last_at_first(
         assert [place.position for _, place in places] == list(range(len(everyone)))
         assert {place.warmup for _, place in places} == {block < warmup}
     assert all(name.startswith("turn") for name, place in seen if place.block == 0 and place.position < n_turns)
-
-
-def test_the_order_changes_from_block_to_block() -> None:
-    seen: list[str] = []
-    turns = [lambda _place, name=name: seen.append(name) for name in "abc"]
-    run_blocks(turns, [], REQUESTS.but(warmup=0, runs=12), NullProgress())
-    assert len({"".join(seen[at : at + 3]) for at in range(0, 36, 3)}) > 2
 
 
 @pytest.fixture
@@ -120,7 +149,7 @@ def test_the_reference_computes_with_our_settings_behind_our_prompts_length(tmp_
         flash_attention="on",
     )
     depths = [250, 260]
-    bench = LlamaBench(install(tmp_path), REQUESTS.but(engine=engine), writer, lambda: depths.pop(0))
+    bench = LlamaBench(install(tmp_path), resolve(REQUESTS.but(engine=engine)), writer, lambda: depths.pop(0))
     bench(Place(0, 1, warmup=True))
     bench(Place(1, 0, warmup=False))
     writer.finish("finished")
@@ -144,8 +173,6 @@ def test_the_reference_computes_with_our_settings_behind_our_prompts_length(tmp_
 
 
 def test_without_threads_the_reference_has_those_of_this_process() -> None:
-    import os
-
     flags = llama_flags(EngineConfig())
     assert flags[flags.index("--threads") + 1] == str(len(os.sched_getaffinity(0)))
 
@@ -164,7 +191,7 @@ def test_a_reference_that_fails_says_so_in_one_line(
     tmp_path: Path, writer: RunWriter, monkeypatch: pytest.MonkeyPatch, fault: str, message: str
 ) -> None:
     monkeypatch.setenv("S2A_STAND_IN_FAULT", fault)
-    bench = LlamaBench(install(tmp_path), REQUESTS, writer, lambda: 0)
+    bench = LlamaBench(install(tmp_path), resolve(REQUESTS), writer, lambda: 0)
     with pytest.raises(EngineError) as error:
         bench(Place(0, 0, warmup=False))
     assert message in str(error.value)

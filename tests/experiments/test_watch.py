@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from s2a_bench.act.events import AbortAsked, StreamBroke
+from s2a_bench.act.record import Record
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.experiments.timeline.watch import STALL, Scene, draw, summary
 from s2a_bench.progress import watching
-from s2a_bench.runtime.events import AbortAsked, StreamBroke
-from s2a_bench.runtime.record import Record
-from tests.runtime.drive import ns, plan, run
+from tests.act.drive import ns, plan, run
 
 THREE = ("naive", "wait-then-act", "stream-to-act")
 ARRIVALS = [2.0, 4.0, 6.0, 8.0]

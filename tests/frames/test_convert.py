@@ -50,28 +50,9 @@ def bt601_fixed_point(yuyv: Array) -> Array:
     return np.stack([((channel + (1 << 19)) >> 20).clip(0, 255) for channel in rgb], axis=-1).astype(np.uint8)
 
 
-def bt601_real(yuyv: Array) -> NDArray[np.float64]:
-    """BT.601 limited range from its two constants, Kr and Kb."""
-    y, u, v = planes(yuyv)
-    red, blue = 0.299, 0.114
-    green = 1 - red - blue
-    luma = np.maximum(y, 0) / 219
-    u_, v_ = u / 112, v / 112
-    r = luma + (1 - red) * v_
-    b = luma + (1 - blue) * u_
-    g = luma - (red * (1 - red) * v_ + blue * (1 - blue) * u_) / green
-    return (np.stack([r, g, b], axis=-1) * 255).clip(0, 255)
-
-
 @given(pictures(2, even=True))
 def test_yuyv_is_bt601_in_fixed_point_exactly(yuyv: Array) -> None:
     np.testing.assert_array_equal(yuyv_to_rgb(yuyv), bt601_fixed_point(yuyv))
-
-
-@given(pictures(2, even=True))
-def test_yuyv_is_within_one_and_a_half_of_bt601_in_real_numbers(yuyv: Array) -> None:
-    # one from OpenCV's coefficients, rounded to three decimals (1.164, 1.596, ...), a half from rounding the result
-    assert np.abs(yuyv_to_rgb(yuyv) - bt601_real(yuyv)).max() <= 1.5
 
 
 @given(pictures(2, even=True))
@@ -99,11 +80,6 @@ def test_the_colour_bars_come_out_right(y: int, u: int, v: int, rgb: tuple[int, 
 def test_swapping_twice_changes_nothing(bgr: Array) -> None:
     np.testing.assert_array_equal(bgr_to_rgb(bgr), bgr[..., ::-1])
     np.testing.assert_array_equal(bgr_to_rgb(bgr_to_rgb(bgr)), bgr)
-
-
-@given(pictures(2, even=True))
-def test_rgb_is_bgr_swapped(yuyv: Array) -> None:
-    np.testing.assert_array_equal(bgr_to_rgb(yuyv_to_bgr(yuyv)), yuyv_to_rgb(yuyv))
 
 
 def test_a_given_buffer_is_filled_and_returned() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import SourceError
-from s2a_bench.frames import images
+from s2a_bench.frames import files
 from s2a_bench.frames.convert import encode_jpeg, encode_png
-from s2a_bench.frames.images import ImageFolder
+from s2a_bench.frames.files import ImageFolder
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 
 
@@ -62,6 +62,6 @@ def test_an_unreadable_picture_is_named_at_once(folder: Path) -> None:
 
 
 def test_a_folder_too_large_to_hold_says_what_fits(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, "LIMIT_BYTES", 2 * 64 * 48 * 3)
+    monkeypatch.setattr(files, "LIMIT_BYTES", 2 * 64 * 48 * 3)
     with pytest.raises(SourceError, match="holds 3 pictures; decoded to 64x48, 2 fit"):
         ImageFolder(str(folder), 64, 48)

@@ -9,13 +9,16 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.frames.v4l2 import CAN_CAPTURE, CAPABILITY, HAS_DEVICE_CAPS, VIDIOC_QUERYCAP
-from s2a_bench.frames.v4l2_formats import (
+from s2a_bench.frames.v4l2 import (
+    CAN_CAPTURE,
     CAN_CAPTURE_PLANES,
+    CAPABILITY,
     FORMAT,
     FRAME_SIZE,
+    HAS_DEVICE_CAPS,
     VIDIOC_ENUM_FMT,
     VIDIOC_ENUM_FRAMESIZES,
+    VIDIOC_QUERYCAP,
     CameraInfo,
     list_cameras,
 )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import SourceError
-from s2a_bench.frames.video import VideoFile
+from s2a_bench.frames.files import VideoFile
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 
 GREYS = [40, 80, 120, 160]

@@ -8,17 +8,20 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import Any
+from unittest.mock import Mock
 
 import cv2
+import jsonschema
 import numpy as np
 from starlette.testclient import TestClient
 
-from s2a_bench.boards.file import parse_profile
+from s2a_bench.boards.profile import parse_profile
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.bag import Recording
 from s2a_bench.frames.convert import encode_png
@@ -26,37 +29,42 @@ from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.plan.parser import Parser
 from s2a_bench.plan.skill_file import parse_skills
-from s2a_bench.report.compare.as_json import compare_json
-from s2a_bench.report.compare.comparison import compare, open_comparison, shown_metrics
-from s2a_bench.report.compare.warnings import warnings_of
+from s2a_bench.report.compare.comparison import compare, open_comparison, shown_metrics, warnings_of
+from s2a_bench.report.compare.shown import compare_json
 from s2a_bench.report.page.chapters import read_chapters
 from s2a_bench.report.page.files import make_report
 from s2a_bench.ros import messages as ros
 from s2a_bench.store.files import count_rows, read_csv, read_parquet
-from s2a_bench.store.requests import EARLIER_STAGES, TOKENS, TokenRow, samples_table
+from s2a_bench.store.manifest import present
+from s2a_bench.store.requests import TOKENS, TokenRow, samples_table
 from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.trace import Remote, Trace
-from s2a_bench.transport import ours
+from s2a_bench.transport import observed
 from s2a_bench.transport.chunks import actions_of
+from s2a_bench.transport.http.chat import of_json, of_picture
 from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
-from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS
-from s2a_bench.transport.http.reading import of_json, of_picture
-from s2a_bench.transport.http.server import _received, application
+from s2a_bench.transport.http.fast import Head
+from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS, Refused
+from s2a_bench.transport.http.protocol import Protocol
+from s2a_bench.transport.http.server import application
 from s2a_bench.transport.limits import LIMITS
 from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.pipeline import pipelines
 from s2a_bench.transport.ros import wire
+from s2a_bench.transport.serving import Core
 from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.transport.zmq import layouts
 from s2a_bench.transport.zmq import wire as gr00t
 from s2a_bench.types import Action, Frame, Request, Token
+from tests.made_runs import STAGES
 from tests.plan.test_parser import FORMATS
 from tests.servers.speakers import SPEAKERS
 
 ROOT = Path(__file__).parents[2]
+MODELS = json.loads((ROOT / "docs/schema/s2a-bench-model-1.json").read_text())["$defs"]
 
 
 @dataclass(frozen=True)
@@ -108,13 +116,25 @@ def bodies() -> list[bytes]:
 
 @cache
 def client() -> TestClient:
-    return TestClient(_received(application(engine_handler(open_engine(EngineConfig(name="echo"))), LIMITS)))
+    core = Core(engine_handler(open_engine(EngineConfig(name="echo"))), LIMITS)
+    app = application(core)
+
+    async def connected(scope: Any, receive: Any, send: Any) -> None:
+        """Stand in for uvicorn's connection."""
+        scope.setdefault("state", {})["protocol"] = Mock(
+            spec=Protocol, gone=lambda: False, trace=Trace(), held=ExitStack()
+        )
+        await app(scope, receive, send)
+
+    return TestClient(connected, "http://localhost")
 
 
 def ask_server(data: bytes) -> None:
     answer = client().post(PATHS["as-deployed"], content=data, headers={"content-type": "application/json"})
     assert answer.status_code in {200, 400, 413}, answer.text
-    for headers, body in (([(PARAMETERS_HEADER.encode(), data)], b""), ([], data)):
+    with suppress(Refused):
+        Head(data)
+    for headers, body in (([(PARAMETERS_HEADER, data.decode("latin-1"))], b""), ([], data)):
         with suppress(RequestFailed):
             (of_picture if headers else of_json)(headers, body, Trace(), LIMITS)
 
@@ -164,10 +184,13 @@ def gguf_files() -> list[bytes]:
 
 
 def read_gguf(data: bytes) -> None:
-    from s2a_bench.cli.model_text import renderables
-    from s2a_bench.inference.gguf_info import describe
+    from s2a_bench.cli.model import renderables
+    from s2a_bench.inference.gguf_file import describe
 
-    renderables(describe(as_file("a.gguf", data), "model info"), None)
+    info = describe(as_file("a.gguf", data), "model info")
+    assert info.bytes == len(data)
+    jsonschema.validate(json.loads(json.dumps(present(info))), MODELS["info"] | {"$defs": MODELS})
+    renderables(info)
 
 
 def tomls(*patterns: str) -> Callable[[], list[bytes]]:
@@ -203,7 +226,7 @@ def read_manifest(data: bytes) -> None:
 
 
 def read_rows(data: bytes) -> None:
-    for table in (TOKENS, samples_table(EARLIER_STAGES)):
+    for table in (TOKENS, samples_table(STAGES)):
         read_csv(as_file("a.csv", data), table.columns)
     count_rows(place() / "a.csv")
 
@@ -250,7 +273,7 @@ METADATA = b"""rosbag2_bagfile_information:
 def read_observation(data: bytes) -> None:
     """Read what a policy server is asked, and what its client is answered."""
     message = unpackb(data)
-    ours.request_of(message, ours.told_in(message), Trace(), LIMITS)
+    observed.request_of(message, observed.told_in(message), Trace(), LIMITS)
     actions_of(message.get("actions") if isinstance(message, dict) else message)
 
 
@@ -266,16 +289,16 @@ def read_gr00t(data: bytes) -> None:
     """Read what a GR00T server is asked, and what its client is answered."""
     message = gr00t.unpack(data)
     with suppress(RequestFailed):
-        ours.remote_of(message)
+        observed.remote_of(message)
     if isinstance(message, dict):
         observation, layout = layouts.observation_in(message.get("data"))
-        ours.request_of(observation, ours.told_in(message), Trace(), LIMITS)
+        observed.request_of(observation, observed.told_in(message), Trace(), LIMITS)
         layouts.answer_of(observation, layout, [Action(0, np.zeros(2, np.float32))])
     layouts.actions_in(message)
 
 
 def gr00ts() -> list[bytes]:
-    """Return requests of both layouts, answers, and marks."""
+    """Return requests of both layouts in both codecs, answers, and marks."""
     picture, state = np.zeros((1, 4, 6, 3), np.uint8), np.zeros((1, 5), np.float64)
     flat = {"video.a": picture, "state.a": state, "annotation.human.task_description": ["go"]}
     nested = {"video": {"a": picture[None]}, "state": {"a": state[None]}, "language": {"task": [["go"]]}}
@@ -285,9 +308,9 @@ def gr00ts() -> list[bytes]:
         {"endpoint": "get_action", "data": {"observation": nested, "options": None}},
         [{"a": np.zeros((1, 4, 2)), "b": np.zeros((1, 4, 1))}, {}],
         {"action.a": np.zeros((4, 2), np.float32)},
-        ours.remote_message(Trace().to_remote()),
+        observed.remote_message(Trace().to_remote()),
     ]
-    return [bytes(gr00t.pack(message)) for message in messages]
+    return [bytes(gr00t.pack(message, maps=maps)) for message in messages for maps in (False, True)]
 
 
 NAMES = [b"http/binary?payload=png&connection=per-request", b"ros/topic?result_timeout=2.5", b"loopback", b"ros/action"]
@@ -315,7 +338,7 @@ TARGETS = {
     "yaml": Target(read_yaml, lambda: [METADATA]),
     "observation": Target(read_observation, observations),
     "marks": Target(
-        lambda data: ours.remote_of(unpackb(data)), lambda: [packb(ours.remote_message(Trace().to_remote()))]
+        lambda data: observed.remote_of(unpackb(data)), lambda: [packb(observed.remote_message(Trace().to_remote()))]
     ),
     "gr00t": Target(read_gr00t, gr00ts),
     "template": Target(

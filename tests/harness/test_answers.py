@@ -14,6 +14,7 @@ from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.throughput.config import ThroughputConfig
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.pixels import fingerprint, together
+from s2a_bench.harness.plan import resolve
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.trace import Trace
 from s2a_bench.transport import ACTIONS, TOKENS, TRANSPORTS
@@ -25,7 +26,8 @@ from s2a_bench.types import Action, Request
 @pytest.fixture
 def actions_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let HTTP carry nothing but actions, as policy servers' wires do."""
-    monkeypatch.setattr(type(HTTP), "answers", lambda *_: (ACTIONS,))
+    able = type(HTTP).capabilities
+    monkeypatch.setattr(type(HTTP), "capabilities", lambda *told: replace(able(*told), answer_kinds=(ACTIONS,)))
 
 
 def config(transports: str = "http,loopback", **more: Any) -> LatencyConfig:
@@ -36,15 +38,16 @@ def config(transports: str = "http,loopback", **more: Any) -> LatencyConfig:
 def test_all_cells_answer_with_tokens_unless_told() -> None:
     assert config(engine="echo").answer == TOKENS
     assert config(engine="echo", settings={"answer": "actions"}).answer == ACTIONS
-    assert config(engine="echo", settings={"answer": "actions", "horizon": 9}).most_pieces == 9
-    assert config(engine="echo", max_tokens=5).most_pieces == 5
+    acting = resolve(config(engine="echo", settings={"answer": "actions", "horizon": 9}))
+    assert (acting.request.max_pieces, acting.servers.max_tokens) == (9, 9)
+    assert resolve(config(engine="echo", max_tokens=5)).request.max_pieces == 5
 
 
 @pytest.mark.usefixtures("actions_alone")
 def test_one_that_carries_nothing_else_decides_for_all() -> None:
     chosen = config(engine="echo")
     assert chosen.answer == ACTIONS
-    assert chosen.served_engine.answer == ACTIONS
+    assert resolve(chosen).servers.engine.answer == ACTIONS
     assert chosen.to_manifest()["engine"]["answer"] == ACTIONS
     assert config("loopback", engine="echo").answer == TOKENS
     with pytest.raises(UsageError, match=r"^`answer`: http/as-deployed does not carry tokens; measure it in a run"):
@@ -130,7 +133,7 @@ def test_what_is_no_state_is_refused(values: Any) -> None:
 def test_a_request_brings_several_pictures_scaled_and_the_state() -> None:
     asked = config("http,ros/topic", engine="echo", cameras=3, resize="224", state=14)
     assert asked.resize == (224, 224)
-    assert asked.observation == "3 x 640x480 as 224x224, state of 14"
+    assert asked.to_manifest()["observation"] == "3 x 640x480 as 224x224, state of 14"
     assert config(engine="echo", resize="320x240").resize == (320, 240)
 
 
@@ -174,4 +177,4 @@ def test_a_checksum_of_several_knows_their_order() -> None:
     source = open_source("synthetic", 64, 48)
     frame = source.read()
     assert together([fingerprint(frame)]) == fingerprint(replace(frame))
-    assert TRANSPORTS["loopback"].answers("", TRANSPORTS["loopback"].options()) == (TOKENS, ACTIONS)
+    assert TRANSPORTS["loopback"].answer_kinds == (TOKENS, ACTIONS)

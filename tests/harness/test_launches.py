@@ -9,6 +9,7 @@ import pytest
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
+from s2a_bench.harness.plan import BlocksPlan
 from s2a_bench.harness.rounds import run_blocks
 from s2a_bench.harness.session import Place
 from s2a_bench.inference import EngineConfig
@@ -37,7 +38,7 @@ def test_every_launch_has_fresh_servers_in_one_run_folder(tmp_path: Path) -> Non
     assert frames.is_unique  # a source goes on where the last launch left it: no picture twice
 
 
-def test_the_order_differs_from_launch_to_launch_and_the_total_is_told() -> None:
+def test_the_order_differs_from_block_to_block_and_launch_to_launch_and_the_total_is_told() -> None:
     seen: list[list[str]] = [[], []]
     progress = NullProgress()
     for launch in range(2):
@@ -46,16 +47,17 @@ def test_the_order_differs_from_launch_to_launch_and_the_total_is_told() -> None
             seen[launch].append(name)
 
         slots = [lambda place, name=name: turn(name, place.launch) for name in "abcd"]
-        run_blocks(slots, [], ECHO.but(launches=2, runs=8, warmup=0), progress, launch)
+        run_blocks(slots, [], BlocksPlan(8, 0, 2, 0), progress, launch)
     assert sorted(seen[0]) == sorted(seen[1])
     assert seen[0] != seen[1]
+    assert len({tuple(launch[at : at + 4]) for launch in seen for at in range(0, 32, 4)}) > 4
     assert progress.expected == progress.done == 64
 
 
 def test_blocks_count_on_over_launches() -> None:
     places: list[Place] = []
     for launch in range(2):
-        run_blocks([places.append], [], ECHO.but(launches=2, runs=2, warmup=1), NullProgress(), launch)
+        run_blocks([places.append], [], BlocksPlan(2, 1, 2, 0), NullProgress(), launch)
     assert [(place.launch, place.block, place.warmup) for place in places] == [
         (0, 0, True),
         (0, 1, False),

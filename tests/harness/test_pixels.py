@@ -14,6 +14,7 @@ from s2a_bench.frames import open_source
 from s2a_bench.frames.convert import bgr_to_rgb, encode_jpeg, yuyv_to_bgr
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.pixels import rgb_fingerprint
+from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.inference import EngineConfig, open_engine
@@ -39,7 +40,7 @@ def measure() -> Iterator[Measure]:
             client = next(connecting)(handler)
             stack.callback(connecting.close)  # type: ignore[attr-defined]  # a generator
             config = LatencyConfig(transports=name, max_tokens=3)
-            session = Session(cell, client, RequestFeed(source, preencoded=False), config)
+            session = Session(cell, client, RequestFeed(source, preencoded=False), resolve(config).request)
             return session.measure(Place(0, 0, warmup=False))
 
         yield run
@@ -66,7 +67,7 @@ def handler(*, alter: bool, answer: str = "tokens") -> Handler:
     ],
 )
 def test_one_altered_pixel_makes_a_lossless_sample_an_error(measure: Measure, name: str) -> None:
-    answer = one_pipeline(name).answers[0]
+    answer = one_pipeline(name).capabilities.answer_kinds[0]
     good, bad = (measure(name, handler(alter=alter, answer=answer)).sample for alter in (False, True))
     assert (good.error, good.rgb_engine) == ("", good.rgb_source)
     assert good.rgb_source is not None

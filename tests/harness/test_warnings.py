@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,16 +12,14 @@ from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.harness.warnings import Counters, SampleGuard
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import Mark
+from tests.made_runs import row_of
 
 GOOD: list[Mark] = [("", 0), ("network", 90), ("", 91), ("inference", 500), ("return", 600)]
 LOOSE: list[Mark] = [("", 0), ("network", 90), ("", 191), ("inference", 500), ("return", 600)]
 
 
-def row(request: str, **fields: object) -> SampleRow:
-    plain = SampleRow(
-        "ros/topic", "ros", "topic", "bgr", "", "echo", "request", "64x48", 0, 0, False, request, 0, marks=GOOD
-    )
-    return replace(plain, **fields)  # type: ignore[arg-type]
+def row(request: str, cell: str = "ros/topic", **fields: Any) -> SampleRow:
+    return row_of(cell, {}, 0, **{"request_id": request, "marks": GOOD, **fields})
 
 
 def codes(*seen: tuple[SampleRow, int]) -> list[str]:
@@ -31,8 +29,20 @@ def codes(*seen: tuple[SampleRow, int]) -> list[str]:
     return [warning.code for warning in guard.warnings()]
 
 
-def test_good_samples_raise_no_warning() -> None:
-    assert codes((row("a"), 1), (row("b"), 2)) == []
+@pytest.mark.parametrize(
+    ("second", "fingerprint"),
+    [
+        (row("b"), 2),
+        (row("b", cell="http/binary"), 1),  # the same picture in another cell
+        (row("b", marks=LOOSE, warmup=True), 2),
+        (row("b", error=INTERRUPTED, marks=[]), 2),
+        (row("b", facts={"headers_off_ms": -2.8}, server_prompt_ms=97.5), 2),
+        (row("b", facts={"headers_off_ms": 19.0}, server_prompt_ms=5.0), 2),
+        (row("b", facts={"headers_off_ms": 200.0}, server_prompt_ms=1000.0), 2),
+    ],
+)
+def test_good_samples_raise_no_warning(second: SampleRow, fingerprint: int) -> None:
+    assert codes((row("a"), 1), (second, fingerprint)) == []
 
 
 @pytest.mark.parametrize(
@@ -53,11 +63,6 @@ def test_each_warning_has_its_code(second: SampleRow, fingerprint: int, code: st
     assert codes((row("a"), 1), (second, fingerprint)) == [code]
 
 
-@pytest.mark.parametrize(("off_ms", "prompt_ms"), [(-2.8, 97.5), (19.0, 5.0), (200.0, 1000.0)])
-def test_headers_that_fit_the_servers_own_time_are_no_warning(off_ms: float, prompt_ms: float) -> None:
-    assert codes((row("a", facts={"headers_off_ms": off_ms}, server_prompt_ms=prompt_ms), 1)) == []
-
-
 @pytest.mark.parametrize(
     ("off_ms", "says"), [(97.0, "ingest is too short, inference too long"), (-97.0, "ingest is too long, inference")]
 )
@@ -75,18 +80,6 @@ def test_hits_that_servers_count_during_the_run_are_a_warning() -> None:
     guard.see_hits({"vllm:mm_cache_hits_total": 4.0}, {"vllm:mm_cache_hits_total": 9.0, "new": 0.0})
     (warning,) = guard.warnings()
     assert (warning.code, "vllm:mm_cache_hits_total: 5" in warning.message) == ("server-cache", True)
-
-
-def test_an_interrupted_request_is_no_failed_one() -> None:
-    assert codes((row("a", error=INTERRUPTED, marks=[]), 1)) == []
-
-
-def test_the_same_picture_in_another_cell_is_no_duplicate() -> None:
-    assert codes((row("a"), 1), (row("b", cell="http/binary"), 1)) == []
-
-
-def test_the_residual_of_a_warm_up_does_not_matter() -> None:
-    assert codes((row("a", marks=LOOSE, warmup=True), 1)) == []
 
 
 def test_a_warning_names_cells_and_the_way_out() -> None:
@@ -152,21 +145,15 @@ def test_failures_in_a_row_end_with_a_success() -> None:
     guard = SampleGuard()
     for number, error in enumerate(["x", "x", "", "x"]):
         guard.see(row(str(number), error=error), number)
-    assert guard.failures_in_a_row("ros/topic") == 1
-    assert guard.successes("ros/topic") == 1
-    assert guard.successes("loopback") == 0
-    assert (guard.last_error("ros/topic"), guard.last_error("loopback")) == ("x", "")
+    assert guard.in_a_row["ros/topic"] == 1
+    assert guard.succeeded["ros/topic"] == 1
+    assert guard.succeeded["loopback"] == 0
+    assert guard.last_error == {"ros/topic": "x"}
 
 
-def test_what_cannot_be_read_is_no_warning() -> None:
+def test_what_cannot_be_read_and_packets_lost_by_others_are_no_warning_about_a_run_without_dds() -> None:
     assert Counters(None, None).warnings_since(Counters(3, 5)) == []
-
-
-def test_this_machine_can_be_read() -> None:
     now = Counters.read()
     assert now.warnings_since(now) == []
-
-
-def test_packets_lost_by_others_are_no_warning_about_a_run_without_dds() -> None:
-    assert Counters.read().receive_buffer_errors is not None
+    assert now.receive_buffer_errors is not None
     assert Counters.read(watches_udp=False).receive_buffer_errors is None

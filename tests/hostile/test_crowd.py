@@ -10,13 +10,13 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.testing.hostile import own_server
-from s2a_bench.testing.hostile.http import chat
+from s2a_bench.testing.hostile.asker import usage
 from s2a_bench.testing.hostile.tcp import crowd, sends
-from s2a_bench.testing.hostile.usage import usage
 from s2a_bench.testing.transport import ask, wiring
 from s2a_bench.transport import open_client
 from s2a_bench.transport.http.own import PATHS
 from s2a_bench.types import Request
+from tests.hostile.wires.http import chat
 
 CLIENTS = 1000
 

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from s2a_bench.inference.grammar_limits import DEPTH, REPETITIONS, RULES, beyond_limits
+from s2a_bench.inference.llama_decode import DEPTH, REPETITIONS, RULES, beyond_limits
 from s2a_bench.plan import grammar, load_skills, paper_format
 
 HOSTILE = {

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.harness.config import RequestsConfig
+from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import Task, run_requests
 from s2a_bench.progress import NullProgress
 from s2a_bench.provenance import Provenance
@@ -93,7 +94,7 @@ def test_a_run_with_them_counts_and_warns_once_a_field(tmp_path: Path) -> None:
     with serving(lambda _: pieces) as url:
         http = {"url": url, "dialect": "llama-server"}
         asked = RequestsConfig(transports="http/as-deployed", options={"http": http}, size="64x48", runs=3, warmup=1)
-        folder = run_requests(Task("latency"), asked, tmp_path, NullProgress())
+        folder = run_requests(Task("latency"), resolve(asked), tmp_path, NullProgress())
     run = read_run(folder)
     assert run.samples.error.tolist() == [""] * 4
     assert run.samples.prompt_n.isna().all()

@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.testing.hostile import HostileSuite, http, ros, ros_servers, shm, websocket, zmq
+from s2a_bench.testing.hostile import HostileSuite
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
+from tests.hostile.wires import http, ros, ros_servers, shm, websocket, zmq
 
 
 class TestHttp(HostileSuite):
@@ -25,7 +26,12 @@ class TestHttp(HostileSuite):
 
 class TestHttpBestEffort(HostileSuite):
     name = "http/best-effort"
+    clients = http.FAST
     servers = http.SERVERS
+
+    @classmethod
+    def told(cls) -> Wiring[Any]:
+        return replace(super().told(), limits=Limits(head_s=2))  # as above
 
 
 class TestHttpBinary(HostileSuite):

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import random
 import socket
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from threading import Event, Lock, Thread
@@ -16,18 +15,19 @@ import httpx
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import Busy, EngineError, RequestFailed
+from s2a_bench.errors import Busy, EngineError
 from s2a_bench.harness.serving import engine_handler
-from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.testing.transport import ask, served, wiring
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Handler, open_client
 from s2a_bench.transport.http.own import PATHS
 from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.transport.turns import Queued, Turn, Turns
+from s2a_bench.transport.serving import Queued, Turn, Turns
 from s2a_bench.types import Request, Token
+from tests.waiting import until
 
 CHAT, BEST_EFFORT = PATHS["as-deployed"], PATHS["best-effort"]
+SERVERS = {CHAT: "http", BEST_EFFORT: "http/best-effort"}
 paths = pytest.mark.parametrize("path", [CHAT, BEST_EFFORT])
 
 
@@ -40,13 +40,6 @@ def serving(handler: Handler, name: str = "http", limits: Limits = LIMITS) -> It
 
 def body(prompt: str = "go on", *, stream: bool = True, **more: Any) -> dict[str, Any]:
     return {"messages": [{"role": "user", "content": prompt}], "stream": stream, **more}
-
-
-def until(met: Callable[[], bool], seconds: float = 20) -> None:
-    deadline = time.monotonic() + seconds
-    while not met():
-        assert time.monotonic() < deadline, "it did not come about"
-        time.sleep(0.005)
 
 
 class Gate:
@@ -197,37 +190,13 @@ def test_requests_end_in_the_order_of_their_acceptance(name: str) -> None:
     assert sum(queued) > 25
 
 
-@paths
-@pytest.mark.parametrize("stream", [True, False])
-def test_200_clients_at_once_are_answered_or_refused_and_none_hangs(stream: bool, path: str) -> None:
-    async def ask_all(url: str) -> list[int]:
-        limits = httpx.Limits(max_connections=None)
-        async with httpx.AsyncClient(timeout=60, limits=limits) as client:
-
-            async def one() -> int:
-                answer = await client.post(url, json=body(stream=stream, max_tokens=20))
-                if answer.status_code == 200 and stream:
-                    assert answer.text.endswith("data: [DONE]\n\n")
-                if answer.status_code == 503:
-                    assert answer.headers["retry-after"] == "1"
-                return answer.status_code
-
-            return await asyncio.gather(*(one() for _ in range(200)))
-
-    with serving(engine_handler(open_engine(EngineConfig(name="echo")))) as url:
-        statuses = asyncio.run(ask_all(url + path))
-        assert set(statuses) <= {200, 503}
-        assert statuses.count(200) >= 65
-        assert httpx.post(url + CHAT, json=body(max_tokens=3)).status_code == 200
-
-
 def ask_and_go(url: str, *, stream: bool, request_id: str, path: str = CHAT) -> socket.socket:
     """Send a request over a socket of its own, and do not read."""
     import json
 
     host, port = url.removeprefix("http://").split(":")
     data = json.dumps(body(stream=stream, request_id=request_id)).encode()
-    head = f"POST {path} HTTP/1.1\r\nHost: a\r\nContent-Type: application/json\r\nContent-Length: {len(data)}\r\n\r\n"
+    head = f"POST {path} HTTP/1.1\r\nContent-Type: application/json\r\nContent-Length: {len(data)}\r\n\r\n"
     connection = socket.create_connection((host, int(port)))
     connection.sendall(head.encode() + data)
     return connection
@@ -238,7 +207,7 @@ def ask_and_go(url: str, *, stream: bool, request_id: str, path: str = CHAT) -> 
 def test_an_answer_whose_client_has_gone_stops_and_a_waiter_who_has_gone_never_begins(stream: bool, path: str) -> None:
     gate = Gate()
     queued = Queued.around(gate)
-    with serving(queued) as url:
+    with serving(queued, SERVERS[path]) as url:
         first = ask_and_go(url, stream=stream, request_id="first", path=path)
         until(lambda: gate.began == ["first"])
         waiting = ask_and_go(url, stream=stream, request_id="waiting", path=path)
@@ -263,7 +232,7 @@ def test_a_token_that_cannot_be_sent_frees_the_engine(stream: bool, path: str) -
         yield Token(1, "\ud800")
 
     queued = Queued.around(surrogates)
-    with serving(queued) as url:
+    with serving(queued, SERVERS[path]) as url:
         for _ in range(3):
             try:
                 httpx.post(url + path, json=body(stream=stream), timeout=10)
@@ -273,43 +242,14 @@ def test_a_token_that_cannot_be_sent_frees_the_engine(stream: bool, path: str) -
 
 
 @paths
-def test_a_client_that_does_not_read_does_not_hold_the_engine(path: str) -> None:
-    def much(request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        for index in range(request.max_tokens):
-            yield Token(index, "a" * 1000)
-
-    queued = Queued.around(much)
-    with serving(queued) as url:
-        deaf = [ask_and_go(url, stream=True, request_id="deaf", path=path) for _ in range(3)]
-        answer = httpx.post(url + path, json=body(max_tokens=20_000), timeout=60)
-        assert answer.text.endswith("data: [DONE]\n\n")
-        until(lambda: queued.turns.silent_s() == 0)
-        for connection in deaf:
-            connection.close()
-
-
-def test_health_says_when_the_engine_is_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.transport.http.server.STUCK_S", 0.2)
+def test_health_says_when_the_engine_is_stuck(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("s2a_bench.transport.serving.STUCK_S", 0.2)
     gate = Gate()
-    with serving(gate) as url:
+    with serving(gate, SERVERS[path]) as url:
         assert httpx.get(url + "/health").status_code == 200
-        connection = ask_and_go(url, stream=True, request_id="a")
+        connection = ask_and_go(url, stream=True, request_id="a", path=path)
         until(lambda: httpx.get(url + "/health").status_code == 503)
         assert "no sign of life" in httpx.get(url + "/health").json()["reason"]
         gate.go.set()
         connection.close()
         until(lambda: httpx.get(url + "/health").status_code == 200)
-
-
-def test_a_ros_request_too_many_is_refused_at_once() -> None:
-    gate = Gate()
-    queued = Queued(Queued.around(gate)._answering, Limits(waiting=0))
-    with serving(queued, "ros/topic") as address:
-        clients = [open_client(wiring("ros/topic", address)) for _ in range(2)]
-        tokens = clients[0].request(Request("a", "a"), Trace())
-        next(iter(tokens))
-        with pytest.raises(RequestFailed, match="0 requests are waiting for the engine already"):
-            ask(clients[1], Request("b", "b"))
-        gate.go.set()
-        for client in clients:
-            client.close()

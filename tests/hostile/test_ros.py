@@ -28,11 +28,12 @@ from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.ros.camera import picture_of
 from s2a_bench.transport.ros.joining import join
 from s2a_bench.transport.ros.wire import READER_QOS, REQUEST_QOS, TOKEN_QOS, request_message, token_message
-from s2a_bench.transport.turns import Queued
+from s2a_bench.transport.serving import Queued
 from s2a_bench.types import Request, Token
 from tests.hostile.test_deadline import Endless
-from tests.hostile.test_limits import png
-from tests.hostile.test_queue import Gate, serving, until
+from tests.hostile.test_queue import Gate, serving
+from tests.hostile.wires.http import bomb, png_of_zeros
+from tests.waiting import until
 
 NAMESPACE = "/s2a_bench"
 
@@ -221,7 +222,7 @@ IMPOSSIBLE = [
     image(64, 48, 0, 64 * 48 * 3),
     image(64, 48, 192, 64 * 48 * 3, "16UC1"),
     image(63, 48, 126, 63 * 48 * 2, "yuv422_yuy2"),
-    ros.compressed_image_message(np.frombuffer(png(30_000, 2000), np.uint8), 0, "c", "png"),
+    ros.compressed_image_message(np.frombuffer(png_of_zeros(30_000, 2000), np.uint8), 0, "c", "png"),
     ros.compressed_image_message(np.frombuffer(b"\xff\xd8" + bytes(100), np.uint8), 0, "c"),
     ros.compressed_image_message(np.zeros(0, np.uint8), 0, "c"),
 ]
@@ -244,11 +245,11 @@ def test_a_smaller_limit_is_the_server_s_own(stranger: Middleware) -> None:
                 ask(client, Request("a", "a", max_tokens=4))
         finally:
             client.close()
-        bomb = ros.compressed_image_message(np.frombuffer(png(30_000, 30_000), np.uint8), 0, "c", "png")
+        picture = ros.compressed_image_message(np.frombuffer(bomb(), np.uint8), 0, "c", "png")
         requests = stranger.publisher(NAMESPACE + "/request", ros.REQUEST, REQUEST_QOS)
         answers = stranger.subscription(NAMESPACE + "/token", ros.TOKEN, READER_QOS)
         until(lambda: bool(requests.matched() and answers.matched()))
-        requests.send(requests.pack(request_message(Request("b", "a", max_tokens=1), (), [bomb])))
+        requests.send(requests.pack(request_message(Request("b", "a", max_tokens=1), (), [picture])))
         packed = answers.take(20)
         assert "30000x30000" in answers.unpack(packed).error
 

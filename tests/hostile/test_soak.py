@@ -9,15 +9,15 @@ import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from benchmarks.soak import HOSTILE, served, told
-from s2a_bench.testing.hostile.usage import usage
+from s2a_bench.testing.hostile.asker import usage
 
 MINUTES = float(os.environ.get("S2A_SOAK_MINUTES", "0.5"))
-Soaks = dict[str, dict[str, Any]]
+KEPT_MIB = 100.0
+Soaks = dict[str, Path]
 
 
 def test_bodies_that_no_framework_lets_go_are_not_kept(tmp_path: Path) -> None:
@@ -28,29 +28,34 @@ def test_bodies_that_no_framework_lets_go_are_not_kept(tmp_path: Path) -> None:
         for _ in range(8):
             big.does(told("http", server.address))
         deadline = time.monotonic() + 30
-        while usage(server.process.pid).rss_mib > before.rss_mib + 100 and time.monotonic() < deadline:
+        while usage(server.process.pid).rss_mib > before.rss_mib + KEPT_MIB and time.monotonic() < deadline:
             time.sleep(0.2)
-        assert usage(server.process.pid).rss_mib < before.rss_mib + 100
+        assert usage(server.process.pid).rss_mib < before.rss_mib + KEPT_MIB
 
 
 @pytest.fixture(scope="module")
 def came(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Soaks:
-    """What came of the soaks of all tests that were chosen, which happen at once, each in a process of its own."""
+    """What came of the soaks of all tests that were chosen, which happen at once, each in a process of its own.
+
+    A soak that broke off left no file: its test fails, and shows what the process said.
+    """
     specs = [item.callspec.params for item in request.session.items if hasattr(item, "callspec")]
     folder = tmp_path_factory.mktemp("soaks")
-    paths = {name: folder / f"{name}.json" for name in HOSTILE if {"soaked": name} in specs}
+    paths = {name: folder / f"{name.replace('/', '-')}.json" for name in HOSTILE if {"soaked": name} in specs}
     with ExitStack() as stack:
         for name, path in paths.items():
             line = [sys.executable, "-m", "benchmarks.soak", name, "--minutes", str(MINUTES), "--blocks", "5"]
-            process = subprocess.Popen([*line, "--output", str(path)], stdout=subprocess.DEVNULL)
+            said = stack.enter_context(path.with_suffix(".said").open("w"))
+            process = subprocess.Popen([*line, "--output", str(path)], stdout=said, stderr=said)
             stack.callback(process.wait)
-    return {name: json.loads(path.read_text()) for name, path in paths.items()}
+    return paths
 
 
 @pytest.mark.parametrize("soaked", [*HOSTILE])
 def test_no_promise_is_broken_within_a_minute(soaked: str, came: Soaks) -> None:
-    """But for the idle latency, which tells of whatever the machine does beside this."""
-    whole = came[soaked]
-    assert [said for said in whole["broken"] if not said.startswith("the idle latency")] == []
-    assert whole["asked"] > 50
-    assert whole["attacks"] > 50
+    """But for the idle latency, which tells of whatever else the machine does; growth takes longer to be judged."""
+    path = came[soaked]
+    assert path.exists(), path.with_suffix(".said").read_text()[-3000:]
+    whole = json.loads(path.read_text())
+    assert [said for said in whole["broken"] if not said.startswith(("the idle latency", "the memory"))] == []
+    assert whole["growth_mib"] < KEPT_MIB

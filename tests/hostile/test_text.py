@@ -26,8 +26,8 @@ from s2a_bench.text import one_line, visible
 from s2a_bench.transport.http.merge import read_patch
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.tables import TextTable, to_latex, to_markdown
-from s2a_bench.writers.terminal import lay_out
+from s2a_bench.writers.latex import to_latex
+from s2a_bench.writers.tables import TextTable, lay_out, to_markdown
 from tests.servers.hostile import delta
 from tests.servers.sockets import head, serving
 

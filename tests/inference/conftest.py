@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -6,14 +7,22 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.models import resolve
 
 
-@pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+@pytest.fixture(scope="session")
+def cached(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(cached: Path) -> Iterator[None]:
+    """For a module: the next one of this process may be of another folder, which has a cache of its own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("S2A_BENCH_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("S2A_BENCH_CACHE", str(cached))
         yield
 
 
 @pytest.fixture(scope="session")
-def tiny(cache: None) -> EngineConfig:  # noqa: ARG001 the files lie there
-    model, mmproj = resolve(EngineConfig())
+def tiny(cached: Path) -> EngineConfig:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("S2A_BENCH_CACHE", str(cached))
+        model, mmproj = resolve(EngineConfig())
     return EngineConfig(model=model, mmproj=mmproj, threads=1)  # two would wait for each other on a busy machine

@@ -1,5 +1,4 @@
 import hashlib
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +6,17 @@ import pytest
 
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import dummy
-from s2a_bench.inference.dummy import DummyFiles, dummy_files, write_dummy
-from s2a_bench.inference.dummy_vocab import FULL_UNKNOWN, byte_names, make_vocab
-from s2a_bench.inference.dummy_weights import CHUNK_BYTES, KINDS, Kind, Tensor
+from s2a_bench.inference.dummy import (
+    CHUNK_BYTES,
+    FULL_UNKNOWN,
+    KINDS,
+    DummyFiles,
+    Kind,
+    Tensor,
+    byte_names,
+    make_vocab,
+    write_dummy,
+)
 from s2a_bench.inference.gguf_file import read_header
 
 gguf = pytest.importorskip("gguf")
@@ -113,7 +120,7 @@ def test_the_byte_alphabet_is_gpt_2s() -> None:
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_a_tensor_has_as_many_bytes_as_it_says_however_it_is_cut(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.inference.dummy_weights.CHUNK_BYTES", 1000)
+    monkeypatch.setattr("s2a_bench.inference.dummy.CHUNK_BYTES", 1000)
     tensor = Tensor("t", (6, 512), kind)
     assert sum(chunk.nbytes for chunk in tensor.chunks(0)) == tensor.nbytes
     assert tensor.nbytes == 6 * 512 // KINDS[kind][0] * KINDS[kind][1]
@@ -156,23 +163,3 @@ def test_a_folder_that_cannot_be_made_is_a_model_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ModelError, match=r"`output` .*file/x: cannot write"):
         write_dummy(tmp_path / "file" / "x")
-
-
-def test_names_differ_by_size_type_and_seed(tmp_path: Path) -> None:
-    names = {
-        dummy_files(tmp_path, size, quant, seed).model.name
-        for size in ("tiny", "full")
-        for quant in ("f16", "q4_0")
-        for seed in (0, 1)
-    }
-    assert len(names) == 8
-
-
-def test_importing_the_seam_does_not_import_llama_cpp() -> None:
-    import subprocess
-
-    code = (
-        "import sys, s2a_bench.inference.models, s2a_bench.cli.model; print(set(sys.modules) & {'llama_cpp', 'gguf'})"
-    )
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert out.strip() == "set()"

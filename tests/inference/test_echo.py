@@ -10,8 +10,8 @@ from s2a_bench.boards.latency import Latencies, read_latency, sequence_ns
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import LATENCY_DRAWN_MS
-from s2a_bench.inference import Engine, EngineConfig, open_engine
-from s2a_bench.inference.echo import EchoEngine, check_latency
+from s2a_bench.inference import Engine, EngineConfig, check_engine, open_engine
+from s2a_bench.inference.echo import EchoEngine
 from s2a_bench.testing.engine import EngineSuite, ask
 from s2a_bench.types import Request
 
@@ -99,7 +99,7 @@ def test_each_answer_tells_its_latency() -> None:
 def test_an_echo_that_answers_at_once_tells_and_emulates_nothing() -> None:
     engine, clock = echo("")
     assert times_ns(engine, clock) == [0, 0, 0]
-    assert (engine.facts, EngineConfig(name="echo").told) == ({}, ())
+    assert (engine.facts, EchoEngine.told(EngineConfig(name="echo"))) == ({}, ())
     assert "emulated" not in engine.describe()
     engine, _ = echo("80")
     assert (engine.describe()["emulated"], engine.describe()["latency"]) == (True, "80")
@@ -119,7 +119,7 @@ def test_an_echo_that_answers_at_once_tells_and_emulates_nothing() -> None:
 )
 def test_a_latency_that_makes_no_sense_is_one_line(asked: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError) as error:
-        check_latency(EngineConfig(**asked))
+        check_engine(EngineConfig(**asked))
     assert message in str(error.value)
 
 

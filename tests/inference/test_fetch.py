@@ -23,8 +23,7 @@ from s2a_bench.cli.model import app
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.fetch import Wanted, fetch, wanted
-from s2a_bench.inference.fetch_names import HUB_MODELS, fetched
-from s2a_bench.inference.models import load_headers
+from s2a_bench.inference.models import fetched, load_headers
 
 NAME = "minicpm-v-2.6"
 REPOSITORY = "openbmb/MiniCPM-V-2_6-gguf"
@@ -402,12 +401,6 @@ def test_a_name_stands_for_its_files_once_they_are_fetched(hub: Hub) -> None:
         load_headers(EngineConfig(model=Path(NAME)))
     assert load_headers(EngineConfig(model=other)).mmproj.path == files.mmproj.path
     assert hub.gets(MODEL) == [None]
-
-
-def test_every_known_name_has_a_place_for_the_quantisation() -> None:
-    for known in HUB_MODELS.values():
-        name = known.model_file(known.quant)
-        assert known.quants([name, known.mmproj, "README.md"]) == [known.quant]
 
 
 def run(*arguments: str) -> Any:

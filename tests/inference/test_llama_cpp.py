@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from s2a_bench.errors import BadRequest, EngineError, ModelError
+from s2a_bench.errors import BadRequest, EngineError, ModelError, UsageError
 from s2a_bench.facts import LLAMA
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.dummy import write_dummy
-from s2a_bench.inference.llama_cpp import LlamaCppEngine
-from s2a_bench.inference.llama_gbnf import GrammarSampler
+from s2a_bench.inference.llama_cpp import LlamaCppEngine, llama_cpp
+from s2a_bench.inference.llama_decode import GrammarSampler
 from s2a_bench.inference.llama_pictures import Steps, mtmd_cpp
 from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
-from s2a_bench.transport.ros.sampling import BOUNDS
+from s2a_bench.transport.ros.action_front import BOUNDS
 from s2a_bench.types import Frame, Request
 
 PLAN = r"""
@@ -273,3 +273,9 @@ def test_the_frame_is_not_kept_after_the_request(shared: LlamaCppEngine) -> None
     frame: Frame = rgb_frame()
     ask(shared, images=(frame,))
     assert shared._handler.frames == ()
+
+
+def test_layers_on_a_gpu_are_refused_by_a_build_for_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(llama_cpp, "llama_supports_gpu_offload", lambda: False)
+    with pytest.raises(UsageError, match="`gpu_layers`: this llama-cpp-python is built for the CPU alone"):
+        LlamaCppEngine(EngineConfig(gpu_layers=-1))

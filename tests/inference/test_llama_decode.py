@@ -9,10 +9,9 @@ import llama_cpp
 import pytest
 
 from s2a_bench.errors import EngineError
-from s2a_bench.inference import EngineConfig
+from s2a_bench.inference import SAMPLINGS, EngineConfig
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.llama_decode import GreedySampler, bindings
-from s2a_bench.inference.llama_settings import SAMPLINGS
 from s2a_bench.testing.engine import ask, rgb_frame
 from s2a_bench.types import Frame, Request
 

@@ -11,7 +11,7 @@ import pytest
 from s2a_bench.errors import EngineError, ModelError
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.echo import EchoEngine
-from s2a_bench.inference.one_thread import AHEAD, OneThreadEngine
+from s2a_bench.inference.one_thread import AHEAD, Llama, OneThreadEngine
 from s2a_bench.testing.engine import EngineSuite
 from s2a_bench.types import Request, Token
 
@@ -80,6 +80,20 @@ def test_all_work_is_done_on_one_thread_that_is_not_the_callers() -> None:
     assert len(set(spy.threads)) == 1
     assert threading.get_ident() not in spy.threads
     assert engine.facts == {"prompt_n": 1.0}
+
+
+def test_engines_that_take_turns_share_a_thread_which_ends_with_the_first(tiny: EngineConfig) -> None:
+    first = Llama(tiny)
+    second = open_engine(tiny.but(flash_attention="off"), first)
+    assert (first.describe()["flash_attention"], second.describe()["flash_attention"]) == ("auto", "off")
+    threads = [engine._submit(threading.get_ident).result() for engine in (first, second)]
+    assert threads[0] == threads[1]
+    for engine in (first, second, first):
+        assert list(engine.generate(Request("a", "go", max_tokens=2)))
+    second.close()
+    assert list(first.generate(Request("b", "go", max_tokens=2)))
+    first.close()
+    assert threads[0] not in {thread.ident for thread in threading.enumerate()}
 
 
 def test_leaving_early_cancels_the_engine() -> None:

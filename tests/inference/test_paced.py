@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from s2a_bench.clock import VirtualClock
-from s2a_bench.inference import Engine, EngineConfig, open_engine
+from s2a_bench.inference import Engine, EngineConfig, PacedEngine, open_engine
 from s2a_bench.inference.echo import EchoEngine
-from s2a_bench.inference.paced import PacedEngine
 from s2a_bench.testing.engine import EngineSuite
 from s2a_bench.testing.transport import wiring
 from s2a_bench.types import Request, Token

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from s2a_bench.boards.file import to_toml
 from s2a_bench.boards.gaps import Lognormal
-from s2a_bench.boards.search import load_profile
+from s2a_bench.boards.profile import load_profile, to_toml
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import EngineError, UsageError
-from s2a_bench.inference import Engine, EngineConfig, open_engine
-from s2a_bench.inference.replay import GAPS, ReplayEngine, check_replay
+from s2a_bench.inference import Engine, EngineConfig, check_engine, open_engine
+from s2a_bench.inference.replay import GAPS, ReplayEngine
 from s2a_bench.plan import Parser, SkillParsed, load_skills, paper_format
 from s2a_bench.testing.engine import EngineSuite, ask
 from s2a_bench.types import Request
@@ -218,7 +217,7 @@ def test_facts_tell_prompt_and_decoding_time() -> None:
 )
 def test_settings_that_do_not_go_together_are_refused(config: EngineConfig, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        check_replay(config)
+        check_engine(config)
 
 
 def test_a_closed_engine_refuses() -> None:

@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 
 from s2a_bench.boards.gaps import Constant
-from s2a_bench.boards.profile import Profile
-from s2a_bench.boards.search import load_profile
+from s2a_bench.boards.profile import Profile, load_profile
 from s2a_bench.machine import environment
-from s2a_bench.machine.board import board_facts, differences, matches
+from s2a_bench.machine.environment import board_facts, differences, matches
 
 
 def profile(**facts: Any) -> Profile:

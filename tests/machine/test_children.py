@@ -13,7 +13,7 @@ from threading import Event, Thread
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.machine.children import start_child
+from s2a_bench.machine.tuning import start_child
 
 STUBBORN = (
     "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); time.sleep(600)"
@@ -21,7 +21,7 @@ STUBBORN = (
 PARENT = """
 import subprocess, sys, time
 from threading import Thread
-from s2a_bench.machine.children import start_child
+from s2a_bench.machine.tuning import start_child
 
 def start():
     child = start_child([sys.executable, "-c", sys.argv[1]], stdout=subprocess.PIPE)

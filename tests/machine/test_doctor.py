@@ -15,8 +15,9 @@ from typing import Any
 import pytest
 
 from s2a_bench.cli.doctor import all_checks
-from s2a_bench.frames.v4l2_formats import CameraInfo
-from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.frames.v4l2 import CameraInfo
+from s2a_bench.harness.config import RequestsConfig
+from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.warnings import before_run
 from s2a_bench.inference.smoke import Smoke
 from s2a_bench.machine import doctor, environment
@@ -96,7 +97,7 @@ def make(tmp_path: Path) -> Make:
 @pytest.fixture(autouse=True)
 def no_smoke(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let llama.cpp pass its test, which takes seconds, unless a test says otherwise."""
-    monkeypatch.setattr("s2a_bench.inference.checks.smoke_test", lambda: Smoke(0))
+    monkeypatch.setattr("s2a_bench.inference.smoke.smoke_test", lambda: Smoke(0))
 
 
 @pytest.fixture(autouse=True)
@@ -246,15 +247,9 @@ def test_a_power_mode_is_asked_of_the_program_where_its_files_are_missing(make: 
         asked.append(command)
         return "NV Power Mode: MODE_30W\n2\n"
 
+    assert current_power_mode(make(RTX, run=run)) is None
     assert current_power_mode(make(tree, run=run)) == ("MODE_30W", {})
     assert asked == [["nvpmodel", "-q"]]
-
-
-def test_a_workstation_is_not_asked_for_nvpmodel(make: Make) -> None:
-    def run(command: Sequence[str]) -> str:
-        raise AssertionError(command)
-
-    assert current_power_mode(make(RTX, run=run)) is None
 
 
 @pytest.mark.parametrize(
@@ -458,13 +453,9 @@ def test_amx_is_used_or_off_for_a_reason(
 def test_a_build_that_dies_is_an_error_and_never_loaded_here(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "llama_cpp", None)  # importing it would say that it does not load
     died = Smoke(-4, "llama.cpp failed its test with q8_0 weights: killed by signal 4 (SIGILL)")
-    monkeypatch.setattr("s2a_bench.inference.checks.smoke_test", lambda: died)
+    monkeypatch.setattr("s2a_bench.inference.smoke.smoke_test", lambda: died)
     finding = see(make(RTX), "llama-build")
     assert finding == Finding("llama-build", "error", died.message, "make clean setup")
-
-
-def test_only_the_doctor_makes_the_smoke_test() -> None:
-    assert "llama-build" not in BEFORE_RUN
 
 
 @pytest.mark.slow
@@ -495,7 +486,7 @@ def test_a_run_gets_the_doctors_warnings_that_concern_it(
     make: Make, tree: dict[str, str], width: int, dds: bool, expected: list[str]
 ) -> None:
     config = RequestsConfig(transports="ros" if dds else "http", size=(width, 480))
-    warnings = before_run(config, make(tree))
+    warnings = before_run(resolve(config).checks, make(tree))
     assert [warning.code for warning in warnings] == expected
     assert all(warning.advice for warning in warnings)
 

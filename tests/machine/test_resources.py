@@ -15,13 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.clock import VirtualClock
-from s2a_bench.machine import resources
-from s2a_bench.machine.resources import READERS, Unreadable, open_readers
-from s2a_bench.machine.resources.host import CpuTimes, Memory
-from s2a_bench.machine.resources.jetson import Jtop, Tegrastats, parse_tegrastats
-from s2a_bench.machine.resources.nvidia import Nvml
-from s2a_bench.machine.resources.rapl import Rapl
-from s2a_bench.machine.resources.rows import RESOURCES
+from s2a_bench.machine.resources import READERS, RESOURCES, Unreadable, open_readers
+from s2a_bench.machine.resources.host import CpuTimes, Memory, Rapl
+from s2a_bench.machine.resources.nvidia import Nvml, Tegrastats, parse_tegrastats
 from s2a_bench.machine.resources.sampler import Sampler
 from s2a_bench.store.run import RunWriter, read_run
 
@@ -127,55 +123,6 @@ def test_without_the_program_the_reader_says_so(tmp_path: Path, monkeypatch: pyt
         Tegrastats()
 
 
-def fake_jtop(monkeypatch: pytest.MonkeyPatch, power: dict[str, object], *, runs: bool = True) -> None:
-    class JtopException(Exception): ...
-
-    class jtop:  # noqa: N801 - its name there
-        def __init__(self, interval: float) -> None:
-            assert interval == 0.1
-            self.power = power
-            self.gpu = {"gpu": {"status": {"load": 42.0}, "freq": {"cur": 1_300_500}}}
-            self.temperature = {"gpu": {"temp": 51.5}}
-
-        def start(self) -> None:
-            if not runs:
-                raise JtopException("The jtop.service is not active")
-
-        def close(self) -> None: ...
-
-    module = types.ModuleType("jtop")
-    module.__dict__.update(jtop=jtop, JtopException=JtopException)
-    monkeypatch.setitem(sys.modules, "jtop", module)
-
-
-def test_jtops_named_total_is_the_boards(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake_jtop(monkeypatch, {"tot": {"name": "VDD_IN", "power": 7310}, "rail": {"VDD_SOC": {"power": 1300}}})
-    expected = {"board_power_w": 7.31, "gpu_busy": 0.42, "gpu_clock_hz": 1_300_500e3, "gpu_temperature_c": 51.5}
-    assert Jtop().read() == expected
-
-
-def test_jtops_total_of_an_agx_orin_is_added_up_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    watts = {"VDD_GPU_SOC": 3000, "VDD_CPU_CV": 1000, "VIN_SYS_5V0": 5000, "VDDQ_VDD2_1V8AO": 400}
-    rails = {name: {"power": milliwatts} for name, milliwatts in watts.items()}
-    fake_jtop(monkeypatch, {"tot": {"power": 9400}, "rail": rails})
-    assert Jtop().read()["board_power_w"] == 9.0
-
-
-def test_jtop_without_its_service_names_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake_jtop(monkeypatch, {}, runs=False)
-    with pytest.raises(Unreadable, match="systemctl restart jtop"):
-        Jtop()
-
-
-def test_tegrastats_is_left_out_where_jtop_reads_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    opened = {"jtop": "tests:A", "tegrastats": "tests:B"}
-    monkeypatch.setattr(resources, "READERS", opened)
-    monkeypatch.setattr(resources, "resolve_name", lambda where: lambda _pids: where)
-    readers, left_out = open_readers([])
-    assert list(readers) == ["jtop"]
-    assert left_out == {"tegrastats": "jtop is used"}
-
-
 def rapl_tree(root: Path, *energies: int, largest: int = 999) -> None:
     for number, energy in enumerate(energies):
         for zone, name in ((f"intel-rapl:{number}", f"package-{number}"), (f"intel-rapl:{number}:0", "core")):
@@ -200,7 +147,7 @@ def test_rapl_adds_packages_and_undoes_the_wrap(tmp_path: Path) -> None:
 
 @given(st.lists(st.integers(0, 999), min_size=1, max_size=30))
 def test_rapl_never_loses_energy_below_one_wrap_a_reading(steps: list[int]) -> None:
-    from s2a_bench.machine.resources.rapl import Zone
+    from s2a_bench.machine.resources.host import Zone
 
     file = os.memfd_create("energy_uj")
     try:

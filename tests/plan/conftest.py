@@ -1,4 +1,3 @@
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -6,27 +5,14 @@ import pytest
 from gguf import GGUFWriter
 
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.dummy_vocab import make_vocab
-from s2a_bench.inference.models import resolve
+from s2a_bench.inference.dummy import make_vocab
 from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.plan import GRANULARITIES, Format, SkillSet, Tokenize, choose_format, load_skills, paper_format
-
-
-@pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("S2A_BENCH_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
+from tests.inference.conftest import cached, tiny  # noqa: F401 - fixtures
 
 
 @pytest.fixture(scope="session")
-def tiny(cache: None) -> EngineConfig:  # noqa: ARG001 the files lie there
-    model, mmproj = resolve(EngineConfig())
-    return EngineConfig(model=model, mmproj=mmproj, threads=1)
-
-
-@pytest.fixture(scope="session")
-def of_bytes(tiny: EngineConfig) -> Tokenizer:
+def of_bytes(tiny: EngineConfig) -> Tokenizer:  # noqa: F811
     return Tokenizer(tiny.model)
 
 

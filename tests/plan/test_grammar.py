@@ -3,7 +3,7 @@ import random
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.inference.llama_gbnf import grammar_error
+from s2a_bench.inference.llama_decode import grammar_error
 from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.plan import Format, Parser, SkillParsed, Tokenize, grammar, load_skills, paper_format, parse_skills
 from tests.plan.gbnf import Gbnf

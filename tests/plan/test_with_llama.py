@@ -13,7 +13,6 @@ from s2a_bench.plan import (
     choose_format,
     grammar,
     load_skills,
-    measure_validity,
     paper_format,
     prompt,
 )
@@ -56,17 +55,3 @@ def test_a_model_under_the_grammar_writes_the_papers_form(engine: LlamaCppEngine
     assert [line.partition(".")[0] for line in answer.splitlines()] == list("12345678")
     parser = Parser(paper)
     assert len([event for event in parser.feed(answer) if isinstance(event, SkillParsed)]) == 8
-
-
-def test_the_grammar_is_what_makes_skills_valid(engine: LlamaCppEngine, of_bytes: Tokenizer, skills: SkillSet) -> None:
-    format_ = choose_format(skills, 4, of_bytes)
-
-    def ask(gbnf: str, seed: int) -> Iterator[str]:
-        return (token.text for token in tokens(engine, prompt(format_, 6), gbnf, seed, 60))
-
-    found = measure_validity(ask, format_, 6, answers=4, tokenize=of_bytes)
-    assert set(found) == {"grammar", "free"}
-    assert (found["grammar"].share, found["grammar"].as_ordered, found["grammar"].skills) == (1.0, 4, 24)
-    assert found["free"].answers == 4
-    assert (found["free"].share or 0.0) < 0.5  # random weights
-    assert found["free"].as_ordered == 0

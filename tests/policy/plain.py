@@ -50,17 +50,6 @@ def held(arrival: Seconds, starts: Seconds, durations: Seconds, latest: Seconds)
     return runs
 
 
-def robust_start(arrival: Seconds, durations: Seconds, gap: float) -> float:
-    """Start when nothing that can still happen, with gaps of at most ``gap``, makes the robot stall (T6)."""
-    done = before(durations)
-    for known in range(1, len(arrival) + 1):
-        latest = [*arrival[:known], *(arrival[known - 1] + k * gap for k in range(1, len(arrival) - known + 1))]
-        start = max(arrival[known - 1], *(t - work for t, work in zip(latest, done, strict=True)))
-        if known == len(arrival) or start < arrival[known]:
-            return start
-    raise AssertionError("a plan has at least one skill")
-
-
 def fluidity(stall: Seconds, nominal: Seconds, tolerance: float) -> float:
     """Count deadlines met and missed as Etalon's algorithm does, token for skill (arXiv 2407.07000)."""
     met, missed = 1, 0

@@ -1,4 +1,4 @@
-"""When fragments arrive."""
+"""When fragments arrive, and the plans that they make."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from s2a_bench.boards.gaps import Constant, Lognormal
-from s2a_bench.policy.arrivals import fragments, tokens, uniform
+from s2a_bench.policy import PlanShape, Timing
+from s2a_bench.policy.arrivals import fragments, recorded_plans, tokens, uniform
 
 
 def test_uniform_fragments_come_every_l_over_r_seconds_after_the_prompt() -> None:
@@ -33,3 +34,12 @@ def test_random_tokens_are_the_running_sum_of_the_familys_gaps() -> None:
     at_s = tokens(gaps, 0.5, 60, 9, np.random.default_rng(8))
     expected = 0.5 + np.cumsum(gaps.sample(np.random.default_rng(8), 60, 9), axis=0)
     assert at_s == pytest.approx(expected, rel=1e-13)
+
+
+def test_recorded_answers_become_plans_and_short_ones_are_left_out() -> None:
+    shape, rng = PlanShape(3, 2, Timing(1.0, 0.8, 1.5), 0.2), np.random.default_rng(0)
+    plans = recorded_plans([np.arange(1.0, 9), np.arange(5.0), np.arange(2.0, 8)], shape, rng)
+    assert plans.token_s is not None
+    np.testing.assert_array_equal(plans.token_s.T, [np.arange(1.0, 7), np.arange(2.0, 8)])
+    np.testing.assert_array_equal(plans.arrival_s.T, [[2, 4, 6], [3, 5, 7]])
+    assert recorded_plans([np.arange(2.0)], shape, rng).arrival_s.shape == (3, 0)

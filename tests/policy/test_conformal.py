@@ -14,12 +14,12 @@ from scipy import stats
 
 from s2a_bench.boards.gaps import Markov
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.study.worlds import World
 from s2a_bench.policy import Plans
 from s2a_bench.policy.conformal import GRID, Tracker, calibrate, choose, coarse, scores, stalled, take, upper_bound
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.naive import Naive
 from s2a_bench.policy.stream_to_act import StreamToAct
+from studies.worlds import World
 
 WORLD = World(4.8, 0.5, 2, 4, 0.25)
 """rho = 1.67: a start at the first skill stalls."""
@@ -144,11 +144,6 @@ def test_durations_of_all_plans_in_one_column_stay_one_when_some_plans_are_taken
 @pytest.mark.parametrize(("scores_", "caution"), [(98, math.inf), (99, 98.0)])
 def test_with_too_few_scores_for_epsilon_the_next_plan_is_waited_for(scores_: int, caution: float) -> None:
     assert Tracker(np.arange(float(scores_)), 0.01).caution == caution
-
-
-def test_where_all_stall_any_share_may_and_where_none_does_it_is_little() -> None:
-    assert upper_bound(50, 50, 0.999) == 1.0
-    assert upper_bound(0, 50, 0.999) == pytest.approx(1 - 0.001 ** (1 / 50))
 
 
 def test_the_level_moves_by_a_step_of_what_went_otherwise_than_epsilon_says() -> None:

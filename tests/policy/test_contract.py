@@ -8,7 +8,6 @@ import pytest
 
 from s2a_bench.policy import POLICIES, Policy
 from s2a_bench.policy import policy as build
-from s2a_bench.policy.robust import RobustStart
 from s2a_bench.policy.stream_to_act import StreamToAct
 from s2a_bench.testing.policy import PolicySuite
 
@@ -25,10 +24,3 @@ class TestStreamToAct(PolicySuite):
     @pytest.fixture
     def policy(self, caution: float) -> Policy:
         return StreamToAct(caution=caution)
-
-
-@pytest.mark.parametrize("bound_s", [0.3, 1.2, 3.0])
-class TestRobust(PolicySuite):
-    @pytest.fixture
-    def policy(self, bound_s: float) -> Policy:
-        return RobustStart(bound_s)

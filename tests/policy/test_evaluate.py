@@ -68,14 +68,6 @@ def test_a_stall_as_long_as_the_tolerance_does_not_count() -> None:
     assert evaluate(arrival_s, np.ones((3, 1)), 0.25).naive_stalls == [1]
 
 
-def test_the_arrays_given_are_left_alone() -> None:
-    plans = draw(3, 5, 2, 1.5, 4)
-    arrival_s, nominal_s = plans.arrival_s.copy(), plans.nominal_s.copy()
-    evaluate(plans.arrival_s, plans.nominal_s)
-    assert (plans.arrival_s == arrival_s).all()
-    assert (plans.nominal_s == nominal_s).all()
-
-
 def test_plans_may_be_strided_views() -> None:
     whole = draw(4, 6, 2, 1.5, 10)
     assert whole.token_s is not None

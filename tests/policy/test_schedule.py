@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from s2a_bench.policy import Plans, PlanShape, Schedule, Timing
+from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.metrics import stalls
-from s2a_bench.policy.robust import RobustStart
 from s2a_bench.policy.schedule import CHUNK, elastic, hold, least_end, safe_start, work_conserving
 from tests.policy import plain
 
@@ -35,10 +34,6 @@ def elastic_plans(draw: st.DrawFn, most_skills: int = 8) -> Plans:
 
 def total(values: np.ndarray) -> float:
     return float(values.sum())
-
-
-def stall_of(arrival: list[float], durations: list[float], first: float) -> float:
-    return sum(plain.stalls(plain.execute(arrival, durations, first), durations))
 
 
 @quick
@@ -184,95 +179,12 @@ def test_t5_the_papers_start_stalls_by_the_difference_when_all_skills_finish_ear
     assert total(stalls(Schedule(starts, plans.least_s))) == safe - papers
 
 
-@st.composite
-def bounded_plans(draw: st.DrawFn) -> tuple[list[float], list[float], float]:
-    """Draw arrivals with gaps of at most a bound, durations, and the bound; often at the bound itself."""
-    n = draw(st.integers(1, 7))
-    bound = draw(st.integers(1, 48)) / 16
-    gap = st.one_of(st.just(bound), st.integers(0, int(bound * 16)).map(lambda k: k / 16))
-    gaps = draw(st.lists(gap, min_size=n - 1, max_size=n - 1))
-    arrival = (np.cumsum([1.0, *gaps])).tolist()
-    return arrival, draw(st.lists(sixteenths, min_size=n, max_size=n)), bound
-
-
-@quick
-@given(bounded_plans())
-def test_t6_the_robust_rule_never_stalls_while_gaps_keep_their_bound(
-    plan: tuple[list[float], list[float], float],
-) -> None:
-    arrival, durations, bound = plan
-    assert stall_of(arrival, durations, plain.robust_start(arrival, durations, bound)) == 0
-
-
-@quick
-@given(bounded_plans(), sixteenths.filter(bool))
-def test_t6_s2a_robust_is_this_rule_where_all_skills_take_the_same_time(
-    plan: tuple[list[float], list[float], float], duration: float
-) -> None:
-    arrival, _, bound = plan
-    n, arrival_s = len(arrival), np.array(arrival)[:, np.newaxis]
-    same = np.full((n, 1), duration)
-    plans = Plans(arrival_s, same, same, same, shape=PlanShape(n, 1, Timing(duration, duration, duration)))
-    first = RobustStart(bound).schedule(plans).start_s[0, 0]
-    assert first == plain.robust_start(arrival, [duration] * n, bound)
-
-
-@quick
-@given(bounded_plans(), st.integers(0, 99))
-def test_t6_whoever_starts_earlier_can_be_made_to_stall(
-    plan: tuple[list[float], list[float], float], hundredths: int
-) -> None:
-    arrival, durations, bound = plan
-    robust = plain.robust_start(arrival, durations, bound)
-    first = arrival[0] + (robust - arrival[0]) * hundredths / 100
-    assume(first < robust)
-    known = sum(t <= first for t in arrival)
-    # Until `first` everything is as seen; from there on every gap is as long as it may be.
-    worst = [*arrival[:known], *(arrival[known - 1] + k * bound for k in range(1, len(arrival) - known + 1))]
-    assert all(t > first for t in worst[known:])
-    assert stall_of(worst, durations, first) > 0
-
-
-@quick
-@given(bounded_plans(), st.floats(0, 0.999))
-def test_t6_without_a_bound_whoever_starts_before_the_last_skill_can_be_made_to_stall(
-    plan: tuple[list[float], list[float], float], part: float
-) -> None:
-    arrival, durations, _ = plan
-    first = arrival[0] + (arrival[-1] - arrival[0]) * part
-    assume(first < arrival[-1])
-    known = sum(t <= first for t in arrival)
-    worst = [*arrival[:known], *(first + sum(durations) + 1 for _ in arrival[known:])]
-    assert stall_of(worst, durations, first) > 0
-
-
 @quick
 @given(elastic_plans())
 def test_t7_the_pre_roll_is_the_highest_point_of_the_walk_of_gaps_minus_durations(plans: Plans) -> None:
     steps = np.diff(plans.arrival_s[:, 0]) - plans.nominal_s[:-1, 0]
     highest = max([0.0, *np.cumsum(steps).tolist()])
     assert safe_start(plans.arrival_s, plans.nominal_s)[0] - plans.arrival_s[0, 0] == highest
-
-
-def pre_roll(rho: float, n_skills: int, cv: float = 0.3, plans: int = 20_000) -> np.ndarray:
-    """Draw S0 - t_1 in units of T, for independent gaps with mean rho."""
-    rng = np.random.default_rng(7)
-    gaps = rng.normal(rho, cv * rho, (n_skills, plans))
-    arrival_s = np.cumsum(gaps, axis=0)
-    return safe_start(arrival_s, np.ones((n_skills, 1))) - arrival_s[0]
-
-
-def test_t7_below_rho_1_the_pre_roll_does_not_grow_with_the_plan() -> None:
-    shorter, longer, longest = (np.quantile(pre_roll(0.8, n), 0.99) for n in (16, 64, 128))
-    assert longer == pytest.approx(shorter, rel=0.05)
-    assert longest == pytest.approx(longer, rel=0.03)
-
-
-@pytest.mark.parametrize("n_skills", [8, 32, 128])
-def test_t7_above_rho_1_the_pre_roll_grows_with_the_plan_as_stated(n_skills: int) -> None:
-    rho, cv, steps = 1.8, 0.3, n_skills - 1
-    stated = steps * (rho - 1) + 2.326 * cv * rho * np.sqrt(steps)  # z = 2.326: the 99 % quantile
-    assert np.quantile(pre_roll(rho, n_skills, cv), 0.99) == pytest.approx(stated, rel=0.02)
 
 
 @pytest.mark.parametrize("n_skills", [1, 2, 8, 32])

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.study.worlds import World, generator
 from s2a_bench.policy import Plans, tracking
 from s2a_bench.policy.conformal import stalled, take
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import EarlyStart, StreamToAct
 from s2a_bench.policy.tracking import Tracked
+from s2a_bench.stats.seeds import generator
+from studies.worlds import World
 
 WORLD = World(0.58, 3.0, 1, 8, 1.0)
 CALIBRATION = WORLD.draw(generator(0, "tracking"), 120)

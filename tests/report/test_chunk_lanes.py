@@ -8,11 +8,11 @@ import pytest
 
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
-from s2a_bench.experiments.chunks.view.lanes import COLOURS, lanes_of
+from s2a_bench.experiments.chunks.view.figures import COLOURS, lanes_of
+from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
-from s2a_bench.report.page.chunk_lanes import panels_of_chunks
-from s2a_bench.report.page.config import ReportConfig
 from s2a_bench.report.page.files import make_report, write_report
+from s2a_bench.report.page.lanes import panels_of_chunks
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
 

@@ -3,22 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from math import inf, nextafter
 from typing import Any
 
 import pytest
 
 from s2a_bench.provenance import Provenance
-from s2a_bench.report.claims.claim import CONTRADICTED, SUPPORTED, UNDECIDED, Part, within
-from s2a_bench.report.claims.intervals import near, verdict_of
-from s2a_bench.report.claims.needs import GPU, is_board, machine_of
-from s2a_bench.report.claims.timeline_parts import all_of
+from s2a_bench.report.claims import (
+    CONTRADICTED,
+    REPRODUCED,
+    SUPPORTED,
+    UNDECIDED,
+    Check,
+    Finding,
+    Judged,
+    Met,
+    Part,
+    all_of,
+    within,
+)
+from s2a_bench.report.claims.requests import PAPERS_MODEL, facts_of, on_board
+from s2a_bench.report.claims.table import CLAIMS
 from s2a_bench.stats import Ratio
 from s2a_bench.store.run import Run
 
 MakeRun = Callable[..., Run]
 ORIN = {"board": "NVIDIA Jetson AGX Orin Developer Kit"}
 RTX = {"gpus": [{"name": "NVIDIA GeForce RTX 4080"}]}
+
+
+def unmeasured(_: Part) -> tuple[list[Ratio], str]:
+    return [], ""
 
 
 @pytest.mark.parametrize(
@@ -37,9 +52,10 @@ RTX = {"gpus": [{"name": "NVIDIA GeForce RTX 4080"}]}
 def test_an_interval_is_wholly_between_the_bounds_or_wholly_outside_or_decides_nothing(
     low: float, high: float, verdict: str
 ) -> None:
-    assert within(low, high, 1.0, 2.0) == verdict
-    assert verdict_of(Ratio(1.5, low, high), 1.0, 2.0) == verdict
-    assert verdict_of(Ratio(1.5, low, None), 1.0, 2.0) == verdict_of(Ratio(1.5, None, high), 1.0, 2.0) == UNDECIDED
+    check = Check("", unmeasured, 1.0, 2.0)
+    assert within(low, high, 1.0, 2.0) == check.verdict([Ratio(1.5, low, high)]) == verdict
+    assert check.verdict([Ratio(1.5, low, None)]) == check.verdict([Ratio(1.5, None, high)]) == UNDECIDED
+    assert Check("", unmeasured).verdict([Ratio(1.5, None, None)]) == SUPPORTED  # only stated
 
 
 @pytest.mark.parametrize(
@@ -55,11 +71,59 @@ def test_of_what_is_claimed_of_all_one_that_contradicts_is_enough(verdicts: list
     assert all_of(verdicts) == verdict
 
 
-def test_a_mean_is_like_the_papers_within_ten_per_cent() -> None:
-    assert near(Ratio(1.0, 0.91, 1.09), "So.") == (SUPPORTED, "So.")
-    assert near(Ratio(1.0, 0.89, 1.09), "So.") == near(Ratio(1.0, 0.91, 1.11), "So.") == (UNDECIDED, "So.")
-    assert near(Ratio(1.2, 1.11, 1.3), "So.") == (CONTRADICTED, "So.")
-    assert near(Ratio(1.0, None, None), "So.") == (UNDECIDED, "So. Too few samples for an interval.")
+@pytest.mark.parametrize(
+    ("values", "each", "alike", "one"),
+    [
+        ((1, 2), SUPPORTED, SUPPORTED, SUPPORTED),
+        ((1, 3), CONTRADICTED, UNDECIDED, SUPPORTED),
+        ((0, 3), CONTRADICTED, UNDECIDED, UNDECIDED),
+        ((3, 4), CONTRADICTED, CONTRADICTED, CONTRADICTED),
+        ((0, -1), CONTRADICTED, CONTRADICTED, CONTRADICTED),
+    ],
+)
+def test_values_lie_inside_each_or_together_or_one_of_them(
+    values: tuple[float, ...], each: str, alike: str, one: str
+) -> None:
+    exact = [Ratio(value, value, value) for value in values]
+    assert Check("", unmeasured, 1, 2).verdict(exact) == each
+    assert Check("", unmeasured, 1, 2, "joint").verdict(exact) == alike
+    assert Check("", unmeasured, 1, 2, "one").verdict(exact) == one
+
+
+def test_more_than_a_half_is_not_a_half() -> None:
+    more = Check("", unmeasured, nextafter(0.5, inf))
+    assert more.verdict([Ratio(0.5, 0.5, 0.5)]) == CONTRADICTED
+    assert more.verdict([Ratio(0.6, 0.5, 0.7)]) == UNDECIDED
+    assert more.verdict([Ratio(0.6, 0.51, 0.7)]) == SUPPORTED
+
+
+@pytest.mark.parametrize(
+    ("testable", "others", "verdict"),
+    [
+        ([], [], UNDECIDED),
+        ([], [UNDECIDED], UNDECIDED),
+        ([SUPPORTED], [], SUPPORTED),
+        ([SUPPORTED, SUPPORTED], [UNDECIDED], SUPPORTED),
+        ([REPRODUCED], [UNDECIDED], REPRODUCED),
+        ([CONTRADICTED], [SUPPORTED], CONTRADICTED),
+        ([UNDECIDED], [], UNDECIDED),
+        ([UNDECIDED], [SUPPORTED], UNDECIDED),
+        ([SUPPORTED, UNDECIDED], [], UNDECIDED),
+        ([CONTRADICTED, UNDECIDED], [], UNDECIDED),
+        ([SUPPORTED, CONTRADICTED], [], UNDECIDED),
+    ],
+)
+def test_runs_that_can_tell_have_to_agree_and_no_other_counts(
+    testable: list[str], others: list[str], verdict: str
+) -> None:
+    findings = [Finding(said, str(place), (Met("board: it", True),)) for place, said in enumerate(testable)]
+    findings += [Finding(said, "", (Met("board: another (needs it)", False),)) for said in others]
+    for order in (findings, findings[::-1]):
+        judged = Judged(CLAIMS[0], dict.fromkeys(order, ("run",)))
+        assert judged.verdict == verdict
+        assert judged.verdicts == set(testable)
+        assert any("disagree" in note for note in judged.notes) == (len(set(testable)) > 1)
+        assert any(note.startswith("Run: ") for note in judged.notes) == (not testable)
 
 
 @pytest.mark.parametrize(
@@ -78,10 +142,11 @@ def test_a_model_is_on_the_gpu_with_all_its_28_layers(
     make_run: MakeRun, offload: bool | None, layers: int | None, found: str, met: bool
 ) -> None:
     model = {"gpu_offload_supported": offload, "gpu_layers": layers, "model_sha256": "ab"}
-    part = Part(make_run({}, manifest={"model": model}), "", None, (Provenance(model_sha256="ab"),))
-    assert (GPU.of(part).found, GPU.of(part).met) == (found, met)
-    others = replace(part, origins=(*part.origins, Provenance(model_sha256="cd")))
-    assert (GPU.of(others).found, GPU.of(others).met) == ("unknown", False)
+    run, ours = make_run({}, manifest={"model": model}), Provenance(model_sha256="ab")
+    on_gpu = PAPERS_MODEL[2].of(facts_of(run, [ours]))
+    assert on_gpu.met == met
+    assert on_gpu.text.startswith(f"processor: {found}")
+    assert facts_of(run, [ours, Provenance(model_sha256="cd")])["processor"] == "unknown"
 
 
 @pytest.mark.parametrize(
@@ -105,7 +170,7 @@ def test_a_model_is_on_the_gpu_with_all_its_28_layers(
 def test_a_board_is_known_by_its_whole_name(
     make_run: MakeRun, environment: dict[str, Any], name: str, same: bool
 ) -> None:
-    assert is_board(make_run({}, manifest={"environment": environment}), name) == same
+    assert on_board(name).of(facts_of(make_run({}, manifest={"environment": environment}), [])).met == same
 
 
 @pytest.mark.parametrize(
@@ -117,4 +182,4 @@ def test_a_board_is_known_by_its_whole_name(
     ],
 )
 def test_a_machine_is_named_by_what_is_known_of_it(make_run: MakeRun, environment: dict[str, Any], named: str) -> None:
-    assert machine_of(make_run({}, manifest={"environment": environment})) == named
+    assert facts_of(make_run({}, manifest={"environment": environment}), [])["board"] == named

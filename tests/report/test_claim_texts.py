@@ -15,11 +15,14 @@ import pytest
 
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
-from s2a_bench.report.claims.verdicts import claim_table, judge_claims
+from s2a_bench.provenance import Origins
+from s2a_bench.report.claims import claim_table
+from s2a_bench.report.claims.table import judge_claims
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
-from tests.report.test_claim_cases import GPU, ORIN, REAL, RTX, Kit, MakeRun, stalling
+from tests.report.conftest import REAL
+from tests.report.test_claim_cases import DUMMY, GPU, ORIN, REPLAY, RTX, Kit, MakeRun, stalling
 
 PAGE = Path(__file__).parents[1] / "data" / "claims.md"
 MakeRow = Callable[..., SampleRow]
@@ -38,8 +41,8 @@ def said(*runs: Run) -> list[str]:
 
 
 @pytest.fixture
-def kit(tmp_path: Path, make_run: MakeRun, spoken: MakeRun) -> Kit:
-    return Kit(tmp_path, make_run, spoken)
+def kit(tmp_path: Path, beside: MakeRun, spoken: MakeRun) -> Kit:
+    return Kit(tmp_path, beside, spoken)
 
 
 def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_row: MakeRow, tmp_path: Path) -> None:
@@ -56,7 +59,6 @@ def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_ro
 
     orin = {"profiles": ("jetson-agx-orin",), "tokens_per_skill": (1, 2, 4, 6)}
     jitter = orin | {"jitter": "lognormal:cv=0.2", "plans": 60}
-    few = kit.latency()
     runs: dict[str, Callable[[], Run]] = {  # title, with the claims it is about in brackets
         "Timelines of table II": lambda: elsewhere(kit.timeline(), **RTX),
         "Timelines with jitter, every 20th of ours stalling (Orin: |V-E: |IV-F: )": lambda: elsewhere(
@@ -72,9 +74,14 @@ def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_ro
         "Timelines on an Orin (Orin: |RTX|V-E: )": lambda: kit.live(REAL, 4.8, environment=ORIN, model=GPU),
         "Transports": kit.latency,
         "Transports, alike": lambda: kit.latency(ratio=1.0),
-        "Transports, one block": lambda: replace(
-            few, tables={"samples": few.samples[few.samples["block"] == 0].reset_index(drop=True)}
+        "Transports, a sample a launch": lambda: kit.latency(n=3),
+        "Transports, one launch": lambda: kit.latency(launches=1),
+        "Transports, a replay behind a proxy beside a dummy (takes longer)": lambda: kit.latency(
+            launches=1,
+            options={"http/as-deployed": {"url": "http://127.0.0.1:8080"}},
+            manifest={"provenance": Origins(DUMMY, {"http/as-deployed": REPLAY}).to_manifest()},
         ),
+        "Transports, llama-server (longer|6.57)": kit.beside_llama_server,
         "Bodies": lambda: bodies(120_500, 90_000),
         "Small bodies": lambda: bodies(66_666, 49_999),
         "A rate (RTX|Orin: )": lambda: kit.rates(34.0, REAL, GPU),

@@ -19,15 +19,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.errors import StoreError, UsageError
-from s2a_bench.experiments.timeline.config import TimelineConfig
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.tables import execution_table, timeline_csv
+from s2a_bench.harness.timelines.config import TimelineConfig
+from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import MOST_CHAPTERS, read_chapters
-from s2a_bench.report.page.config import ReportConfig
-from s2a_bench.report.page.files import make_report, write_report
+from s2a_bench.report.page.files import inline, make_report, write_report
 from s2a_bench.report.page.lanes import panels_of, ticks_of
-from s2a_bench.report.page.plots import inline
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run, RunWriter, read_run
 from s2a_bench.store.sweep import CELLS, CellRow
@@ -246,9 +245,9 @@ def test_a_sweep_of_timelines_is_shown_as_the_one_run_that_it_amounts_to(tmp_pat
     assert pooled.content.tables["timelines"] == replace(execution_table(whole), provenance=whole.origins.line)
     assert pooled.content.csvs == timeline_csv(whole)
     assert pooled.run.origins == whole.origins
-    assert panels_of(pooled.content.timelines) == panels_of(timelines_of(whole))
+    assert panels_of(pooled.content.lanes) == panels_of(timelines_of(whole))
     assert len(overview.content.tables["cells"].rows) == 12
-    assert overview.content.summary[0] == "12 of 12 cells of s2a-bench timeline are finished."
+    assert overview.content.sentences[0] == "12 of 12 cells of s2a-bench timeline are finished."
     page = Page(page_of(folder))
     assert "as it was" in page.text
     assert page.text.count("sweep on ") >= 2  # its title names the page
@@ -259,7 +258,7 @@ def test_cells_of_one_name_are_not_made_one(tmp_path: Path) -> None:
     folder = sweep_of(tmp_path / "sweeps", [({"n": n}, timeline(tmp_path, **same)) for n in (1, 2)])
     _, first, second = read_chapters([folder], against_paper=False)
     assert first.content.tables == second.content.tables
-    assert [len(chapter.content.timelines) for chapter in (first, second)] == [3, 3]
+    assert [len(chapter.content.lanes) for chapter in (first, second)] == [3, 3]
     assert first.name != second.name
 
 
@@ -283,7 +282,7 @@ def test_measured_cells_stand_side_by_side_and_are_not_pooled(tmp_path: Path, ma
     ]
     assert "14 cells were run: the first 12" in overview.caveats[0]
     assert overview.content.tables["cells"].rows[-1][3] == "failed: no room"
-    assert "1 failed" in overview.content.summary[1]
+    assert "1 failed" in overview.content.sentences[1]
 
 
 @pytest.mark.parametrize(
@@ -300,7 +299,7 @@ def test_an_unfinished_run_is_shown_and_told(make_run: MakeRun, state: str, erro
 
 def test_a_run_without_rows_is_told(make_run: MakeRun) -> None:
     (chapter,) = read_chapters([make_run({}).path], against_paper=False)
-    assert chapter.content.summary == ("The run has no rows: it ended before anything was measured.",)
+    assert chapter.content.sentences == ("The run has no rows: it ended before anything was measured.",)
 
 
 def test_a_timeline_that_was_cut_off_does_not_hide_the_others(computed: Path, tmp_path: Path) -> None:
@@ -448,4 +447,4 @@ def test_a_chapter_of_another_command_is_named_and_not_guessed_at(make_run: Make
     run = make_run(n=2)
     (run.path / "manifest.json").write_text(json.dumps({**run.manifest, "command": "dance"}))
     (chapter,) = read_chapters([run.path], against_paper=False)
-    assert chapter.content.summary[0].startswith("There is no view of dance runs; this one holds samples (")
+    assert chapter.content.sentences[0].startswith("There is no view of dance runs; this one holds samples (")

@@ -14,8 +14,8 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import Accepted, Feedback, Rejected, Result, llama, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.testing.action import NAME, WAIT_S, Action, ActionSuite, event, offer, receive, send, start
-from s2a_bench.testing.middleware import Join
+from tests.ros.action_suite import NAME, WAIT_S, Action, ActionSuite, event, offer, receive, send, start
+from tests.ros.middleware_suite import Join, until
 from tests.ros.words import hears_them, served
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
@@ -36,9 +36,7 @@ def action(join: Join) -> Action:
 
 
 class TestCycloneActions(ActionSuite):
-    @pytest.fixture
-    def join(self, join: Join) -> Join:
-        return join
+    """In a domain of Cyclone DDS."""
 
 
 def announced(domain: int, wanted: set[tuple[str, str]]) -> dict[tuple[str, str], Any]:
@@ -52,11 +50,12 @@ def announced(domain: int, wanted: set[tuple[str, str]]) -> dict[tuple[str, str]
         "reader": BuiltinDataReader(observer, BuiltinTopicDcpsSubscription),
     }
     found: dict[tuple[str, str], Any] = {}
-    deadline = now_ns() + 20_000_000_000
-    while not wanted <= found.keys():
-        assert now_ns() < deadline, f"not discovered: {wanted - found.keys()}"
+
+    def look() -> None:
         for kind, reader in readers.items():
-            found |= {(kind, end.topic_name): end for end in reader.take(N=100)}
+            found.update({(kind, end.topic_name): end for end in reader.take(N=100)})
+
+    until(lambda: wanted <= found.keys(), look)
     return found
 
 
@@ -110,8 +109,8 @@ def test_an_id_is_written_as_recorded() -> None:
 
 def test_a_node_is_listed_by_name_with_its_endpoints(dds_domain: int) -> None:
     from s2a_bench.ros import QoS
+    from s2a_bench.ros.cyclone import PARTICIPANT_ENTITIES
     from s2a_bench.ros.dds import RawReader, Waiter, dds_qos
-    from s2a_bench.ros.graph import PARTICIPANT_ENTITIES
 
     listening = open_middleware(domain_id=dds_domain)
     named = open_middleware(domain_id=dds_domain, node_name="/llama/llama_node")
@@ -166,7 +165,7 @@ def test_a_goal_of_version_4_4_makes_the_round(join: Join) -> None:
 
 
 def test_replies_to_other_clients_are_ignored(join: Join) -> None:
-    from s2a_bench.ros.dds_service import HEADER, HEADER_AT
+    from s2a_bench.ros.dds_service import HEADER, HEADER_AT, Caller
 
     action = offer(join)
     sent = send(action.client)
@@ -174,8 +173,8 @@ def test_replies_to_other_clients_are_ignored(join: Join) -> None:
     service = goal._server.send_goal
     guid, number = HEADER.unpack_from(goal._packed, HEADER_AT)
     response = ros.default(service.reply_type, accepted=False)
-    service.reply(service.pack(response), (guid ^ 1, number))
-    service.reply(service.pack(response), (guid, number + 7))
+    service.respond(service.pack(response), Caller(0, (guid ^ 1, number)))
+    service.respond(service.pack(response), Caller(0, (guid, number + 7)))
     goal.accept()
     assert event(action.client, Accepted).goal_id == sent
 
@@ -205,10 +204,7 @@ def test_client_and_server_are_two_processes(join: Join, dds_domain: int) -> Non
         assert process.stdin is not None
         process.stdin.close()
     assert process.returncode == 0
-    deadline = now_ns() + 20_000_000_000
-    while client.server_present() and now_ns() < deadline:
-        client.next_event(0.01)
-    assert not client.server_present()
+    until(lambda: not client.server_present(), lambda: client.next_event(0.01))
 
 
 def test_a_server_may_send_faster_than_its_client_reads(join: Join, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,7 +221,7 @@ def test_a_server_may_send_faster_than_its_client_reads(join: Join, monkeypatch:
         return packed
 
     with monkeypatch.context() as patched:
-        patched.setattr(client._feedback, "take", never_empty)  # type: ignore[attr-defined]
+        patched.setattr(client._feedback.__self__, "take", never_empty)  # type: ignore[attr-defined]
         came = [client.next_event(WAIT_S) for _ in range(2500)]
     assert {type(one) for one in came} == {Feedback}
     rest = iter(lambda: client.next_event(1), None)
@@ -235,14 +231,14 @@ def test_a_server_may_send_faster_than_its_client_reads(join: Join, monkeypatch:
 def test_peers_that_come_while_they_are_counted_do_no_harm(action: Action, monkeypatch: pytest.MonkeyPatch) -> None:
     """cyclonedds reads past its list where a peer has joined between two calls: the service thread died of it."""
     readers = action.server._get_result.writer  # type: ignore[attr-defined]
-    real, calls = readers.entity.get_matched_subscriptions, count()
+    real, calls = readers._handles, count()
 
     def grows() -> list[int]:
         if not next(calls) % 2:
             raise IndexError("invalid index")
         return list(real())
 
-    monkeypatch.setattr(readers.entity, "get_matched_subscriptions", grows)
+    monkeypatch.setattr(readers, "_handles", grows)
     goal = start(action)
     goal.succeed(llama.text_result("on", [1]))
     assert event(action.client, Result).goal_id == goal.id
@@ -251,14 +247,14 @@ def test_peers_that_come_while_they_are_counted_do_no_harm(action: Action, monke
 
 def test_a_request_that_breaks_the_service_leaves_its_thread(action: Action, monkeypatch: pytest.MonkeyPatch) -> None:
     service = action.server._get_result  # type: ignore[attr-defined]
-    real, calls = service.await_client, count()
+    real, calls = service.reaches, count()
 
-    def breaks(sender: int) -> bool:
+    def breaks(caller: object) -> bool:
         if not next(calls):
             raise ValueError("whatever")
-        return bool(real(sender))
+        return bool(real(caller))
 
-    monkeypatch.setattr(service, "await_client", breaks)
+    monkeypatch.setattr(service, "reaches", breaks)
     first = start(action)
     first.succeed(llama.text_result("on", [1]))
     second = start(action)

@@ -6,10 +6,9 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.clock import now_ns
 from s2a_bench.ros import REQUEST_BYTES, QoS
 from s2a_bench.ros import messages as ros
-from s2a_bench.testing.middleware import GET_TYPES, WAIT_S, Join
+from tests.ros.middleware_suite import GET_TYPES, WAIT_S, Join, until
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
@@ -25,7 +24,7 @@ def test_its_endpoints_are_those_of_ros(join: Join) -> None:
 
     server, client = join(), join()
     server.service(NAME, GET_TYPES, lengths, QoS(depth=1000))
-    ends = client.service_client(NAME, GET_TYPES).ends()  # type: ignore[attr-defined]
+    ends = client.service_client(NAME, GET_TYPES)._asker.ends  # type: ignore[attr-defined]
     for end, topic, half in zip(ends, ("rq/%sRequest", "rr/%sReply"), ("Request", "Response"), strict=True):
         topic_of = end.entity.topic
         assert topic_of.name == topic % NAME[1:]
@@ -41,9 +40,7 @@ def test_garbage_is_dropped_and_logged_once(join: Join, caplog: pytest.LogCaptur
     server, stranger = join(), join()
     server.service(NAME, GET_TYPES, lengths)
     writer = RawWriter(stranger._participant, f"rq{NAME}Request", GET_TYPES + "_Request", dds_qos(QoS(), "x=y;"))  # type: ignore[attr-defined]
-    deadline = now_ns() + int(WAIT_S * 1e9)
-    while not writer.matched():
-        assert now_ns() < deadline
+    until(writer.matched)
     head = bytes.fromhex("00010000") + bytes(16)
     many, endless = head + b"\xff\xff\xff\x7f", head + bytes.fromhex("01000000 ffffff7f")
     for body in (b"\0\1\0\0", head, many, endless, head + b"\xff" * 64, head + bytes(REQUEST_BYTES)):

@@ -133,12 +133,6 @@ def test_what_does_not_fit_its_encoding_is_refused(encoding: str, fields: dict[s
         picture_of(image(encoding, pixels(encoding if encoding in SHAPES else "bgra8"), **fields), Trace())
 
 
-@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-def test_depth_is_refused_and_says_what_to_do(encoding: str) -> None:
-    with pytest.raises(TransportError, match=f"'{encoding}' is depth, .*: give it the camera's colour topic"):
-        picture_of(image(encoding, pixels("bgra8")), Trace())
-
-
 def compressed(data: NDArray[np.uint8], kind: str, format_: str) -> Any:
     """A message as compressed_image_transport writes it, of what OpenCV is given."""
     done, coded = cv2.imencode(f".{kind}", data)

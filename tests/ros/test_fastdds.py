@@ -10,8 +10,9 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from s2a_bench.ros.llama import GENERATE_RESPONSE
 from s2a_bench.testing.transport import wiring
 from s2a_bench.transport import open_client
 from s2a_bench.types import Frame
+from tests.ros.middleware_suite import until
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
@@ -44,6 +46,7 @@ SIZES = {"reliable": (640, 480), "best_effort": (64, 48)}
 QOS = {"reliable": QoS(depth=10), "best_effort": QoS(depth=10, reliable=False)}
 Peer: TypeAlias = "subprocess.Popen[str]"
 Start: TypeAlias = Callable[..., Peer]
+End = TypeVar("End")
 
 
 def pixels(n: int, width: int, height: int) -> np.ndarray:
@@ -90,6 +93,14 @@ def middleware(dds_domain: int) -> Iterator[Middleware]:
     joined.close()
 
 
+def opened(first: str, ours: Callable[[], End], theirs: Callable[[], Peer]) -> tuple[End, Peer]:
+    """Open our end and start the peer, one of them first."""
+    if first == "cyclone":
+        return ours(), theirs()
+    peer = theirs()
+    return ours(), peer
+
+
 @pytest.mark.parametrize("reliability", list(QOS))
 @pytest.mark.parametrize("first", ["fastdds", "cyclone"])
 @pytest.mark.parametrize("discovery", ["localhost", "subnet"])
@@ -101,19 +112,12 @@ def test_fast_dds_images_reach_us(
     width, height = SIZES[reliability]
     topic = f"/from_fastdds/{reliability}/{discovery}/{first}"
     arguments = (discovery, "pub", topic, reliability, width, height, COUNT)
-    if first == "cyclone":
-        subscription = middleware.subscription(topic, ros.IMAGE, QOS[reliability])
-        peer = start(*arguments)
-    else:
-        peer = start(*arguments)
-        subscription = middleware.subscription(topic, ros.IMAGE, QOS[reliability])
+    subscribe = partial(middleware.subscription, topic, ros.IMAGE, QOS[reliability])
+    subscription, peer = opened(first, subscribe, partial(start, *arguments))
     assert peer.stdin is not None
     assert peer.stdout is not None
     assert peer.stdout.readline() == "matched\n"
-    deadline = now_ns() + 20_000_000_000
-    while not subscription.matched():
-        assert now_ns() < deadline
-        subscription.take(0.01)
+    until(subscription.matched, lambda: subscription.take(0.01))
     for n in range(COUNT):
         peer.stdin.write("next\n")
         peer.stdin.flush()
@@ -139,19 +143,11 @@ def test_our_images_reach_fast_dds(
     width, height = SIZES[reliability]
     topic = f"/to_fastdds/{reliability}/{discovery}/{first}"
     arguments = (discovery, "sub", topic, reliability, COUNT)
-    if first == "cyclone":
-        publisher = middleware.publisher(topic, ros.IMAGE, QOS[reliability])
-        peer = start(*arguments)
-    else:
-        peer = start(*arguments)
-        publisher = middleware.publisher(topic, ros.IMAGE, QOS[reliability])
+    publish = partial(middleware.publisher, topic, ros.IMAGE, QOS[reliability])
+    publisher, peer = opened(first, publish, partial(start, *arguments))
     assert peer.stdout is not None
     assert peer.stdout.readline() == "matched\n"
-    waiting = middleware.subscription("/nothing", ros.IMAGE, QoS())
-    deadline = now_ns() + 20_000_000_000
-    while not publisher.matched():
-        assert now_ns() < deadline
-        waiting.take(0.01)
+    until(publisher.matched)
     for n in range(COUNT):
         message = ros.image_message(
             Frame(n, 0, width, height, "bgr8", pixels(n, width, height)), n * 1_000_000_000 + n + 1, f"cyclone_{n}"

@@ -5,17 +5,15 @@ from __future__ import annotations
 import pytest
 
 from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.ros import MIDDLEWARES, QoS, open_middleware
+from s2a_bench.ros import MIDDLEWARES, QoS, default_middleware, open_middleware
 from s2a_bench.ros.messages import type_hash
-from s2a_bench.testing.middleware import Join, MiddlewareSuite
+from tests.ros.middleware_suite import MiddlewareSuite
 
 cyclonedds = pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
 
 class TestCyclone(MiddlewareSuite):
-    @pytest.fixture
-    def join(self, join: Join) -> Join:
-        return join
+    """In a domain of Cyclone DDS."""
 
 
 def test_endpoints_look_like_those_of_ros(dds_domain: int) -> None:
@@ -46,7 +44,33 @@ def test_an_unknown_middleware_is_named() -> None:
         open_middleware("iceoryx")
 
 
-def test_a_missing_package_is_named_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(MIDDLEWARES, "cyclonedds", "s2a_bench.ros.no_such_module:X")
-    with pytest.raises(TransportError, match=r"cyclonedds is not installed.*--transport"):
-        open_middleware("cyclonedds")
+@pytest.mark.parametrize(
+    ("name", "way_out"), [("cyclonedds", "--transport"), ("zenoh", r"pip install 's2a-bench\[zenoh\]'")]
+)
+def test_a_missing_package_is_named_with_the_way_out(name: str, way_out: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(MIDDLEWARES, name, "s2a_bench.ros.no_such_module:X")
+    with pytest.raises(TransportError, match=f"{name} is not installed.*{way_out}"):
+        open_middleware(name)
+
+
+JAZZY = {"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": "/opt/ros/jazzy"}
+
+
+@pytest.mark.parametrize(
+    ("environ", "there", "expected"),
+    [
+        (JAZZY, "rclpy cyclonedds", "rclpy"),
+        (JAZZY, "", "cyclonedds"),
+        ({"ROS_DISTRO": "jazzy"}, "rclpy", "cyclonedds"),
+        ({"AMENT_PREFIX_PATH": "/ws/install"}, "rclpy", "cyclonedds"),
+        ({}, "rclpy", "cyclonedds"),
+        ({}, "cyclonedds zenoh", "cyclonedds"),
+        ({}, "zenoh", "zenoh"),
+        ({}, "", "cyclonedds"),
+    ],
+)
+def test_rclpy_is_chosen_where_ros_is_sourced_and_zenoh_where_it_alone_is_there(
+    environ: dict[str, str], there: str, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("s2a_bench.ros.find_spec", lambda name: name in there.split() or None)
+    assert default_middleware(environ) == expected

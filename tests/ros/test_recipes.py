@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import subprocess
@@ -23,6 +24,10 @@ def commands(text: str) -> list[str]:
         text = re.sub(pattern, instead, text)
     lines = [line.split("  #")[0].strip() for line in text.splitlines()]
     return [part.strip() for line in lines for part in line.split("&&")]
+
+
+def test_the_script_in_python_is_one_for_the_oldest_python() -> None:
+    ast.parse((RECIPES / "rclpy_speed").read_text(), feature_version=(3, 10))
 
 
 @pytest.mark.parametrize("name", ["colcon", "rclpy"])

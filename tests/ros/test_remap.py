@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack
 
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.ros import Middleware, QoS, open_middleware
+from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros.remap import Remapped, table
-from s2a_bench.testing.action import NAME, ActionSuite
-from s2a_bench.testing.middleware import STRING, Join, MiddlewareSuite, text, wait_matched
 from s2a_bench.transport.ros.options import RosOptions
+from tests.ros.action_suite import NAME, ActionSuite
+from tests.ros.middleware_suite import STRING, Join, MiddlewareSuite, joining, text, wait_matched
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
@@ -44,31 +43,21 @@ def test_what_is_no_rule_is_refused(rule: str) -> None:
 
 
 @pytest.fixture
-def remapped_join(dds_domain: int) -> Iterator[Join]:
-    with ExitStack() as stack:
-
-        def join() -> Middleware:
-            middleware = Remapped(open_middleware("cyclonedds", domain_id=dds_domain), RULES)
-            stack.callback(middleware.close)
-            return middleware
-
+def join(dds_domain: int) -> Iterator[Join]:
+    with joining(lambda: Remapped(open_middleware("cyclonedds", domain_id=dds_domain), RULES)) as join:
         yield join
 
 
 class TestRemapped(MiddlewareSuite):
-    @pytest.fixture
-    def join(self, remapped_join: Join) -> Join:
-        return remapped_join
+    """Topics and services under other names."""
 
 
 class TestRemappedActions(ActionSuite):
-    @pytest.fixture
-    def join(self, remapped_join: Join) -> Join:
-        return remapped_join
+    """An action under another name."""
 
 
-def test_peers_find_what_is_remapped_under_its_other_name(remapped_join: Join, dds_domain: int) -> None:
-    publisher = remapped_join().publisher("/test/order", STRING, QoS())
+def test_peers_find_what_is_remapped_under_its_other_name(join: Join, dds_domain: int) -> None:
+    publisher = join().publisher("/test/order", STRING, QoS())
     plain = open_middleware("cyclonedds", domain_id=dds_domain)
     try:
         subscription = plain.subscription("/other/order", STRING, QoS())

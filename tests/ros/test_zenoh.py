@@ -4,30 +4,29 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import (
-    MIDDLEWARES,
-    REQUEST_BYTES,
-    Middleware,
-    QoS,
-    Rejected,
-    Result,
-    default_middleware,
-    llama,
-    open_middleware,
-)
+from s2a_bench.ros import REQUEST_BYTES, QoS, Rejected, Result, llama, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.router import Router, endpoint_of, free_endpoint, listens
-from s2a_bench.testing.action import NAME, ActionSuite, event, offer, receive, start
-from s2a_bench.testing.middleware import GET_TYPES, STRING, WAIT_S, Join, MiddlewareSuite, text, wait_matched
+from tests.ros.action_suite import NAME, ActionSuite, event, offer, receive, start
+from tests.ros.middleware_suite import (
+    GET_TYPES,
+    STRING,
+    WAIT_S,
+    Join,
+    MiddlewareSuite,
+    joining,
+    text,
+    until,
+    wait_matched,
+)
 from tests.ros.words import hears_them, served
 
 zenoh = pytest.importorskip("zenoh", reason="the extra zenoh is not installed")
@@ -38,75 +37,49 @@ def endpoint() -> str:
     return free_endpoint()
 
 
-@pytest.fixture
-def join(endpoint: str, dds_domain: int) -> Iterator[Join]:
+def router_inside(endpoint: str, domain: int) -> AbstractContextManager[Join]:
     """Join sessions of which the first is the router."""
-    with ExitStack() as stack:
-        joined: list[Middleware] = []
+    first = iter([True])
+    return joining(lambda: open_middleware("zenoh", domain_id=domain, router=Router(endpoint, host=next(first, False))))
 
-        def join() -> Middleware:
-            middleware = open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint, host=not joined))
-            joined.append(middleware)
-            stack.callback(middleware.close)
-            return middleware
 
+@contextmanager
+def router_apart(endpoint: str, domain: int) -> Iterator[Join]:
+    """Join sessions that meet at a router that is none of them."""
+    with router_inside(endpoint, domain) as join:
+        join()
+        yield join
+
+
+@pytest.fixture(params=[router_inside, router_apart])
+def join(request: pytest.FixtureRequest, endpoint: str, dds_domain: int) -> Iterator[Join]:
+    with request.param(endpoint, dds_domain) as join:
         yield join
 
 
 @pytest.fixture
 def routed(endpoint: str, dds_domain: int) -> Iterator[Join]:
-    """Join sessions that meet at a router that is none of them."""
-    with ExitStack() as stack:
-
-        def join(host: bool = False) -> Middleware:
-            middleware = open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint, host=host))
-            stack.callback(middleware.close)
-            return middleware
-
-        join(host=True)
+    with router_apart(endpoint, dds_domain) as join:
         yield join
 
 
 class TestZenoh(MiddlewareSuite):
-    @pytest.fixture
-    def join(self, join: Join) -> Join:
-        return join
-
-
-class TestZenohThroughARouter(MiddlewareSuite):
-    @pytest.fixture
-    def join(self, routed: Join) -> Join:
-        return routed
+    """With a session as the router, and with a router of its own."""
 
 
 class TestZenohActions(ActionSuite):
-    @pytest.fixture
-    def join(self, join: Join) -> Join:
-        return join
-
-
-class TestZenohActionsThroughARouter(ActionSuite):
-    @pytest.fixture
-    def join(self, routed: Join) -> Join:
-        return routed
+    """With a session as the router, and with a router of its own."""
 
 
 @pytest.fixture
 def stranger(routed: Join, endpoint: str) -> Iterator[Any]:
     """A session that is no ROS node."""
-    from s2a_bench.ros.zenoh_session import open_session
+    from s2a_bench.ros.zenoh_node import open_session
 
     del routed
     session = open_session(endpoint, host=False)
     yield session
     session.close()
-
-
-def until(met: Callable[[], object]) -> None:
-    deadline = now_ns() + int(WAIT_S * 1e9)
-    while not met():
-        assert now_ns() < deadline, "it did not come about"
-        time.sleep(0.002)
 
 
 def tokens_of(session: Any, domain: int) -> list[str]:
@@ -163,17 +136,18 @@ def test_a_latched_topic_is_there_for_who_joins_later(routed: Join) -> None:
     assert late.take(0.05) is None
 
 
-def test_nothing_listens_beyond_loopback(join: Join) -> None:
+def test_nothing_listens_beyond_loopback(endpoint: str, dds_domain: int) -> None:
     before = {*links()}
-    join()
-    join()
-    inodes = {link[8:-1] for link in map(str, {*links()} - before) if link.startswith("socket:")}
-    rows = [
-        (kind, row[1], row[3])
-        for kind in ("tcp", "tcp6", "udp", "udp6")
-        for row in map(str.split, Path("/proc/net", kind).read_text().splitlines()[1:])
-        if row[9] in inodes
-    ]
+    with router_inside(endpoint, dds_domain) as join:
+        join()
+        join()
+        inodes = {link[8:-1] for link in map(str, {*links()} - before) if link.startswith("socket:")}
+        rows = [
+            (kind, row[1], row[3])
+            for kind in ("tcp", "tcp6", "udp", "udp6")
+            for row in map(str.split, Path("/proc/net", kind).read_text().splitlines()[1:])
+            if row[9] in inodes
+        ]
     listening = {at.partition(":")[0] for kind, at, state in rows if kind.startswith("tcp") and state == "0A"}
     assert listening == {"0100007F"}
     assert not [at for kind, at, _ in rows if kind.startswith("udp")]
@@ -297,7 +271,7 @@ def test_without_a_router_one_line_says_where_to_get_one(endpoint: str) -> None:
 
 
 def test_a_router_that_says_nothing_is_given_up(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.ros.zenoh_session.OPEN_MS", 100)
+    monkeypatch.setattr("s2a_bench.ros.zenoh_node.OPEN_MS", 100)
     with socket.create_server(("127.0.0.1", endpoint_of(endpoint)[2])), pytest.raises(TransportError, match="no Zenoh"):
         open_middleware("zenoh", router=Router(endpoint))
 
@@ -324,43 +298,28 @@ def test_noise_at_the_routers_port_does_no_harm(join: Join, endpoint: str) -> No
 def test_an_inbox_is_bounded_and_says_once_that_it_is_full(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from s2a_bench.ros import zenoh_inbox
+    from s2a_bench.ros import zenoh_node
 
-    monkeypatch.setattr(zenoh_inbox, "HELD_BYTES", 10_000)
-    inbox: Any = zenoh_inbox.Inbox("/x", zenoh_inbox.Bell())
+    monkeypatch.setattr(zenoh_node, "HELD_BYTES", 10_000)
+    inbox: Any = zenoh_node.Inbox("/x", zenoh_node.Bell())
     took = [inbox.put(number, 1000) for number in range(9)]
     assert took == [True] * 4 + [False] * 5
     assert [*inbox.arrived()] == [0, 1, 2, 3]
     assert inbox.put(9, 1000)
     assert caplog.messages == ["/x: messages are dropped: 0 MiB wait to be taken"]
-    small: Any = zenoh_inbox.Inbox("/y", zenoh_inbox.Bell(), most_bytes=5000)
+    small: Any = zenoh_node.Inbox("/y", zenoh_node.Bell(), most_bytes=5000)
     assert [small.put(number, 1000) for number in range(3)] == [True, True, False]
-    last: Any = zenoh_inbox.Inbox("/x", zenoh_inbox.Bell(), depth=2)
+    last: Any = zenoh_node.Inbox("/x", zenoh_node.Bell(), depth=2)
     assert all(last.put(number, 1000) for number in range(9))
     assert [*last.arrived()] == [7, 8]
 
 
-def test_a_closed_middleware_is_told_of(join: Join) -> None:
-    middleware = join()
-    publisher, client = middleware.publisher("/topic", STRING, QoS()), middleware.service_client("/ask", GET_TYPES)
-    middleware.close()
-    with pytest.raises(TransportError, match=r"Zenoh: /topic: .*closed"):
-        publisher.send(publisher.pack(text("x")))
-    with pytest.raises(TransportError, match="no server of the service /ask appeared"):
-        client.call(ros.default(GET_TYPES + "_Request"), 0.05)
-    with pytest.raises(TransportError, match="the middleware is closed"):
-        middleware.subscription("/topic", STRING, QoS())
-
-
 def test_a_message_that_is_too_large_is_dropped_and_the_next_arrives(
-    endpoint: str, dds_domain: int, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch, endpoint: str, dds_domain: int
 ) -> None:
-    monkeypatch.setattr("s2a_bench.ros.zenoh_session.MESSAGE_BYTES", 1 << 20)
-    with ExitStack() as stack:
-        ends = [open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint, host)) for host in (True, False)]
-        for each in ends:
-            stack.callback(each.close)
-        publisher, subscription = ends[1].publisher("/x", STRING, QoS()), ends[0].subscription("/x", STRING, QoS(0))
+    monkeypatch.setattr("s2a_bench.ros.zenoh_node.MESSAGE_BYTES", 1 << 20)
+    with router_inside(endpoint, dds_domain) as join:
+        subscription, publisher = join().subscription("/x", STRING, QoS(0)), join().publisher("/x", STRING, QoS())
         wait_matched(publisher, subscription)
         for value in ("a" * (3 << 20), "whole"):
             publisher.send(publisher.pack(text(value)))
@@ -379,20 +338,3 @@ def test_a_server_that_was_the_router_may_die_and_come_back(endpoint: str, dds_d
         hears_them(client, WAIT_S)
         server.kill()
     middleware.close()
-
-
-def test_a_missing_package_is_named_with_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(MIDDLEWARES, "zenoh", "s2a_bench.ros.no_such_module:X")
-    with pytest.raises(TransportError, match=r"zenoh is not installed.*pip install 's2a-bench\[zenoh\]'"):
-        open_middleware("zenoh")
-
-
-@pytest.mark.parametrize(
-    ("there", "expected"),
-    [({"cyclonedds", "zenoh"}, "cyclonedds"), ({"zenoh"}, "zenoh"), ({"cyclonedds"}, "cyclonedds"), ((), "cyclonedds")],
-)
-def test_zenoh_is_the_default_where_it_alone_is_there(
-    there: set[str], expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("s2a_bench.ros.find_spec", lambda name: name in there or None)
-    assert default_middleware({}) == expected

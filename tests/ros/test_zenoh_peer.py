@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from s2a_bench.clock import now_ns
 from s2a_bench.ros import Middleware, QoS, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.router import Router, endpoint_of, free_endpoint
-from s2a_bench.testing.middleware import GET_TYPES, STRING, WAIT_S, text
 from s2a_bench.types import Frame
+from tests.ros.middleware_suite import GET_TYPES, STRING, WAIT_S, text, until
 from tests.ros.zenoh_peer import write_definitions
 
 pytestmark = pytest.mark.skipif(
@@ -72,12 +71,6 @@ def peer(ours: Middleware, stack: ExitStack, tmp_path: Path) -> Peer:
         return read
 
     return start
-
-
-def until(met: Callable[[], object]) -> None:
-    deadline = now_ns() + int(WAIT_S * 1e9)
-    while not met():
-        assert now_ns() < deadline, "it did not come about"
 
 
 @pytest.mark.parametrize(("width", "height"), [(64, 48), (1920, 1080)])

@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 from s2a_bench.ros import Accepted, ActionClient, Feedback, Result
-from s2a_bench.testing.action import NAME, event, send, text_of
+from tests.ros.action_suite import NAME, event, send, text_of
 
 WORDS = [f"word{number}" for number in range(200)]
 SERVER = """

@@ -14,8 +14,7 @@ from scipy import stats
 from scipy.signal import lfilter
 
 from s2a_bench.stats.batches import Launch, Memory, Rows
-from s2a_bench.stats.change import change_between, holm
-from s2a_bench.stats.power import Noise
+from s2a_bench.stats.change import Noise, change_between, holm
 
 Floats: TypeAlias = NDArray[np.float64]
 LEVEL = 0.05

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from s2a_bench.stats.change import change_between
-from s2a_bench.stats.power import Noise
+from s2a_bench.stats.change import Noise, change_between
 
 
 @pytest.mark.parametrize(("launches", "spread"), [(3, 0.08), (5, 0.04), (10, 0.13)])

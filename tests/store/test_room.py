@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from s2a_bench.store.room import RESERVE, release, reserve, why
+from s2a_bench.store.files import RESERVE, release, reserve, why
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])

@@ -21,10 +21,10 @@ from pyarrow import parquet
 
 from s2a_bench.errors import MissingExtra, StoreError
 from s2a_bench.store import manifest as manifests
-from s2a_bench.store.files import read_csv, read_parquet
-from s2a_bench.store.requests import EARLIER_STAGES, TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
-from s2a_bench.store.room import RESERVE, RESERVE_BYTES, why
+from s2a_bench.store.files import RESERVE, RESERVE_BYTES, read_csv, read_parquet, why
+from s2a_bench.store.requests import TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
 from s2a_bench.store.run import Run, RunWriter, fits, read_run
+from tests.made_runs import STAGES
 
 CHAIN = [
     ("", 1_000),
@@ -66,13 +66,21 @@ def token(index: int, text: str, engine_ns: int | None = 5) -> TokenRow:
     return TokenRow("r1", "ros/topic", index, 100 + index, text, engine_ns, 9_007_199_254_740_993)
 
 
+def kept(folder: Path, *samples: SampleRow) -> Run:
+    """Keep samples in a run that finishes, and read it."""
+    with RunWriter.create(folder, "latency", {"stages": STAGES}) as run:
+        for each in samples:
+            run.sample(each)
+    return read_run(run.path)
+
+
 @pytest.fixture
 def open_run(tmp_path: Path) -> Iterator[Callable[..., RunWriter]]:
     """Open runs that the test leaves unfinished."""
     runs: list[RunWriter] = []
 
     def create(root: Path = tmp_path) -> RunWriter:
-        runs.append(RunWriter.create(root, "latency", {}))
+        runs.append(RunWriter.create(root, "latency", {"stages": STAGES}))
         return runs[-1]
 
     yield create
@@ -82,7 +90,9 @@ def open_run(tmp_path: Path) -> Iterator[Callable[..., RunWriter]]:
 
 
 def test_a_finished_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {"configuration": {"runs": 2}, "seeds": {"order": 3}}) as run:
+    with RunWriter.create(
+        tmp_path, "latency", {"stages": STAGES, "configuration": {"runs": 2}, "seeds": {"order": 3}}
+    ) as run:
         run.sample(sample())
         run.tokens([token(0, "a")])
         run.update(environment={"cpu": "EPYC"}, configuration={"warmup": 1}, warnings=[{"code": "x"}])
@@ -103,77 +113,53 @@ def test_a_finished_run_reads_back_as_it_was_written(tmp_path: Path) -> None:
     assert row["warmup"] == False  # noqa: E712 - a numpy bool
     assert read.tokens["client_ns"].tolist() == [9_007_199_254_740_993]
     assert read.frames.empty
-    assert list(read.frames.columns) == list(frames_table(EARLIER_STAGES).columns)
+    assert list(read.frames.columns) == list(frames_table(STAGES).columns)
 
 
 def test_derived_columns_are_the_budget_of_the_chain(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        run.sample(sample())
-    row = read_run(run.path).samples.iloc[0]
-    assert row["capture_ns"] == 100
-    assert row["cdr_pack_ns"] == 200
-    assert row["network_ns"] == 1_000
-    assert row["inference_ns"] == 10_000
-    assert row["return_ns"] == 500
-    assert row["residual_ns"] == 50
-    assert row["e2e_ns"] == 11_850
-    assert row["e2e_without_inference_ns"] == 1_850
-    assert pd.isna(row["e2e_without_model_ns"])
-    assert row["ttft_ns"] == 11_750
+    row = kept(tmp_path, sample()).samples.iloc[0]
+    expected = {"capture": 100, "cdr_pack": 200, "network": 1_000, "inference": 10_000, "return": 500, "residual": 50}
+    expected |= {"e2e": 11_850, "e2e_without_inference": 1_850, "ttft": 11_750}
+    assert {name: row[f"{name}_ns"] for name in expected} == expected
     assert row["residual_share"] == 50 / 1_850
+    assert pd.isna(row["e2e_without_model_ns"])
 
 
 def test_a_llama_servers_model_time_is_what_it_reports(tmp_path: Path) -> None:
     marks = [("", 0), ("capture", 2_000_000), ("ingest", 12_000_000), ("inference", 50_000_000)]
     told = {"half": 30.0, "none": None, "more than there was": 51.0, "nothing": 0.0}
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        for name, prompt_ms in told.items():
-            run.sample(sample(name, marks=marks, server_prompt_ms=prompt_ms))
-    samples = read_run(run.path).samples
+    rows = (sample(name, marks=marks, server_prompt_ms=prompt_ms) for name, prompt_ms in told.items())
+    samples = kept(tmp_path, *rows).samples
     assert samples["e2e_without_inference_ns"].tolist() == [12_000_000] * 4
     assert samples["e2e_without_model_ns"].iloc[0] == 20_000_000
     assert samples["e2e_without_model_ns"].iloc[1:].isna().all()
 
 
-def test_an_absent_stage_is_null_and_never_zero(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        run.sample(sample())
-    samples = read_run(run.path).samples
-    absent = [f"{stage}_ns" for stage in EARLIER_STAGES if stage not in dict(CHAIN)]
-    assert len(absent) == len(EARLIER_STAGES) - 5
+def test_an_absent_stage_is_null_and_one_that_took_no_time_is_zero(tmp_path: Path) -> None:
+    at_once = [("", 5), ("capture", 5), ("inference", 5), ("return", 9)]
+    samples = kept(tmp_path, sample(), sample(marks=at_once)).samples
+    absent = [f"{stage}_ns" for stage in STAGES if stage not in dict(CHAIN)]
+    assert len(absent) == len(STAGES) - 5
     assert samples[absent].isna().all(axis=None)
     assert pd.isna(samples["frame_age_ns"][0])
-
-
-def test_a_stage_that_took_no_time_is_zero_and_not_null(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        run.sample(sample(marks=[("", 5), ("capture", 5), ("inference", 5), ("return", 9)]))
-    row = read_run(run.path).samples.iloc[0]
-    assert row["capture_ns"] == 0
+    assert samples["capture_ns"].tolist() == [100, 0]
 
 
 def test_a_failed_sample_is_a_row_with_its_error_and_without_durations(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        run.sample(sample(error='refused: "no", 503\nretry'))
-        run.sample(sample("r2"))
-    samples = read_run(run.path).samples
+    samples = kept(tmp_path, sample(error='refused: "no", 503\nretry'), sample("r2")).samples
     assert samples["error"].tolist() == ['refused: "no", 503\nretry', ""]
-    derived = [*(f"{stage}_ns" for stage in EARLIER_STAGES), "e2e_ns", "ttft_ns", "residual_ns", "residual_share"]
+    derived = [*(f"{stage}_ns" for stage in STAGES), "e2e_ns", "ttft_ns", "residual_ns", "residual_share"]
     assert samples[derived].iloc[0].isna().all()
     assert samples["e2e_ns"].iloc[1] == 11_850
 
 
 def test_a_sample_without_a_token_has_no_end_to_end(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        run.sample(sample(marks=CHAIN[:-1], n_tokens=0))
-    assert pd.isna(read_run(run.path).samples["e2e_ns"][0])
+    assert pd.isna(kept(tmp_path, sample(marks=CHAIN[:-1], n_tokens=0)).samples["e2e_ns"][0])
 
 
 @pytest.mark.parametrize("end", ["return", "ingest", "server"])
 def test_where_nothing_is_captured_the_first_token_counts_from_the_start(tmp_path: Path, end: str) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        run.sample(sample(marks=[("", 100), ("network", 150), (end, 900)]))
-    row = read_run(run.path).samples.iloc[0]
+    row = kept(tmp_path, sample(marks=[("", 100), ("network", 150), (end, 900)])).samples.iloc[0]
     assert (row["e2e_ns"], row["ttft_ns"]) == (800, 800)
 
 
@@ -191,12 +177,12 @@ def test_csv_and_parquet_hold_the_same_columns_and_values(tmp_path: Path) -> Non
         "é漢\U0001f916",
         "\x00",
     ]
-    with RunWriter.create(tmp_path, "latency", {}) as run:
+    with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as run:
         run.sample(sample())
         run.sample(sample("r2", error="x", server_prompt_ms=float("nan"), facts={"nan": float("nan")}))
         run.tokens(token(index, text, None if index % 2 else index) for index, text in enumerate(texts))
         run.frame(FrameRow("ros/topic", 3, 900, CHAIN[:4], "r1"))
-    for table in (samples_table(EARLIER_STAGES), TOKENS, frames_table(EARLIER_STAGES)):
+    for table in (samples_table(STAGES), TOKENS, frames_table(STAGES)):
         csv = read_csv(run.path / f"{table.name}.csv", table.columns)
         parquet = read_parquet(run.path / f"{table.name}.parquet", table.columns)
         assert csv.column_names == parquet.column_names == list(table.columns)
@@ -210,22 +196,20 @@ def test_csv_and_parquet_hold_the_same_columns_and_values(tmp_path: Path) -> Non
 
 def test_integers_stay_integers_beside_nulls(tmp_path: Path) -> None:
     big = 9_007_199_254_740_993  # 2^53 + 1: a float would lose it
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        run.sample(sample(last_token_ns=big))
-        run.sample(sample("r2", last_token_ns=None))
+    run = kept(tmp_path, sample(last_token_ns=big), sample("r2", last_token_ns=None))
     raw = pd.read_parquet(run.path / "samples.parquet", dtype_backend="numpy_nullable")
     assert raw["last_token_ns"][0] == big
-    assert str(read_run(run.path).samples["last_token_ns"].dtype) == "Int64"
+    assert str(run.samples["last_token_ns"].dtype) == "Int64"
 
 
 def test_half_a_character_from_a_model_does_not_stop_the_run(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
+    with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as run:
         run.tokens([token(0, "\udcff")])
     assert read_run(run.path).tokens["text"].tolist() == ["\\udcff"]
 
 
 def test_frames_of_a_stream_have_a_budget_of_their_own(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
+    with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as run:
         assert not (run.path / "frames.csv").exists()
         run.frame(FrameRow("ros/topic", 3, 900, CHAIN[:5], ""))
         run.frame(FrameRow("ros/topic", 4, 950, [], "r2"))
@@ -285,28 +269,21 @@ sys.stdin.read()
     assert not list(folder.glob("*.parquet"))
 
 
-def test_two_runs_of_one_second_get_folders_of_their_own(tmp_path: Path, open_run: Callable[..., RunWriter]) -> None:
-    paths = [open_run(tmp_path / "new" / "results").path for _ in range(4)]
-    assert len(set(paths)) == 4
-    assert all(path.name.split("-")[1] == "latency" for path in paths)
-    assert all(path.name[8] == "T" and path.name[15] == "Z" for path in paths)
-
-
-def test_a_folder_is_named_after_time_command_and_host(
-    tmp_path: Path, open_run: Callable[..., RunWriter], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(socket, "gethostname", lambda: "jetson")
-    assert re.fullmatch(r"\d{8}T\d{6}Z-latency-jetson", open_run(tmp_path).path.name)
-
-
-@pytest.mark.parametrize("where", ["file", "file/below"])
-def test_an_output_that_is_no_folder_is_refused_by_name(tmp_path: Path, where: str) -> None:
+@pytest.mark.parametrize(
+    ("where", "said"),
+    [
+        ("file", "`output` .*file.*is not a folder"),
+        ("file/below", "`output` .*file.*is not a folder"),
+        ("/proc/s2a", "`output` /proc/s2a: cannot create"),
+    ],
+)
+def test_an_output_where_no_folder_can_be_is_refused_by_name(tmp_path: Path, where: str, said: str) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match=r"`output` .*file.*is not a folder"):
-        RunWriter.create(tmp_path / where, "latency", {})
+    with pytest.raises(StoreError, match=said):
+        RunWriter.create(tmp_path / where, "latency", {"stages": STAGES})
 
 
-def test_the_second_folder_of_a_second_gets_a_2_and_a_strange_host_is_spelled_out(
+def test_a_folder_is_named_after_time_command_and_host_and_the_second_of_a_second_gets_a_2(
     tmp_path: Path, open_run: Callable[..., RunWriter], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     noon = datetime(2026, 1, 2, 12, tzinfo=timezone.utc)
@@ -314,7 +291,7 @@ def test_the_second_folder_of_a_second_gets_a_2_and_a_strange_host_is_spelled_ou
     names = []
     for host in ("orin", "orin", "orin", "a b/c!", "--", ""):
         monkeypatch.setattr(socket, "gethostname", lambda host=host: host)
-        names.append(open_run(tmp_path).path.name)
+        names.append(open_run(tmp_path / "new" / "results").path.name)
     stem = "20260102T120000Z-latency-"
     spelled = ["orin", "orin-2", "orin-3", "a-b-c", "unnamed", "unnamed-2"]
     assert names == [stem + name for name in spelled]
@@ -323,7 +300,7 @@ def test_the_second_folder_of_a_second_gets_a_2_and_a_strange_host_is_spelled_ou
 def test_an_output_without_write_permission_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
     with pytest.raises(StoreError, match=f"`output` {tmp_path}: cannot create a folder there: permission denied"):
-        RunWriter.create(tmp_path, "latency", {})
+        RunWriter.create(tmp_path, "latency", {"stages": STAGES})
 
 
 def test_a_disk_without_room_for_the_reserve_ends_the_run_before_it_begins(
@@ -345,18 +322,6 @@ def test_rows_that_do_not_fit_their_manifest_are_told_with_their_folders(wrong: 
     said = rf"^one, two: rows and manifest do not fit: {wrong.__name__}\('x'\)$"
     with pytest.raises(StoreError, match=said), fits(*runs):
         raise wrong("x")
-
-
-def test_an_output_that_cannot_be_written_is_refused_by_name() -> None:
-    with pytest.raises(StoreError, match=r"`output` /proc/s2a: cannot create"):
-        RunWriter.create(Path("/proc/s2a"), "latency", {})
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_without_write_permission_is_refused(tmp_path: Path) -> None:
-    tmp_path.chmod(0o500)
-    with pytest.raises(StoreError, match="`output`"):
-        RunWriter.create(tmp_path, "latency", {})
 
 
 class FullDisk:
@@ -390,9 +355,9 @@ def test_a_full_disk_names_the_file_and_leaves_whole_records(
     assert read_run(run.path).samples["request_id"].tolist() == ["r1", "r3"]
 
 
-def test_the_way_out_of_the_block_is_the_state_of_the_run(tmp_path: Path) -> None:
+def test_the_way_out_of_the_block_is_the_state_of_the_run(tmp_path: Path, open_run: Callable[..., RunWriter]) -> None:
     def leave(error: BaseException) -> dict[str, object]:
-        run = RunWriter.create(tmp_path, "latency", {})
+        run = RunWriter.create(tmp_path, "latency", {"stages": STAGES})
         with pytest.raises(type(error)), run:  # noqa: PT012 - the block is what is tested
             run.sample(sample())
             raise error
@@ -404,30 +369,17 @@ def test_the_way_out_of_the_block_is_the_state_of_the_run(tmp_path: Path) -> Non
     assert (interrupted["state"], interrupted["error"]) == ("interrupted", "KeyboardInterrupt")
     failed = leave(StoreError("server died"))
     assert (failed["state"], failed["error"]) == ("failed", "server died")
-
-
-def test_what_goes_wrong_first_is_what_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(path: Path, _table: object) -> None:
-        raise StoreError(f"cannot write {path}")
-
-    monkeypatch.setattr("s2a_bench.store.run.write_parquet", refuse)
-    with pytest.raises(RuntimeError, match="first"), RunWriter.create(tmp_path, "latency", {}) as run:
-        raise RuntimeError("first")
-    assert (read_run(run.path).manifest["state"], read_run(run.path).manifest["error"]) == ("failed", "first")
-
-
-def test_finishing_twice_keeps_the_first_state(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
+    with open_run() as run:
         run.finish("failed", "server died")
-        run.finish("finished")
-    assert read_run(run.path).manifest["state"] == "failed"
-    assert read_run(run.path).manifest["error"] == "server died"
+        run.finish("finished")  # too late
+        with pytest.raises(ValueError, match="not 'running'"):
+            run.finish("running")
+    assert (read_run(run.path).manifest["state"], read_run(run.path).manifest["error"]) == ("failed", "server died")
 
 
 def test_a_run_that_goes_on_is_read_with_its_new_rows_before_it_finishes(tmp_path: Path) -> None:
-    samples = samples_table(EARLIER_STAGES)
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        run.sample(sample("r1"))
+    samples = samples_table(STAGES)
+    run = kept(tmp_path, sample("r1"))
     again = RunWriter.reopen(run.path, [samples, TOKENS])
     again.sample(sample("r2"))
     read = read_run(run.path)
@@ -448,7 +400,7 @@ def test_intervals_are_drawn_from_the_seed_that_the_manifest_tells(tmp_path: Pat
 
 
 def test_rows_are_counted_in_files_of_either_kind_and_empty_tables_left_out(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
+    with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as run:
         run.sample(sample("r1"))
         run.sample(sample("r2", error='a "quoted"\nline'))
         assert read_run(run.path).row_counts() == {"samples": 2}
@@ -457,20 +409,27 @@ def test_rows_are_counted_in_files_of_either_kind_and_empty_tables_left_out(tmp_
     assert read_run(run.path).row_counts() == {"samples": 2, "tokens": 3}
 
 
-def test_an_unknown_final_state_is_refused(open_run: Callable[..., RunWriter]) -> None:
-    with pytest.raises(ValueError, match="not 'running'"):
-        open_run().finish("running")
-
-
-def test_a_folder_that_is_no_run_or_anothers_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="no run folder"):
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "no run folder"),
+        ('{"schema": "s2a-bench/9"}', "s2a-bench/9.*s2a-bench/1"),
+        (
+            '{"schema": "s2a-bench/1", "command": "latency", "state": "finished", "environment": {"affinity": ["3"]}}',
+            r"environment.affinity\[0\]: '3' should be a valid integer",
+        ),
+        *((text, "manifest.json is damaged: .") for text in ("{", "[" * 100_000, '{"a": "\\ud800"}', "\xff", "")),
+        ('{"a": ' + "9" * 5000 + "}", "manifest.json is damaged: ."),
+    ],
+)
+def test_a_folder_that_is_no_run_or_anothers_is_refused_in_one_line(
+    tmp_path: Path, text: str | None, said: str
+) -> None:
+    if text is not None:
+        (tmp_path / "manifest.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(StoreError, match=said) as error:
         read_run(tmp_path)
-    (tmp_path / "manifest.json").write_text('{"schema": "s2a-bench/9"}')
-    with pytest.raises(StoreError, match=r"s2a-bench/9.*s2a-bench/1"):
-        read_run(tmp_path)
-    (tmp_path / "manifest.json").write_text("{")
-    with pytest.raises(StoreError, match="damaged"):
-        read_run(tmp_path)
+    assert len(str(error.value).splitlines()) == 1
 
 
 def test_an_empty_line_is_a_row_of_one_empty_column(tmp_path: Path) -> None:
@@ -499,7 +458,7 @@ def _zeros(path: Path) -> None:
 
 @pytest.mark.parametrize("damage", [_words, _zeros, lambda path: path.write_bytes(b"PAR1")])
 def test_a_damaged_parquet_file_is_one_line_with_the_way_out(tmp_path: Path, damage: Callable[[Path], None]) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
+    with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as run:
         run.tokens([token(0, "a")])
     damage(run.path / "tokens.parquet")
     with pytest.raises(StoreError, match=r"tokens\.parquet is damaged: .+; remove it to read the CSV$") as error:
@@ -511,9 +470,8 @@ def test_a_damaged_parquet_file_is_one_line_with_the_way_out(tmp_path: Path, dam
 
 @pytest.mark.parametrize("torn", ["r1,torn", ""])
 def test_a_run_that_was_killed_goes_on_after_its_last_whole_record(tmp_path: Path, torn: str) -> None:
-    samples = samples_table(EARLIER_STAGES)
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        run.sample(sample("r1"))
+    samples = samples_table(STAGES)
+    run = kept(tmp_path, sample("r1"))
     path = run.path / "samples.csv"
     path.write_text(path.read_text() + torn if torn else "")  # without torn: not even the header came
     again = RunWriter.reopen(run.path, [samples])
@@ -558,38 +516,21 @@ WRONG = {
 
 @pytest.mark.parametrize("key", WRONG)
 def test_a_manifest_of_the_wrong_shape_is_one_line_with_file_and_key(tmp_path: Path, key: str) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as run:
-        pass
-    path = run.path / "manifest.json"
+    path = kept(tmp_path).path / "manifest.json"
     value, said = WRONG[key]
     path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
     with pytest.raises(StoreError) as error:
-        read_run(run.path)
+        read_run(path.parent)
     assert str(error.value) == f"{path} is damaged: {said}"
 
 
-def test_a_number_as_text_is_no_number(tmp_path: Path) -> None:
-    manifest = {"schema": "s2a-bench/1", "command": "latency", "state": "finished", "environment": {"affinity": ["3"]}}
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(StoreError, match=r"environment.affinity\[0\]: '3' should be a valid integer"):
-        read_run(tmp_path)
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": "\\ud800"}', '{"a": ' + "9" * 5000 + "}", "\xff", ""])
-def test_a_manifest_that_is_no_json_is_one_line(tmp_path: Path, text: str) -> None:
-    (tmp_path / "manifest.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(StoreError, match=r"manifest.json is damaged: .") as error:
-        read_run(tmp_path)
-    assert len(str(error.value).splitlines()) == 1
-
-
-def test_what_earlier_versions_did_not_write_is_absent_and_not_wrong(tmp_path: Path) -> None:
+def test_what_a_manifest_does_not_have_is_absent_and_not_wrong(tmp_path: Path) -> None:
     manifest = {"schema": "s2a-bench/1", "command": "latency", "state": "finished"}
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     assert read_run(tmp_path).manifest == manifest
 
 
-def test_the_runs_that_earlier_versions_made_are_read() -> None:
+def test_the_reference_runs_are_read() -> None:
     folders = sorted((Path(__file__).parents[2] / "results/reference").glob("*/manifest.json"))
     assert {"echo-raw", "echo-jpeg", "llama-jpeg", "timeline-live"} <= {path.parent.name for path in folders}
     assert {read_run(path.parent).manifest["state"] for path in folders} == {"finished"}
@@ -616,7 +557,7 @@ def test_a_full_disk_names_its_file_system_and_the_run_has_failed(
         write(folder, manifest)
 
     monkeypatch.setattr("s2a_bench.store.run.manifests.write", no_room_but_the_reserve)
-    run = RunWriter.create(tmp_path, "latency", {})
+    run = RunWriter.create(tmp_path, "latency", {"stages": STAGES})
     assert (run.path / RESERVE).stat().st_size == RESERVE_BYTES
     with pytest.raises(StoreError, match=r"No space left on device \(file system /"), run:  # noqa: PT012
         run.sample(sample("r1"))
@@ -632,7 +573,7 @@ def test_a_full_disk_names_its_file_system_and_the_run_has_failed(
 
 
 def test_facts_can_be_told_on_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = RunWriter.create(tmp_path, "latency", {})
+    run = RunWriter.create(tmp_path, "latency", {"stages": STAGES})
     monkeypatch.setattr("s2a_bench.store.manifest.os.fsync", lambda _: _refuse_while(run.path / RESERVE))
     run.update(warnings=[{"code": "x"}])
     assert read_run(run.path).manifest["warnings"] == [{"code": "x"}]
@@ -644,17 +585,21 @@ def _refuse_while(path: Path) -> None:
         raise OSError(28, "No space left on device")
 
 
-def test_a_run_whose_parquet_files_cannot_be_written_has_failed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("first", [None, RuntimeError("first")])
+def test_a_run_whose_parquet_files_cannot_be_written_has_failed_of_what_went_wrong_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: Exception | None
 ) -> None:
     def refuse(path: Path, _table: object) -> None:
         raise StoreError(f"cannot write {path}")
 
     monkeypatch.setattr("s2a_bench.store.run.write_parquet", refuse)
-    with pytest.raises(StoreError, match=r"samples\.parquet"), RunWriter.create(tmp_path, "latency", {}) as run:
+    run = RunWriter.create(tmp_path, "latency", {"stages": STAGES})
+    said = str(first or f"cannot write {run.path / 'samples.parquet'}")
+    with pytest.raises(type(first or StoreError("")), match=re.escape(said)), run:  # noqa: PT012 - the block is tested
         run.sample(sample())
-    manifest = read_run(run.path).manifest
-    assert (manifest["state"], manifest["error"]) == ("failed", f"cannot write {run.path / 'samples.parquet'}")
+        if first:
+            raise first
+    assert (read_run(run.path).manifest["state"], read_run(run.path).manifest["error"]) == ("failed", said)
 
 
 def test_without_pyarrow_the_run_stays_and_its_reader_is_told_the_way_out(
@@ -663,9 +608,8 @@ def test_without_pyarrow_the_run_stays_and_its_reader_is_told_the_way_out(
     with monkeypatch.context() as patch:
         for module in ("pyarrow", "pyarrow.csv", "pyarrow.parquet"):
             patch.setitem(sys.modules, module, None)
-        with RunWriter.create(tmp_path, "latency", {}) as run:
-            run.sample(sample())
-        assert read_run(run.path).manifest["state"] == "finished"
+        run = kept(tmp_path, sample())
+        assert run.manifest["state"] == "finished"
         with pytest.raises(MissingExtra, match=r"pyarrow does not load beside NumPy .*: the CSV files in .* are whole"):
-            _ = read_run(run.path).samples
+            _ = run.samples
     assert len(read_run(run.path).samples) == 1

@@ -19,12 +19,9 @@ from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.sweep import CELLS, read_sweep
 from s2a_bench.sweep import Cell, Command, Outcome
-from s2a_bench.sweep.file import SweepFile, read_sweep_file
-from s2a_bench.sweep.grid import expand, rounds
-from s2a_bench.sweep.machine import difference
+from s2a_bench.sweep.file import SweepFile, expand, read_sweep_file, rounds
 from s2a_bench.sweep.plan import Plan, plan_sweep
-from s2a_bench.sweep.run import SweepRun, check_resume, only_one, start_sweep
-from s2a_bench.sweep.timing import expect
+from s2a_bench.sweep.run import SweepRun, check_resume, difference, expect, only_one, start_sweep
 from s2a_bench.testing import NullProgress
 
 values = st.lists(st.integers(0, 9), min_size=1, max_size=4, unique=True)

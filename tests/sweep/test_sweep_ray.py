@@ -14,7 +14,8 @@ import pandas as pd
 import pytest
 
 from benchmarks.sweep_scaling import measure, part, work
-from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
+from s2a_bench.experiments.timeline.rows import TIMELINES
+from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.sweep import Sweep, read_sweep
 
 ray = pytest.importorskip("ray", reason="the extra 'ray' is not installed")

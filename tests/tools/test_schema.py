@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 import jsonschema
 import pytest
 
-from s2a_bench.store.bounds import NonNegative, about
 from s2a_bench.store.manifest import present
+from s2a_bench.store.schema import NonNegative, about
 from s2a_bench.writers.as_json import cell_of_row
 
 ROOT = Path(__file__).parent.parent.parent

@@ -79,7 +79,7 @@ class TestWebsocketJpeg(TransportSuite):
     name, lossless, whole = "websocket/openpi?payload=jpeg", False, True
 
 
-@pytest.mark.parametrize("layout", ["n1.6", "n1.5"])
+@pytest.mark.parametrize("layout", ["n1.7", "n1.6", "n1.5"])
 @pytest.mark.parametrize("payload", ["raw", "png"])
 class TestZmq(TransportSuite):
     whole = True

@@ -79,6 +79,11 @@ def test_nobody_there_is_one_line() -> None:
         assert found(f"{scheme}://127.0.0.1:{port}")["server"].level == "error"
 
 
+def test_a_server_that_breaks_off_is_one_line() -> None:
+    with answering(b"") as (place, _):
+        assert found(f"tcp://{place}")["server"].level == "error"
+
+
 @pytest.mark.parametrize("url", ["foo://x", "http://", "grpc://:80", "http://[x", "http://a:99999999", "x", ""])
 def test_what_is_no_url_of_a_server_is_refused(url: str) -> None:
     with pytest.raises(UsageError, match=r"^`url`: "):

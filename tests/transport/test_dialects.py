@@ -133,7 +133,7 @@ FACTS = {
 def test_what_a_server_tells_of_itself_is_kept_by_clear_names(speaker: Speaker) -> None:
     texts, trace = said(speaker, answer(speaker))
     assert texts == ["go", "_to"]
-    told = {name: value for name, value in trace.facts.items() if name not in HTTP.tells}
+    told = {name: value for name, value in trace.facts.items() if name not in HTTP.facts}
     assert told == pytest.approx(FACTS[speaker.dialect])
 
 
@@ -150,6 +150,7 @@ def test_missing_usage_and_timings_are_absent_not_zero(speaker: Speaker) -> None
         trace.facts
     )
     assert trace.chain()[-1][0] == "server"
+    assert budget(trace.chain()).e2e_without_inference_ns is None
 
 
 def test_a_failure_on_the_way_keeps_the_tokens_before_it(speaker: Speaker) -> None:
@@ -165,10 +166,19 @@ def test_an_answer_without_its_end_is_a_failure(speaker: Speaker) -> None:
         said(speaker, answer(speaker)[:-1])
 
 
-def test_a_connection_that_breaks_in_the_middle_of_a_chunk_is_a_failure(speaker: Speaker) -> None:
-    broken = [kept_head(speaker.kind), chunk(speaker.token(GO_TO[0])), b"ff\r\ndata", CLOSE]
+@pytest.mark.parametrize(
+    "broken",
+    [
+        [kept_head("text/event-stream"), chunk(Cloud().token(GO_TO[0])), b"ff\r\ndata", CLOSE],
+        [head("200 OK", "text/event-stream", "Content-Length: 9999"), Cloud().token(GO_TO[0])],
+        [b"SSH-2.0-OpenSSH_9.6\r\n", CLOSE],
+        [CLOSE],
+    ],
+    ids=["chunk", "length", "SSH", "nothing"],
+)
+def test_a_connection_that_breaks_is_a_failure(broken: Pieces) -> None:
     with pytest.raises(RequestFailed, match="broke the connection"):
-        said(speaker, broken)
+        said(Cloud(), broken)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +190,7 @@ def test_a_connection_that_breaks_in_the_middle_of_a_chunk_is_a_failure(speaker:
         ("413 Payload Too Large", [], "answered 413: no way; choose a smaller `size`", None),
         ("429 Too Many Requests", ["Retry-After: 7"], "answered 429: no way; it asks to wait 7 s; .*quota", 7.0),
         ("503 Service Unavailable", ["retry-after: 1.5"], "answered 503: no way; it asks to wait 1.5 s$", 1.5),
-        ("503 Busy", ["Retry-After: Wed, 21 Oct 2015 07:28:00 GMT"], "answered 503: no way$", 0.0),
+        ("503 Busy", ["Retry-After: Wed, 21 Oct 2015 07:28:00 GMT"], "answered 503: no way$", None),
         ("503 Busy", ["Retry-After: soon"], "answered 503: no way$", None),
         ("500 Oops", [], "answered 500: no way$", None),
     ],
@@ -550,6 +560,11 @@ class TestWhatAServerHas:
     def test_a_dead_server_is_told_before_flags_are_judged(self) -> None:
         with pytest.raises(ServerDied, match=r"nothing answers at http://127\.0\.0\.1:9/v1/models"):
             open_client(wiring("http/as-deployed", url="http://127.0.0.1:9"))
+
+    def test_a_dead_server_that_needs_no_asking_is_told_with_the_first_request(self, speaker: Speaker) -> None:
+        client = open_client(route(speaker, "http://127.0.0.1:9"))
+        with pytest.raises(ServerDied, match=r"nothing answers at http://127\.0\.0\.1:9/"):
+            ask(client, Request("a", "plan"))
 
 
 @pytest.mark.parametrize(

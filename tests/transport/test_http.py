@@ -15,11 +15,11 @@ import httpx
 import numpy as np
 import pytest
 
-from s2a_bench.errors import PortInUse
 from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Remote, Trace, budget
 from s2a_bench.transport import Handler, open_client, open_server
 from s2a_bench.transport.http import own as dialect
+from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.types import Request, Token
 
 
@@ -29,9 +29,9 @@ def handler() -> Recorder:
 
 
 @contextmanager
-def serving(handler: Handler) -> Iterator[str]:
+def serving(handler: Handler, name: str = "http") -> Iterator[str]:
     """Serve for as long as the context lasts."""
-    with served(wiring("http"), handler) as (server, _):
+    with served(wiring(name), handler) as (server, _):
         yield server.address
 
 
@@ -41,13 +41,11 @@ def url(handler: Recorder) -> Iterator[str]:
         yield address
 
 
-def stages(url: str, variant: str, payload: str) -> set[str]:
-    client = open_client(wiring(f"http/{variant}", url, payload=payload))
-    try:
-        _, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
-    finally:
-        client.close()
-    return set(budget(trace.chain()).stages_ns)
+@pytest.fixture
+def urls(url: str, handler: Recorder) -> Iterator[dict[str, str]]:
+    """Our servers, by the variants that they answer."""
+    with serving(handler, "http/best-effort") as fast:
+        yield {"as-deployed": url, "best-effort": fast, "binary": fast}
 
 
 COMMON = {"convert", "json_pack", "network", "json_parse", "inference", "return"}
@@ -63,8 +61,12 @@ COMMON = {"convert", "json_pack", "network", "json_parse", "inference", "return"
         ("binary", "raw", {"channel_swap"}),
     ],
 )
-def test_each_variant_has_its_stages_and_no_other(url: str, variant: str, payload: str, expected: set[str]) -> None:
-    assert stages(url, variant, payload) == COMMON | expected
+def test_each_variant_has_its_stages_and_no_other(
+    urls: dict[str, str], variant: str, payload: str, expected: set[str]
+) -> None:
+    with closing(open_client(wiring(f"http/{variant}", urls[variant], payload=payload))) as client:
+        _, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
+    assert set(budget(trace.chain()).stages_ns) == COMMON | expected
 
 
 def test_a_new_client_per_request_shows_as_connect(url: str) -> None:
@@ -140,27 +142,30 @@ def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: Reco
 
 
 @pytest.mark.parametrize(
-    ("path", "body", "status", "message"),
+    ("variant", "body", "message"),
     [
-        (dialect.PATHS["as-deployed"], b"{}", 400, "body.messages"),
-        (dialect.PATHS["as-deployed"], b"{", 400, "JSON"),
-        (dialect.PATHS["best-effort"], b"{", 400, "no JSON"),
-        (dialect.PATHS["best-effort"], b"{}", 400, "messages"),
-        (dialect.PATHS["best-effort"], b'{"messages": [], "max_tokens": "many"}', 400, "max_tokens"),
-        (dialect.PATHS["best-effort"], b'{"messages": [{"content": [{"type": "text", "text": 3}]}]}', 400, "messages"),
-        (dialect.PATHS["binary"], b"", 400, "s2a-request"),
+        ("as-deployed", b"{}", "body.messages"),
+        ("as-deployed", b"{", "JSON"),
+        ("as-deployed", b'{"messages": [' + b"[]," * 20_000 + b"[]]}", "more than 20000 values"),
+        ("best-effort", b"{", "no JSON"),
+        ("best-effort", b"{}", "messages"),
+        ("best-effort", b'{"messages": [], "max_tokens": "many"}', "max_tokens"),
+        ("best-effort", b'{"messages": [{"content": [{"type": "text", "text": 3}]}]}', "messages"),
+        ("best-effort", b"[" * 20_001, "more than 20000 values"),
+        ("binary", b"", "s2a-request"),
     ],
 )
-def test_a_bad_body_is_refused_with_the_reason(url: str, path: str, body: bytes, status: int, message: str) -> None:
-    answer = httpx.post(url + path, content=body, headers={"content-type": "application/json"})
-    assert answer.status_code == status
+def test_a_bad_body_is_refused_with_the_reason(urls: dict[str, str], variant: str, body: bytes, message: str) -> None:
+    headers = {"content-type": "application/json"}
+    answer = httpx.post(urls[variant] + dialect.PATHS[variant], content=body, headers=headers)
+    assert answer.status_code == 400
     assert message in answer.json()["error"]["message"]
 
 
-@pytest.mark.parametrize("header", ["[1]", '{"prompt": 3}', '{"seed": [1]}'])
-def test_a_bad_header_of_a_binary_request_is_refused(url: str, header: str) -> None:
+@pytest.mark.parametrize("header", ["[1]", '{"prompt": 3}', '{"seed": [1]}', f"[{'1,' * 20_000}1]"])
+def test_a_bad_header_of_a_binary_request_is_refused(urls: dict[str, str], header: str) -> None:
     headers = {dialect.PARAMETERS_HEADER: header}
-    assert httpx.post(url + dialect.PATHS["binary"], headers=headers).status_code == 400
+    assert httpx.post(urls["binary"] + dialect.PATHS["binary"], headers=headers).status_code == 400
 
 
 def test_an_answer_that_nobody_reads_any_more_ends_on_its_own_thread() -> None:
@@ -219,14 +224,28 @@ def test_a_bad_picture_is_refused_with_the_reason(url: str, uri: str) -> None:
     assert httpx.post(url + "/v1/chat/completions", json=body).status_code == 400
 
 
-def test_health_and_models_answer(url: str) -> None:
-    assert httpx.get(url + "/health").json() == {"status": "ok"}
-    assert httpx.get(url + "/v1/models").json()["data"][0]["id"] == "s2a"
+def test_health_and_models_answer(urls: dict[str, str]) -> None:
+    for url in urls.values():
+        assert httpx.get(url + "/health").json() == {"status": "ok"}
+        assert httpx.get(url + "/v1/models").json()["data"][0]["id"] == "s2a"
 
 
-def test_a_port_in_use_is_named(url: str, handler: Recorder) -> None:
-    with pytest.raises(PortInUse, match=r"`port`: .* is in use"):
-        open_server(wiring("http", url.removeprefix("http://")), handler)
+@pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
+@pytest.mark.parametrize(
+    ("headers", "status"), [({"host": "example.com"}, 403), ({"origin": "http://localhost"}, 403), ({"host": ""}, 200)]
+)
+def test_a_page_in_a_browser_is_not_answered(
+    urls: dict[str, str], variant: str, headers: dict[str, str], status: int
+) -> None:
+    body = {"messages": [{"role": "user", "content": "plan"}]}
+    answer = httpx.post(urls[variant] + "/v1/chat/completions", json=body, headers=headers)
+    assert answer.status_code == status
+    assert ("message" in answer.json().get("error", {})) == (status == 403)
+
+
+def test_best_effort_and_binary_share_a_server_and_as_deployed_has_its_own() -> None:
+    deployed, best_effort, binary = (one_pipeline(f"http/{name}").server for name in dialect.PATHS)
+    assert deployed != best_effort == binary
 
 
 def test_servers_bind_loopback_unless_told(url: str) -> None:

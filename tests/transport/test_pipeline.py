@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import Any
 
 import pytest
 
 from s2a_bench.errors import UsageError
+from s2a_bench.transport import Choice
 from s2a_bench.transport.pipeline import one_pipeline, pipelines
 
 
@@ -79,13 +81,12 @@ def test_cells_share_a_server_unless_it_would_be_told_something_else() -> None:
 def test_a_router_is_zenohs() -> None:
     ros = one_pipeline("ros?middleware=cyclonedds&router=tcp/127.0.0.1:7447")
     with pytest.raises(UsageError, match="`router` is Zenoh's: choose `middleware` zenoh, or leave it out"):
-        ros.transport.check("topic", ros.options, mode="request", engine="echo")
+        ros.transport.require(Choice(ros.options, "topic", mode="request", engine="echo"))
 
 
 def test_two_servers_of_one_transport_do_not_collide() -> None:
     http, ros = one_pipeline("http", port=8000), one_pipeline("ros?namespace=/mine")
-    assert http.transport.bind(http.options, []) == "127.0.0.1:8000"
-    assert http.transport.bind(http.options, ["127.0.0.1:8000"]) == "127.0.0.1:0"
-    assert ros.transport.bind(ros.options, ["/mine", "/mine_2"]) == "/mine_3"
+    assert list(http.options.addresses()) == ["127.0.0.1:8000", "127.0.0.1:0"]
+    assert list(islice(ros.options.addresses(), 3)) == ["/mine", "/mine_2", "/mine_3"]
     unnamed = one_pipeline("ros")
-    assert len({unnamed.transport.bind(unnamed.options, []) for _ in range(9)}) == 9
+    assert len({address for _ in range(9) for address in unnamed.options.addresses()}) == 9

@@ -11,21 +11,20 @@ import pytest
 
 from s2a_bench import registry
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.latency.metrics import latency_json
 from s2a_bench.experiments.latency.run import run_latency
-from s2a_bench.experiments.latency.view.as_json import latency_json
-from s2a_bench.experiments.latency.view.cells import cells_of
+from s2a_bench.experiments.latency.view import stage_table, summary_table
 from s2a_bench.experiments.latency.view.figures import latency_figures
-from s2a_bench.experiments.latency.view.tables import stage_table, summary_table
-from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.experiments.requests import cells_of
+from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import option
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import TransportSuite
 from s2a_bench.trace import Trace
-from s2a_bench.transport import TRANSPORTS, Client, Handler, Server, Transport, Wiring, declared
+from s2a_bench.transport import SERVER, TRANSPORTS, Client, Handler, Options, Server, Transport, Wiring, declared
 from s2a_bench.transport.loopback.in_process import LoopbackClient, LoopbackServer
-from s2a_bench.transport.options import SERVER, Options
 from s2a_bench.types import Request, Token
 
 
@@ -44,7 +43,7 @@ class Toy(Transport[ToyOptions]):
     name = "toy"
     options = ToyOptions
     stages: ClassVar[dict[str, str]] = {"greet": "pack", "hand_over": "parse"}
-    looks: ClassVar[dict[str, tuple[str, str]]] = {"": ("#123456", "-")}
+    style: ClassVar[dict[str, tuple[str, str]]] = {"": ("#123456", "-")}
     packages = ("pytest",)
     in_process = True
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from threading import Event, Thread
@@ -20,8 +20,9 @@ from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_fram
 from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client, open_server
 from s2a_bench.transport.ros.camera import CAMERA
-from s2a_bench.transport.turns import Queued
+from s2a_bench.transport.serving import Queued
 from s2a_bench.types import Frame, Request, Token
+from tests.waiting import until
 
 
 @pytest.fixture
@@ -32,13 +33,6 @@ def stack() -> Iterator[ExitStack]:
 
 def serve(stack: ExitStack, told: Wiring[Any], handler: Handler) -> Any:
     return stack.enter_context(served(told, handler))[0]
-
-
-def until(met: Callable[[], bool]) -> None:
-    deadline = now_ns() + 20_000_000_000
-    while not met():
-        assert now_ns() < deadline, "it did not come about"
-        Event().wait(0.005)
 
 
 def connect(stack: ExitStack, told: Wiring[Any]) -> Client:
@@ -87,6 +81,16 @@ def test_a_request_without_a_picture_is_about_the_newest_frame(
     decoding = {"raw": "channel_swap", "yuyv": "yuv_decode"}.get(payload, "image_decode")
     assert stages == ["network", "cdr_parse", decoding]
     assert decoding not in budget(trace.chain()).stages_ns
+
+
+def test_a_client_is_a_camera_from_when_it_is_used_as_one(stack: ExitStack, told: Wiring[Any]) -> None:
+    server = serve(stack, told, Recorder(["x"]))
+    clients = [connect(stack, replace(told, variant=variant)) for variant in ("topic", "action")]
+    publishers = server._cache._cameras[0].publishers
+    assert publishers() == 0
+    for count, client in enumerate(clients, 1):
+        assert client.camera is client.camera
+        until(lambda count=count: publishers() == count)  # type: ignore[misc]  # bound at once
 
 
 def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, told: Wiring[Any], dds_domain: int) -> None:
@@ -141,10 +145,11 @@ def ask_until_refused(client: Client) -> tuple[str, Trace]:
 def test_a_waiting_request_is_about_the_frame_that_is_the_newest_when_its_turn_comes(
     stack: ExitStack, dds_domain: int
 ) -> None:
-    go, seen = Event(), list[int]()
+    go, started, seen = Event(), Event(), list[int]()
 
     def handler(request: Request, _trace: Trace) -> Generator[Token, None, None]:
         seen.extend(image.stamp_ns for image in request.images)
+        started.set()
         assert go.wait(20)
         yield Token(0, "x")
 
@@ -152,11 +157,11 @@ def test_a_waiting_request_is_about_the_frame_that_is_the_newest_when_its_turn_c
     told = wiring("ros/topic", "/test_turn", domain_id=dds_domain)
     server = serve(stack, told, queued)
     clients = [connect(stack, told) for _ in range(2)]
-    camera = clients[0].camera
-    assert camera is not None
     threads = [Thread(target=ask, args=(client, Request("a", "plan"))) for client in clients]
     threads[0].start()
-    until(lambda: queued.turns.silent_s() > 0)
+    assert started.wait(20)
+    camera = clients[1].camera
+    assert camera is not None
     threads[1].start()
     until(lambda: bool(queued.turns.waiting))
     frame = yuyv_frame()
@@ -166,37 +171,6 @@ def test_a_waiting_request_is_about_the_frame_that_is_the_newest_when_its_turn_c
     for thread in threads:
         thread.join(20)
     assert seen == [camera.stamp_ns(frame)]
-
-
-def test_a_request_that_waits_for_the_engine_says_so(stack: ExitStack, told: Wiring[Any]) -> None:
-    go, started = Event(), Event()
-
-    def handler(request: Request, trace: Trace) -> Generator[Token, None, None]:
-        started.set()
-        assert go.wait(20)
-        trace.mark("inference")
-        yield Token(0, request.id)
-
-    queued = Queued.around(handler)
-    serve(stack, told, queued)
-    clients = [connect(stack, told) for _ in range(2)]
-    traces: dict[str, Any] = {}
-
-    def run(client: Client, name: str) -> None:
-        _, traces[name] = ask(client, Request(name, "plan"))
-
-    threads = [Thread(target=run, args=(client, name)) for client, name in zip(clients, ("1", "2"), strict=True)]
-    threads[0].start()
-    assert started.wait(20)
-    threads[1].start()
-    deadline = now_ns() + 20_000_000_000
-    while not queued.turns.waiting:
-        assert now_ns() < deadline, "the second request never joined the queue"
-    go.set()
-    for thread in threads:
-        thread.join(20)
-    assert "queue" not in budget(traces["1"].chain()).stages_ns
-    assert budget(traces["2"].chain()).stages_ns["queue"] > 0
 
 
 @pytest.mark.parametrize(("came", "told_of"), [([0, 2], "piece 2 came instead of 1"), ([0, 0], "piece 0 .* of 1")])

@@ -15,16 +15,15 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.inference import EngineConfig
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.diagnostics import ARRAY, Finding, Level, diagnostic_array
+from s2a_bench.ros.diagnostics import ARRAY, LOG, LONGEST, Finding, Level, diagnostic_array, log_message
 from s2a_bench.ros.parameters import PARAMETER, SERVICE, value_message, value_of
-from s2a_bench.ros.rosout import LOG, LONGEST, log_message
 from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring, open_client
 from s2a_bench.transport.ros.joining import join
 from s2a_bench.transport.ros.node import EVENT, Activity, snake
 from s2a_bench.transport.ros.server import RosServer
-from s2a_bench.transport.turns import STUCK_S, Queued
+from s2a_bench.transport.serving import STUCK_S, Queued
 from s2a_bench.types import Request
 
 NODE = "/behaves/brain"
@@ -146,8 +145,8 @@ def test_a_request_that_cannot_be_prepared_is_a_failure(
         with pytest.raises(RequestFailed):
             ask(client, Request("a", "plan", max_tokens=0))
     failures = [record.getMessage() for record in caplog.records if "a request failed" in record.getMessage()]
-    assert failures == ["a request failed: it could not be read or prepared"]
-    assert server._activity.failures == 2
+    assert failures == ["a request failed: max_tokens should be a whole number of 1 to 65536"]
+    assert server._shared.activity.failures == 2
 
 
 def values_of(status: Any) -> dict[str, str]:
@@ -168,21 +167,22 @@ def activity(waiting: int = 0, silent_s: float = 0.0) -> Activity:
     ],
 )
 def test_the_level_says_what_is_wrong_with_requests(made: Activity, level: Level, message: str) -> None:
-    requests, _ = made.findings(0, None, 1)
+    requests, _ = made.findings(0, None, str, 1)
     assert requests.level is level
     assert message in requests.message
 
 
 def test_failures_and_old_frames_are_warnings_and_a_failure_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     made = activity()
-    for _ in range(3):
-        made.failed("no model")
-    requests, camera = made.findings(7, now_ns() - 5_000_000_000, 1)
+    for number in range(3):
+        made.failed(f"no model for {number}.5 s")
+    requests, camera = made.findings(7, now_ns() - 5_000_000_000, lambda: "2 publishers", 1)
     assert (requests.level, requests.message) == (Level.WARN, "3 requests failed")
     assert (camera.level, camera.values["frames"]) == (Level.WARN, 7)
+    assert camera.message == "the newest frame is 5.0 s old: 2 publishers"
     assert camera.values["frame_age_s"] >= 5
-    assert [record.getMessage() for record in caplog.records] == ["a request failed: no model"]
-    requests, camera = made.findings(8, now_ns(), 60)
+    assert [record.getMessage() for record in caplog.records] == ["a request failed: no model for 0.5 s"]
+    requests, camera = made.findings(8, now_ns(), lambda: "2 publishers", 60)
     assert (requests.level, camera.level) == (Level.OK, Level.OK)
 
 

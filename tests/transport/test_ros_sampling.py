@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.inference import honoured_by
+from s2a_bench.inference import ENGINES
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.ros.messages import VERSIONS, default, deserialise, serialise
-from s2a_bench.transport.ros.sampling import BOUNDS, Wishes
+from s2a_bench.transport.ros.action_front import BOUNDS, Wishes
 
-HONOURED = honoured_by("llama")
+HONOURED = ENGINES["llama"].honours
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -50,4 +50,4 @@ def test_numbers_that_make_no_sense_fail_the_goal(name: str, value: float) -> No
 
 def test_whatever_the_llama_engine_honours_has_bounds() -> None:
     assert set(HONOURED) == set(BOUNDS)
-    assert not honoured_by("echo")
+    assert not ENGINES["echo"].honours

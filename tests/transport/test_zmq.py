@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import io
 import json
+import pickle
 import warnings
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
@@ -18,16 +20,21 @@ import pytest
 import zmq
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import PortInUse, RequestFailed, ServerDied, UsageError
+from s2a_bench.errors import RequestFailed, ServerDied, UsageError
+from s2a_bench.experiments.latency.config import LatencyConfig
+from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.frames.convert import yuyv_to_rgb
+from s2a_bench.store.run import read_run
+from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Client, Handler, Server, open_client, open_server
+from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.dangers import examine
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.zmq.watch import Watch
 from s2a_bench.types import Action, Piece, Request
+from tests.waiting import until
 
 CHUNK = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
 KEY = "s3cret-robot-key"
@@ -65,8 +72,20 @@ def decoded(value: Any) -> Any:
     return np.load(io.BytesIO(value["as_npy"]), allow_pickle=False) if "__ndarray_class__" in value else value
 
 
+def mapped(peer: Any) -> dict[str, Callable[..., Any]]:
+    """Packing and reading of msgpack-numpy, as N1.7 has them."""
+    return {"packb": peer.packb, "unpackb": peer.unpackb}
+
+
+FILES: dict[str, Callable[..., Any]] = {
+    "packb": lambda value: msgpack.packb(value, default=encoded),
+    "unpackb": lambda data: msgpack.unpackb(data, object_hook=decoded),
+}
+"""Those of N1.5 and N1.6."""
+
+
 @contextmanager
-def plain(address: str) -> Iterator[Callable[..., Any]]:
+def plain(address: str, packb: Any = FILES["packb"], unpackb: Any = FILES["unpackb"]) -> Iterator[Callable[..., Any]]:
     """A client as GR00T's: a REQ socket, one endpoint a call."""
     context = zmq.Context()
     peer = context.socket(zmq.REQ)
@@ -74,8 +93,8 @@ def plain(address: str) -> Iterator[Callable[..., Any]]:
     peer.connect(address)
 
     def call(endpoint: str, data: Any = None, **fields: Any) -> Any:
-        peer.send(msgpack.packb({"endpoint": endpoint, "data": data, **fields}, default=encoded))
-        return msgpack.unpackb(peer.recv(), object_hook=decoded)
+        peer.send(packb({"endpoint": endpoint, "data": data, **fields}))
+        return unpackb(peer.recv())
 
     try:
         yield call
@@ -84,7 +103,9 @@ def plain(address: str) -> Iterator[Callable[..., Any]]:
 
 
 @contextmanager
-def policy(answers: Callable[[Any], Any]) -> Iterator[str]:
+def policy(
+    answers: Callable[[Any], Any], packb: Any = FILES["packb"], unpackb: Any = FILES["unpackb"]
+) -> Iterator[str]:
     """A server as GR00T's: a REP socket, one request after the other; bytes and None are sent as they are, or not."""
     context, over = zmq.Context(), Event()
     peer = context.socket(zmq.REP)
@@ -94,13 +115,13 @@ def policy(answers: Callable[[Any], Any]) -> Iterator[str]:
     def serve() -> None:
         while not over.is_set():
             try:
-                request = msgpack.unpackb(peer.recv(), object_hook=decoded)
+                request = unpackb(peer.recv())
             except zmq.Again:
                 continue
             answer = answers(request)
             if answer is None:
                 return
-            peer.send(answer if isinstance(answer, bytes) else msgpack.packb(answer, default=encoded))
+            peer.send(answer if isinstance(answer, bytes) else packb(answer))
 
     thread = Thread(target=serve)
     thread.start()
@@ -116,6 +137,15 @@ def flat(frames: int = 1, batched: bool = False) -> dict[str, Any]:
     video, state = np.full((frames, 48, 64, 3), 7, np.uint8), np.arange(5, dtype=np.float64)[np.newaxis]
     whole = {"video.front": video, "state.single_arm": state, "state.gripper": np.array([[0.5]])}
     return {**{key: each[np.newaxis] if batched else each for key, each in whole.items()}, TASK: ["pick it up"]}
+
+
+def nested() -> dict[str, Any]:
+    """An observation in the layout of N1.6 and N1.7."""
+    return {
+        "video": {"front": np.zeros((1, 2, 48, 64, 3), np.uint8), "wrist": np.ones((1, 1, 32, 32, 3), np.uint8)},
+        "state": {"arm": np.zeros((1, 1, 5), np.float32)},
+        "language": {TASK: [["pick it up"]]},
+    }
 
 
 class Held:
@@ -135,11 +165,9 @@ class Held:
         yield Action(0, CHUNK[0])
 
 
-def until(met: Callable[[], bool]) -> None:
-    deadline = now_ns() + 20_000_000_000
-    while not met():
-        assert now_ns() < deadline
-        Event().wait(0.005)
+@pytest.fixture
+def peer() -> Any:
+    return pytest.importorskip("msgpack_numpy")
 
 
 @pytest.fixture
@@ -186,18 +214,30 @@ class TestClientsOfOthers:
 
     def test_n1_6_is_answered_with_a_list(self) -> None:
         handler = Recorder(list(CHUNK))
-        observation = {
-            "video": {"front": np.zeros((1, 2, 48, 64, 3), np.uint8), "wrist": np.ones((1, 1, 32, 32, 3), np.uint8)},
-            "state": {"arm": np.zeros((1, 1, 5), np.float32)},
-            "language": {TASK: [["pick it up"]]},
-        }
         with serving(handler) as server, plain(server.address) as call:
-            actions, info = call("get_action", {"observation": observation, "options": {"words": "not the prompt"}})
+            actions, info = call("get_action", {"observation": nested(), "options": {"words": "not the prompt"}})
         assert info == {}
         np.testing.assert_array_equal(actions["robot"], CHUNK[np.newaxis])
         (got,) = handler.requests
         assert (got.prompt, got.state) == ("pick it up", (0.0,) * 5)
         assert [image.data.shape for image in got.images] == [(48, 64, 3), (48, 64, 3), (32, 32, 3)]
+
+    def test_n1_7_is_answered_in_its_own_codec(self, peer: Any) -> None:
+        handler = Recorder(list(CHUNK))
+        with serving(handler) as server, plain(server.address, **mapped(peer)) as call:
+            actions, info = call("get_action", {"observation": nested(), "options": None})
+            with plain(server.address) as older:
+                files, _ = older("get_action", {"observation": nested(), "options": None})
+        assert info == {}
+        np.testing.assert_array_equal(actions["robot"], CHUNK[np.newaxis])
+        np.testing.assert_array_equal(files["robot"], CHUNK[np.newaxis])
+        assert [(got.prompt, got.state) for got in handler.requests] == [("pick it up", (0.0,) * 5)] * 2
+        assert [image.data.shape for image in handler.requests[0].images] == [(48, 64, 3), (48, 64, 3), (32, 32, 3)]
+
+    def test_objects_of_msgpack_numpy_are_refused_in_a_line(self, peer: Any) -> None:
+        with serving(Recorder(list(CHUNK))) as server, plain(server.address, **mapped(peer)) as call:
+            error = call("get_action", {"observation": {"state": {"arm": np.array([{}], object)}}})["error"]
+        assert "nothing is unpickled" in error
 
     def test_other_endpoints_answer_as_gr00ts(self) -> None:
         with serving(Recorder([])) as server, plain(server.address) as call:
@@ -212,6 +252,12 @@ class TestClientsOfOthers:
         with serving(Recorder([]), layout="n1.5") as server, plain(server.address) as call:
             video = call("get_modality_config")["video"]
         assert json.loads(video["as_json"]) == {"delta_indices": [0], "modality_keys": ["video.ego_view"]}
+
+    def test_n1_7s_modalities_have_a_mark_of_their_own(self) -> None:
+        with serving(Recorder([]), layout="n1.7") as server, plain(server.address) as call:
+            configs = call("get_modality_config")
+        assert [list(config) for config in configs.values()] == [["__ModalityConfig__", "as_json"]] * 4
+        assert configs["video"]["as_json"]["modality_keys"] == ["ego_view"]
 
     def test_nobody_ends_the_server_over_the_network(self) -> None:
         with serving(Recorder([])) as server, plain(server.address) as call:
@@ -251,7 +297,7 @@ class TestServer:
     def test_who_goes_leaves_the_queue(self) -> None:
         held = Held()
         with serving(held, Limits(waiting=1)) as server, ExitStack() as stack:
-            turns = server._office.queued.turns  # type: ignore[attr-defined]
+            turns = server._core.queued.turns  # type: ignore[attr-defined]
             first, last = (stack.enter_context(plain(server.address)) for _ in range(2))
             asking = Thread(target=lambda: first("get_action", flat(), s2a={"id": "first"}))
             asking.start()
@@ -269,51 +315,6 @@ class TestServer:
             assert "action.robot" in last("get_action", flat(), s2a={"id": "last"})
         assert held.ids == ["first", "last"]
 
-    def test_requests_of_several_clients_are_all_answered(self) -> None:
-        handler = Recorder(list(CHUNK))
-        failed: list[Exception] = []
-
-        def asks(address: str) -> None:
-            try:
-                with robot(address) as client:
-                    for number in range(20):
-                        assert len(ask(client, Request(f"{number}", "go", (yuyv_frame(),)))[0]) == 4
-            except Exception as error:  # noqa: BLE001 - a finding
-                failed.append(error)
-
-        with serving(handler) as server:
-            threads = [Thread(target=asks, args=(server.address,)) for _ in range(6)]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join(60)
-        assert failed == []
-        assert len(handler.requests) == 120
-
-    def test_a_full_queue_refuses(self) -> None:
-        held = Held()
-        with serving(held, Limits(waiting=0)) as server, ExitStack() as stack:
-            first = stack.enter_context(plain(server.address))
-            asking = Thread(target=lambda: first("get_action", flat()))
-            asking.start()
-            assert held.begun.wait(20)
-            with robot(server.address) as client, pytest.raises(RequestFailed, match="waiting for the engine") as busy:
-                ask(client, Request("a", "go"))
-            held.let.set()
-            asking.join()
-        assert busy.value.retry_after_s == 1.0
-
-    def test_a_request_that_waits_too_long_is_given_up(self) -> None:
-        held = Held()
-        with serving(held, Limits(answer_s=0.3)) as server, ExitStack() as stack:
-            first, second = (stack.enter_context(plain(server.address)) for _ in range(2))
-            asking = Thread(target=lambda: first("get_action", flat()))
-            asking.start()
-            assert held.begun.wait(20)
-            assert "waiting for the engine" in second("get_action", flat())["error"]
-            held.let.set()
-            asking.join()
-
     def test_without_its_key_nothing_is_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("ROBOT_KEY", KEY)
         handler = Recorder(list(CHUNK))
@@ -322,19 +323,7 @@ class TestServer:
                 for endpoint in ("ping", "get_action", "get_modality_config", "kill", "s2a_marks"):
                     assert "Unauthorized" in call(endpoint, flat(), **wrong)["error"]
             assert call("ping", api_token=KEY)["status"] == "ok"
-            with robot(server.address, api_key_env="ROBOT_KEY") as client:
-                assert len(ask(client, Request("a", "go", (yuyv_frame(),)))[0]) == 4
-            with robot(server.address) as client, pytest.raises(RequestFailed, match="Unauthorized"):
-                ask(client, Request("a", "go"))
-        assert len(handler.requests) == 1
-
-    def test_strangers_need_a_key(self) -> None:
-        with pytest.raises(UsageError, match="`api_key_env`, or let everybody in with `no_auth`"):
-            open_server(wiring("zmq/gr00t", "0.0.0.0:0"), Recorder([]))
-
-    def test_a_port_in_use_is_told(self) -> None:
-        with serving(Recorder([])) as server, pytest.raises(PortInUse, match="is in use"):
-            open_server(wiring("zmq/gr00t", server.address), Recorder([]))
+        assert handler.requests == []
 
 
 class TestWatch:
@@ -360,26 +349,10 @@ class TestWatch:
         context.destroy(0)
         assert len(set(descriptors)) < 3
 
-    def test_what_came_and_is_not_complete_is_counted(self) -> None:
-        context = zmq.Context()
-        router = context.socket(zmq.ROUTER)
-        watch = Watch(router)
-        port = router.bind_to_random_port("tcp://127.0.0.1")
-        peer = context.socket(zmq.DEALER)
-        peer.connect(f"tcp://127.0.0.1:{port}")
-        for sizes in ((0, 10), (0, 255), (0, 256), (1, 1 << 20)):
-            peer.send_multipart([bytes(size) for size in sizes])
-            frames = router.recv_multipart(copy=False)
-            connection = watch.of(frames[-1].get(zmq.SRCFD))
-            connection.take([len(frame) for frame in frames[1:]])
-            assert 0 < connection.look() < 200  # the greeting alone
-        watch.close()
-        context.destroy(0)
-
 
 class TestBlackBox:
-    @pytest.mark.parametrize("layout", ["n1.5", "n1.6"])
-    def test_a_foreign_policy_is_told_what_the_template_says(self, layout: str) -> None:
+    @pytest.mark.parametrize("layout", ["n1.5", "n1.6", "n1.7"])
+    def test_a_foreign_policy_is_told_what_the_template_says(self, layout: str, peer: Any) -> None:
         told: list[Any] = []
 
         def answers(request: Any) -> Any:
@@ -390,7 +363,8 @@ class TestBlackBox:
             return [{"arm": arm[np.newaxis], "gripper": gripper[np.newaxis]}, {"seconds": 1.0}]
 
         frame = yuyv_frame(seed=4)
-        with policy(answers) as url, robot("", url=url, layout=layout) as client:
+        codec = mapped(peer) if layout == "n1.7" else FILES
+        with policy(answers, **codec) as url, robot("", url=url, layout=layout) as client:
             actions, trace = ask(client, Request("a", "pick it up", (frame,), state=(0.5, 1.5)))
         np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)  # type: ignore[union-attr]
         (request,) = told
@@ -417,7 +391,7 @@ class TestBlackBox:
             return [{"robot": CHUNK[np.newaxis]}, {}]
 
         frames = (yuyv_frame(seed=1), yuyv_frame(seed=2))
-        with policy(answers) as url, robot("", url=url, template="gr00t-so100") as client:
+        with policy(answers) as url, robot("", url=url, layout="n1.6", template="gr00t-so100") as client:
             ask(client, Request("a", "go", frames, state=(1, 2, 3, 4, 5, 6)))
             with pytest.raises(RequestFailed, match=r"video\.wrist.* wants picture 1"):
                 ask(client, Request("a", "go", frames[:1], state=(1, 2, 3, 4, 5, 6)))
@@ -428,7 +402,7 @@ class TestBlackBox:
 
     def test_an_error_is_told_and_the_next_request_goes_on(self) -> None:
         answers = iter([{"error": "no such\nrobot"}, b"ERROR", [{"robot": CHUNK[np.newaxis]}, {}]])
-        with policy(lambda _: next(answers)) as url, robot("", url=url) as client:
+        with policy(lambda _: next(answers)) as url, robot("", url=url, layout="n1.6") as client:
             with pytest.raises(RequestFailed, match="no such robot"):
                 ask(client, Request("a", "go"))
             with pytest.raises(RequestFailed, match="another kind of policy"):
@@ -446,12 +420,12 @@ class TestBlackBox:
             return [{"robot": np.zeros((1, 4, 3), np.float32)}, {}]  # nobody waits for it
 
         with policy(answers) as url:
-            told = wiring("zmq/gr00t", url=url, timeout_s=0.5)
+            told = wiring("zmq/gr00t", url=url, layout="n1.6", timeout_s=0.5)
             client = open_client(told)
             with pytest.raises(RequestFailed, match=r"silent for too long: 0\.5 s"):
                 ask(client, Request("a", "go"))
             client.close()
-            with robot("", url=url) as patient:
+            with robot("", url=url, layout="n1.6") as patient:
                 actions, trace = ask(patient, Request("a", "go"))
         np.testing.assert_array_equal(actions[1].values, CHUNK[1])  # type: ignore[union-attr]
         assert trace.facts.get("reconnects") is None
@@ -465,7 +439,7 @@ class TestBlackBox:
                 Event().wait(1.0)
             return [{"robot": (CHUNK + calls[-1])[np.newaxis]}, {}]
 
-        with policy(answers) as url, robot("", url=url, timeout_s=0.7) as client:
+        with policy(answers) as url, robot("", url=url, layout="n1.6", timeout_s=0.7) as client:
             with pytest.raises(RequestFailed, match="silent"):
                 ask(client, Request("a", "go"))
             Event().wait(0.5)
@@ -474,9 +448,13 @@ class TestBlackBox:
         assert trace.facts["reconnects"] == 1.0
         assert "connect" in dict(trace.chain())
 
-    def test_nothing_there_is_told_at_once(self) -> None:
+    @pytest.mark.parametrize("layout", ["auto", "n1.6"])
+    def test_nothing_there_is_told_at_once(self, layout: str) -> None:
         began = now_ns()
-        with robot("", url="tcp://127.0.0.1:1") as client, pytest.raises(ServerDied, match="nothing answers at tcp"):
+        with (
+            pytest.raises(ServerDied, match="nothing answers at tcp"),
+            robot("", url="tcp://127.0.0.1:1", layout=layout) as client,
+        ):
             ask(client, Request("a", "go"))
         assert now_ns() - began < 10e9
 
@@ -507,6 +485,105 @@ class TestBlackBox:
             one_pipeline("zmq", url=url)
 
 
+def configs(mark: str) -> dict[str, Any]:
+    return {"video": {mark: True, "as_json": {"delta_indices": [0], "modality_keys": ["ego_view"]}}}
+
+
+class Policy:
+    """What a policy server does, and what it was sent."""
+
+    def __init__(self, answer: Any) -> None:
+        self.answer, self.requests = answer, list[Any]()
+
+    def __call__(self, request: Any) -> Any:
+        self.requests.append(request)
+        if request["endpoint"] != "get_action":
+            return self.answer if request["endpoint"] == "get_modality_config" else {"status": "ok"}
+        (picture,) = request["data"]["observation"]["video"].values()
+        if not isinstance(picture, np.ndarray):
+            return {"error": f"must be a numpy array. Got {type(picture)}"}
+        return [{"robot": CHUNK[np.newaxis]}, {}]
+
+    @property
+    def endpoints(self) -> list[str]:
+        return [request["endpoint"] for request in self.requests]
+
+
+class TestLayoutOfAServer:
+    """The layout `auto`."""
+
+    def test_n1_7s_configurations_have_its_arrays_sent(self, peer: Any) -> None:
+        answers = Policy(configs("__ModalityConfig__"))
+        with policy(answers, **mapped(peer)) as url, robot("", url=url) as client:
+            assert client.describe() == {"url": url, "template": "gr00t-n1.6", "layout": "n1.7"}
+            for number in range(2):
+                ask(client, Request(f"{number}", "go", (yuyv_frame(),)))
+        assert answers.endpoints == ["get_modality_config", "get_action", "get_action"]
+
+    def test_arrays_in_its_configurations_are_a_mark_too(self, peer: Any) -> None:
+        answers = Policy({"state": {"mean": np.zeros(2)}})
+        with policy(answers, **mapped(peer)) as url, robot("", url=url) as client:
+            ask(client, Request("a", "go", (yuyv_frame(),)))
+
+    @pytest.mark.parametrize(
+        "answer", [configs("__ModalityConfig_class__"), {}, {"error": "Unknown endpoint"}, {"state": np.zeros(2)}, [1]]
+    )
+    def test_all_others_have_n1_6s_sent(self, answer: Any) -> None:
+        answers = Policy(answer)
+        with policy(answers) as url, robot("", url=url) as client:
+            assert client.describe()["layout"] == "n1.6"
+            ask(client, Request("a", "go", (yuyv_frame(),)))
+        assert answers.endpoints == ["get_modality_config", "get_action"]
+
+    def test_the_key_goes_with_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("ROBOT_KEY", KEY)
+        answers = Policy({})
+        with policy(answers) as url, robot("", url=url, api_key_env="ROBOT_KEY"):
+            assert answers.requests == [{"endpoint": "get_modality_config", "api_token": KEY}]
+
+    def test_a_silent_server_and_one_of_another_kind_are_told(self) -> None:
+        begun = Event()
+        for answers, why in (
+            (lambda _: begun.wait(1) or {}, r"silent for too long: 0\.5 s"),
+            (lambda _: b"ERROR", "another kind of policy"),
+            (lambda _: b"PK\x03\x04", "no message"),
+        ):
+            with (
+                policy(answers) as url,
+                pytest.raises(RequestFailed, match=why),
+                robot("", url=url, timeout_s=0.5),
+            ):
+                pass
+
+    @pytest.mark.parametrize(("layout", "found"), [("auto", "n1.6"), ("n1.6", "n1.6"), ("n1.7", "n1.7")])
+    def test_our_own_server_tells_its_layout(self, layout: str, found: str) -> None:
+        handler = Recorder(list(CHUNK))
+        with serving(handler, layout=layout) as server, robot("", url=server.address) as client:
+            assert client.describe()["layout"] == found
+            ask(client, Request("a", "go", (yuyv_frame(),)))
+            with robot(server.address) as own:
+                assert own.describe()["layout"] == "n1.6"
+                ask(own, Request("b", "go", (yuyv_frame(),)))
+        assert [request.images[0].data.shape for request in handler.requests] == [(48, 64, 3)] * 2
+
+    def test_unless_told_it_has_the_marks_of_all_who_nest(self) -> None:
+        with serving(Recorder([])) as server, plain(server.address) as call:
+            video = call("get_modality_config")["video"]
+        assert (video.pop("__ModalityConfig_class__"), video.pop("__ModalityConfig__")) == (True, True)
+        assert video["as_json"]["modality_keys"] == ["ego_view"]
+
+    def test_a_run_records_it_and_no_sample_waits_for_it(self, peer: Any, tmp_path: Path) -> None:
+        answers = Policy(configs("__ModalityConfig__"))
+        with policy(answers, **mapped(peer)) as url:
+            config = LatencyConfig(transports=(f"zmq?url={url}",), runs=2, warmup=0, size=(64, 48))
+            run = read_run(run_latency(config, tmp_path, NullProgress()))
+        assert run.manifest["asked"] == {
+            f"zmq/gr00t?url={url}": {"url": url, "template": "gr00t-n1.6", "layout": "n1.7"}
+        }
+        assert answers.endpoints == ["get_modality_config", "get_action", "get_action"]
+        assert run.samples["error"].isna().all() or set(run.samples["error"]) == {""}
+
+
 class TestDangers:
     def test_who_answers_everybody_is_told_of_by_a_ping(self) -> None:
         told: list[Any] = []
@@ -517,10 +594,43 @@ class TestDangers:
 
         with policy(answers) as url:
             found = {finding.code: finding for finding in examine(url)}
-        assert told == [{"endpoint": "ping"}]
+        assert told == [{"endpoint": "ping"}, {"endpoint": "get_modality_config"}]
         assert found["no-key"].level == "advice"
         assert "`kill`" in found["no-key"].message
         assert found["pickle"].level == "advice"
+        assert "no answer tells which GR00T it is: early N1.7 servers unpickle" in found["pickle"].message
+
+    @pytest.mark.parametrize("answer", [b"ERROR", b"PK\x03\x04" + bytes(9), pickle.dumps({"status": "ok"})])
+    def test_n1_is_known_by_its_answer_to_a_ping(self, answer: bytes) -> None:
+        told: list[Any] = []
+        with policy(lambda request: told.append(request) or answer) as url:  # type: ignore[func-returns-value]
+            findings = examine(url)
+        assert told == [{"endpoint": "ping"}]
+        assert [(finding.code, finding.level) for finding in findings] == [
+            ("plain-text", "state"),
+            ("pickle", "warning"),
+        ]
+        assert "torch.load" in findings[1].message
+
+    @pytest.mark.parametrize(
+        ("mark", "level", "what"),
+        [
+            ("__ModalityConfig__", "advice", "GR00T N1.7's: early N1.7 servers unpickle arrays of kind O"),
+            ("__ModalityConfig_class__", "state", "N1.5's or N1.6's: they unpickle nothing"),
+        ],
+    )
+    def test_which_gr00t_may_unpickle_its_configurations_tell(self, mark: str, level: str, what: str) -> None:
+        with policy(Policy(configs(mark))) as url:
+            found = {finding.code: finding for finding in examine(url)}
+        assert found["pickle"].level == level
+        assert what in found["pickle"].message
+
+    @pytest.mark.parametrize("answer", [b"hello", [1], msgpack.packb(5)])
+    def test_what_is_no_gr00t_is_an_error(self, answer: Any) -> None:
+        with policy(lambda _: answer) as url:
+            found = {finding.code: finding for finding in examine(url)}
+        assert found["server"].level == "error"
+        assert "pickle" not in found
 
     def test_a_key_is_no_danger(self) -> None:
         with policy(lambda _: {"error": "Unauthorized: Invalid API token"}) as url:
@@ -534,6 +644,6 @@ class TestDangers:
 
 def test_it_carries_actions_and_state_alone() -> None:
     pipeline = one_pipeline("zmq")
-    assert pipeline.answers == ("actions",)
-    assert pipeline.transport.takes_state(pipeline.variant, pipeline.options)
-    assert pipeline.transport.travels("gr00t", one_pipeline("zmq", url="tcp://127.0.0.1:1").options) == ("raw",)
+    assert pipeline.capabilities.answer_kinds == ("actions",)
+    assert pipeline.capabilities.accepts_state
+    assert one_pipeline("zmq", url="tcp://127.0.0.1:1").capabilities.payloads == ("raw",)

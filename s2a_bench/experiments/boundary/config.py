@@ -5,13 +5,13 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
+from s2a_bench.boards.tokens import NO_JITTER, gaps_of
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.timeline.config import NO_JITTER
 from s2a_bench.options import Names, Numbers, Options, WholeNumbers, option
 
 if TYPE_CHECKING:
     from s2a_bench.boards.profile import Profile
-    from s2a_bench.policy.boundary import Grid
+    from s2a_bench.policy.evaluate import Grid
 
 PLANS: Final = 2000
 """Plans a point with jitter; without, one tells all."""
@@ -48,13 +48,12 @@ class BoundaryConfig(Options):
     @cached_property
     def boards(self) -> list[Profile]:
         """Read the profiles; raises UsageError for one that there is not."""
-        from s2a_bench.boards.search import load_profile
+        from s2a_bench.boards.profile import load_profile
 
         return [load_profile(name) for name in self.profiles]
 
     @property
     def virtual(self) -> bool:
-        """Return True: nothing is measured."""
         return True
 
     @property
@@ -64,28 +63,23 @@ class BoundaryConfig(Options):
 
     @property
     def grid(self) -> Grid:
-        """Return the plane's points."""
         import numpy as np
 
-        from s2a_bench.policy.boundary import Grid
+        from s2a_bench.policy.evaluate import Grid
 
         rates = np.geomspace(self.rates[0], self.rates[-1], self.rates_tried)
         return Grid(tuple(range(1, self.most_tokens + 1)), tuple(float(rate) for rate in rates))
 
     @property
     def rates_tried(self) -> int:
-        """Return how many rates the grid has."""
         return self.points if self.points is not None else MARKS if self.jitter == NO_JITTER else SHADES
 
     @property
     def plans_a_point(self) -> int:
-        """Return how many plans are tried at each point."""
         return self.plans if self.plans is not None else 1 if self.jitter == NO_JITTER else PLANS
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
-        from s2a_bench.experiments.timeline.plans import gaps_of
-
         if len(self.rates) != 2 or not 0 < self.rates[0] < self.rates[1] < float("inf"):  # noqa: PLR2004 - from, to
             raise UsageError("`rates`: should be two tokens/s, the lower first, as 0.3,60")
         for tokens in self.tokens_per_skill:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
 
-from s2a_bench.store.schema import Table
+from s2a_bench.store.schema import Fraction, Many, Positive, Table, about
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,15 +17,15 @@ class BoundaryRow:
     """
 
     duration: str
-    duration_s: float
-    tokens_per_skill: int
+    duration_s: Positive
+    tokens_per_skill: Annotated[Many, about("L, the delimiter included.")]
     tokens_per_s: float
     board: str
-    n_skills: int
-    family: str
-    plans: int
-    stall_free: bool
-    p_stall: float
+    n_skills: Many
+    family: Annotated[str, about("--jitter.")]
+    plans: Many
+    stall_free: Annotated[bool, about("What the formula says of even tokens.")]
+    p_stall: Annotated[Fraction, about("Share of the plans that stalled when tried.")]
 
 
 BOUNDARY: Final[Table[BoundaryRow]] = Table("boundary", BoundaryRow)

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from s2a_bench.boards.tokens import gaps_of
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
-from s2a_bench.experiments.study.worlds import generator
-from s2a_bench.experiments.timeline.plans import gaps_of
 from s2a_bench.machine import environment
-from s2a_bench.policy.boundary import Grid, analytic, simulate
 from s2a_bench.policy.conformal import TOLERANCE_S
+from s2a_bench.policy.evaluate import Grid, analytic, simulate
 from s2a_bench.provenance import Origins, Provenance
+from s2a_bench.stats.seeds import generator
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:

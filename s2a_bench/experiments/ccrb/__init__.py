@@ -8,8 +8,8 @@ EXPERIMENT = Experiment(
     "and when.",
     config="s2a_bench.experiments.ccrb.config:CcrbConfig",
     run="s2a_bench.experiments.ccrb.run:run_ccrb",
-    view="s2a_bench.experiments.ccrb.view:show",
-    cell="s2a_bench.experiments.ccrb.view.cell:CcrbCell",
+    view="s2a_bench.experiments.ccrb.view.tables:show",
+    cell="s2a_bench.experiments.ccrb.view.tables:CcrbCell",
     view_options="s2a_bench.experiments.ccrb.config:CcrbView",
     unit="parts",
 )

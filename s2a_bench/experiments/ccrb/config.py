@@ -2,28 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import Field
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.ccrb.asked import Asked, live_timeline
-from s2a_bench.options import Names, Numbers, Options, one_of, option
-from s2a_bench.policy import POLICIES
+from s2a_bench.inference import EngineConfig
+from s2a_bench.options import Names, Numbers, Options, group, one_of, option
+from s2a_bench.policy import COMPARED, POLICIES
 from s2a_bench.scenario import SIMULATORS
-from s2a_bench.scenario.ccrb.options import CcrbOptions
+from s2a_bench.scenario.ccrb.options import SKILL_SET, CcrbOptions
 
 if TYPE_CHECKING:
-    from s2a_bench.experiments.timeline.config import TimelineConfig
+    from s2a_bench.harness.timelines.config import TimelineConfig
+
+
+class Asked(Options):
+    """Which model answers, over which transport."""
+
+    live: bool = option(False, "take the tokens of a model that really answers, about the rendered scene")
+    transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]")
+    engine: EngineConfig = group(EngineConfig, only=("name", "model", "mmproj", "threads", "pace"), about="--live: ")
+
+    def check(self) -> None:
+        """Refuse what needs ``live``; raises UsageError naming the field."""
+        for name in () if self.live else self.given():
+            if name != "live":
+                raise UsageError(f"`{name}` is about a model that answers; it needs `live`")
+
 
 LONG_S: Final = 600.0
 """Plans that take longer than this are no driving."""
 SPANS: Final = {"phase_rates": 10_000.0, "phase_gaps_m": 1000.0}
 """Fields with a span, from and to, and the most that it may reach."""
-MODELLED: Final = ("rate", "prompt_s", "phase", "random", "all_followers", "sensitivity", "openscenario")
+MODELLED: Final = ("rate", "prompt_s", "phase", "random", "all_followers", "sensitivity")
 """Fields about tokens that are modelled, besides the profile: refused where a model answers."""
 
 DRAWN: Final = ("all_followers", "sensitivity", "seeds", "seed_points")
@@ -34,7 +49,7 @@ class CcrbConfig(Options):
     """What is driven; the defaults are the operating point at which the paper's outcome comes about."""
 
     policies: Names = option(
-        ("naive", "wait-then-act", "stream-to-act"),
+        COMPARED,
         f"{', '.join(POLICIES)}, with parameters as in NAME?parameter=value&other=value; several with commas",
         flag="policy",
     )
@@ -65,7 +80,6 @@ class CcrbConfig(Options):
     seed_points: int = option(128, "points that each of them draws", ge=1, le=65_536, hidden=True)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
     asked: Asked = Field(default_factory=Asked)
-    openscenario: Path | None = option(None, "also write the scenario as an OpenSCENARIO file, its road beside it")
 
     @property
     def virtual(self) -> bool:
@@ -74,13 +88,12 @@ class CcrbConfig(Options):
 
     @property
     def world(self) -> dict[str, Any]:
-        """Return the settings of the simulator."""
         return {"host": self.host} if self.simulator == "carla" else {}
 
     @cached_property
     def timeline(self) -> TimelineConfig:
         """Return the timeline run whose plans these are: one setting, even tokens."""
-        from s2a_bench.experiments.timeline.config import TimelineConfig
+        from s2a_bench.harness.timelines.config import TimelineConfig
 
         durations, rate = self.scenario.durations, self.asked.engine.pace if self.asked.live else self.rate
         return TimelineConfig(
@@ -98,8 +111,27 @@ class CcrbConfig(Options):
 
     @cached_property
     def request(self) -> TimelineConfig:
-        """Return the live timeline whose plan is driven in a live run."""
-        return live_timeline(self)
+        """Return the live timeline whose one plan is driven; raises UsageError naming the field."""
+        from s2a_bench.harness.timelines.config import TimelineConfig
+
+        asked = self.asked
+        played = asked.engine.kind.plays
+        skills, tokens = played or (SKILL_SET, self.tokens_per_skill)
+        if self.tokens_per_skill != tokens:
+            raise UsageError(
+                f"`engine` {asked.engine.name} writes {tokens} tokens a skill; leave out `tokens_per_skill`"
+            )
+        return TimelineConfig(
+            live=True,
+            transport=asked.transport,
+            engine=asked.engine,
+            profiles=(self.profile,) if played else (),
+            skills=skills,
+            policies=self.policies,
+            tokens_per_skill=(self.tokens_per_skill,),
+            n_skills=(self.scenario.skills,),
+            seed=self.seed,
+        )
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
@@ -109,16 +141,17 @@ class CcrbConfig(Options):
                 raise UsageError(f"`{name}`: should be two numbers above 0 and at most {most:g}, the lower first")
         if self.scenario.lane_change and self.simulator == "longitudinal":
             raise UsageError("`lane_change`: the longitudinal simulator knows one lane; take `simulator` embedded")
-        if self.openscenario is not None and self.openscenario.suffix != ".xosc":
-            raise UsageError(f"`openscenario`: {self.openscenario} should end in .xosc")
         if self.asked.live:
             self._check_live()
         self.timeline.check()
         self._check_length()
 
+    def risks(self) -> Iterator[tuple[str, str, str]]:
+        return self.request.risks() if self.asked.live else super().risks()
+
     def to_manifest(self) -> dict[str, Any]:
         """Return the options as plain data, those of the scenario among them, without those of the other mode."""
-        left_out = {"scenario", "asked", "openscenario"}
+        left_out = {"scenario", "asked"}
         left_out |= {name for name in DRAWN if getattr(self, name) == type(self).model_fields[name].default}
         left_out |= {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"} if self.asked.live else set()
         own = {**self.model_dump(exclude=left_out), **self.scenario.to_manifest()}
@@ -126,13 +159,12 @@ class CcrbConfig(Options):
 
     def _check_live(self) -> None:
         """Refuse what is about tokens that are modelled, and what the model cannot be asked."""
-        for name in MODELLED if self.asked.replayed else (*MODELLED, "profile"):
+        for name in MODELLED if self.asked.engine.kind.plays else (*MODELLED, "profile"):
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")
         _ = self.request
 
     def _check_length(self) -> None:
-        """Refuse plans that no drive could wait for."""
         board = self.timeline.boards[0]
         whole_s = board.prompt_s + self.tokens_per_skill * (self.scenario.n_skills + 1) / board.tokens_per_s
         if whole_s > LONG_S:

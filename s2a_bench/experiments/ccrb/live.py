@@ -6,35 +6,31 @@ parsed, as arrivals are those of parsed skills; the set-points that the ego driv
 
 from __future__ import annotations
 
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from s2a_bench.act.events import Event, PlanFeed, SkillCame
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.plans import Prepared, complete
-from s2a_bench.experiments.ccrb.point import drive_point
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.timeline.live.asks import Ask
-from s2a_bench.experiments.timeline.live.asks import prepare as prepare_policies
-from s2a_bench.experiments.timeline.live.link import Link, word
-from s2a_bench.experiments.timeline.rows import SKILLS
-from s2a_bench.machine import environment
-from s2a_bench.machine.tuning import keep_large_blocks, limit_threads
+from s2a_bench.experiments.ccrb.run import Prepared, complete, drive_point
+from s2a_bench.frames import FrameSource
+from s2a_bench.frames.stamp import Stamped
+from s2a_bench.harness.plan import FeedPlan
+from s2a_bench.harness.rounds import Launch, Task, run_requests
+from s2a_bench.harness.timelines.link import Ask, Link, word
+from s2a_bench.harness.timelines.policies import prepare as prepare_policies
 from s2a_bench.plan import Parser
 from s2a_bench.policy import Plans, PlanShape, Timing
-from s2a_bench.policy.conformal import TOLERANCE_S
 from s2a_bench.policy.estimator import GapPrior
-from s2a_bench.policy.metrics import stalls
-from s2a_bench.runtime.events import Event, SkillCame
-from s2a_bench.runtime.feed import PlanFeed
-from s2a_bench.scenario import simulator
-from s2a_bench.scenario.ccrb.source import RoadSource
-from s2a_bench.store.requests import TOKENS, samples_table
-from s2a_bench.store.run import RunWriter
+from s2a_bench.scenario import Simulator, simulator
+from s2a_bench.scenario.ccrb.render import RoadSource
+from s2a_bench.store.requests import SKILLS
 
 if TYPE_CHECKING:
     from s2a_bench.policy import Floats
@@ -46,37 +42,33 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
 
     Whatever happens, the requests so far are in the folder.
     """
-    limit_threads()
-    keep_large_blocks()
-    with ExitStack() as stack:
-        world = stack.enter_context(closing(simulator(config.simulator, **config.world)))
-        live = config.request
-        requests, (ask,) = word(live, progress)
-        source = RoadSource(config.scenario.cars, requests.width, requests.height, fps=requests.fps)
-        manifest = {
-            "configuration": {**config.to_manifest(), "live": {**live.to_manifest(), "source": source.name}},
-            "follower_law": config.scenario.follower_law,
-            "stages": requests.stages,
-            "facts": requests.facts,
-            "environment": environment.collect(requests.packages),
-            "seeds": {"sampling": requests.seed, "nonce": requests.nonce},
-        }
-        tables = (ROLLOUTS, TRAJECTORIES, SKILLS, samples_table(requests.stages), TOKENS)
-        writer = stack.enter_context(RunWriter.create(output, "ccrb", manifest, tables))
-        progress.opened(writer.path)
-        progress.expect(requests.warmup + 1)
-        link = Link(live, requests, writer, progress)
-        try:
-            link.connect(stack, source, f"{world.name} simulator")
-            prior = link.warm_up(ask)
-            progress.stage(f"one plan over {link.cell.name}")
-            ready = _hear(config, ask, link, prior)
-            progress.advance()
-            progress.stage("driving the operating point")
-            drive_point(config, ready, world, writer)
-        finally:
-            writer.update(warnings=[warning.to_manifest() for warning in link.warnings])
-        return writer.path
+
+    def road(feed: FeedPlan) -> FrameSource:
+        return Stamped(RoadSource(config.scenario.cars, *feed.size, fps=feed.fps), feed.nonce)
+
+    with closing(simulator(config.simulator, **config.world)) as world:
+        plan, (ask,) = word(config.request, progress)
+        live = {**config.request.to_manifest(), "source": RoadSource.name}
+        plan = plan.telling(
+            configuration={**config.to_manifest(), "live": live},
+            follower_law=config.scenario.follower_law,
+            seeds={"sampling": plan.request.seed, "nonce": plan.feed.nonce},
+        )
+        tables = (ROLLOUTS, TRAJECTORIES, SKILLS)
+        task = Task("ccrb", drive=partial(_drive, config, ask, world), tables=tables, source=road)
+        return run_requests(task, plan, output, progress)
+
+
+def _drive(config: CcrbConfig, ask: Ask, world: Simulator, launch: Launch) -> None:
+    progress = launch.progress
+    progress.expect(launch.plan.blocks.warmup + 1)
+    link = Link(config.request, launch, f"{world.name} simulator")
+    prior = link.warm_up(ask)
+    progress.stage(f"one plan over {link.cell.name}")
+    ready = _hear(config, ask, link, prior)
+    progress.advance()
+    progress.stage("driving the operating point")
+    drive_point(config, ready, world, launch.writer)
 
 
 def _hear(config: CcrbConfig, ask: Ask, link: Link, prior: GapPrior | None) -> Prepared:
@@ -112,8 +104,5 @@ def _hear(config: CcrbConfig, ask: Ask, link: Link, prior: GapPrior | None) -> P
         column(feed.token_ns),
         shape,
     )
-    following = prepare_policies(config.request, shape, prior)
-    ready = complete(config, setting, request_id, plans, following.policies())
-    gaps_s = {name: stalls(schedule) for name, schedule in ready.schedules.items()}
-    following.learn_plan(plans, {name: bool((gap_s > TOLERANCE_S).any()) for name, gap_s in gaps_s.items()})
-    return ready
+    policies = prepare_policies(config.request, shape, prior).policies()
+    return complete(config, setting, request_id, plans, policies)

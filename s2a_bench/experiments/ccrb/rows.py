@@ -1,22 +1,65 @@
-"""The rows of a CCRB run: roll-outs, and the trajectories of those that are shown."""
+"""The rows of a CCRB run, and the metrics of a policy at the operating point."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
+from s2a_bench.experiments import COUNT, TIME, Better, Metric, columns
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
-from s2a_bench.store.bounds import Count, Facts, Many, NonNegative, Positive, about
-from s2a_bench.store.schema import Table
+from s2a_bench.store.schema import Many, NonNegative, Positive, Table, about, with_fields
 
-Impact = Annotated[float, Facts(minimum=LEAST_IMPACT_MPS)]
+_DEADLINE: Final = (
+    "S_front: who brakes as planned from then on keeps 2 m to the lead; negative: too late from the beginning."
+)
+_IMPACT: Final = (LEAST_IMPACT_MPS, None)
+MPS2, MPS3 = "m/s\N{SUPERSCRIPT TWO}", "m/s\N{SUPERSCRIPT THREE}"
+
+
+def _metric(name: str, unit: str, title: str = "", better: Better = "lower", **more: Any) -> Metric:
+    """Return a metric that is 0 or more; of a time or a count every roll-out has a value."""
+    return Metric(name, unit, better, title, **{"bounds": (0, None), "optional": "kind" not in more, **more})
+
+
+TIMES: Final = (
+    _metric("start_s", "s", "start", kind=TIME),
+    _metric("end_s", "s", kind=TIME),
+    _metric("stalls", "", "stalls", kind=COUNT),
+    _metric("stall_s", "s", "stalled", kind=TIME),
+    _metric("deadline_s", "s", kind=TIME, bounds=(None, None), about=_DEADLINE),
+)
+"""When the ego acted."""
+IMPACTS: Final = (
+    _metric("impact_speed_mps", "m/s", "impact", bounds=_IMPACT, about="Of the harder impact; absent without one."),
+    _metric("front_impact_mps", "m/s", bounds=_IMPACT),
+    _metric("rear_impact_mps", "m/s", bounds=_IMPACT),
+    _metric("min_front_gap_m", "m", "front gap", "higher", optional=False),
+    _metric("min_rear_gap_m", "m", "rear gap", "higher"),
+)
+"""What became of the cars."""
+MARGINS: Final = (
+    _metric("min_front_ttc_s", "s", "TTC front", "higher", about="Absent where the cars never closed in."),
+    _metric("min_rear_ttc_s", "s", "TTC rear", "higher"),
+    _metric(
+        *("required_decel_mps2", MPS2, "DRAC"),
+        about="Greatest closing speed^2 / (2 gap) towards the lead; absent with a front impact.",
+    ),
+)
+"""How near an impact was."""
+MOTION: Final = (
+    _metric("rms_jerk", MPS3, "RMS jerk"),
+    _metric("peak_jerk", MPS3, "peak jerk"),
+    _metric("sparc", "", "SPARC", "higher", bounds=(None, 0)),
+)
+"""How smoothly the ego drove."""
+METRICS: Final = (*TIMES, *IMPACTS, *MARGINS, *MOTION)
 
 
 @dataclass(frozen=True, slots=True)
-class RolloutRow:
-    """One roll-out of the driving scenario: what was tried, and what became of the cars. SI units.
+class AboutRollout:
+    """What a row of `ROLLOUTS` says of a roll-out besides the metrics: what was tried. SI units.
 
     ``study`` is what it belongs to: point, phase or random; ``draw`` counts its scenarios. ``title`` names the board.
     ``late`` says that s2a-ttc could not keep the deadline ``deadline_ns`` (S_front) without stalls; null for others.
@@ -53,27 +96,19 @@ class RolloutRow:
         bool | None,
         about("Whether the car behind stops behind an ego whose tokens come at once; if not, rear says nothing."),
     ]
-    start_ns: int
-    end_ns: int
-    stalls: Count
-    stall_ns: int
-    deadline_ns: int
-    late: Annotated[bool | None, about("s2a-ttc only: no stall-free start keeps the deadline.")]
-    outcome: Annotated[str, {"enum": ["none", "front", "rear", "both"]}]
-    impact_speed_mps: Annotated[Impact | None, about("Of the harder impact; absent without one.")]
-    front_impact_mps: Impact | None
-    rear_impact_mps: Impact | None
-    min_front_gap_m: NonNegative
-    min_rear_gap_m: NonNegative | None
-    min_front_ttc_s: Annotated[NonNegative | None, about("Absent where the cars never closed in.")]
-    min_rear_ttc_s: NonNegative | None
-    required_decel_mps2: Annotated[
-        NonNegative | None,
-        about("Greatest closing speed^2 / (2 gap) towards the lead; absent with a front impact."),
-    ]
-    rms_jerk: NonNegative | None = None
-    peak_jerk: NonNegative | None = None
-    sparc: Annotated[float | None, {"maximum": 0}] = None
+
+
+RolloutRow: Final = with_fields(
+    "RolloutRow",
+    "One roll-out of the driving scenario: what was tried, and what became of the cars.",
+    AboutRollout,
+    {
+        **columns(TIMES),
+        "late": Annotated[bool | None, about("s2a-ttc only: no stall-free start keeps the deadline.")],
+        "outcome": Annotated[str, {"enum": ["none", "front", "rear", "both"]}],
+        **columns((*IMPACTS, *MARGINS, *MOTION)),
+    },
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +175,7 @@ class TrajectoryRow:
     rear_acceleration_mps2: float
 
 
-ROLLOUTS: Final[Table[RolloutRow]] = Table("rollouts", RolloutRow)
+ROLLOUTS: Final[Table[AboutRollout]] = Table("rollouts", RolloutRow)
 """One row a roll-out of the driving scenario."""
 
 

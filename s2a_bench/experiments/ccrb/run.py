@@ -1,32 +1,128 @@
-"""The CCRB run: the policies at one operating point, and where their ordering holds."""
+"""The CCRB run: one plan at the operating point, driven by every policy; and where their ordering holds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.plans import prepare
-from s2a_bench.experiments.ccrb.point import drive_point
 from s2a_bench.experiments.ccrb.rows import FOLLOWER_STUDY, ROLLOUTS, SENSITIVITY, TRAJECTORIES
-from s2a_bench.experiments.ccrb.studies import pieces, studies, study_rows
-from s2a_bench.experiments.ccrb.variations import VARIED, follower_rows, sensitivity_rows
-from s2a_bench.experiments.timeline.rows import SKILLS
-from s2a_bench.experiments.timeline.to_rows import token_rows
+from s2a_bench.experiments.ccrb.studies import (
+    VARIED,
+    follower_rows,
+    motion_of,
+    pieces,
+    rollout_rows,
+    sensitivity_rows,
+    studies,
+    study_rows,
+    trajectory_rows,
+)
+from s2a_bench.harness.timelines.config import Setting, settings
+from s2a_bench.harness.timelines.policies import draw, learn
+from s2a_bench.harness.timelines.rows import skill_rows, to_ns, token_rows
 from s2a_bench.machine import environment
+from s2a_bench.plan.skillset import Durations
+from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.provenance import Origins
-from s2a_bench.scenario import simulator
+from s2a_bench.scenario import Simulator, simulator
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import NCAP_DECELS_MPS2, NCAP_GAPS_M
-from s2a_bench.store.requests import TOKENS
+from s2a_bench.scenario.ccrb.drive import drive
+from s2a_bench.scenario.ccrb.ttc import NAME as TTC
+from s2a_bench.scenario.ccrb.ttc import ttc_aware
+from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.schema import Table
 
 if TYPE_CHECKING:
     from s2a_bench.progress import Progress
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """One plan, ready to be driven by every policy."""
+
+    setting: Setting
+    request_id: str
+    plans: Plans
+    schedules: dict[str, Schedule]
+    late: bool | None
+    """Whether s2a-ttc missed its deadline; None where it was not asked for."""
+
+
+def prepare(config: CcrbConfig) -> Prepared:
+    """Let the board's tokens come, and ask the policies; they are the plans' ``token_s``."""
+    board, setting = next(settings(config.timeline))
+    known = learn(config.timeline, board, setting)
+    _, plans = draw(config.timeline, board, setting, 1, "plans")
+    policies = {name: known.prepare(policy) for name, policy in config.timeline.chosen.items()}
+    return complete(config, setting, setting.request_id(0), plans, policies)
+
+
+def complete(
+    config: CcrbConfig, setting: Setting, request_id: str, plans: Plans, policies: Mapping[str, Policy]
+) -> Prepared:
+    """Ask the policies about a plan, drawn or heard."""
+    asked = config.scenario
+    if asked.lane_change:
+        plans = with_lane_change(plans, asked.lane_durations)
+    schedules = {name: policy.schedule(plans) for name, policy in policies.items()}
+    late = None
+    if config.ttc:
+        timed = ttc_aware(plans, asked.deadline_s)
+        schedules[TTC], late = timed.schedule, bool(timed.late[0])
+    return Prepared(setting, request_id, plans, schedules, late)
+
+
+def with_lane_change(plans: Plans, lane: Durations) -> Plans:
+    """Let the last skill take as long as a lane change."""
+    changed: dict[str, Any] = {name: np.array(getattr(plans, name)) for name in ("nominal_s", "least_s", "most_s")}
+    for name, value in changed.items():
+        value[-1] = getattr(lane, name)
+    return replace(plans, **changed)
+
+
+def drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: RunWriter) -> None:
+    """Drive the policies one after the other, and keep everything."""
+    asked = config.scenario
+    for name, schedule in ready.schedules.items():
+        driven = drive(world, asked.cars, asked.driving, schedule, record=True)
+        path = driven.trajectory
+        assert path is not None  # noqa: S101 - as asked for
+        cell = f"{ready.setting.name}/{asked.gap}/{name}"
+        late = ready.late if name == TTC else None
+        about = {**_about(config, ready, world), "cell": cell, "policy": name, "late": late}
+        writer.append(ROLLOUTS, rollout_rows(about, schedule, driven.outcomes, motion=motion_of(path)))
+        writer.append(SKILLS, skill_rows(cell, ready.plans, schedule, [ready.request_id], texts=[asked.texts]))
+        writer.append(TRAJECTORIES, trajectory_rows(cell, path))
+
+
+def _about(config: CcrbConfig, ready: Prepared, world: Simulator) -> dict[str, Any]:
+    """Return what the roll-outs of the operating point have in common."""
+    setting, asked = ready.setting, config.scenario
+    of_setting = ("board", "title", "emulated", "tokens_per_s", "prompt_s", "n_skills", "t_nom_s")
+    of_scenario = ("follower", "reflex", "lane_change", "front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s")
+    return {
+        "study": "point",
+        "draw": 0,
+        "simulator": world.name,
+        "gap_behaviour": asked.gap,
+        "tokens_per_skill": config.tokens_per_skill,
+        "speed_mps": float(asked.driving.set_point_mps[0, 0]),
+        "plan_decel_mps2": asked.decel_mps2,
+        "follower_survives": asked.follower_survives,
+        "deadline_ns": to_ns(asked.deadline_s),
+        **{name: getattr(setting, name) for name in of_setting},
+        **{name: getattr(asked, name) for name in of_scenario},
+    }
+
 
 _BOARD = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin")
 
@@ -47,11 +143,6 @@ def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
             "boards": [{name: getattr(board, name) for name in _BOARD}],
             "provenance": Origins(board.provenance).to_manifest(),
         }
-        if config.openscenario is not None:
-            from s2a_bench.scenario.ccrb.openscenario import write_openscenario
-
-            written = write_openscenario(config.openscenario, config.scenario, ready.schedules)
-            manifest["openscenario"] = [str(path) for path in written]
         with RunWriter.create(output, "ccrb", manifest, (ROLLOUTS, TRAJECTORIES, SKILLS, TOKENS)) as writer:
             progress.opened(writer.path)
             progress.stage("driving the operating point")

@@ -8,6 +8,6 @@ EXPERIMENT = Experiment(
     config="s2a_bench.experiments.chunks.config:ChunksConfig",
     run="s2a_bench.experiments.chunks.run:run_chunks",
     view="s2a_bench.experiments.chunks.view:show",
-    cell="s2a_bench.experiments.chunks.view.cell:ChunkCell",
+    cell="s2a_bench.experiments.chunks.view.tables:ChunkCell",
     unit="cells",
 )

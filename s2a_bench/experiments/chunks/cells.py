@@ -1,18 +1,15 @@
-"""What is tried: each mode as it is given, and the first queue again with its trigger chosen by each rule."""
+"""What is tried: each mode as given, and the first whose trigger rules may choose again, with each rule's."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from s2a_bench.experiments.chunks.closed import execution_horizon
-from s2a_bench.experiments.study.worlds import generator
-from s2a_bench.policy.chunks.append import Queue
-from s2a_bench.policy.chunks.learning import Learning
-from s2a_bench.policy.chunks.trigger import Maximum, Mean, Rule, Tracked, calibrate, follow, trigger
-from s2a_bench.policy.chunks.varied import Varied
+from s2a_bench.policy.chunks.trigger import Learning, Maximum, Mean, Rule, Tracked, calibrate, follow, trigger
+from s2a_bench.policy.parameters import canonical
+from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.config import ChunksConfig
@@ -47,10 +44,18 @@ class Cell:
     triggers: tuple[int, ...] = ()
     slower: float = 1.0
     """So many times slower than the others it executes its actions (time-scaling)."""
+    begin: Callable[[], Rule] | None = None
+    """Makes the rule that chooses triggers while it acts."""
+
+    @property
+    def acting(self) -> Mode:
+        """Return the mode with the triggers that a rule chose, or chooses as it acts."""
+        if self.begin is not None:
+            return Learning(self.mode, self.begin)
+        return self.mode.varied(self.triggers) if self.triggers else self.mode
 
     @property
     def cell(self) -> str:
-        """Return its name."""
         rule = "" if self.rule == GIVEN else f", {self.rule}"
         return f"{self.name}{rule} @ {self.drawn.source.name}"
 
@@ -70,26 +75,31 @@ def draw(config: ChunksConfig, source: Source) -> Drawn:
 
 def cells(config: ChunksConfig, drawn: Drawn) -> Iterator[Cell]:
     """Yield the cells of one source; live, nothing has been judged yet."""
-    for name, mode in config.made.items():
-        yield Cell(mode, name, GIVEN, drawn)
-    queue = next((mode for mode in config.made.values() if isinstance(mode, Queue)), None)
-    if queue is None:
+    for name, given in config.made.items():
+        yield Cell(given, name, GIVEN, drawn)
+    mode = config.triggered
+    if mode is None:
         return
-    name = f"queue?execute={queue.execute}" if queue.execute else "queue"
+    name = without_trigger(mode)
     for rule in config.rules_tried:
-        most = max(1, execution_horizon(queue, config.setting) - 1)
+        most = max(1, mode.execution_horizon(config.setting) - 1)
         if rule in FIXED:
             ready_ns = (
                 calibrate(drawn.learnt, config.epsilon).caution if rule == "calibrated" else _oracle_ns(config, drawn)
             )
             chosen = trigger(ready_ns, config.setting, most)
-            mode = replace(queue, trigger=chosen.ticks)
-            yield Cell(mode, name, rule, drawn, (chosen.ticks,), min(chosen.beta, config.slowest))
+            triggers = (chosen.ticks,)
+            yield Cell(mode, name, rule, drawn, triggers, min(chosen.beta, config.slowest))
         elif config.live:
-            yield Cell(Learning(partial(_made, config, rule, drawn), queue.execute), name, rule, drawn)
+            yield Cell(mode, name, rule, drawn, begin=partial(_made, config, rule, drawn))
         else:
-            triggers = follow(_made(config, rule, drawn), drawn.judged, config.setting, most).trigger.tolist()
-            yield Cell(Varied(tuple(triggers), queue.execute), name, rule, drawn, tuple(triggers))
+            triggers = tuple(follow(_made(config, rule, drawn), drawn.judged, config.setting, most).tolist())
+            yield Cell(mode, name, rule, drawn, triggers)
+
+
+def without_trigger(mode: Mode) -> str:
+    """Name a mode whatever its trigger."""
+    return canonical(mode.name, mode.varied((0,)))
 
 
 def _made(config: ChunksConfig, rule: str, drawn: Drawn) -> Rule:

@@ -1,33 +1,68 @@
-"""What a run of chunks tries, and what it refuses."""
+"""What a run of chunks tries, live whom it asks, and what it refuses."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 from pydantic import BeforeValidator
 
+from s2a_bench import extras
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.latencies import split
-from s2a_bench.experiments.chunks.live.config import SHOWN, LiveRequests
+from s2a_bench.harness.config import FirstVariants, RequestsConfig
+from s2a_bench.inference import STAND_IN, EngineConfig
 from s2a_bench.options import Names, Options, group, one_of, option
-from s2a_bench.policy.chunks import Rounding
+from s2a_bench.policy.chunks import COMPARED, MODES, Rounding
+from s2a_bench.transport import TRANSPORTS
+from s2a_bench.transport.defaults import ACTING
 
 if TYPE_CHECKING:
+    from s2a_bench.act import ActionKind
     from s2a_bench.experiments.chunks.latencies import Source
     from s2a_bench.policy.chunks import Mode, Setting
-    from s2a_bench.robots.plant import Plant
+
+SHOWN: Final = (
+    *("transports", "variants", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
+    *("prompt", "warmup", "timeout_s", "deadline_s", "sample_resources_hz", "nonce"),
+)
+"""The options that are flags of `chunks`."""
+
+
+class LiveRequests(RequestsConfig):
+    """The requests of a control loop."""
+
+    COUNTS_TOKENS: ClassVar[str] = ""
+
+    transports: Names = option(
+        ACTING[:1] if all(map(extras.installed, TRANSPORTS[ACTING[0]].packages)) else ACTING[1:],
+        "transports as in latency; several with commas, each with every mode "
+        f"[default: {ACTING[0]}, {ACTING[1]} where its packages are not installed]",
+        flag="transport",
+    )
+    variants: FirstVariants = group(FirstVariants)
+    engine: EngineConfig = group(EngineConfig, only=("name", "profile", "gaps", "action_dim"))
+    warmup: int = option(5, "requests before a cell's loop starts, kept and marked", ge=1, le=10**6)
+    sample_resources_hz: float = option(
+        0.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0
+    )
+
+    def check(self) -> None:
+        """Refuse what makes no sense; nothing where nobody is asked for anything, as in virtual time."""
+        if self.model_fields_set:
+            super().check()
+
 
 RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
 """What may choose the trigger of queue."""
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
-VIRTUAL: Final = ("cycles", "calibration_cycles", "stability", "tokens_per_action")
+VIRTUAL: Final = ("cycles", "calibration_cycles", "tokens_per_action")
 """Options that live runs do not have."""
 FASTEST_LIVE_HZ: Final = 10_000.0
 MOST_LIVE_TICKS: Final = 1_000_000
@@ -40,8 +75,8 @@ class ChunksConfig(Options):
     """Modes and rules under latencies."""
 
     modes: Names = option(
-        ("sync", "queue?trigger=6", "replace?execute=8", "aggregate?trigger=6"),
-        "sync, queue, streamed, replace, aggregate, each with ?parameter=value&...; several with commas",
+        COMPARED,
+        f"{', '.join(MODES)}, each with ?parameter=value&...; several with commas",
     )
     latency: Sources = option(
         (EXAMPLE,),
@@ -71,12 +106,6 @@ class ChunksConfig(Options):
     shown_ticks: int = option(
         120, "control ticks of each row that are drawn, and in virtual time kept", ge=0, le=100_000
     )
-    stability: int = option(
-        33,
-        "mean latencies of the diagrams of stability (first replace) and smoothness, from 0 to H ticks; 0 for none",
-        ge=0,
-        le=1000,
-    )
     robot: str = option(
         "plant",
         "what takes the actions: plant?frequency_hz=5&damping=1, live also ros?topic=/NAME, call?function=MODULE:NAME; "
@@ -95,7 +124,6 @@ class ChunksConfig(Options):
 
     @property
     def virtual(self) -> bool:
-        """Return whether nothing is measured."""
         return not self.live
 
     @cached_property
@@ -103,7 +131,7 @@ class ChunksConfig(Options):
         """Return what the control loop asks for, live; raises UsageError naming the field."""
         told: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
         if self.known:
-            told |= {"latency": self.known} | ({"name": "echo"} if not self.requests.engine.model_fields_set else {})
+            told |= {"latency": self.known} | ({"name": STAND_IN} if not self.requests.engine.model_fields_set else {})
         return self.requests.but(engine=self.requests.engine.but(**told), seed=self.seed, runs=1)
 
     @property
@@ -112,12 +140,10 @@ class ChunksConfig(Options):
         return self.latency[0] if "latency" in self.model_fields_set else ""
 
     def named(self, pipeline: str) -> str:
-        """Return what a row says of where latencies come from, live."""
         return f"{pipeline}, {self.known}" if self.known else pipeline
 
     @property
     def setting(self) -> Setting:
-        """Return what all modes are told."""
         from s2a_bench.policy.chunks import Setting
 
         return Setting(round(1e9 / self.control_hz), self.horizon, self.rounding).slowed(self.slow_down)
@@ -125,7 +151,6 @@ class ChunksConfig(Options):
     @cached_property
     def made(self) -> dict[str, Mode]:
         """Return the modes by their names with parameters; raises UsageError naming the field."""
-        from s2a_bench.policy.chunks import MODES
         from s2a_bench.policy.parameters import build, canonical
 
         known = {written: written.partition("?")[0] for written in self.modes}
@@ -134,8 +159,10 @@ class ChunksConfig(Options):
         made = [build(MODES[name], written, "modes") for written, name in known.items()]
         found = {canonical(each.name, each): each for each in made}
         for name, each in found.items():
-            if getattr(each, "execute", 0) > self.horizon:
-                raise UsageError(f"`modes`: {name}: a chunk has {self.horizon} actions (`horizon`)")
+            try:
+                each.execution_horizon(self.setting)
+            except ValueError as error:
+                raise UsageError(f"`modes`: {name}: a chunk has {self.horizon} actions (`horizon`)") from error
         return found
 
     @cached_property
@@ -148,16 +175,16 @@ class ChunksConfig(Options):
         )
 
     @cached_property
-    def plant(self) -> Plant | None:
+    def plant(self) -> ActionKind | None:
         """Return what takes actions in virtual time; raises UsageError naming the field."""
-        from s2a_bench.robots import kind
-        from s2a_bench.robots.plant import Plant
+        from s2a_bench.act import ActionKind, kind
 
         if not self.robot:
             return None
-        found = kind(self.robot)
-        if not isinstance(found, Plant):
-            raise UsageError(f"`robot`: {found.name}: virtual time has no actions to send; name a plant, or nothing")
+        found = kind(self.robot, ActionKind)
+        if not found.simulated:
+            name = self.robot.partition("?")[0]
+            raise UsageError(f"`robot`: {name}: virtual time has no actions to send; name a plant, or nothing")
         return found
 
     @property
@@ -165,10 +192,14 @@ class ChunksConfig(Options):
         """Return what chooses triggers; live nothing unless it is asked for."""
         return self.rules if not self.live or "rules" in self.model_fields_set else ()
 
+    @cached_property
+    def triggered(self) -> Mode | None:
+        """Return the first mode whose trigger rules may choose."""
+        return next((each for each in self.made.values() if each.triggered), None)
+
     @property
     def with_rules(self) -> bool:
-        """Return whether rules choose the trigger of a queue."""
-        return bool(self.rules_tried) and any(each.name == "queue" for each in self.made.values())
+        return bool(self.rules_tried) and self.triggered is not None
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
@@ -188,16 +219,19 @@ class ChunksConfig(Options):
             recorded = source.recorded_ns
             learnt = self.calibration_cycles if recorded is None else min(self.calibration_cycles, recorded.size // 2)
             if self.with_rules:
-                _promised(source.name, learnt, self.epsilon, check)
+                try:
+                    check(learnt, self.epsilon)
+                except UsageError as error:
+                    raise UsageError(f"{error}; or leave the `rules` out ({source.name})") from error
             if recorded is not None and recorded.size - learnt * self.with_rules < 2:  # noqa: PLR2004 - a boundary
                 raise UsageError(f"`latency`: {source.name} has {recorded.size} latencies; two or more are needed")
 
     def _check_live(self) -> None:
         """Refuse what only virtual time has, and what no server could be told."""
-        from s2a_bench.robots import kind
+        from s2a_bench.act import ActionKind, kind
 
         if self.robot:
-            kind(self.robot)
+            kind(self.robot, ActionKind)
         said = self.model_fields_set
         if alone := next((field for field in VIRTUAL if field in said), ""):
             raise UsageError(f"`{alone}` is for virtual time; live there are `seconds` and `warmup`")
@@ -210,7 +244,6 @@ class ChunksConfig(Options):
         self._check_file()
 
     def _check_ticks(self) -> None:
-        """Refuse live loops that nobody could run."""
         if self.seconds * 1e9 < 2 * self.setting.period_ns:
             raise UsageError(
                 f"`seconds`: {self.seconds:g} s are less than two ticks at `control_hz` {self.control_hz:g}"
@@ -226,7 +259,6 @@ class ChunksConfig(Options):
             )
 
     def _check_learning(self) -> None:
-        """Refuse live rules that know, or have learnt, too little."""
         if "oracle" in self.rules_tried:
             raise UsageError("`rules`: nobody is an oracle live; take calibrated, tracked, maximum or mean")
         if {"calibrated", "tracked"} & {*self.rules_tried} and self.with_rules:
@@ -250,16 +282,15 @@ class ChunksConfig(Options):
         if file is not None and (file.suffix != ".csv" or not file.parent.is_dir()):
             raise UsageError(f"`export_delays`: {file} should be a .csv file in a folder that there is")
 
+    def risks(self) -> Iterator[tuple[str, str, str]]:
+        from s2a_bench.act import ActionKind, kind
+
+        yield from super().risks()
+        if self.robot and (risk := kind(self.robot, ActionKind).risk):
+            yield "robot", risk, self.robot
+
     def to_manifest(self) -> dict[str, Any]:
         """Return the options as plain data, with the numbers that follow from others."""
         file = None if self.export_delays is None else str(self.export_delays)
         more = {"modes": list(self.made), "period_ns": self.setting.period_ns, "export_delays": file}
         return {**self.model_dump(exclude={"requests"}), **more}
-
-
-def _promised(name: str, learnt: int, epsilon: float, check: Any) -> None:
-    """Refuse rules that have too little to learn from."""
-    try:
-        check(learnt, epsilon)
-    except UsageError as error:
-        raise UsageError(f"{error}; or leave the `rules` out ({name})") from error

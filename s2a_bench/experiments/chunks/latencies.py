@@ -1,22 +1,28 @@
-"""Where latencies come from: what `boards.latency` reads, a run folder, a profile."""
+"""Where latencies come from: what `boards.latency` reads, a run folder, a profile; and delays, written for others."""
 
 from __future__ import annotations
 
+import csv
+import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.boards.gaps import Gaps
 from s2a_bench.boards.latency import draw_ns, read_latency, whole_ns
-from s2a_bench.errors import UsageError
+from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.provenance import NONE, Provenance
+from s2a_bench.store.run import fits, read_run
 
 if TYPE_CHECKING:
     import numpy as np
+    import pandas as pd
 
-    from s2a_bench.policy.chunks import Ints
+    from s2a_bench.experiments.chunks.cells import Drawn
+    from s2a_bench.policy.chunks import Ints, Mode, Setting
+    from s2a_bench.store.run import Run
 
 _PARAMETER: Final = re.compile(r"\s*\w+\s*=")
 
@@ -34,18 +40,17 @@ class Source:
     """Tokens of a chunk, where a profile answers."""
     weights: str = NONE
     requests: tuple[Mapping[str, object], ...] = ()
-    """Of measured ones what is known of each request, by the columns of `delays.COLUMNS`."""
+    """Of measured ones what is known of each request, by the columns of `COLUMNS`."""
 
     @property
     def provenance(self) -> Provenance:
-        """Return where numbers come from that are computed with these latencies."""
         return Provenance.computed(self.name, self.weights)
 
     def draw(self, rng: np.random.Generator, count: int) -> Ints:
         """Draw latencies of shape (count,), in ns; raises TypeError for recorded ones, which are not drawn."""
         if self.profile:
-            from s2a_bench.boards.search import load_profile
-            from s2a_bench.experiments.timeline.plans import AS_PROFILE, board_of_profile
+            from s2a_bench.boards.profile import load_profile
+            from s2a_bench.boards.tokens import AS_PROFILE, board_of_profile
 
             board = board_of_profile(load_profile(self.profile), AS_PROFILE, None)
             return whole_ns(board.tokens(self.tokens, rng, count)[-1])
@@ -62,8 +67,6 @@ def sources(written: str, tokens: int) -> Iterator[Source]:
     if (read := read_latency(written)) is not None:
         yield Source(written, read.gaps, read.recorded_ns)
     elif Path(folder := written.partition("#")[0]).is_dir():
-        from s2a_bench.experiments.chunks.measured import measured
-
         yield from measured(Path(folder), written.partition("#")[2])
     else:
         yield _of_profile(written, tokens)
@@ -81,9 +84,141 @@ def split(value: object) -> object:
 
 
 def _of_profile(written: str, tokens: int) -> Source:
-    from s2a_bench.boards.search import load_profile, profile_files
+    from s2a_bench.boards.profile import load_profile, profile_files
 
     if written not in profile_files() and not (written.endswith(".toml") and Path(written).is_file()):
         kinds = "a number of ms, a family, a .csv file, a run folder, or a profile of 'profile list'"
         raise UsageError(f"`latency`: '{written}' should be {kinds}")
     return Source(written, profile=written, tokens=tokens, weights=load_profile(written).weights)
+
+
+def measured(folder: Path, only: str = "") -> Iterator[Source]:
+    """Yield the latencies of each cell of a latency or throughput run, or of one, in the order of asking.
+
+    Failed requests and warm-ups are left out. Raises StoreError where there is no run, UsageError where it has no
+    answers, or no such cell.
+    """
+    import numpy as np
+
+    run = read_run(folder)
+    with fits(run):
+        samples = run.samples
+        good = samples[~samples["warmup"] & (samples["error"] == "") & samples["e2e_ns"].notna()]
+        cells = list(good["cell"].unique())
+        if not cells:
+            raise UsageError(
+                f"`latency`: {folder} holds no answers; give the run folder of a latency or throughput run"
+            )
+        if only and only not in cells:
+            raise UsageError(f"`latency`: {folder} has no cell '{only}', only {', '.join(cells)}")
+        spans = _pieces(run)
+        for cell in [only] if only else cells:
+            requests = [_request(row, run, spans) for row in good[good["cell"] == cell].to_dict("records")]
+            yield Source(
+                f"{folder}#{cell}",
+                recorded_ns=np.array([request["latency_ns"] for request in requests], np.int64),
+                weights=run.origins.of(cell).weights,
+                requests=tuple({**request, "provenance": run.origins.of_row(cell)} for request in requests),
+            )
+
+
+def _request(row: Mapping[Any, Any], run: Run, pieces: Mapping[str, tuple[int, int | None]]) -> dict[str, Any]:
+    """Return what is known of a request: its marks by the group of stages that ends there, null where there is none."""
+    marks = json.loads(row["marks"])
+    ends = {run.stages.get(stage, ""): at_ns for stage, at_ns in marks}
+    streaming_ns, last_engine_ns = pieces.get(row["request_id"], (0, None))
+    latency_ns = int(row["e2e_ns"]) + streaming_ns
+    return {
+        "observation_ns": marks[0][1],
+        "sent_ns": ends.get("pack"),
+        "server_in_ns": ends.get("network"),
+        "server_out_ns": last_engine_ns or ends.get("inference"),
+        "received_ns": marks[0][1] + latency_ns,
+        "bytes": _whole(row["payload_bytes"]),
+        "latency_ns": latency_ns,
+    }
+
+
+def _pieces(run: Run) -> dict[str, tuple[int, int | None]]:
+    """Return by request how long after the first piece the last one came, and when that left the engine."""
+    found: pd.DataFrame = run.tokens.groupby("request_id").agg(
+        first=("client_ns", "min"), last=("client_ns", "max"), left=("engine_ns", "max")
+    )
+    return {str(name): (int(last - first), _whole(left)) for name, first, last, left in found.itertuples()}
+
+
+def _whole(value: Any) -> int | None:
+    import pandas as pd
+
+    return None if pd.isna(value) else int(value)
+
+
+COLUMNS: Final = (
+    "request",
+    "observation_ns",
+    "sent_ns",
+    "server_in_ns",
+    "server_out_ns",
+    "received_ns",
+    "bytes",
+    "latency_ns",
+    "d",
+    "rounding",
+    "delta_t_ns",
+    "provenance",
+)
+"""Columns of delays as CSV, for simulators that assume one so far: a row a request, its times and d.
+
+| column | meaning |
+|---|---|
+| request | number, from 0 |
+| observation_ns, received_ns | when the observation was made, when the whole chunk was there; L is their difference |
+| sent_ns, server_in_ns, server_out_ns | on the way there, at the server, on the way back; empty where nobody knows |
+| bytes | of the request; empty where nothing travelled |
+| latency_ns | L |
+| d | L in control ticks, by the convention of the column ``rounding`` (floor, ceil) |
+| delta_t_ns | the control tick that d counts in |
+
+All times are whole ns of one clock. What a reader needs of it says `boards.latency`, which reads it back.
+"""
+
+
+def delay_rows(drawn: Drawn, mode: Mode, setting: Setting) -> Iterator[dict[str, object]]:
+    """Yield a row a request: of measured latencies when each really was made, else as ``mode`` makes them.
+
+    Of a measured run all requests that count are there, also those that rules learn from.
+    """
+    source = drawn.source
+    requests = source.requests or _simulated(drawn, mode, setting)
+    for number, request in enumerate(requests):
+        yield {
+            "request": number,
+            "provenance": source.provenance.code,
+            **{name: "" if value is None else value for name, value in request.items()},
+            "d": _delay(request["latency_ns"], setting),
+            "rounding": setting.rounding,
+            "delta_t_ns": setting.period_ns,
+        }
+
+
+def _simulated(drawn: Drawn, mode: Mode, setting: Setting) -> Iterator[dict[str, object]]:
+    asked_ns = mode.cycles(drawn.judged, setting).request_tick * setting.period_ns
+    for at_ns, latency_ns in zip(asked_ns.tolist(), drawn.judged.tolist(), strict=True):
+        yield {"observation_ns": at_ns, "received_ns": at_ns + latency_ns, "latency_ns": latency_ns}
+
+
+def _delay(latency_ns: object, setting: Setting) -> int:
+    import numpy as np
+
+    return int(setting.delay_ticks(np.array([latency_ns], np.int64))[0])
+
+
+def write_delays(path: Path, rows: Iterable[Mapping[str, object]]) -> None:
+    """Write rows, each with some of `COLUMNS`; raises StoreError where that fails."""
+    try:
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:
+        raise StoreError(f"`export_delays`: cannot write {path}: {error}") from error

@@ -1,13 +1,108 @@
-"""The rows of a run of chunks: cells, the first ticks of each, and what is varied besides."""
+"""The rows of a run of chunks, and the one metric table that columns, JSON and its schema, CSV and tables are made of.
+
+A new metric is a row here, and a value under its name in `to_rows.metrics_of`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, make_dataclass
-from typing import Annotated, Final
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
 
-from s2a_bench.experiments.chunks.metrics import METRICS
-from s2a_bench.store.bounds import Count, Many, NonNegative, Positive, about
-from s2a_bench.store.schema import Table
+from s2a_bench.experiments import COUNT, SHARE, Better, Metric, columns
+from s2a_bench.store.schema import Count, Many, NonNegative, Positive, Table, about, with_fields
+
+
+def _number(name: str, unit: str, title: str, about: str, better: Better = "lower", **more: Any) -> Metric:
+    given = {"bounds": (0, None), "optional": True, **more}
+    return Metric(name, unit, better, title, "mean", about=about, **given)
+
+
+def _ticks(name: str, title: str, about: str, **more: Any) -> Metric:
+    return _number(name, "ticks", title, about, **more)
+
+
+def _share(name: str, title: str, about: str, better: Better = "lower") -> Metric:
+    return _number(name, "", title, about, better, bounds=(0, 1), kind=SHARE)
+
+
+def _plant(name: str, unit: str, title: str, about: str, better: Better = "lower") -> Metric:
+    units = "u: the actions' unit, in virtual time the target's standard deviation."
+    return _number(name, unit, title, f"{about} {units}", better)
+
+
+METRICS: Final[Mapping[str, Metric]] = {
+    metric.name: metric
+    for metric in (
+        _ticks("ticks", "ticks", "Control ticks from the first action on.", better="neither", kind=COUNT),
+        _ticks("stall_ticks", "stalled", "Those without an action.", kind=COUNT),
+        _number("stall_ticks_per_s", "1/s", "stalls/s", "Stalled ticks a second, from the first action on."),
+        _share("stall_share", "stalled", "Share of the ticks that stall."),
+        _ticks("longest_stall_ticks", "longest", "The longest stall.", kind=COUNT),
+        _number("boundaries", "", "cycles", "From one executed chunk to the next.", "neither", kind=COUNT),
+        _number("stalled_cycles", "", "stalled cycles", "Boundaries with a stall.", kind=COUNT),
+        _share("p_stall_cycle", "P(stall), %", "Share of the boundaries with a stall."),
+        _share("p_stall_low", "from", "Its two-sided 95 % interval (Clopper and Pearson), the lower end."),
+        _share("p_stall_high", "to", "The upper end."),
+        _share("p_stall_closed", "form", "What the closed form says of the same delays, where it holds."),
+        _ticks("age_ticks_mean", "age", "Of the observation behind an executed action."),
+        _ticks("age_ticks_p99", "p99", "Its 99th percentile."),
+        _ticks("age_ticks_max", "max", "The greatest."),
+        _ticks("age_ticks_blended", "blended", "Its mean where actions are blended: ages weighted as the actions are."),
+        _number("reaction_s_mean", "s", "react (ms)", "From an event to the start of the first tick that knows of it."),
+        _number("reaction_s_p99", "s", "p99", "Its 99th percentile."),
+        _number("reaction_s_closed", "s", "form", "Its mean by the closed form, in ticks, where that holds."),
+        _number("first_action_s", "s", "first action", "From the first observation until an action leaves."),
+        _number("control_rate_hz", "Hz", "Hz", "Executed actions a second, from the first on.", "higher"),
+        _ticks("delay_ticks_mean", "d", "Realised d, by the row's convention.", better="neither"),
+        _ticks("delay_ticks_p99", "p99", "Its 99th percentile.", better="neither"),
+        _ticks("delay_ticks_max", "max", "The greatest.", better="neither"),
+        _ticks("delay_assumed_ticks", "assumed", "The d that the mode is ready for: trigger, or `assumed`."),
+        _share("p_delay_above", "above, %", "Share of the requests whose d is above the assumed one."),
+        _ticks(
+            "margin_ticks",
+            "margin",
+            "The stability margin: all latencies may be so much longer without a stall; -1 where some stalls as it is.",
+            better="higher",
+            bounds=(-1, None),
+            kind=COUNT,
+        ),
+        _number(
+            "slow_down",
+            "",
+            "beta",
+            "So many times slower actions stall in a share epsilon of the cycles at most, at the greatest trigger.",
+            bounds=(1, None),
+        ),
+        _number(
+            "slower",
+            "",
+            "slower",
+            "So many times slower than it was asked for actions were executed.",
+            bounds=(1, None),
+        ),
+        _share("thrown_away_share", "unused, %", "Actions never executed, of all."),
+        _number("jump_mean", "actions", "jump", "By how many actions the robot is thrown at a boundary."),
+        _number("jump_max", "actions", "max", "The greatest."),
+        _plant("tracking_rms", "u", "tracking", "Position of the plant less the target's, root mean square."),
+        _plant("tracking_rms_ideal", "u", "ideal", "The same, asked in every tick and answered at once.", "neither"),
+        _plant("jerk_rms", "u/s^3", "jerk", "Change of acceleration over a control period, by it; root mean square."),
+        _plant("jerk_rms_ideal", "u/s^3", "ideal", "The same, asked in every tick and answered at once.", "neither"),
+        _plant("boundary_jump_mean", "u", "jump", "From a chunk's last executed action to the next one's first."),
+        _plant("boundary_jump_p99", "u", "p99", "Its 99th percentile."),
+        _plant("action_step_mean", "u", "step", "From one action to the next within a chunk.", "neither"),
+        _ticks("blocked_ticks", "blocked", "Ticks in which the control loop waits for an answer.", kind=COUNT),
+        _share("agreement", "alike, %", "Live: share of the ticks as virtual time has them.", "higher"),
+        _number("jitter_s_p50", "s", "jitter (ms)", "Live: how long after it was due an action left, the median."),
+        _number("jitter_s_p99", "s", "p99", "Its 99th percentile."),
+        _number("jitter_s_max", "s", "max", "The greatest."),
+        _ticks("late_ticks", "late", "Live: ticks whose action left a whole tick late or more.", kind=COUNT),
+        _number("blocked_s_p99", "s", "busy (ms)", "Live: what asking and sending took of a tick, 99th percentile."),
+        _number("blocked_s_max", "s", "max", "The greatest."),
+        _number("bytes_up_per_s", "bytes/s", "MB/s up", "Live: what the pictures weigh that leave in a second."),
+    )
+}
+"""The metrics by their names, in the order of their columns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,18 +125,12 @@ class AboutCell:
     ] = None
 
 
-ChunkRow: Final = make_dataclass(
+ChunkRow: Final = with_fields(
     "ChunkRow",
-    [
-        (name, Annotated[(int if metric.whole else float) | None, metric.schema], field(default=None))
-        for name, metric in METRICS.items()
-    ],
-    bases=(AboutCell,),
-    frozen=True,
-    slots=True,
-    kw_only=True,
+    "A mode and rule under a source of latencies, with a column a metric.",
+    AboutCell,
+    columns(METRICS.values()),
 )
-"""A mode and rule under a source of latencies, with a column a metric."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,19 +190,6 @@ class TriggerRow:
 
 
 @dataclass(frozen=True, slots=True)
-class StabilityRow:
-    """A mode at one mean latency and execution horizon: the source's latencies, all longer or shorter by one factor."""
-
-    latency: str
-    mode: str
-    latency_s: float
-    execution_horizon: int
-    requests: int
-    stall_share: float | None
-    p_stall_cycle: float | None
-
-
-@dataclass(frozen=True, slots=True)
 class ReactionRow:
     """A quantile of a cell's reaction times: as simulated, and by the closed form where it holds."""
 
@@ -124,17 +200,17 @@ class ReactionRow:
 
 
 @dataclass(frozen=True, slots=True)
-class SmoothnessRow:
-    """A mode at one mean latency, on a plant: the source's latencies, all longer or shorter by one factor."""
+class MeanRow:
+    """A mode at one mean latency: the source's latencies, all longer or shorter by one factor."""
 
     latency: str
     mode: str
     latency_s: float
+    stall_share: float | None
     tracking_rms: float | None
     tracking_rms_ideal: float | None
     jerk_rms: float | None
     jerk_rms_ideal: float | None
-    boundary_jump_mean: float | None
 
 
 CHUNKS: Final[Table[AboutCell]] = Table("chunks", ChunkRow)
@@ -145,9 +221,7 @@ REQUESTS: Final[Table[RequestRow]] = Table("chunk_requests", RequestRow)
 """One row a request that left within those ticks."""
 TRIGGERS: Final[Table[TriggerRow]] = Table("chunk_triggers", TriggerRow)
 """One row a trigger and source of latencies."""
-STABILITY: Final[Table[StabilityRow]] = Table("chunk_stability", StabilityRow)
-"""One row a mean latency and execution horizon."""
 REACTIONS: Final[Table[ReactionRow]] = Table("chunk_reactions", ReactionRow)
 """One row a cell and quantile."""
-SMOOTHNESS: Final[Table[SmoothnessRow]] = Table("chunk_smoothness", SmoothnessRow)
+MEANS: Final[Table[MeanRow]] = Table("chunk_means", MeanRow)
 """One row a mode and mean latency."""

@@ -1,25 +1,90 @@
-"""The run of chunks in virtual time: every mode and rule under the same latencies."""
+"""The run of chunks in virtual time: modes and rules under the same latencies; triggers and mean latencies varied."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells, draw
+from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells, draw, without_trigger
 from s2a_bench.experiments.chunks.config import ChunksConfig
-from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
-from s2a_bench.experiments.chunks.rows import CHUNKS, REACTIONS, REQUESTS, SMOOTHNESS, STABILITY, TICKS, TRIGGERS
-from s2a_bench.experiments.chunks.smooth import Follower, follower, smoothness_rows
-from s2a_bench.experiments.chunks.to_rows import chunk_row, reaction_rows, reactions_s, request_rows, tick_rows
-from s2a_bench.experiments.chunks.varying import stability_rows, trigger_rows
-from s2a_bench.experiments.study.worlds import generator
+from s2a_bench.experiments.chunks.latencies import delay_rows, write_delays
+from s2a_bench.experiments.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS, MeanRow, TriggerRow
+from s2a_bench.experiments.chunks.smooth import Follower, follower
+from s2a_bench.experiments.chunks.to_rows import stalls_of, write_cell
 from s2a_bench.machine import environment
+from s2a_bench.policy.chunks.closed import closed
+from s2a_bench.policy.chunks.metrics import measure
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
+    from s2a_bench.policy.chunks import Cycles
     from s2a_bench.progress import Progress
+
+MOST_POINTS: Final = 64
+"""Triggers that are tried of a longer chunk."""
+MEANS_TRIED: Final = 33
+REQUESTS_TRIED: Final = 2000
+"""Of a mean latency."""
+SMOOTH: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal")
+"""What is kept of a follower's motion at each."""
+
+
+def trigger_rows(config: ChunksConfig, drawn: Drawn) -> Iterator[TriggerRow]:
+    """Try every trigger of the first mode that has one to choose."""
+    if config.triggered is None:
+        return
+    setting = config.setting
+    length = config.triggered.execution_horizon(setting)
+    for trigger in _steps(0, length - 1):
+        mode = config.triggered.varied((trigger,))
+        cycles = mode.cycles(drawn.judged, setting)
+        found = stalls_of(cycles)
+        del found["stalled_cycles"]
+        if found["boundaries"]:
+            yield TriggerRow(
+                latency=drawn.source.name,
+                mode=without_trigger(mode),
+                execution_horizon=length,
+                trigger=trigger,
+                **found,
+                p_stall_closed=closed(mode, drawn.judged, setting).p_stall,
+                age_ticks_mean=mean_age(cycles),
+            )
+
+
+def mean_rows(config: ChunksConfig, drawn: Drawn, follows: Follower | None) -> Iterator[MeanRow]:
+    """Try each mode as given with a source's latencies made longer or shorter: means from 0 to H ticks."""
+    setting, judged = config.setting, drawn.judged[:REQUESTS_TRIED]
+    shape = judged / max(float(judged.mean()), 1.0)
+    for mean_ns in np.linspace(0, setting.horizon * setting.period_ns, MEANS_TRIED):
+        latency_ns = np.rint(shape * mean_ns).astype(np.int64)
+        for name, mode in config.made.items():
+            cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
+            share = measure(mode, cycles, ticks).stall_share
+            smooth = follows.measure(mode, cycles, ticks) if follows else {}
+            yield MeanRow(
+                latency=drawn.source.name,
+                mode=name,
+                latency_s=mean_ns / 1e9,
+                stall_share=None if np.isnan(share) else share,
+                **{each: smooth.get(each) for each in SMOOTH},
+            )
+
+
+def mean_age(cycles: Cycles) -> float:
+    """Return the mean age of the observation behind executed actions, in ticks, of chunks executed in one run each."""
+    middle = cycles.start_tick - cycles.request_tick + (cycles.executed - 1) / 2
+    return float(np.average(middle, weights=cycles.executed))
+
+
+def _steps(first: int, last: int) -> list[int]:
+    return [int(step) for step in np.unique(np.linspace(first, last, min(last - first + 1, MOST_POINTS)).round())]
+
 
 MOST_TICKS = 100_000_000
 """Control ticks of a cell: they are held in memory."""
@@ -28,7 +93,7 @@ MOST_TICKS = 100_000_000
 def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
     """Simulate every cell, or act live, and return the run folder; raises S2AError for what a user can mend."""
     if config.live:
-        from s2a_bench.experiments.chunks.live.run import run_live
+        from s2a_bench.experiments.chunks.live import run_live
 
         return run_live(config, output, progress)
     drawn = [draw(config, source) for source in config.sources]
@@ -53,8 +118,7 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
             progress.advance()
         for each in drawn:
             writer.append(TRIGGERS, trigger_rows(config, each))
-        writer.append(STABILITY, stability_rows(config, drawn[0]))
-        writer.append(SMOOTHNESS, smoothness_rows(config, drawn[0], follows))
+        writer.append(MEANS, mean_rows(config, drawn[0], follows))
         if config.export_delays is not None:
             write_delays(config.export_delays, delay_rows(drawn[0], tried[0].mode, config.setting))
         return writer.path
@@ -62,14 +126,9 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
 
 def _simulate(config: ChunksConfig, cell: Cell, follows: Follower | None, writer: RunWriter) -> None:
     setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
-    cycles, ticks = cell.mode.cycles(latency_ns, setting), cell.mode.ticks(latency_ns, setting)
-    reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
+    cycles, ticks = cell.acting.cycles(latency_ns, setting), cell.acting.ticks(latency_ns, setting)
     smooth = follows.measure(cell.mode, cycles, ticks) if follows and cell.slower == 1 else {}
-    row = chunk_row(cell, setting, cycles, ticks, epsilon=config.epsilon, reaction_s=reaction_s, smooth=smooth)
-    writer.append(CHUNKS, [row])
-    writer.append(REACTIONS, reaction_rows(cell, latency_ns, setting, reaction_s))
-    writer.append(TICKS, tick_rows(cell.cell, ticks, config.shown_ticks))
-    writer.append(REQUESTS, request_rows(cell.cell, latency_ns, cycles, config.shown_ticks))
+    write_cell(config, writer, cell, cycles, ticks, config.shown_ticks, more=smooth)
 
 
 def _check(config: ChunksConfig, drawn: Drawn) -> None:

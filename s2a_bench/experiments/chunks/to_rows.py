@@ -4,22 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.chunks.closed import assumed_ticks, beta, closed, execution_horizon
-from s2a_bench.experiments.chunks.metrics import METRICS
-from s2a_bench.experiments.chunks.rows import AboutCell, ChunkRow, ReactionRow, RequestRow, TickRow
-from s2a_bench.policy.chunks.aggregate import Aggregate
+from s2a_bench.experiments import COUNT
+from s2a_bench.experiments.chunks.rows import (
+    CHUNKS,
+    METRICS,
+    REACTIONS,
+    REQUESTS,
+    TICKS,
+    ChunkRow,
+    ReactionRow,
+    RequestRow,
+    TickRow,
+)
+from s2a_bench.policy.chunks.closed import beta, closed
 from s2a_bench.policy.chunks.metrics import margin_ticks, measure, reaction_ticks
 from s2a_bench.policy.conformal import upper_bound
+from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.cells import Cell
+    from s2a_bench.experiments.chunks.config import ChunksConfig
     from s2a_bench.policy import Floats
     from s2a_bench.policy.chunks import Cycles, Ints, Setting, Ticks
+    from s2a_bench.store.run import RunWriter
 
 EVENTS: Final = 100_000
 """Moments of events that reactions are measured at."""
@@ -30,41 +42,46 @@ _SIDE: Final = 0.975
 """Confidence of each end of a two-sided 95 % interval."""
 
 
-def chunk_row(
+def write_cell(
+    config: ChunksConfig,
+    writer: RunWriter,
     cell: Cell,
-    setting: Setting,
     cycles: Cycles,
     ticks: Ticks,
+    most: int,
     *,
-    epsilon: float,
-    reaction_s: Floats,
-    smooth: Mapping[str, float],
-) -> AboutCell:
-    """Describe a cell's run.
+    more: Mapping[str, Any],
+    late_ns: Ints | None = None,
+    names: Mapping[int, str] = NO_NAMES,
+) -> None:
+    """Write the rows of what a cell did, its ticks and requests within the first ``most`` ticks.
 
-    ``reaction_s`` are its reaction times, ``smooth`` its metrics of smoothness if any, and ``epsilon`` is the share
-    that may stall.
+    ``more`` are metrics that others do not have, or that stand in for what is computed here; ``late_ns`` is how long
+    after it was due each action left, ``names`` are the ids of the requests' samples.
     """
-    latency_s = cell.drawn.judged / 1e9
-    triggers = cell.triggers or ((cell.mode.trigger,) if hasattr(cell.mode, "trigger") else ())
-    values = {**metrics_of(cell, setting, cycles, ticks, reaction_s), **smooth}
-    values |= {"slow_down": beta(cell.mode, cell.drawn.judged, setting, epsilon), "slower": cell.slower}
-    row: AboutCell = ChunkRow(
+    setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
+    reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
+    values = metrics_of(cell, setting, cycles, ticks, reaction_s)
+    values |= {"slow_down": beta(cell.mode, latency_ns, setting, config.epsilon), "slower": cell.slower, **more}
+    row = ChunkRow(
         cell=cell.cell,
         mode=cell.name,
         rule=cell.rule,
         latency=cell.drawn.source.name,
-        latency_s=float(latency_s.mean()),
-        latency_s_p99=float(np.quantile(latency_s, 0.99)),
+        latency_s=float((latency_ns / 1e9).mean()),
+        latency_s_p99=float(np.quantile(latency_ns / 1e9, 0.99)),
         rounding=setting.rounding,
         delta_t_s=setting.period_ns / 1e9,
         horizon=setting.horizon,
-        execution_horizon=execution_horizon(cell.mode, setting),
-        requests=int(latency_s.size),
-        trigger=float(np.mean(triggers)) if triggers else None,
-        **{name: _plain(values.get(name), whole=metric.whole) for name, metric in METRICS.items()},
+        execution_horizon=cell.mode.execution_horizon(setting),
+        requests=int(latency_ns.size),
+        trigger=_mean(cell.triggers, cell.mode.trigger),
+        **{name: _plain(values.get(name), whole=metric.kind == COUNT) for name, metric in METRICS.items()},
     )
-    return row
+    writer.append(CHUNKS, [row])
+    writer.append(REACTIONS, reaction_rows(cell, latency_ns, setting, reaction_s))
+    writer.append(TICKS, tick_rows(cell.cell, ticks, most, late_ns))
+    writer.append(REQUESTS, request_rows(cell.cell, latency_ns, cycles, most, names))
 
 
 def metrics_of(
@@ -73,21 +90,15 @@ def metrics_of(
     """Return the value of every metric of what was simulated; NaN or None where there is none."""
     period_s, latency_ns = setting.period_ns / 1e9, cell.drawn.judged
     found: dict[str, Any] = asdict(measure(cell.mode, cycles, ticks))
-    settled = cycles.settled
-    boundaries, stalled = int(settled.sum()), int((cycles.stall_ticks[settled] > 0).sum())
-    low, high = interval(stalled, boundaries)
-    expected = closed(cell.mode, latency_ns, setting)
+    expected = closed(cell.acting, latency_ns, setting)
     mean_reaction = expected.mean_reaction_ticks
     delay = cycles.delay_ticks[: latency_ns.size]  # live, an answer may not have come by the end
     later = setting.rounding == "floor"  # an action leaves at the end of its tick
-    assumed = np.array(cell.triggers, np.float64) if cell.triggers else assumed_ticks(cell.mode)
+    assumed = np.array(cell.triggers, np.float64) if cell.triggers else cell.mode.assumed_ticks
     length = found["ticks"] or math.nan
     return found | {
+        **stalls_of(cycles),
         "stall_ticks_per_s": found["stall_ticks"] / length / period_s,
-        "boundaries": boundaries,
-        "stalled_cycles": stalled,
-        "p_stall_low": low,
-        "p_stall_high": high,
         "p_stall_closed": expected.p_stall,
         "age_ticks_blended": _blended(cell, cycles),
         "reaction_s_mean": float(reaction_s.mean()) if reaction_s.size else None,
@@ -98,17 +109,25 @@ def metrics_of(
         "delay_ticks_mean": float(delay.mean()),
         "delay_ticks_p99": float(np.quantile(delay, 0.99)),
         "delay_ticks_max": float(delay.max()),
-        "delay_assumed_ticks": None if assumed is None else float(np.mean(assumed)),
+        "delay_assumed_ticks": _mean(cell.triggers, cell.mode.assumed_ticks),
         "p_delay_above": None if assumed is None else float(np.mean(delay[1:] > _later(assumed))),
-        "margin_ticks": margin_ticks(cell.mode, latency_ns, setting) if len(cell.triggers) < 2 else None,  # noqa: PLR2004 - the rule would answer
+        "margin_ticks": margin_ticks(cell.acting, latency_ns, setting) if len(cell.triggers) < 2 else None,  # noqa: PLR2004 - the rule would answer
     }
 
 
-def interval(stalled: int, cycles: int) -> tuple[float | None, float | None]:
-    """Return the two-sided 95 % interval of a share (Clopper and Pearson); None of nothing."""
-    if not cycles:
-        return None, None
-    return 1 - upper_bound(cycles - stalled, cycles, _SIDE), upper_bound(stalled, cycles, _SIDE)
+def stalls_of(cycles: Cycles) -> dict[str, Any]:
+    """Return the metrics of the boundaries between chunks."""
+    return stall_metrics(int((cycles.stall_ticks[cycles.settled] > 0).sum()), int(cycles.settled.sum()))
+
+
+def stall_metrics(stalled: int, boundaries: int) -> dict[str, Any]:
+    """Return counts, share and its two-sided 95 % interval (Clopper and Pearson); without boundaries counts alone."""
+    found: dict[str, Any] = {"boundaries": boundaries, "stalled_cycles": stalled}
+    if boundaries:
+        found["p_stall_cycle"] = stalled / boundaries
+        found["p_stall_low"] = 1 - upper_bound(boundaries - stalled, boundaries, _SIDE)
+        found["p_stall_high"] = upper_bound(stalled, boundaries, _SIDE)
+    return found
 
 
 def reactions_s(cycles: Cycles, ticks: Ticks, setting: Setting, rng: np.random.Generator) -> Floats:
@@ -126,15 +145,15 @@ def reaction_rows(cell: Cell, latency_ns: Ints, setting: Setting, reaction_s: Fl
     if not reaction_s.size:
         return
     period_s = setting.period_ns / 1e9
-    told = closed(cell.mode, latency_ns, setting).reaction_ticks(SHARES)
+    told = closed(cell.acting, latency_ns, setting).reaction_ticks(SHARES)
     found = np.quantile(reaction_s, SHARES).tolist()
     closed_s = [None] * SHARES.size if told is None else (told * period_s).tolist()
     for share, simulated_s, expected_s in zip(SHARES.tolist(), found, closed_s, strict=True):
         yield ReactionRow(cell.cell, share, simulated_s, expected_s)
 
 
-def tick_rows(cell: str, ticks: Ticks, most: int, late_ns: Ints | None = None) -> Iterator[TickRow]:
-    """Yield the first ticks of a cell; ``late_ns`` is how long after it was due each action left."""
+def tick_rows(cell: str, ticks: Ticks, most: int, late_ns: Ints | None) -> Iterator[TickRow]:
+    """Yield the first ticks of a cell."""
     late = [None] * most if late_ns is None else late_ns.tolist()
     columns = (ticks.chunk, ticks.index, ticks.age, ticks.stalled)
     for tick, (chunk, index, age, stalled) in enumerate(zip(*(each[:most].tolist() for each in columns), strict=True)):
@@ -151,37 +170,36 @@ def tick_rows(cell: str, ticks: Ticks, most: int, late_ns: Ints | None = None) -
 
 
 def request_rows(
-    cell: str, latency_ns: Ints, cycles: Cycles, most: int, names: Mapping[int, str] = NO_NAMES
+    cell: str, latency_ns: Ints, cycles: Cycles, most: int, names: Mapping[int, str]
 ) -> Iterator[RequestRow]:
-    """Yield the requests that left within the first ticks of a cell; ``names`` are the ids of their samples."""
-    for request in range(min(latency_ns.size, int(np.searchsorted(cycles.request_tick, most)))):
-        executed = int(cycles.executed[request])
+    """Yield the requests that left within the first ticks of a cell."""
+    count = min(latency_ns.size, int(np.searchsorted(cycles.request_tick, most)))
+    kept = [each.name for each in fields(RequestRow)]
+    columns = {name: getattr(cycles, name)[:count].tolist() for name in kept if hasattr(cycles, name)}
+    for request in range(count):
+        row = {name: values[request] for name, values in columns.items()}
+        if not row["executed"]:
+            row |= dict.fromkeys(("start_tick", "first_index", "jump"))
         yield RequestRow(
             cell=cell,
             request=request,
-            request_tick=int(cycles.request_tick[request]),
             latency_ns=int(latency_ns[request]),
-            delay_ticks=int(cycles.delay_ticks[request]),
-            start_tick=int(cycles.start_tick[request]) if executed else None,
-            first_index=int(cycles.first_index[request]) if executed else None,
-            executed=executed,
-            thrown_away=int(cycles.thrown_away[request]),
-            stall_ticks=int(cycles.stall_ticks[request]),
-            jump=int(cycles.jump[request]) if executed else None,
             request_id=names.get(request),
+            **row,
         )
 
 
+def _mean(triggers: tuple[int, ...], given: int | None) -> float | None:
+    """Return the mean of what a rule chose, else what the mode was given."""
+    return float(np.mean(triggers)) if triggers else None if given is None else float(given)
+
+
 def _blended(cell: Cell, cycles: Cycles) -> float | None:
-    """Return the mean age behind blended actions, in ticks."""
-    if not isinstance(cell.mode, Aggregate):
-        return None
     age = cell.mode.blended_age(cycles)
-    return float(np.nanmean(age)) if np.isfinite(age).any() else None
+    return None if age is None or not np.isfinite(age).any() else float(np.nanmean(age))
 
 
 def _later(assumed: Any) -> Any:
-    """Return what was assumed of all requests but the first one."""
     return assumed[1:] if isinstance(assumed, np.ndarray) and assumed.size > 1 else assumed
 
 

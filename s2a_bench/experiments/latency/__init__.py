@@ -9,7 +9,7 @@ EXPERIMENT = Experiment(
     config="s2a_bench.experiments.latency.config:LatencyConfig",
     run="s2a_bench.experiments.latency.run:run_latency",
     view="s2a_bench.experiments.latency.view:show",
-    cell="s2a_bench.experiments.latency.view.cell:LatencyCell",
+    cell="s2a_bench.experiments.latency.metrics:LatencyCell",
     view_options="s2a_bench.experiments.latency.config:LatencyView",
-    compared="s2a_bench.experiments.latency.view.compared:COMPARED",
+    compared="s2a_bench.experiments.latency.metrics:COMPARED",
 )

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from s2a_bench.errors import UsageError
 from s2a_bench.experiments.paper import AgainstPaper
-from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import group, option
-
-WIRES = {"bgr": "raw", "compressed": "jpeg"}
-"""Values of the former --wire -> those of --payload."""
 
 
 class LatencyConfig(RequestsConfig):
@@ -26,14 +22,6 @@ class LatencyConfig(RequestsConfig):
             *("flash_attention", "answer", "horizon", "action_dim"),
         ),
     )
-    wire: str = option("", "gone: see --payload", hidden=True)
-
-    def check(self) -> None:
-        """Refuse what makes no sense, and the former name of the payload."""
-        if self.wire:
-            now = WIRES.get(self.wire, self.wire)
-            raise UsageError(f"`wire` is gone: write `payload` {now}, or for ROS alone `transport` 'ros?payload={now}'")
-        super().check()
 
 
 class LatencyView(AgainstPaper):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from s2a_bench.harness.plan import RequestsConfig
+from s2a_bench.harness.config import RequestsConfig
+from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import Task, run_requests
 from s2a_bench.progress import Progress
 
@@ -14,4 +15,4 @@ def run_latency(config: RequestsConfig, output: Path, progress: Progress) -> Pat
 
     Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
     """
-    return run_requests(Task("latency"), config.answered(progress.say), output, progress)
+    return run_requests(Task("latency"), resolve(config.answered(progress.say)), output, progress)

@@ -11,22 +11,20 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.boards.file import parse_profile, to_toml
 from s2a_bench.boards.fit import fit_gaps
 from s2a_bench.boards.gaps import to_table
-from s2a_bench.boards.profile import Profile
+from s2a_bench.boards.profile import Profile, parse_profile, to_toml
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, StoreError, UsageError
-from s2a_bench.experiments.profile_capture.config import LEAST_GAPS, CaptureConfig
+from s2a_bench.experiments.profile_capture import LEAST_GAPS, CaptureConfig
 from s2a_bench.frames import open_source
 from s2a_bench.frames.convert import bgr_to_rgb, to_bgr
 from s2a_bench.frames.stamp import Stamped
-from s2a_bench.harness.flash_attention import decided
 from s2a_bench.harness.warnings import Counters, before_run
 from s2a_bench.inference import Engine, EngineConfig, need_engine
 from s2a_bench.inference.models import resolve
 from s2a_bench.machine import environment
-from s2a_bench.machine.board import board_facts
+from s2a_bench.machine.environment import board_facts
 from s2a_bench.machine.tuning import limit_threads
 from s2a_bench.types import Frame, Request
 
@@ -99,15 +97,14 @@ def capture(config: CaptureConfig, progress: Progress) -> dict[str, Any]:
 
     Raises EngineError where the model's answers are too short to time.
     """
-    need_engine(config.engine.name)
+    need_engine(config.engine)
     limit_threads()
     progress.expect(config.warmup + config.requests)
     warnings = before_run()
     with ExitStack() as stack:
         model, mmproj = resolve(config.engine)
-        decided_engine, _ = decided(config.engine.but(model=model, mmproj=mmproj), progress.stage)
         progress.stage("loading the model")
-        engine = open_model(decided_engine)
+        engine = open_model(config.engine.but(model=model, mmproj=mmproj))
         stack.callback(engine.close)
         before = Counters.read(watches_udp=False)
         asked = answers(engine, config)

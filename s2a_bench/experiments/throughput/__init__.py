@@ -8,7 +8,7 @@ EXPERIMENT = Experiment(
     config="s2a_bench.experiments.throughput.config:ThroughputConfig",
     run="s2a_bench.experiments.throughput.run:run_throughput",
     view="s2a_bench.experiments.throughput.view:show",
-    cell="s2a_bench.experiments.throughput.view.cell:ThroughputCell",
+    cell="s2a_bench.experiments.throughput.metrics:ThroughputCell",
     view_options="s2a_bench.experiments.paper:AgainstPaper",
-    compared="s2a_bench.experiments.throughput.view.compared:COMPARED",
+    compared="s2a_bench.experiments.throughput.metrics:COMPARED",
 )

@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final
 
-from pydantic import field_validator
+from pydantic import AfterValidator, field_validator
 
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.plan import FirstVariants, RequestsConfig
-from s2a_bench.inference import ANSWERS, ENGINES, EngineConfig
-from s2a_bench.options import Names, group, one_of, option
-from s2a_bench.transport.http import HTTP, LLAMA_SERVER
-from s2a_bench.transport.loopback import LOOPBACK
+from s2a_bench.harness.config import FirstVariants, RequestsConfig
+from s2a_bench.inference import ANSWERS, ENGINES, FLASH_ATTENTION, MODEL, EngineConfig
+from s2a_bench.options import Names, group, listed, one_of, option
+from s2a_bench.transport.defaults import LLAMA_SERVER, LOOPBACK
 
 IN_PROCESS: Final = "in-process"
 """What this command calls the transport `loopback`: here it is the engine that is looked at, not the way to it."""
@@ -22,17 +21,27 @@ IN_PROCESS: Final = "in-process"
 
 TWIN: Final = "llama-server"
 """What `engine` may be here besides: llama.cpp's own server, beside the engine in this process on the same files."""
-TWINS: Final = (IN_PROCESS, f"{HTTP.name}/{LLAMA_SERVER}")
+TWINS: Final = (IN_PROCESS, LLAMA_SERVER)
+
+
+def _ways(written: str) -> str:
+    for way in listed(written) or ("",):
+        if way not in FLASH_ATTENTION:
+            raise ValueError(f"'{way}' is none of {', '.join(FLASH_ATTENTION)}")
+    return ",".join(listed(written))
 
 
 class ThroughputEngine(EngineConfig):
     """The engine, among those that compute."""
 
     name: Annotated[str, one_of(lambda: ENGINES)] = option(
-        "llama",
-        f"{', '.join(name for name in ENGINES if name != 'echo')}, {TWIN}; replay plays --profile (EMULATED), {TWIN} "
-        "is llama.cpp's own, in turn with llama in this process",
+        MODEL,
+        f"{', '.join(name for name, kind in ENGINES.loaded() if kind.computes)}, {TWIN}; replay plays --profile "
+        f"(EMULATED), {TWIN} is llama.cpp's own, in turn with llama in this process",
         flag="engine",
+    )
+    flash_attention: Annotated[str, AfterValidator(_ways)] = option(
+        "auto", "auto (llama.cpp's own choice), on, off; several with commas, each in cells of its own"
     )
 
 
@@ -40,6 +49,7 @@ class ThroughputConfig(RequestsConfig):
     """The settings of a throughput run."""
 
     QUICK: ClassVar[dict[str, int]] = {"runs": 3, "warmup": 1, "max_tokens": 32}
+    OF_ENGINE: ClassVar[tuple[str, ...]] = ("flash_attention",)
 
     transports: Names = option(
         (IN_PROCESS,), "in-process, http, ros, as in latency; several with commas", flag="transport"
@@ -52,7 +62,9 @@ class ThroughputConfig(RequestsConfig):
     warmup: int = option(2, "warm-ups a cell, kept and marked [default: 2, quick: 1]", ge=0, le=10**9)
     max_tokens: int = option(128, "tokens an answer [default: 128, quick: 32]", ge=1, le=2**20)
     reference: Path | None = option(
-        None, "llama.cpp's llama-bench, run in turn with ours on the same model file, which takes --sampling greedy"
+        None,
+        "llama.cpp's llama-bench, run in turn with ours on the same model file, which takes --sampling greedy",
+        risk="program",
     )
 
     def __init__(self, **given: Any) -> None:
@@ -61,7 +73,7 @@ class ThroughputConfig(RequestsConfig):
         if isinstance(engine, Mapping) and engine.get("name") == TWIN:
             if "transports" in given:
                 raise UsageError(f"`engine` {TWIN} is `transport` {','.join(TWINS)}; leave one of them out")
-            given = {**given, "engine": {**engine, "name": "llama"}, "transports": TWINS}
+            given = {**given, "engine": {**engine, "name": MODEL}, "transports": TWINS}
         super().__init__(**given)
 
     @field_validator("engine", mode="before")
@@ -71,8 +83,13 @@ class ThroughputConfig(RequestsConfig):
 
     @property
     def names(self) -> Sequence[str]:
-        """Return pipeline names, ``in-process`` by that of its transport."""
-        return [LOOPBACK.name if name == IN_PROCESS else name for name in self.transports]
+        """Return pipeline names, ``in-process`` by that of its transport, each with every way of flash attention."""
+        written = (name.partition("?") for name in self.transports)
+        names = [f"{LOOPBACK if path == IN_PROCESS else path}{mark}{query}" for path, mark, query in written]
+        ways = listed(self.engine.flash_attention)
+        if len(ways) == 1:
+            return names
+        return [f"{name}{'&' if '?' in name else '?'}flash_attention={way}" for name in names for way in ways]
 
     @property
     def greedy(self) -> bool:
@@ -80,20 +97,30 @@ class ThroughputConfig(RequestsConfig):
         told = "sampling" in self.engine.model_fields_set or self.reference is None
         return self.engine.sampling == "greedy" if told else True
 
+    @property
+    def reads_model(self) -> bool:
+        return self.reference is not None or super().reads_model
+
     def check(self) -> None:
-        """Raise UsageError, naming the field, for a combination that makes no sense."""
         super().check()
         if self.max_tokens < 2:  # noqa: PLR2004 - a rate needs two tokens
             raise UsageError("`max_tokens`: a rate needs 2 tokens or more")
-        if self.engine.name == "echo":
-            raise UsageError("`engine` echo computes nothing; `engine` llama or replay has tokens a second")
+        if not self.engine.kind.computes:
+            raise UsageError(
+                f"`engine` {self.engine.name} computes nothing; `engine` llama or replay has tokens a second"
+            )
+        named = "," in self.engine.flash_attention or any(each.engine for each in self.pipelines)
+        if named and not self.engine.kind.needs_model:
+            raise UsageError(f"`engine` {self.engine.name} knows no flash attention; leave out `flash_attention`")
         if self.foreign and self.greedy:
             raise UsageError(f"`sampling` greedy is our own engine's; leave it out with `{self.foreign}`")
         if self.reference is None:
             return
         if not (self.reference.is_file() and os.access(self.reference, os.X_OK)):
             raise UsageError(f"`reference`: {self.reference} is no program that can be run")
-        if self.engine.name != "llama":
+        if not self.engine.kind.needs_model:
             raise UsageError(f"`reference` runs a model file; leave out `engine` {self.engine.name}")
+        if named:
+            raise UsageError("`reference` runs with one `flash_attention` at a time; name it by its flag")
         if self.grammar:
             raise UsageError("`reference`: llama-bench knows no grammar; leave out `grammar`")

@@ -1,13 +1,32 @@
-"""The throughput run: how many tokens a second a model writes, in this process, over transports, beside llama-bench."""
+"""The throughput run: how many tokens a second a model writes, in this process, over transports, beside llama-bench.
+
+llama.cpp's own ``llama-bench`` is a reference on the same file and settings, one run of it a block. Its ``tg`` test
+decodes random tokens, samples nothing and turns nothing into text. It starts behind ``--n-depth`` tokens, here as many
+as our prompts have, as attention costs more the longer the context is.
+"""
 
 from __future__ import annotations
 
+import json
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import COMPILE_AGAIN, EngineError, how_it_ended
 from s2a_bench.experiments.throughput.config import IN_PROCESS, ThroughputConfig
-from s2a_bench.experiments.throughput.llama_bench import LlamaBench
+from s2a_bench.experiments.throughput.metrics import REFERENCE, ReferenceRow
+from s2a_bench.harness.plan import Plan, resolve
+from s2a_bench.harness.processes import llama_flags
 from s2a_bench.harness.rounds import Launch, Task, in_blocks, run_requests
+from s2a_bench.harness.session import Place
 from s2a_bench.progress import Progress
+from s2a_bench.store.run import RunWriter
+
+LONGEST_S = 7200
+"""A board that writes half a token a second still ends in time."""
 
 
 def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -> Path:
@@ -21,9 +40,73 @@ def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -
             return max(session.prompt_n for session in launch.sessions)
 
         reference = config.reference
-        in_blocks(launch, [LlamaBench(reference, launch.config, launch.writer, longest_prompt)] if reference else [])
+        in_blocks(launch, [LlamaBench(reference, launch.plan, launch.writer, longest_prompt)] if reference else [])
 
     sampling = "greedy" if config.greedy else "model"
-    requests = config.but(engine=config.engine.but(sampling=sampling))
-    task = Task("throughput", IN_PROCESS, needs_model=config.reference is not None, drive=drive)
-    return run_requests(task, requests, output, progress)
+    plan = resolve(config.but(engine=config.engine.but(sampling=sampling)))
+    cells = tuple(
+        replace(cell, name=cell.name.replace(cell.transport.name, IN_PROCESS, 1)) if cell.transport.in_process else cell
+        for cell in plan.cells
+    )
+    return run_requests(Task("throughput", drive=drive), replace(plan, cells=cells), output, progress)
+
+
+class LlamaBench:
+    """One turn of llama-bench a block; called with its place."""
+
+    def __init__(self, program: Path, plan: Plan, writer: RunWriter, depth: Callable[[], int]) -> None:
+        """Prepare the command; ``depth`` tells how many tokens lie in the context before those that are timed."""
+        self._program = program
+        self._writer = writer
+        self._depth = depth
+        engine = plan.servers.engine
+        self._flash_attention = engine.flash_attention
+        self._command = [str(program), *llama_flags(engine), "--output", "json", "--repetitions", "1"]
+        self._command += ["--n-prompt", "0", "--n-gen", str(plan.request.max_pieces)]
+
+    def __call__(self, place: Place) -> None:
+        """Run it once and keep what it says; raises EngineError where it fails."""
+        command = [*self._command, "--n-depth", str(self._depth())]
+        self._writer.update(reference={"command": command})
+        started_ns = now_ns()
+        test = self._run(command)
+        row = ReferenceRow(
+            block=place.block,
+            position=place.position,
+            warmup=place.warmup,
+            started_ns=started_ns,
+            finished_ns=now_ns(),
+            n_gen=test["n_gen"],
+            depth=test.get("n_depth", 0),
+            decode_ns=test["samples_ns"][0],
+            launch=place.launch,
+            facts={name: test[name] for name in test if not name.startswith(("samples", "avg", "stddev"))},
+        )
+        self._writer.append(REFERENCE, [row])
+
+    def _run(self, command: list[str]) -> dict[str, Any]:
+        try:
+            done = subprocess.run(  # noqa: S603 - the user's own program
+                command, capture_output=True, text=True, errors="replace", check=False, timeout=LONGEST_S
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise EngineError(f"--reference {self._program}: {error}") from error
+        said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1][:200]
+        if done.returncode:
+            how = how_it_ended(done.returncode, COMPILE_AGAIN)
+            raise EngineError(f"--reference {self._program}: {how}: {said}")
+        try:
+            (test,) = json.loads(done.stdout)
+            if not (test["n_gen"] > 0 and test["samples_ns"][0] > 0):
+                raise ValueError("it generated nothing")
+        except (ValueError, KeyError, TypeError, IndexError) as error:
+            raise EngineError(
+                f"--reference {self._program}: its answer is not llama-bench's JSON of one test ({error!r}); "
+                "a llama-bench of 2026 is needed"
+            ) from error
+        if isinstance(test.get("flash_attn"), bool) and self._flash_attention != "off":
+            raise EngineError(
+                f"--reference {self._program}: it is too old to know --flash-attn {self._flash_attention}, reads that "
+                "as off and would be compared with something else; take a newer one, or --flash-attention off"
+            )
+        return dict(test)

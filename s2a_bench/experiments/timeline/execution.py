@@ -10,19 +10,22 @@ from typing import Any, Final
 
 import numpy as np
 
+from s2a_bench.act import SkillRobot
+from s2a_bench.act.events import AbortAsked, Event, LiveInbox
+from s2a_bench.act.executor import Executor
+from s2a_bench.act.record import Record, SkillRun
 from s2a_bench.clock import SystemClock, now_ns
-from s2a_bench.experiments.timeline.policies import finite
-from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows
+from s2a_bench.experiments.timeline.rows import TIMELINES
+from s2a_bench.experiments.timeline.to_rows import timeline_rows
+from s2a_bench.harness.timelines.config import Setting
+from s2a_bench.harness.timelines.policies import finite
+from s2a_bench.harness.timelines.rows import skill_rows
 from s2a_bench.plan import Gap
 from s2a_bench.policy import Plans, PlanShape, Policy, Schedule
 from s2a_bench.policy.evaluate import TOLERANCE_S
-from s2a_bench.runtime import Robot
-from s2a_bench.runtime.events import AbortAsked, Event, LiveInbox
-from s2a_bench.runtime.executor import Executor
-from s2a_bench.runtime.record import Record, SkillRun
 from s2a_bench.stats import summarise
 from s2a_bench.store.manifest import RunWarning
+from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import RunWriter
 
 SWITCH_S: Final = 0.0005
@@ -33,7 +36,7 @@ class SideBySide:
     """One executor a policy, all told the same. Use as a context manager; leaving it early aborts them."""
 
     def __init__(
-        self, policies: Mapping[str, Policy], shape: PlanShape, gap: Gap, robots: Sequence[Robot], silence_s: float
+        self, policies: Mapping[str, Policy], shape: PlanShape, gap: Gap, robots: Sequence[SkillRobot], silence_s: float
     ) -> None:
         """Prepare; policies by the names they are recorded under, one robot each."""
         self._inboxes = [LiveInbox() for _ in policies]
@@ -47,16 +50,13 @@ class SideBySide:
 
     @property
     def records(self) -> list[Record]:
-        """Return the records, which grow."""
         return [executor.record for executor in self._executors]
 
     def tell(self, event: Event) -> None:
-        """Tell all executors."""
         for inbox in self._inboxes:
             inbox.put(event)
 
     def finish(self) -> list[Record]:
-        """Wait until all plans have ended."""
         return [future.result() for future in self._futures]
 
     def __enter__(self) -> SideBySide:  # noqa: PYI034 - Self is typing's since 3.11
@@ -105,7 +105,7 @@ def keep(
                 [request_id],
                 first_plan=plan,
                 requested_ns=[record.requested_ns],
-                caution=finite(getattr(policies[record.policy], "caution", None)),
+                caution=finite(policies[record.policy].caution),
                 tolerance_s=TOLERANCE_S,
             )
             texts = [[str(skill.call) for skill in record.ran]]

@@ -1,12 +1,114 @@
-"""The rows of a timeline run: plans under policies, and their skills."""
+"""The rows of a timeline run, and the one metric table that columns, JSON, CSV, tables and comparison are made of.
+
+A new metric is a row here, and under its name an array of one number a plan in `to_rows.metrics_of`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, make_dataclass
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
 
-from s2a_bench.experiments.timeline.metrics import METRICS
-from s2a_bench.store.schema import Table, Value
+from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Better, Metric, columns
+from s2a_bench.store.schema import Table, with_fields
+
+
+@dataclass(frozen=True, slots=True)
+class TimelineMetric(Metric):
+    """A metric of plans, 0 or more unless told otherwise."""
+
+    bounds: tuple[float | None, float | None] = (0, None)
+
+    def stored(self, value: float) -> int | float | bool:
+        if self.kind == TIME:
+            return round(float(value) * 1e9)
+        # Times are exact to a nanosecond, so that what is less of a share is rounding; 0.0 makes -0.0 a zero.
+        plain: int | float | bool = self.column_type(value)
+        return round(plain, 9) + 0.0 if isinstance(plain, float) else plain
+
+
+def _time(name: str, title: str = "", about: str = "", statistic: str = "median") -> TimelineMetric:
+    return TimelineMetric(name, "s", title=title, statistic=statistic, kind=TIME, about=about)
+
+
+def _mean(name: str, title: str = "", about: str = "", better: Better = "lower", **more: Any) -> TimelineMetric:
+    return TimelineMetric(name, "", better, title, "mean", about=about, **more)
+
+
+_UNBOUND: Final = (None, None)
+_SHARE: Final = (0, 1)
+
+METRICS: Final[Mapping[str, TimelineMetric]] = {
+    metric.name: metric
+    for metric in (
+        _time("start_s", "start", "Time to first action, s_1."),
+        _time("end_s", "end", "Completion, e_N."),
+        _time("safe_start_s", about="S0."),
+        _time("last_arrival_s", about="t_N."),
+        _time("safe_end_s", about="S0 + P_N."),
+        _time("least_end_s", about="E_lo."),
+        _mean("stalls", "stalls", "Stalls longer than 20 ms a plan.", kind=COUNT),
+        _mean("p_any_stall", "P(stall)", "Share of the plans that stall at all.", kind=FLAG, bounds=_SHARE),
+        _time("stall_s", "stalled", "All stalls of a plan together.", "mean"),
+        _time("longest_stall_s", "longest", statistic="mean"),
+        _mean(
+            "stall_ratio",
+            "stall ratio",
+            "Stalled share of the time from first action to completion.",
+            kind=SHARE,
+            bounds=_SHARE,
+        ),
+        _mean("start_regret", "late start", "max(0, s_1 - S0) / S0.", kind=SHARE, optional=True),
+        _mean(
+            "start_regret_elastic",
+            "over S_lo",
+            "max(0, s_1 - S_lo) / S_lo, over the least start that T_max allows.",
+            kind=SHARE,
+            optional=True,
+        ),
+        _mean("signed_start_regret", about="(s_1 - S0) / S0.", bounds=_UNBOUND, optional=True),
+        _mean(
+            "start_regret_of_wait",
+            "of wait",
+            "max(0, s_1 - S0) / (t_N - S0); absent where t_N = S0.",
+            kind=SHARE,
+            optional=True,
+        ),
+        _mean("end_regret", "late end", "(e_N - E) / E with E = S0 + P_N.", kind=SHARE, bounds=_UNBOUND),
+        _mean(
+            "end_regret_of_wait", about="(e_N - E) / (t_N - S0); absent where t_N = S0.", bounds=_UNBOUND, optional=True
+        ),
+        _mean(
+            "end_regret_elastic",
+            "over E_lo",
+            "(e_N - E_lo) / E_lo, over the least end that T_min allows.",
+            kind=SHARE,
+            bounds=_UNBOUND,
+        ),
+        _time("mean_queue_wait_s", "queued", "s_i - t_i.", "mean"),
+        _time("longest_queue_wait_s", "longest", statistic="mean"),
+        _time("mean_action_age_s", "age", "s_i - the time of the picture."),
+        _time("oldest_action_s", "oldest"),
+        _mean("speed_distortion", "distortion", "Durations over nominal ones."),
+        _mean("fluidity", "fluidity", "Share of deadlines met (Etalon).", "higher", bounds=_SHARE),
+        _mean(
+            "rms_jerk",
+            "RMS jerk",
+            "Of a model: 1 / s^2 at unit speed; mean over the plans whose skills are kept.",
+            optional=True,
+        ),
+        _mean("peak_jerk", "peak jerk", optional=True),
+        _mean(
+            "sparc",
+            "SPARC",
+            "Spectral arc length: closer to 0 is smoother.",
+            "higher",
+            bounds=(None, 0),
+            optional=True,
+        ),
+    )
+}
+"""The metrics by their names, in the order of their columns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,58 +137,13 @@ class PlanRow:
     caution: float | None
 
 
-TimelineRow: Final = make_dataclass(
+TimelineRow: Final = with_fields(
     "TimelineRow",
-    [
-        (metric.column, metric.column_type, *([field(default=None)] if metric.optional else []))
-        for metric in METRICS.values()
-    ],
-    bases=(PlanRow,),
-    frozen=True,
-    slots=True,
-    kw_only=True,
+    "One plan under one policy, with a column a metric. Motion is null for plans whose skills are not kept.",
+    PlanRow,
+    columns(METRICS.values()),
 )
-"""One plan under one policy, with a column a metric. Motion is null for plans whose skills are not kept."""
-
-
-@dataclass(frozen=True, slots=True)
-class SkillRow:
-    """One skill of a plan: when its fragment was complete, when it ran; ``stall_ns`` is the stall before it.
-
-    Times count from the request. ``text`` is the call, empty where no model wrote one. ``due_ns``, of skills that were
-    really executed, is when the reason to start was there; it is null where times were computed.
-    """
-
-    cell: str
-    request_id: str
-    plan: int
-    index: int
-    text: str
-    arrival_ns: int
-    start_ns: int
-    end_ns: int
-    stall_ns: int
-    nominal_ns: int
-    least_ns: int
-    most_ns: int
-    due_ns: int | None = None
 
 
 TIMELINES: Final[Table[PlanRow]] = Table("timelines", TimelineRow)
 """One row a plan and policy."""
-
-
-def _derive_skill(row: SkillRow) -> dict[str, Value]:
-    """Compute how long a skill lay ready, its duration over the nominal one, and how late the robot had the order."""
-    stretch = (row.end_ns - row.start_ns) / row.nominal_ns if row.nominal_ns else None
-    jitter_ns = None if row.due_ns is None else row.start_ns - row.due_ns
-    return {"queue_wait_ns": row.start_ns - row.arrival_ns, "stretch": stretch, "start_jitter_ns": jitter_ns}
-
-
-SKILLS: Final[Table[SkillRow]] = Table(
-    "skills",
-    SkillRow,
-    {"queue_wait_ns": "int64", "stretch": "float64", "start_jitter_ns": "int64"},
-    _derive_skill,
-)
-"""One row a skill."""

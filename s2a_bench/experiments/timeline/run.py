@@ -1,22 +1,279 @@
-"""A timeline run: computed in virtual time, played on the clock, or live."""
+"""A timeline run on boards' tokens, every policy on the same arrivals: computed, or played on the system clock."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments.timeline.config import TimelineConfig
+from s2a_bench.act.events import Requested, SkillCame, StreamEnded, TokenCame
+from s2a_bench.act.executor import SILENCE_S
+from s2a_bench.act.record import Record
+from s2a_bench.act.timed import TimedRobot
+from s2a_bench.boards.gaps import to_table
+from s2a_bench.boards.tokens import Board
+from s2a_bench.clock import SystemClock
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep, quick_switching
+from s2a_bench.experiments.timeline.rows import TIMELINES
+from s2a_bench.experiments.timeline.to_rows import timeline_rows
+from s2a_bench.experiments.timeline.watch import Scene
+from s2a_bench.harness.timelines.config import Setting, TimelineConfig, settings
+from s2a_bench.harness.timelines.policies import Following, Knowledge, draw, finite, learn, plans_of
+from s2a_bench.harness.timelines.rows import KEPT_PLANS, skill_rows, token_rows
+from s2a_bench.machine import environment
+from s2a_bench.plan import Call, Durations, Skill
+from s2a_bench.policy import Plans, Policy, Schedule
+from s2a_bench.policy.schedule import safe_start
+from s2a_bench.progress import Progress, watching
+from s2a_bench.provenance import Origins, Provenance
+from s2a_bench.store.manifest import RunWarning
+from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
+from s2a_bench.store.run import RunWriter, read_run
 
 if TYPE_CHECKING:
-    from s2a_bench.progress import Progress
+    from s2a_bench.policy import Floats
+MODE = "real-time"
 
 
 def run_timeline(config: TimelineConfig, output: Path, progress: Progress) -> Path:
     """Run all timelines and return the run folder; raises S2AError for what a user can mend."""
     if config.live:
-        from s2a_bench.experiments.timeline.live.run import run_live as run
-    elif config.real_time:
-        from s2a_bench.experiments.timeline.real_time import run_real_time as run
-    else:
-        from s2a_bench.experiments.timeline.virtual import run_virtual as run
-    return run(config, output, progress)
+        from s2a_bench.experiments.timeline.live import run_live
+
+        return run_live(config, output, progress)
+    if config.real_time:
+        return run_real_time(config, output, progress)
+    work = list(settings(config))
+    answers = recordings(config.calibrate) if config.calibrate else []
+    for _, setting in work if answers else ():
+        plans_of(config, setting, answers)  # what is wrong shows before there is a folder
+    with RunWriter.create(output, "timeline", manifest_of(config, work), (TIMELINES, SKILLS, TOKENS)) as writer:
+        progress.opened(writer.path)
+        progress.stage("computing timelines")
+        if config.random:
+            progress.expect(len(work))
+        calibrations: dict[str, Any] = {}
+        for board, setting in work:
+            calibrations |= _compute(config, board, setting, answers, writer)
+            if config.random:
+                progress.advance()
+        warnings = calibration_warnings(calibrations)
+        writer.update(calibrations=calibrations, warnings=[warning.to_manifest() for warning in warnings])
+        return writer.path
+
+
+def _compute(
+    config: TimelineConfig, board: Board, setting: Setting, answers: Sequence[Floats], writer: RunWriter
+) -> dict[str, Any]:
+    """Draw one setting's plans, let every policy decide them, keep the rows and return the calibrations."""
+    known = learn(config, board, setting, answers)
+    token_s, plans = draw(config, board, setting, config.plans_a_cell, "plans")
+    request_ids = [setting.request_id(plan) for plan in range(config.plans_a_cell)]
+    writer.append(TOKENS, token_rows(setting.name, token_s, request_ids))
+    for name, chosen in config.chosen.items():
+        caution, schedule = _decide(known, chosen, plans, track=config.track)
+        rows = timeline_rows(setting, name, plans, schedule, request_ids, caution=caution)
+        writer.append(TIMELINES, rows)
+        writer.append(SKILLS, skill_rows(rows[0].cell, plans, schedule, request_ids))
+    return known.facts(setting)
+
+
+def _decide(
+    known: Knowledge, chosen: Policy, plans: Plans, *, track: bool
+) -> tuple[float | Sequence[float | None] | None, Schedule]:
+    """Return a policy's lambda, of each plan where it follows them, and what it makes of the plans."""
+    tracked = known.tracked(chosen) if track else None
+    if tracked is not None:
+        cautions, schedule = tracked.follow(plans)
+        return [finite(float(caution)) for caution in cautions], schedule
+    policy = known.prepare(chosen)
+    return finite(policy.caution), policy.schedule(plans)
+
+
+def manifest_of(config: TimelineConfig, work: Sequence[tuple[Board, Setting]]) -> dict[str, Any]:
+    """Return what is known before a run that no model answers."""
+    return {
+        "configuration": config.to_manifest(),
+        "environment": environment.collect(),
+        "seeds": {"plans": config.seed},
+        "boards": [_facts(board) for board in config.boards],
+        "provenance": _origins(config, work).to_manifest(),
+    }
+
+
+def _origins(config: TimelineConfig, work: Sequence[tuple[Board, Setting]]) -> Origins:
+    """Return where the numbers of each timeline come from: its board's tokens."""
+    clock = {setting.mode: "virtual" if setting.mode == "virtual" else "monotonic" for _, setting in work}
+    cells = {
+        name: replace(board.provenance, clock=clock[setting.mode])
+        for board, setting in work
+        for name in (setting.name, *(f"{setting.name}/{policy}" for policy in config.chosen))
+    }
+    return Origins(next(iter(cells.values()), Provenance()), cells)
+
+
+def _facts(board: Board) -> dict[str, Any]:
+    """Return a board as plain data; a recording as its family alone."""
+    plain = asdict(board) | {"gaps": to_table(board.gaps)}
+    plain["gaps"].pop("trace", None)
+    return plain
+
+
+def calibration_warnings(calibrations: dict[str, Any]) -> list[RunWarning]:
+    """Return where stream-to-act could not be calibrated well."""
+    waits = [name for name, found in calibrations.items() if found["caution"] is None]
+    if not waits:
+        return []
+    return [
+        RunWarning(
+            "calibration-waits",
+            f"stream-to-act waits for the whole plan in {', '.join(waits)}: no smaller lambda kept stalls rare enough",
+            "allow more stalls with --epsilon, or calibrate on more plans with --calibration-plans",
+        )
+    ]
+
+
+def recordings(folder: Path) -> list[Floats]:
+    """Return the token times of every request that counts, in s from the request, of a latency or throughput run.
+
+    Raises StoreError where there is no run, UsageError where it has no tokens.
+    """
+    run = read_run(folder)
+    samples = run.samples
+    good = samples[~samples["warmup"] & (samples["error"] == "") & samples["ttft_ns"].notna()]
+    tokens = run.tokens.sort_values("index").groupby("request_id")["client_ns"]
+    times = {request_id: column.to_numpy(dtype="float64") for request_id, column in tokens}
+    found = [
+        (times[sample["request_id"]] - times[sample["request_id"]][0] + float(sample["ttft_ns"])) / 1e9
+        for sample in good.to_dict("records")
+        if sample["request_id"] in times
+    ]
+    if not found:
+        raise UsageError(f"`calibrate`: {folder} holds no answers; give the run folder of a latency or throughput run")
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Play:
+    """One plan to be played: when its tokens come, and what they say."""
+
+    token_s: Floats
+    plans: Plans
+    """Of shape (N, 1)."""
+
+    @property
+    def calls(self) -> list[Call]:
+        """Return the skills; nobody wrote them, so they are numbers with durations."""
+        times = zip(self.plans.least_s[:, 0], self.plans.nominal_s[:, 0], self.plans.most_s[:, 0], strict=True)
+        return [
+            Call(Skill(f"skill{number}", (), Durations(*map(float, durations)), "hold"), ())
+            for number, durations in enumerate(times, start=1)
+        ]
+
+    @property
+    def span_s(self) -> float:
+        """Return when the last policy ends: the one that waits."""
+        return float(self.plans.arrival_s[-1, 0] + self.plans.nominal_s.sum())
+
+
+def run_real_time(config: TimelineConfig, output: Path, progress: Progress) -> Path:
+    """Play all timelines, one setting after the other, and return the run folder; raises S2AError.
+
+    Nothing is measured of a model: arrivals are emulated, executions are real.
+    """
+    answers = recordings(config.calibrate) if config.calibrate else []
+    work = [(board, replace(setting, mode=MODE)) for board, setting in settings(config)]
+    tables = (TIMELINES, SKILLS, TOKENS)
+    with RunWriter.create(output, "timeline", manifest_of(config, work), tables) as writer, quick_switching():
+        progress.opened(writer.path)
+        progress.expect(len(work) * config.plans_a_cell)
+        run = _RealTime(config, answers, writer, progress)
+        try:
+            for board, setting in work:
+                run.play(board, setting)
+        finally:
+            run.conclude()
+        return writer.path
+
+
+@dataclass(slots=True)
+class _RealTime:
+    """A run under way, and what is said of the whole at its end, however it ends."""
+
+    config: TimelineConfig
+    answers: Sequence[Floats]
+    writer: RunWriter
+    progress: Progress
+    records: list[Record] = field(default_factory=list)
+    warnings: list[RunWarning] = field(default_factory=list)
+    calibrations: dict[str, Any] = field(default_factory=dict)
+
+    def play(self, board: Board, setting: Setting) -> None:
+        """Play the plans of one setting."""
+        config = self.config
+        self.progress.stage(f"learning {setting.title}")
+        known = learn(config, board, setting, self.answers)
+        made = {name: known.prepare(policy) for name, policy in config.chosen.items()}
+        self.calibrations |= known.facts(setting)
+        every = {name: known.tracked(policy) for name, policy in config.chosen.items() if config.track}
+        tracked = {name: each for name, each in every.items() if each is not None}
+        following = Following(config.shape(setting), made, tracked)
+        token_s, plans = draw(config, board, setting, config.plans_a_cell, "plans")
+        for plan in range(config.plans_a_cell):
+            cut = slice(plan, plan + 1)
+            one = Plans(plans.arrival_s[:, cut], plans.nominal_s[:, cut], plans.least_s[:, cut], plans.most_s[:, cut])
+            self._execute(setting, plan, _Play(token_s[:, plan], one), following)
+            self.progress.advance()
+
+    def _execute(self, setting: Setting, plan: int, play: _Play, following: Following) -> None:
+        """Let every policy execute one plan."""
+        self.progress.stage(f"{setting.title}, L = {setting.tokens_per_skill}: about {play.span_s:.0f} s")
+        safe_s = float(safe_start(play.plans.arrival_s, play.plans.nominal_s)[0])
+        shape = replace(self.config.shape(setting), safe_start_s=safe_s)
+        policies = following.policies()
+        robots = [TimedRobot() for _ in policies]
+        executors = SideBySide(policies, shape, "hold", robots, max(SILENCE_S, 2 * play.span_s))
+        title = f"{setting.title}, {setting.tokens_per_s:g} tokens/s, L = {setting.tokens_per_skill} (EMULATED)"
+        try:
+            with executors, watching(self.progress, Scene(title, executors.records, setting.n_skills, play.span_s)):
+                _play(play, setting.tokens_per_skill, executors)
+        finally:  # what an interruption leaves is kept too
+            self.records += executors.records
+            request_id = setting.request_id(plan)
+            if plan < KEPT_PLANS:
+                self.writer.append(TOKENS, _token_rows(setting, request_id, executors.records[0]))
+            self.warnings += keep(self.writer, setting, plan, request_id, policies, executors.records)
+        following.learn(executors.records)
+
+    def conclude(self) -> None:
+        """Write what is said of the whole run."""
+        warnings = [*self.warnings, *calibration_warnings(self.calibrations)]
+        self.writer.update(
+            calibrations=self.calibrations,
+            start_jitter=jitter_facts(self.records),
+            warnings=[warning.to_manifest() for warning in warnings],
+        )
+
+
+def _play(play: _Play, tokens_per_skill: int, executors: SideBySide) -> None:
+    """Tell the executors of every token at its time, and wait until they are done."""
+    clock = SystemClock()
+    requested_ns = clock.now_ns()
+    executors.tell(Requested(requested_ns))
+    calls = iter(play.calls)
+    for place, due_s in enumerate(play.token_s, start=1):
+        clock.sleep_until_ns(requested_ns + round(float(due_s) * 1e9))
+        at_ns = clock.now_ns()
+        executors.tell(TokenCame(at_ns))
+        if place % tokens_per_skill == 0:
+            executors.tell(SkillCame(at_ns, next(calls)))
+    executors.tell(StreamEnded(clock.now_ns()))
+    executors.finish()
+
+
+def _token_rows(setting: Setting, request_id: str, record: Record) -> list[TokenRow]:
+    return [
+        TokenRow(request_id, setting.name, index, -1, "", None, at_ns) for index, at_ns in enumerate(record.token_ns)
+    ]

@@ -12,7 +12,7 @@ from rich.text import Text
 from s2a_bench.clock import now_ns
 
 if TYPE_CHECKING:
-    from s2a_bench.runtime.record import Record
+    from s2a_bench.act.record import Record
 
 STATUS = 21
 """Columns to the right of the lanes."""
@@ -37,11 +37,9 @@ class Scene:
     """About how long it takes."""
 
     def draw(self, width: int) -> Group:
-        """Draw what has happened by now."""
         return draw(self, now_ns(), width)
 
     def lines(self) -> Iterator[str]:
-        """Return how each policy's plan went."""
         return (f"  {record.policy}: {summary(record)}" for record in self.records)
 
 
@@ -68,7 +66,7 @@ def draw(scene: Scene, at_ns: int, width: int) -> Group:
 
 def summary(record: Record) -> str:
     """Say in words how a plan went."""
-    stalls = [stall / 1e9 for stall in record.stalls_ns if stall > STALL_S * 1e9]
+    stalls = _stalls_s(record)
     if not record.skills or record.requested_ns is None:
         return f"{record.outcome}, nothing was started" + (f": {record.why}" if record.why else "")
     start_s = (record.skills[0].start_ns - record.requested_ns) / 1e9
@@ -80,13 +78,10 @@ def summary(record: Record) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Axis:
-    """Seconds as columns."""
-
     columns: int
     span_s: float
 
     def column(self, at_s: float) -> int:
-        """Return the column of a time."""
         return min(max(int(at_s / self.span_s * self.columns), 0), self.columns - 1)
 
     def cells(self, from_s: float, to_s: float) -> range:
@@ -137,12 +132,15 @@ def _lane(record: Record, axis: _Axis, now_s: float, safe_s: float | None, colou
 
 
 def _status(record: Record, n_skills: int, *, short: bool) -> str:
-    """Count what has happened."""
     done = f"{len(record.ran)}/{n_skills}"
     if record.outcome not in {None, "completed"}:
         return f"{done} {record.outcome}"
-    stalls = [stall / 1e9 for stall in record.stalls_ns if stall > STALL_S * 1e9]
+    stalls = _stalls_s(record)
     return f"{done} {sum(stalls):.1f}s" if short else f"{done} {len(stalls)} stalls {sum(stalls):.1f} s"
+
+
+def _stalls_s(record: Record) -> list[float]:
+    return [stall / 1e9 for stall in record.stalls_ns if stall > STALL_S * 1e9]
 
 
 def _scale(axis: _Axis, safe_s: float | None, known: bool) -> Text:

@@ -17,9 +17,11 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from s2a_bench import extras
+from s2a_bench.options import Options, option
+from s2a_bench.store.manifest import RunWarning
 
 if TYPE_CHECKING:
-    from s2a_bench.frames.v4l2_formats import CameraInfo
+    from s2a_bench.frames.v4l2 import CameraInfo
 
 Level: TypeAlias = Literal["state", "advice", "warning", "error"]
 LEVELS: tuple[Level, ...] = ("state", "advice", "warning", "error")
@@ -50,13 +52,9 @@ def _run(command: Sequence[str]) -> str | None:
     return done.stdout if done.returncode == 0 else None
 
 
-def _finds(package: str) -> bool:
-    return extras.installed(package)
-
-
 def _cameras() -> list[CameraInfo]:
     """List this machine's cameras; their module brings OpenCV, which a run's checks do not need."""
-    from s2a_bench.frames.v4l2_formats import list_cameras
+    from s2a_bench.frames.v4l2 import list_cameras
 
     return list_cameras()
 
@@ -72,7 +70,7 @@ class Machine:
     """Where run folders go."""
     run: Callable[[Sequence[str]], str | None] = _run
     which: Callable[[str], str | None] = shutil.which
-    finds: Callable[[str], bool] = _finds
+    finds: Callable[[str], bool] = extras.installed
     """Whether this Python has a package."""
     cameras: Callable[[], list[CameraInfo]] = _cameras
 
@@ -85,17 +83,15 @@ class Machine:
 
     def number(self, path: str) -> int | None:
         """Return the number in a file; None where there is none."""
-        text = self.read(path)
         try:
-            return None if text is None else int(text)
+            return int(self.read(path) or "")
         except ValueError:
             return None
 
     def read_all(self, pattern: str) -> dict[str, str]:
         """Return the texts of the files that match, by path below the root."""
-        found = {str(path.relative_to(self.root)): path for path in sorted(self.root.glob(pattern))}
-        texts = {name: self.read(name) for name in found}
-        return {name: text for name, text in texts.items() if text is not None}
+        found = (str(path.relative_to(self.root)) for path in sorted(self.root.glob(pattern)))
+        return {name: text for name in found if (text := self.read(name)) is not None}
 
 
 Check: TypeAlias = Callable[[Machine], Finding | None]
@@ -109,16 +105,16 @@ CHECKS: dict[str, str] = {
     "gpu-throttling": "s2a_bench.machine.doctor.gpu:gpu_throttling",
     "power-mode": "s2a_bench.machine.doctor.gpu:power_mode",
     "jetson-clocks": "s2a_bench.machine.doctor.gpu:jetson_clocks",
-    "cpus": "s2a_bench.machine.doctor.cpu:cpus",
-    "cpu-governor": "s2a_bench.machine.doctor.cpu:governor",
-    "cpu-turbo": "s2a_bench.machine.doctor.cpu:turbo",
-    "load": "s2a_bench.machine.doctor.cpu:load",
-    "cpu-throttling": "s2a_bench.machine.doctor.cpu:throttling",
-    "temperature": "s2a_bench.machine.doctor.cpu:temperature",
-    "clock-source": "s2a_bench.machine.doctor.cpu:clock_source",
-    "memory": "s2a_bench.machine.doctor.room:memory",
-    "disk": "s2a_bench.machine.doctor.room:disk",
-    "cameras": "s2a_bench.machine.doctor.robot:cameras",
+    "cpus": "s2a_bench.machine.doctor.host:cpus",
+    "cpu-governor": "s2a_bench.machine.doctor.host:governor",
+    "cpu-turbo": "s2a_bench.machine.doctor.host:turbo",
+    "load": "s2a_bench.machine.doctor.host:load",
+    "cpu-throttling": "s2a_bench.machine.doctor.host:throttling",
+    "temperature": "s2a_bench.machine.doctor.host:temperature",
+    "clock-source": "s2a_bench.machine.doctor.host:clock_source",
+    "memory": "s2a_bench.machine.doctor.host:memory",
+    "disk": "s2a_bench.machine.doctor.host:disk",
+    "cameras": "s2a_bench.machine.doctor.host:cameras",
 }
 """Code of the findings -> check, in the order in which they are shown; engines and transports declare their own."""
 
@@ -137,3 +133,16 @@ def examine(machine: Machine, checks: Mapping[str, str] = CHECKS) -> list[Findin
 def worst(findings: Iterable[Finding]) -> Level:
     """Return the most severe level."""
     return max((finding.level for finding in findings), key=LEVELS.index, default="state")
+
+
+def warnings_of(findings: Iterable[Finding]) -> list[RunWarning]:
+    """Return the warnings and errors as runs store them."""
+    return [RunWarning(seen.code, seen.message, seen.fix) for seen in findings if seen.level in {"warning", "error"}]
+
+
+class DoctorConfig(Options):
+    """How a machine is examined."""
+
+    output: Path = option(Path("results"), "folder for run folders, whose disk is looked at")
+    url: str = option("", "instead of this machine, a server that somebody else runs: what it does that is dangerous")
+    strict: bool = option(False, "exit with 1 on warnings too")

@@ -16,6 +16,11 @@ NVIDIA_VENDOR, DISPLAY_CLASS = "0x10de", "0x03"
 TOO_HOT = {0x08: "hardware slowdown", 0x20: "too warm (driver)", 0x40: "too warm (hardware)", 0x80: "power brake"}
 """Bits of nvmlDeviceGetCurrentClocksThrottleReasons that mean trouble; idle and the power limit are everyday."""
 FULL_POWER = "MAXN"
+JETSON_CLOCKS = {
+    "CPU": ("sys/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_min_freq", ""),
+    "GPU": ("sys/class/devfreq/*/min_freq", "gpu|gv11b|ga10b|gp10b|gm20b"),
+}
+"""Name -> the files with each clock's lowest frequency, and which of them are meant."""
 
 
 @contextmanager
@@ -43,12 +48,10 @@ def nvml() -> Iterator[tuple[Any, list[Any]]]:
 def identity(lib: Any, card: Any) -> dict[str, str]:
     """Name a GPU and its driver, as far as NVML tells: a Jetson's knows next to nothing."""
     facts = {}
-    for key, ask in (
-        ("name", lambda: lib.nvmlDeviceGetName(card)),
-        ("driver", lib.nvmlSystemGetDriverVersion),
-    ):
-        with suppress(lib.NVMLError):
-            facts[key] = str(ask())
+    with suppress(lib.NVMLError):
+        facts["name"] = str(lib.nvmlDeviceGetName(card))
+    with suppress(lib.NVMLError):
+        facts["driver"] = str(lib.nvmlSystemGetDriverVersion())
     return facts
 
 
@@ -81,9 +84,9 @@ def gpu(machine: Machine) -> Finding:
         return Finding("gpu", "state", "the board's own, which shares its memory")
     if has_nvidia(machine) and not extras.installed("pynvml"):
         return Finding("gpu", "advice", "an NVIDIA GPU that is not watched", extras.how_to_install("nvidia"))
-    for path in machine.read_all("sys/bus/pci/devices/*/vendor").items():
-        folder = path[0].rpartition("/")[0]
-        if path[1] == NVIDIA_VENDOR and (machine.read(f"{folder}/class") or "").startswith(DISPLAY_CLASS):
+    for path, vendor in machine.read_all("sys/bus/pci/devices/*/vendor").items():
+        folder = path.rpartition("/")[0]
+        if vendor == NVIDIA_VENDOR and (machine.read(f"{folder}/class") or "").startswith(DISPLAY_CLASS):
             return Finding(
                 "gpu",
                 "warning",
@@ -158,23 +161,14 @@ def jetson_clocks(machine: Machine) -> Finding | None:
         return None
     loose = [
         name
-        for name, folder, low, high in (
-            ("CPU", "sys/devices/system/cpu/cpu[0-9]*/cpufreq", "scaling_min_freq", "scaling_max_freq"),
-            ("GPU", "sys/class/devfreq/*", "min_freq", "max_freq"),
+        for name, (pattern, among) in JETSON_CLOCKS.items()
+        if any(
+            lowest != machine.read(f"{path.removesuffix('min_freq')}max_freq")
+            for path, lowest in machine.read_all(pattern).items()
+            if re.search(among, path)
         )
-        if _moves(machine, folder, low, high, gpu_only=name == "GPU")
     ]
     if loose:
         told = f"the clock of {' and '.join(loose)} follows the load: the first tokens of every answer are slow"
         return Finding("jetson-clocks", "warning", told, "sudo jetson_clocks")
     return Finding("jetson-clocks", "state", "clocks locked")
-
-
-def _moves(machine: Machine, folder: str, low: str, high: str, *, gpu_only: bool) -> bool:
-    """Return whether one of the devices has a range of clocks."""
-    lowest = machine.read_all(f"{folder}/{low}")
-    return any(
-        value != machine.read(f"{path.rpartition('/')[0]}/{high}")
-        for path, value in lowest.items()
-        if not gpu_only or re.search(r"gpu|gv11b|ga10b|gp10b|gm20b", path)
-    )

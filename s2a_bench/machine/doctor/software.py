@@ -30,7 +30,7 @@ def packages(machine: Machine) -> Finding:  # noqa: ARG001 - the packages of thi
     missing = []
     for extra in extras.EXTRAS:
         added = [each for each in stated if _applies(each, extra) and not _applies(each)]
-        if all(_installed(each.name) for each in added):
+        if all(installed(each.name) for each in added):
             needed += added
         else:
             missing.append(extra)
@@ -47,7 +47,7 @@ def _applies(requirement: Requirement, extra: str = "") -> bool:
     return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
 
-def _installed(package: str) -> str:
+def installed(package: str) -> str:
     """Return a package's version; "" where it is not there."""
     try:
         return version(package)
@@ -57,7 +57,7 @@ def _installed(package: str) -> str:
 
 def _problem(requirement: Requirement) -> str:
     """Return what is wrong with a package that is needed, "" if nothing is."""
-    found = _installed(requirement.name)
+    found = installed(requirement.name)
     if not found:
         return f"{requirement.name} is missing"
     fits = requirement.specifier.contains(found, prereleases=True)

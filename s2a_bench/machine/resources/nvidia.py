@@ -1,7 +1,15 @@
-"""NVIDIA GPUs through NVML (nvidia-ml-py), all of the machine together."""
+"""NVIDIA's GPUs through NVML, all of the machine together; a Jetson's board through tegrastats.
+
+A Jetson's GPU shares the board's memory, so there is no GPU memory of its own. ``board_power_w`` is the module's input
+(VDD_IN, POM_5V_IN) or, on an AGX Orin, which has no such rail, the sum of the three that make it up.
+"""
 
 from __future__ import annotations
 
+import os
+import re
+import shutil
+import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
@@ -11,6 +19,15 @@ from s2a_bench.errors import MissingExtra
 from s2a_bench.machine.resources import Unreadable
 
 Query = Callable[[Any], float]
+
+INTERVAL_MS = 100
+INPUTS = ("VDD_IN", "POM_5V_IN")
+AGX_ORIN = ("VDD_GPU_SOC", "VDD_CPU_CV", "VIN_SYS_5V0")
+"""Its VDDQ_VDD2_1V8AO is fed by VIN_SYS_5V0 and must not be counted twice."""
+
+RAIL = re.compile(r"\b([A-Z][A-Z0-9_]+) (\d+)(?:mW)?/\d+(?:mW)?(?= |$)")
+GPU = re.compile(r"\bGR3D_FREQ (\d+)%(?:@\[?(\d+))?")
+TEMPERATURE = re.compile(r"\b(?:gpu|GPU)@(-?\d+(?:\.\d+)?)C")
 
 
 class Nvml:
@@ -32,8 +49,8 @@ class Nvml:
         self._open = True
         try:
             self._gpus = [pynvml.nvmlDeviceGetHandleByIndex(place) for place in range(pynvml.nvmlDeviceGetCount())]
-            names = [_text(pynvml.nvmlDeviceGetName(gpu)) for gpu in self._gpus]
-            driver = _text(pynvml.nvmlSystemGetDriverVersion())
+            names = [pynvml.nvmlDeviceGetName(gpu) for gpu in self._gpus]
+            driver = pynvml.nvmlSystemGetDriverVersion()
         except self._failed as error:
             self.close()
             raise Unreadable(f"NVML: {error}") from error
@@ -44,7 +61,6 @@ class Nvml:
         self.about = f"{', '.join(names)} (driver {driver})"
 
     def read(self) -> Mapping[str, float]:
-        """Return what every GPU answers."""
         values = {}
         for name, (together, query) in self._queries.items():
             with suppress(self._failed):
@@ -52,7 +68,6 @@ class Nvml:
         return values
 
     def close(self) -> None:
-        """Let the library go."""
         if self._open:
             self._open = False
             with suppress(self._failed):
@@ -78,5 +93,56 @@ def _queries(nvml: Any) -> dict[str, tuple[Callable[[list[float]], float], Query
     }
 
 
-def _text(value: str | bytes) -> str:
-    return value.decode() if isinstance(value, bytes) else value
+def parse_tegrastats(line: str) -> dict[str, float]:
+    """Read a line of tegrastats (JetPack 4 to 6); a rail's first figure is the present, its second a mean."""
+    values: dict[str, float] = {}
+    if found := GPU.search(line):
+        values["gpu_busy"] = int(found[1]) / 100
+        if found[2]:
+            values["gpu_clock_hz"] = int(found[2]) * 1e6
+    if found := TEMPERATURE.search(line):
+        values["gpu_temperature_c"] = float(found[1])
+    board_w = board_power({name: int(milliwatts) / 1e3 for name, milliwatts in RAIL.findall(line)})
+    return values if board_w is None else {**values, "board_power_w": board_w}
+
+
+def board_power(rails_w: Mapping[str, float]) -> float | None:
+    """Return the whole board's power from that of its rails, in watts; None for a board we do not know."""
+    for name in INPUTS:
+        if name in rails_w:
+            return rails_w[name]
+    return sum(rails_w[name] for name in AGX_ORIN) if set(AGX_ORIN) <= rails_w.keys() else None
+
+
+class Tegrastats:
+    """The program, running beside; each reading takes the newest whole line it has written."""
+
+    cheap = False
+
+    def __init__(self, pids: Sequence[int] = ()) -> None:  # noqa: ARG002 - the whole board's
+        """Start it; raises Unreadable where it is not installed."""
+        program = shutil.which("tegrastats")
+        if program is None:
+            raise Unreadable("no tegrastats: this is no Jetson, or the program is not in the container")
+        self.about = f"{program} every {INTERVAL_MS} ms"
+        self._text = b""
+        self._process = subprocess.Popen(  # noqa: S603 - found above
+            [program, "--interval", str(INTERVAL_MS)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
+        assert self._process.stdout is not None  # noqa: S101 - opened as a pipe
+        self._pipe = self._process.stdout.fileno()
+        os.set_blocking(self._pipe, False)
+
+    def read(self) -> Mapping[str, float]:
+        """Return the newest line's values, each line once; nothing where no line came since."""
+        with suppress(BlockingIOError):
+            while chunk := os.read(self._pipe, 65536):
+                self._text += chunk
+        whole, newline, self._text = self._text.rpartition(b"\n")
+        return parse_tegrastats(whole.rpartition(b"\n")[2].decode(errors="replace")) if newline else {}
+
+    def close(self) -> None:
+        self._process.terminate()
+        self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()

@@ -16,8 +16,7 @@ from threading import Event, Lock, Thread
 from typing import Any
 
 from s2a_bench.clock import now_ns
-from s2a_bench.machine.resources import Reader, open_readers
-from s2a_bench.machine.resources.rows import BOARD_ENERGY_J, ENERGY_J, POWER_W, RESOURCES, ResourceRow
+from s2a_bench.machine.resources import BOARD_ENERGY_J, ENERGY_J, POWER_W, RESOURCES, Reader, ResourceRow, open_readers
 from s2a_bench.store.run import RunWriter
 
 COUNTERS = ("client_cpu_ns", "server_cpu_ns", "package_energy_j", "gpu_energy_j")
@@ -100,7 +99,6 @@ class Sampler:
             source.reader.close()
 
     def poll(self) -> None:
-        """Read every reader once."""
         for source in self._sources:
             self._read(source)
         self._polls += 1

@@ -10,8 +10,8 @@ A policy answers an observation with a *chunk* of H actions, each meant for one 
 | trigger m | actions left when the next request leaves |
 | stall | a tick, after the first action, that finds no action to execute |
 
-A chunk is a plan whose pieces all take Delta t (`skills.as_plans`), and a plan of skills is a chunk whose pieces differ
-in length: S0 = max_i (t_i - i Delta t) is `schedule.safe_start` of both.
+A chunk is a plan whose pieces all take Delta t, and a plan of skills is a chunk whose pieces differ in length:
+S0 = max_i (t_i - i Delta t) is `schedule.safe_start` of both.
 
 Time is counted in whole control ticks, and nothing is compared in floating point: latencies and Delta t are integer
 nanoseconds. A tick begins with observing and asking, where the mode says so, and has one action or a stall. A chunk
@@ -24,19 +24,22 @@ A simulation has one latency a request, and ends where there is none for the nex
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, Protocol, TypeAlias
 
+from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    Ints: TypeAlias = NDArray[np.int64]
-    Flags: TypeAlias = NDArray[np.bool_]
+    from s2a_bench.policy import Floats
+    from s2a_bench.policy.chunks.closed import Closed
 
+Ints: TypeAlias = "NDArray[np.int64]"
+Flags: TypeAlias = "NDArray[np.bool_]"
 Rounding: TypeAlias = Literal["floor", "ceil"]
 """floor: an action leaves at the end of its tick, so that one whose chunk arrives within the tick is in time (Real-time
 chunking, arXiv 2506.07339). ceil: it leaves at the tick's start (lerobot). They differ by one tick unless L
@@ -52,7 +55,6 @@ class Setting:
     rounding: Rounding = "floor"
 
     def __post_init__(self) -> None:
-        """Refuse what is no setting; raises ValueError."""
         if self.period_ns < 1 or self.horizon < 1:
             raise ValueError(f"period {self.period_ns} ns and horizon {self.horizon} should be 1 or more")
 
@@ -65,6 +67,12 @@ class Setting:
     def known_ticks(self, latency_ns: Ints) -> Ints:
         """Return after how many ticks a request may follow from the answer: ceil(L / Delta t)."""
         return -(-latency_ns // self.period_ns)
+
+    def length(self, execute: int) -> int:
+        """Return s: ``execute``, 0 for the whole chunk; raises ValueError where a chunk has fewer actions."""
+        if execute > self.horizon:
+            raise ValueError(f"execute = {execute} of a chunk of {self.horizon} actions")
+        return execute or self.horizon
 
     def slowed(self, beta: float) -> Setting:
         """Return the setting with all actions executed ``beta`` times slower (time-scaling), up to whole ns."""
@@ -82,17 +90,21 @@ class Action:
 class ChunkStepper(Protocol):
     """One mode following one robot. Ticks never decrease; each tick asks `ask` once, then `act` once."""
 
+    trigger: int = 0
+    """How many actions may be left when it asks: set before every `ask` where the mode is `Mode.triggered`."""
+    triggers: Sequence[int] = ()
+    """The trigger of each request so far, where a rule chooses them."""
+    past: int = 0
+    """How many actions of the newest chunk are past, where the mode blends."""
+
     def arrived(self, request: int, actions: int, tick: int) -> None:
         """Learn that the first ``actions`` actions of a request's chunk are here; requests count from 0."""
-        ...
 
     def ask(self, tick: int) -> bool:
         """Return whether to observe and to ask now."""
-        ...
 
     def act(self, tick: int) -> Action | None:
         """Return what to execute in this tick, None where there is nothing."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,12 +164,36 @@ class Ticks:
 
 
 class Mode(Protocol):
-    """A rule for asking and for taking over; a subclass of this one gets `cycles` and `ticks` from its stepper."""
+    """A rule for asking and for taking over; a subclass of this one gets `cycles` and `ticks` from its stepper.
+
+    The stepper is a subclass of `ChunkStepper`.
+    """
+
+    streams: ClassVar[bool] = False
+    """Whether it acts on a chunk that has not arrived whole."""
+    blocks: ClassVar[bool] = False
+    """Whether the control loop waits for the answer."""
+    triggered: ClassVar[bool] = False
+    """Whether rules may choose its trigger, request by request: its stepper obeys `ChunkStepper.trigger`."""
 
     @property
     def name(self) -> str:
         """Return its name, as in MODES."""
-        ...
+
+    @property
+    def several(self) -> bool:
+        """Whether a request may leave while another one is under way."""
+        return False
+
+    @property
+    def trigger(self) -> int | None:
+        """Return m; None where it does not ask by the actions that are left."""
+        return None
+
+    @property
+    def assumed_ticks(self) -> int | None:
+        """Return the d that it is ready for; None where it assumes nothing."""
+        return self.trigger
 
     @property
     def gap_ns(self) -> int:
@@ -165,33 +201,60 @@ class Mode(Protocol):
         return 0
 
     @property
-    def streams(self) -> bool:
-        """Return whether it acts on a chunk that has not arrived whole."""
-        return False
-
-    @property
     def weight(self) -> float:
         """Return the share of a new action where it meets one that is due at the same time; 1: it takes its place."""
         return 1.0
 
-    @property
-    def blocks(self) -> bool:
-        """Return whether the control loop waits for the answer."""
-        return False
-
     def stepper(self, setting: Setting) -> ChunkStepper:
         """Follow one robot."""
-        ...
+
+    def varied(self, triggers: tuple[int, ...]) -> Mode:
+        """Return it with a trigger for each request, the last one ever after, where it is `triggered`."""
+        from s2a_bench.policy.chunks.trigger import Varied
+
+        return Varied(self, triggers)
+
+    def execution_horizon(self, setting: Setting) -> int:
+        """Return s, for how many ticks a chunk is to be executed; raises ValueError where it has fewer actions."""
+        return setting.horizon
+
+    def slack(self, setting: Setting) -> int | None:
+        """Return the greatest d that its best trigger would not stall with; None where slower actions do not help."""
+        return self.execution_horizon(setting) - 1 if self.triggered else None
+
+    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:  # noqa: ARG002 - for subclasses
+        """Say what follows without a simulation from latencies of shape (R,), in ns, R > 0, of the steady state."""
+        from s2a_bench.policy.chunks.closed import Closed
+
+        return Closed()
+
+    def blend(self, cycles: Cycles, ticks: Ticks) -> Iterator[tuple[Ints, Ints, Ints, Floats]]:  # noqa: ARG002
+        """Yield what executed actions are made of: in which ticks, whose chunk, which action of it, with which weight.
+
+        All that is newest comes first, then what is next to newest. The weights of a tick add up to 1.
+        """
+        import numpy as np
+
+        acted = np.flatnonzero(ticks.chunk >= 0)
+        yield acted, ticks.chunk[acted], ticks.index[acted], np.ones(acted.size)
+
+    def blended_age(self, cycles: Cycles) -> Floats | None:  # noqa: ARG002 - for subclasses
+        """Return the mean age behind each executed action in ticks, shape (K,), NaN for no action.
+
+        Ages are weighted as actions are; `Ticks.age` is that of the newest observation in the blend. None where nothing
+        is blended.
+        """
+        return None
 
     def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
         """Say what becomes of requests with latencies of shape (R,), in ns; the first leaves at tick 0."""
-        from s2a_bench.policy.chunks.stepping import step
+        from s2a_bench.policy.chunks.cycles import step
 
         return step(self, latency_ns, setting)[0]
 
     def ticks(self, latency_ns: Ints, setting: Setting) -> Ticks:
         """Say what each tick does, for the same requests."""
-        from s2a_bench.policy.chunks.stepping import step
+        from s2a_bench.policy.chunks.cycles import step
 
         return step(self, latency_ns, setting)[1]
 
@@ -209,9 +272,20 @@ MODES: Final[Registry[Callable[..., Mode]]] = Registry(
 )
 """What builds each mode from its parameters, which all have defaults."""
 
+COMPARED: Final = ("sync", "queue?trigger=6", "replace?execute=8", "aggregate?trigger=6")
+"""What commands compare unless told."""
+
 
 def mode(written: str) -> Mode:
     """Build the mode ``name[?parameter=value&...]``; raises UsageError for an unknown name, parameter or value."""
     from s2a_bench.policy.parameters import build
 
     return build(MODES[written.partition("?")[0]], written, MODES.field)
+
+
+def streams(written: str) -> bool:
+    """Whether a mode acts on chunks that have not arrived whole; False for one whose package is not installed."""
+    try:
+        return mode(written).streams
+    except UsageError:
+        return False

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, TypeAlias
+from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
+import numpy as np
 from pydantic import Field
 
-from s2a_bench.policy.chunks import Action, Cycles, Setting
-from s2a_bench.policy.chunks.cycles import Laid
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
-    from s2a_bench.policy.chunks import ChunkStepper, Ints
+from s2a_bench.policy import Floats
+from s2a_bench.policy.chunks import Action, ChunkStepper, Cycles, Ints, Setting, Ticks
+from s2a_bench.policy.chunks.closed import Closed, stall_share
+from s2a_bench.policy.chunks.cycles import Laid, assemble, lay
 
 Kind: TypeAlias = Literal["weighted_average", "latest_only", "average", "conservative"]
 WEIGHTS: Final[Mapping[Kind, float]] = {
@@ -41,22 +40,26 @@ class Aggregate(Laid):
 
     @property
     def weight(self) -> float:
-        """Return the new action's weight."""
         return WEIGHTS[self.kind]
 
     def stepper(self, setting: Setting) -> ChunkStepper:
-        """Follow one robot."""
-        return AggregateStepper(self.trigger, setting.horizon)
+        return AggregateStepper(setting.horizon, self.trigger)
+
+    def execution_horizon(self, setting: Setting) -> int:
+        return max(0, setting.horizon - self.trigger)
+
+    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:
+        if 2 * self.trigger >= setting.horizon:
+            return Closed()
+        delay = setting.delay_ticks(latency_ns)
+        cycle = delay + setting.horizon - np.minimum(delay, self.trigger) - self.trigger
+        return Closed(stall_share(delay, self.trigger), delay, cycle)
 
     def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
         """Say what becomes of requests with latencies of shape (R,), in ns.
 
         With q actions left at the request, min(d, q) of the new chunk are past when it arrives.
         """
-        import numpy as np
-
-        from s2a_bench.policy.chunks.cycles import assemble
-
         delay, horizon, most = setting.delay_ticks(latency_ns), setting.horizon, self.trigger
         known = setting.known_ticks(latency_ns)
         if 2 * most < horizon:  # what is left on arrival is above the trigger whatever the delay
@@ -76,16 +79,8 @@ class Aggregate(Laid):
         until = np.minimum(np.append(usable[1:], leaves[-1]), usable + horizon - first)
         return assemble(request, usable, usable, first, until, ticks=int(leaves[-1]), horizon=horizon)
 
-    def blend(self, cycles: Cycles) -> Iterator[tuple[Ints, Ints, Ints, Floats]]:
-        """Yield what executed actions are made of: in which ticks, whose chunk, which action of it, with which weight.
-
-        All that is newest comes first, then what is next to newest. The weights of a tick add up to 1.
-        """
-        import numpy as np
-
-        from s2a_bench.policy.chunks.cycles import lay
-
-        ticks, weight = lay(cycles), WEIGHTS[self.kind]
+    def blend(self, cycles: Cycles, ticks: Ticks) -> Iterator[tuple[Ints, Ints, Ints, Floats]]:
+        weight = self.weight
         acted = np.flatnonzero(ticks.chunk >= 0)
         newest, index = ticks.chunk[acted], ticks.index[acted]
         due = np.searchsorted(acted, cycles.request_tick)  # what is due first, in actions since the start
@@ -101,24 +96,18 @@ class Aggregate(Laid):
             open_, chunk = open_[also], older[also]
 
     def blended_age(self, cycles: Cycles) -> Floats:
-        """Return the mean age behind each executed action in ticks, shape (K,): ages weighted as actions are.
-
-        NaN for no action. `Ticks.age` is that of the newest observation in the blend.
-        """
-        import numpy as np
-
         blended = np.full(cycles.ticks, np.nan)
-        for tick, chunk, _, share in self.blend(cycles):
+        for tick, chunk, _, share in self.blend(cycles, lay(cycles)):
             blended[tick] = np.nan_to_num(blended[tick]) + share * (tick - cycles.request_tick[chunk])
         return blended
 
 
 @dataclass(slots=True)
-class AggregateStepper:
+class AggregateStepper(ChunkStepper):
     """The newest chunk, and how many of its actions are past."""
 
-    trigger: int
     horizon: int
+    trigger: int = 0
     newest: int = -1
     past: int = 0
     """Actions executed since the newest chunk's observation."""
@@ -132,7 +121,6 @@ class AggregateStepper:
         self.newest, self.past, self.under_way = request, self.since_asked, False
 
     def ask(self, tick: int) -> bool:  # noqa: ARG002 - whenever few are left
-        """Ask when few actions are left, and no chunk is under way."""
         left = self.horizon - self.past if self.newest >= 0 else 0
         if self.under_way or left > self.trigger:
             return False
@@ -141,7 +129,6 @@ class AggregateStepper:
         return True
 
     def act(self, tick: int) -> Action | None:  # noqa: ARG002 - whatever is next
-        """Execute the next action."""
         if self.newest < 0 or self.past == self.horizon:
             return None
         self.past += 1

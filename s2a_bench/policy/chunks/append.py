@@ -7,60 +7,98 @@ observation. One request is under way at a time.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
-from s2a_bench.policy.chunks import Action, Cycles, Setting
-from s2a_bench.policy.chunks.cycles import Laid
-from s2a_bench.policy.chunks.stepping import step
-
-if TYPE_CHECKING:
-    from s2a_bench.policy.chunks import ChunkStepper, Ints, Ticks
+from s2a_bench.policy.chunks import Action, ChunkStepper, Cycles, Ints, Mode, Setting, Ticks
+from s2a_bench.policy.chunks.closed import Closed, appended
+from s2a_bench.policy.chunks.cycles import Laid, assemble, lay, step
+from s2a_bench.policy.chunks.trigger import Varied
 
 Execute = Annotated[int, Field(ge=0)]
 
 
+class Appending(Laid):
+    """A mode that executes the first ``execute`` actions of each chunk; 0: the whole chunk."""
+
+    execute: int
+
+    def execution_horizon(self, setting: Setting) -> int:
+        return setting.length(self.execute)
+
+
 @dataclass(frozen=True, slots=True)
-class Queue(Laid):
+class Queue(Appending):
     """Ask when ``trigger`` actions are left, and append; ``execute`` is s, 0 for the whole chunk."""
 
     name: ClassVar[str] = "queue"
+    triggered: ClassVar[bool] = True
 
     trigger: Annotated[int, Field(ge=0)] = 0
     execute: Execute = 0
 
     def stepper(self, setting: Setting) -> ChunkStepper:
-        """Follow one robot."""
-        return QueueStepper(self.trigger, length_of(self.execute, setting))
+        return QueueStepper(self.execution_horizon(setting), self.trigger)
+
+    def varied(self, triggers: tuple[int, ...]) -> Mode:
+        return VariedQueue(self, triggers) if len(triggers) > 1 else replace(self, trigger=triggers[0])
+
+    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:
+        delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
+        return appended(delay, known, self.trigger, self.execution_horizon(setting))
 
     def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
-        """Say what becomes of requests with latencies of shape (R,), in ns."""
         delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
-        return _append(delay, known, delay, self.trigger, length_of(self.execute, setting), setting.horizon)
+        return _append(delay, known, delay, self.trigger, self.execution_horizon(setting), setting.horizon)
+
+
+class VariedQueue(Varied):
+    """The same with a trigger for each request."""
+
+    def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
+        """Say what becomes of requests with latencies of shape (R,), in ns, one request at a time."""
+        delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
+        length, last = self.mode.execution_horizon(setting), len(self.triggers) - 1
+        leaves, starts, left = [0], [], 0
+        for request, (ticks, here) in enumerate(zip(delay.tolist(), known.tolist(), strict=True)):
+            now = leaves[-1]
+            starts.append(now + max(left, ticks))
+            end = starts[-1] + length
+            leaves.append(max(end - self.triggers[min(request + 1, last)], now + max(here, 1)))
+            left = max(0, end - leaves[-1])
+        asked, start = np.array(leaves[:-1], np.int64), np.array(starts, np.int64)
+        first, until = np.zeros_like(start), start + length
+        return assemble(asked, asked + delay, start, first, until, ticks=leaves[-1], horizon=setting.horizon)
+
+    def ticks(self, latency_ns: Ints, setting: Setting) -> Ticks:
+        return lay(self.cycles(latency_ns, setting))
 
 
 @dataclass(frozen=True, slots=True)
-class Sync(Laid):
+class Sync(Appending):
     """Ask when the chunk is used up, and stand still meanwhile: the loop is blocked while it stalls."""
 
     name: ClassVar[str] = "sync"
     blocks: ClassVar[bool] = True
+    assumed_ticks: ClassVar[int] = 0
 
     execute: Execute = 0
 
     def stepper(self, setting: Setting) -> ChunkStepper:
-        """Follow one robot."""
         return Queue(0, self.execute).stepper(setting)
 
+    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:
+        return Queue(0, self.execute).closed_form(latency_ns, setting)
+
     def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
-        """Say what becomes of requests with latencies of shape (R,), in ns."""
         return Queue(0, self.execute).cycles(latency_ns, setting)
 
 
 @dataclass(frozen=True, slots=True)
-class Streamed(Laid):
+class Streamed(Appending):
     """As queue, with actions that arrive one after another: the first after L, then one every ``gap_s``.
 
     ``start=safe`` begins a chunk at S0, as soon as no stall within it can follow: L and then s - 1 times gap - Delta t,
@@ -71,6 +109,7 @@ class Streamed(Laid):
 
     name: ClassVar[str] = "streamed"
     streams: ClassVar[bool] = True
+    assumed_ticks: ClassVar[None] = None
 
     trigger: Annotated[int, Field(ge=0)] = 0
     execute: Execute = 0
@@ -79,41 +118,48 @@ class Streamed(Laid):
 
     @property
     def gap_ns(self) -> int:
-        """Return the time from one action's arrival to the next one's."""
         return round(self.gap_s * 1e9)
 
     def hold_ticks(self, setting: Setting) -> int:
         """Return for how many ticks the first action is held back, S0 - L rounded up."""
         slower_ns = max(0, self.gap_ns - setting.period_ns) if self.start == "safe" else 0
-        return -(-(length_of(self.execute, setting) - 1) * slower_ns // setting.period_ns)
+        return -(-(self.execution_horizon(setting) - 1) * slower_ns // setting.period_ns)
+
+    def waits_within(self, setting: Setting) -> bool:
+        """Whether it may stall within a chunk: then neither arrays nor a closed form tell."""
+        return self.start == "naive" and self.gap_ns > setting.period_ns
 
     def stepper(self, setting: Setting) -> ChunkStepper:
-        """Follow one robot."""
-        return QueueStepper(self.trigger, length_of(self.execute, setting), self.hold_ticks(setting))
+        return QueueStepper(self.execution_horizon(setting), self.trigger, self.hold_ticks(setting))
+
+    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:
+        if self.waits_within(setting):
+            return Closed()
+        length = self.execution_horizon(setting)
+        known = setting.known_ticks(latency_ns + (length - 1) * self.gap_ns)
+        return appended(setting.delay_ticks(latency_ns) + self.hold_ticks(setting), known, self.trigger, length)
 
     def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
-        """Say what becomes of requests whose first actions have latencies of shape (R,), in ns."""
-        if self.start == "naive" and self.gap_ns > setting.period_ns:
+        if self.waits_within(setting):
             return step(self, latency_ns, setting)[0]
-        length = length_of(self.execute, setting)
+        length = self.execution_horizon(setting)
         known = setting.known_ticks(latency_ns + (length - 1) * self.gap_ns)
         whole = setting.delay_ticks(latency_ns + (setting.horizon - 1) * self.gap_ns)
         ready = setting.delay_ticks(latency_ns) + self.hold_ticks(setting)
         return _append(ready, known, whole, self.trigger, length, setting.horizon)
 
     def ticks(self, latency_ns: Ints, setting: Setting) -> Ticks:
-        """Say what each tick does."""
-        if self.start == "naive" and self.gap_ns > setting.period_ns:
+        if self.waits_within(setting):
             return step(self, latency_ns, setting)[1]
         return Laid.ticks(self, latency_ns, setting)
 
 
 @dataclass(slots=True)
-class QueueStepper:
+class QueueStepper(ChunkStepper):
     """A queue of actions; the first of a chunk is held back for ``hold`` ticks after it arrived."""
 
-    trigger: int
     length: int
+    trigger: int = 0
     hold: int = 0
     waiting: deque[tuple[Action, int]] = field(default_factory=deque)
     """Actions, and from which tick on they may be executed."""
@@ -139,17 +185,9 @@ class QueueStepper:
         return True
 
     def act(self, tick: int) -> Action | None:
-        """Execute the next action."""
         if not self.waiting or self.waiting[0][1] > tick:
             return None
         return self.waiting.popleft()[0]
-
-
-def length_of(execute: int, setting: Setting) -> int:
-    """Return s; raises ValueError where a chunk has fewer actions."""
-    if execute > setting.horizon:
-        raise ValueError(f"execute = {execute} of a chunk of {setting.horizon} actions")
-    return execute or setting.horizon
 
 
 def _append(ready: Ints, known: Ints, whole: Ints, trigger: int, length: int, horizon: int) -> Cycles:
@@ -159,10 +197,6 @@ def _append(ready: Ints, known: Ints, whole: Ints, trigger: int, length: int, ho
     ``trigger`` are left and all are known to be here, at max(e + length - trigger, k + known). Where that is always the
     former, q is always the trigger, and nothing depends on what was before.
     """
-    import numpy as np
-
-    from s2a_bench.policy.chunks.cycles import assemble
-
     left = np.full(ready.size, trigger)
     left[:1] = 0
     step = np.maximum(left, ready) + length - trigger

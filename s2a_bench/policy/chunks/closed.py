@@ -1,6 +1,6 @@
 """Closed forms: what a mode costs at a latency, without simulating; each says when it holds.
 
-All but `start_s` are about the steady state, from the second request on, and of requests that do not overlap: one is
+They are about the steady state, from the second request on, and of requests that do not overlap: one is
 under way at a time, and L <= s Delta t unless said otherwise. Ticks are whole; d and ceil(L / Delta t), "known", are
 what `Setting` makes of a latency. In continuous time, on a robot whose ticks are shifted by a stall, d Delta t is L.
 """
@@ -11,95 +11,73 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from s2a_bench.policy import Floats
+from s2a_bench.policy.chunks import Ints
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from s2a_bench.policy import Floats
-    from s2a_bench.policy.chunks import Ints
+    from s2a_bench.policy.chunks import Mode, Setting
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
-    """Least, mean and greatest of an evenly spread number."""
+class Closed:
+    """P(stall), and each request's wait from observation to takeover and cycle until the next request, in ticks.
 
-    least: float
-    mean: float
-    most: float
-
-
-def queue_stall_s(latency_s: ArrayLike, trigger: int, period_s: float) -> Floats:
-    """Return max(0, L - m Delta t), the stall at each boundary in continuous time, for m <= s and any L.
-
-    On a robot with a fixed tick it is rounded to `queue_stall_ticks`: none iff m >= d, that is m >= ceil(L / Delta t)
-    where actions leave at the start of their tick, one less (but for whole L / Delta t) where they leave at its end.
+    None where no closed form holds.
     """
-    return np.maximum(0.0, np.asarray(latency_s, dtype=np.float64) - trigger * period_s)
+
+    p_stall: float | None = None
+    wait_ticks: Ints | None = None
+    cycle_ticks: Ints | None = None
+
+    @property
+    def mean_reaction_ticks(self) -> float | None:
+        """Return E[w] + E[c^2] / (2 E[c])."""
+        if self.wait_ticks is None or self.cycle_ticks is None:
+            return None
+        return mean_reaction_s(self.wait_ticks, self.cycle_ticks)
+
+    def reaction_ticks(self, shares: Floats) -> Floats | None:
+        """Return the quantiles of the time from an event at a uniform moment to the reaction, for shares of any shape.
+
+        An event falls into a cycle with a chance in proportion to its length, anywhere within it; what is left of the
+        cycle and the next request's wait add up. For constant waits and cycles it is U(w, w + c). Both are whole ticks,
+        so that the distribution is linear between them.
+        """
+        from scipy.signal import convolve
+
+        if self.wait_ticks is None or self.cycle_ticks is None:
+            return None
+        rest = np.arange(int(self.cycle_ticks.max()) + 1)
+        longer = np.bincount(self.cycle_ticks, minlength=rest.size)[::-1].cumsum()[::-1]  # cycles of k ticks or more
+        within = longer[1:] / self.cycle_ticks.sum()  # of an event k to k + 1 ticks before the next one
+        least = int(self.wait_ticks.min())
+        waits = np.bincount(self.wait_ticks - least) / self.wait_ticks.size
+        together = np.maximum(convolve(waits, within), 0)  # by FFT where many ticks would take minutes otherwise
+        reached = np.concatenate(([0.0], np.cumsum(together)))
+        found: Floats = np.interp(shares, reached, least + np.arange(reached.size))
+        return found
 
 
-def queue_stall_ticks(delay_ticks: Ints, trigger: int) -> Ints:
-    """Return max(0, d - m): the stall at each boundary under queue, and under aggregate too.
-
-    For m < s with latencies of any size, each cycle by itself; `steady_stall_ticks` is for any m. In aggregate s is
-    H - m, and m < H / 2. Sync is m = 0.
-    """
-    stall: Ints = np.maximum(0, delay_ticks - trigger)
-    return stall
+def closed(mode: Mode, latency_ns: Ints, setting: Setting) -> Closed:
+    """Return what the closed forms say of a mode at latencies of shape (R,), in ns, the first one's left out."""
+    return mode.closed_form(latency_ns[1:], setting) if latency_ns.size > 1 else Closed()
 
 
-def steady_stall_ticks(ready_ticks: Ints, known_ticks: Ints, trigger: int, execute: int) -> Ints:
-    """Return max(0, ready - m, known - s), the stall at each boundary of queue and streamed at constant latency.
-
-    For any m. A chunk may begin ``ready`` ticks after its request: d, and for streamed S0 in ticks; ``known`` is when
-    the next request may follow from its last action. known - s is what no trigger helps against: one answer at a time
-    takes longer than its actions last, as actions that arrive more slowly than they are executed always do.
-    """
-    stall: Ints = np.maximum(np.maximum(0, ready_ticks - trigger), known_ticks - execute)
-    return stall
+def appended(ready: Ints, known: Ints, trigger: int, length: int) -> Closed:
+    """Say it of chunks one after another, where the next request never has to wait for the answer."""
+    wait = np.maximum(ready, trigger)
+    cycle = wait + length - trigger
+    return Closed() if (cycle < np.maximum(known, 1)).any() else Closed(stall_share(ready, trigger), wait, cycle)
 
 
-def sync_motion_share(latency_s: ArrayLike, execute: int, period_s: float) -> Floats:
-    """Return s Delta t / (s Delta t + L), the share of time in motion under sync; random L counts with its mean."""
-    busy_s = execute * period_s
-    return busy_s / (busy_s + np.asarray(latency_s, dtype=np.float64))
-
-
-def replace_stall_ticks(delay_ticks: Ints, cycle_ticks: ArrayLike, horizon: int) -> Ints:
-    """Return min(c, max(0, c + d - H)), the stall between a chunk's takeover and the next one's, at constant d.
-
-    c is s, or max(s, known) where the next request waits for the answer: with d > s and one request under way a cycle
-    is longer than s, and stalls longer than s + d - H says. The bound c is met where d >= H: every action is past.
-    """
-    cycle = np.asarray(cycle_ticks, dtype=np.int64)
-    stall: Ints = np.minimum(cycle, np.maximum(0, cycle + delay_ticks - horizon))
-    return stall
-
-
-def replace_age_ticks(delay: int, cycle: int, horizon: int) -> Span:
-    """Return the age of the observation behind the executed actions: d to c + d - 1 ticks, mean d + (c - 1) / 2.
-
-    Where the chunk runs out before (c + d > H), d to H - 1. Raises ValueError for d >= H, which executes nothing.
-    """
-    if delay >= horizon:
-        raise ValueError(f"a delay of {delay} ticks leaves no action of {horizon}")
-    last = min(cycle + delay, horizon) - 1
-    return Span(delay, (delay + last) / 2, last)
-
-
-def queue_age_ticks(delay: int, trigger: int, execute: int) -> Span:
-    """Return the same under queue, where nothing is skipped: max(m, d) to max(m, d) + s - 1; as `queue_stall_ticks`."""
-    first = max(delay, trigger)
-    return Span(first, first + (execute - 1) / 2, first + execute - 1)
-
-
-def reaction_s(wait_s: float, cycle_s: float) -> Span:
-    """Return the time from an event at a uniform moment to the first action that knows of it: U(w, w + c).
-
-    w is from observation to takeover and c from request to request, both constant: L and s Delta t for replace; for
-    queue max(L, m Delta t) and s Delta t + its stall, since m actions are executed first; for sync L and s Delta t + L,
-    whose mean is 1.5 L + s Delta t / 2.
-    """
-    return Span(wait_s, wait_s + cycle_s / 2, wait_s + cycle_s)
+def beta(mode: Mode, latency_ns: Ints, setting: Setting, epsilon: float) -> float | None:
+    """Return by how much actions would have to be slower for P(stall) <= epsilon; None for a mode without slack."""
+    slack = mode.slack(setting)
+    if slack is None or slack < 1:
+        return None
+    return slow_down(float(np.quantile(latency_ns, 1 - epsilon)) / 1e9, slack, setting.period_ns / 1e9)
 
 
 def mean_reaction_s(wait_s: ArrayLike, cycle_s: ArrayLike) -> float:
@@ -111,13 +89,6 @@ def mean_reaction_s(wait_s: ArrayLike, cycle_s: ArrayLike) -> float:
     """
     wait, cycle = np.asarray(wait_s, dtype=np.float64), np.asarray(cycle_s, dtype=np.float64)
     return float(wait.mean() + np.square(cycle).mean() / (2 * cycle.mean()))
-
-
-def start_s(first_s: ArrayLike, gap_s: ArrayLike, actions: int, period_s: float) -> Floats:
-    """Return S0 of actions that arrive evenly: TTFA + (H - 1) max(0, delta - Delta t); ``actions`` is H."""
-    slower = np.maximum(0.0, np.asarray(gap_s, dtype=np.float64) - period_s)
-    start: Floats = np.asarray(first_s, dtype=np.float64) + (actions - 1) * slower
-    return start
 
 
 def slack_ticks(horizon: int, execute: int, under_way: Literal["one", "many"] = "one") -> int:
@@ -158,12 +129,3 @@ def slow_down(latency_s: float, slack: int, period_s: float) -> float:
     if slack < 1:
         raise ValueError("without slack there is a stall at any speed")
     return max(1.0, latency_s / (slack * period_s))
-
-
-def jump_actions(assumed_ticks: Ints, delay_ticks: Ints) -> Ints:
-    """Return |d_hat - d|: by so many actions the robot jumps where chunks take over at a fixed index.
-
-    Where it did not stall since the observation; after a stall only actions that were executed count, not d.
-    """
-    jump: Ints = np.abs(assumed_ticks - delay_ticks)
-    return jump

@@ -1,25 +1,28 @@
-"""From when each chunk takes over to what that means: the part that all modes with arrays share.
+"""What becomes of requests and ticks: from arrays of when chunks take over, or of a stepper in virtual ticks.
 
-A chunk that is executed at all is executed in one run of ticks, and runs follow one another; between them lie stalls.
+In modes with arrays a chunk that is executed at all is executed in one run of ticks; between runs lie stalls.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import heapq
+from typing import Final, TypeAlias
 
 import numpy as np
 
-from s2a_bench.policy.chunks import Cycles, Mode, Setting, Ticks
+from s2a_bench.policy.chunks import ChunkStepper, Cycles, Ints, Mode, Setting, Ticks
 
-if TYPE_CHECKING:
-    from s2a_bench.policy.chunks import Ints
+_Arrival: TypeAlias = tuple[int, int, int, int]
+"""When actions are usable, from when on asking knows of them, the request, and how many of its actions that are."""
+
+NEVER: Final = 2**61
+"""An arrival that does not come, in ns."""
 
 
 class Laid(Mode):
     """A mode with arrays for `cycles`, in which every chunk is one run: its ticks follow from that."""
 
     def ticks(self, latency_ns: Ints, setting: Setting) -> Ticks:
-        """Say what each tick does."""
         return lay(self.cycles(latency_ns, setting))
 
 
@@ -102,3 +105,49 @@ def _executed_before(tick: Ints, start: Ints, length: Ints, done_before: Ints) -
 def _stalled(chunk: Ints) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     begun = np.maximum.accumulate(chunk >= 0) if chunk.size else chunk >= 0
     return np.asarray(begun & (chunk < 0))
+
+
+def step(mode: Mode, latency_ns: Ints, setting: Setting) -> tuple[Cycles, Ticks]:
+    """Run a mode's stepper until it asks once more than there are latencies, shape (R,) in ns."""
+    shifts = np.arange(setting.horizon) * mode.gap_ns
+    return follow(mode, latency_ns[:, np.newaxis] + shifts, setting)
+
+
+def follow(mode: Mode, arrival_ns: Ints, setting: Setting, most: int = NEVER) -> tuple[Cycles, Ticks]:
+    """Do the same with the arrival of every action after the request's tick began: shape (R, H), in ns.
+
+    It ends after ``most`` ticks, if there have been as many.
+    """
+    count, horizon = len(arrival_ns), setting.horizon
+    usable, known = setting.delay_ticks(arrival_ns), setting.known_ticks(arrival_ns)
+    stepper = mode.stepper(setting)
+    coming: list[_Arrival] = []
+    leaves: list[int] = []
+    chunk: list[int] = []
+    index: list[int] = []
+    tick = 0
+    while tick < most:
+        while coming and coming[0][:2] <= (tick, tick):
+            _deliver(stepper, heapq.heappop(coming))
+        if stepper.ask(tick):
+            request = len(leaves)
+            if request == count:
+                break
+            leaves.append(tick)
+            times = list(zip((tick + usable[request]).tolist(), (tick + known[request]).tolist(), strict=True))
+            for at, actions in {at: place for place, at in enumerate(times, 1)}.items():
+                heapq.heappush(coming, (*at, request, actions))
+        while coming and coming[0][0] <= tick:
+            _deliver(stepper, heapq.heappop(coming))
+        acted = stepper.act(tick)
+        chunk.append(-1 if acted is None else acted.request)
+        index.append(-1 if acted is None else acted.index)
+        tick += 1
+    request_tick = np.array(leaves, np.int64)
+    usable_tick = request_tick + usable[:, -1]
+    return gather(request_tick, usable_tick, np.array(chunk, np.int64), np.array(index, np.int64), horizon)
+
+
+def _deliver(stepper: ChunkStepper, arrival: _Arrival) -> None:
+    tick, _, request, actions = arrival
+    stepper.arrived(request, actions, tick)

@@ -6,15 +6,13 @@ The first request has no boundary: waiting for it is the time to first action, n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from s2a_bench.policy import Floats
-    from s2a_bench.policy.chunks import Cycles, Ints, Mode, Setting, Ticks
+from s2a_bench.policy import Floats
+from s2a_bench.policy.chunks import Cycles, Ints, Mode, Setting, Ticks
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +85,10 @@ def margin_ticks(mode: Mode, latency_ns: Ints, setting: Setting) -> int:
 
     -1 for a run that stalls as it is. All of it counts, so that a longer run has a smaller margin.
     """
-    added = 0
-    while added <= 2 * setting.horizon and not _stalls(mode, latency_ns + added * setting.period_ns, setting):
-        added += 1
-    return added - 1
-
-
-def _stalls(mode: Mode, latency_ns: Ints, setting: Setting) -> bool:
-    return bool(mode.ticks(latency_ns, setting).stalled.any())
+    for added in range(2 * setting.horizon + 1):
+        if mode.ticks(latency_ns + added * setting.period_ns, setting).stalled.any():
+            return added - 1
+    return 2 * setting.horizon
 
 
 def _longest(ticks: Ticks) -> int:

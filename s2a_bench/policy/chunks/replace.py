@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
-from s2a_bench.policy.chunks import Action, Cycles, Setting
-from s2a_bench.policy.chunks.cycles import Laid
-
-if TYPE_CHECKING:
-    from s2a_bench.policy.chunks import ChunkStepper, Ints
+from s2a_bench.policy.chunks import Action, ChunkStepper, Cycles, Ints, Setting
+from s2a_bench.policy.chunks.closed import Closed, replace_stall_share, slack_ticks, stall_share
+from s2a_bench.policy.chunks.cycles import Laid, assemble
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,19 +33,41 @@ class Replace(Laid):
     under_way: Literal["one", "many"] = "one"
     assumed: Annotated[int, Field(ge=-1)] = -1
 
+    @property
+    def several(self) -> bool:
+        return self.under_way == "many"
+
+    @property
+    def assumed_ticks(self) -> int | None:
+        return None if self.assumed < 0 else self.assumed
+
     def stepper(self, setting: Setting) -> ChunkStepper:
-        """Follow one robot."""
         return ReplaceStepper(self, setting.horizon)
 
+    def execution_horizon(self, setting: Setting) -> int:
+        return setting.length(self.execute)
+
+    def slack(self, setting: Setting) -> int:
+        return slack_ticks(setting.horizon, self.execute, self.under_way)
+
+    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:
+        if self.assumed >= 0:
+            return Closed()
+        delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
+        if not self.several:
+            share = replace_stall_share(delay, known, self.execute, setting.horizon)
+            cycle = np.maximum(self.execute, known)
+        elif delay.max() > self.execute:
+            return Closed()
+        else:
+            share = stall_share(delay, setting.horizon - self.execute)
+            cycle = np.full_like(delay, self.execute)
+        return Closed(share, delay, cycle) if delay.max() < setting.horizon else Closed(share)
+
     def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
-        """Say what becomes of requests with latencies of shape (R,), in ns."""
-        import numpy as np
-
-        from s2a_bench.policy.chunks.cycles import assemble
-
         delay = setting.delay_ticks(latency_ns)
         step = np.full(delay.size, self.execute)
-        if self.under_way == "one":
+        if not self.several:
             step = np.maximum(step, setting.known_ticks(latency_ns))
         step[:1] = delay[:1] + self.execute
         leaves = np.concatenate(([0], np.cumsum(step)))
@@ -60,7 +81,7 @@ class Replace(Laid):
 
 
 @dataclass(slots=True)
-class ReplaceStepper:
+class ReplaceStepper(ChunkStepper):
     """The newest chunk, and from when on its actions are due."""
 
     rule: Replace
@@ -86,7 +107,7 @@ class ReplaceStepper:
 
     def ask(self, tick: int) -> bool:
         """Ask every so many ticks, and first of all at once."""
-        waits = self.asked_at and (self.rule.under_way == "one" or self.newest < 0)
+        waits = self.asked_at and (not self.rule.several or self.newest < 0)
         if tick < self.next_ask or waits:
             return False
         self.asked_at.append((self.asked, tick))
@@ -95,6 +116,5 @@ class ReplaceStepper:
         return True
 
     def act(self, tick: int) -> Action | None:
-        """Execute the action that is due."""
         index = tick - self.due_from
         return Action(self.newest, index) if self.newest >= 0 and index < self.horizon else None

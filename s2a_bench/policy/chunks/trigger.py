@@ -1,11 +1,11 @@
-"""When to ask: how many actions should be left, so that a share epsilon of the cycles at most stalls.
+"""When to ask: how many actions should be left, so that at most a share epsilon of the cycles stalls; modes that do.
 
 A cycle's score is its latency: queue stalls where d > m, so the latency is the least trigger, in ns, from which on this
 cycle does not stall. Choosing the r-th greatest of n recorded latencies is the conformal rule that stream-to-act is
 calibrated with, and promises the same (`conformal`): with exchangeable latencies P(stall) <= (r + 1) / (n + 1).
 
 Beside it stand rules to compare with: lerobot's all-time maximum, whose trigger only ever grows; the mean, that most
-cycles near the mean exceed; and an oracle that knows the distribution, not the draw. ``most`` is the greatest trigger
+cycles near the mean exceed. ``most`` is the greatest trigger
 there is, s for queue and H - s for the others: where the latency is above it no trigger helps, but slowing down does.
 """
 
@@ -14,16 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Protocol
 
+import numpy as np
+
+from s2a_bench.policy.chunks import Action, ChunkStepper, Ints, Mode, Setting
 from s2a_bench.policy.chunks.closed import slow_down
 from s2a_bench.policy.conformal import EPSILON, Calibration, Guarantee, Tracker, choose
-
-if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
-    from s2a_bench.policy.chunks import Ints, Setting
-
-NS: Final = 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +37,9 @@ class Rule(Protocol):
     @property
     def latency_ns(self) -> float:
         """Return the latency to be ready for in the next cycle; infinity for as great a one as there can be."""
-        ...
 
     def learn(self, latency_ns: int, *, stalled: bool) -> None:
         """Learn how long the answer took, and whether the robot stalled."""
-        ...
 
 
 def trigger(latency_ns: float, setting: Setting, most: int) -> Trigger:
@@ -58,7 +53,7 @@ def trigger(latency_ns: float, setting: Setting, most: int) -> Trigger:
     ticks = _ticks(latency_ns, setting)
     if ticks <= most:
         return Trigger(ticks)
-    return Trigger(most, slow_down(latency_ns / NS, most, setting.period_ns / NS))
+    return Trigger(most, slow_down(latency_ns / 1e9, most, setting.period_ns / 1e9))
 
 
 def calibrate(latency_ns: Ints, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence") -> Calibration:
@@ -67,37 +62,6 @@ def calibrate(latency_ns: Ints, epsilon: float = EPSILON, guarantee: Guarantee =
     Raises UsageError where so few latencies allow no such promise.
     """
     return choose(latency_ns.astype(float), epsilon, guarantee)
-
-
-def oracle_ticks(survival: Callable[[float], float], setting: Setting, epsilon: float = EPSILON) -> int:
-    """Return the smallest safe trigger, the least m with P(d > m) <= ``epsilon``, from P(L > x) with x in s.
-
-    It is ceil(F^-1(1 - epsilon) / Delta t) where actions leave at the start of their tick, and the floor of that where
-    they leave at its end. Of a distribution without atoms.
-    """
-    later = 1 if setting.rounding == "floor" else 0
-
-    def safe(ticks: int) -> bool:
-        return survival((ticks + later) * setting.period_ns / NS) <= epsilon
-
-    high = 1
-    while not safe(high):
-        high *= 2
-    low = 0
-    while low < high:
-        middle = (low + high) // 2
-        low, high = (low, middle) if safe(middle) else (middle + 1, high)
-    return low
-
-
-@dataclass(slots=True)
-class Fixed:
-    """One latency for ever: what a calibration or the oracle found."""
-
-    latency_ns: float
-
-    def learn(self, latency_ns: int, *, stalled: bool) -> None:
-        """Learn nothing."""
 
 
 @dataclass(slots=True)
@@ -111,7 +75,6 @@ class Maximum:
     latency_ns: float = 0.0
 
     def learn(self, latency_ns: int, *, stalled: bool) -> None:  # noqa: ARG002 - what counts is the latency
-        """Keep the greatest."""
         self.latency_ns = max(self.latency_ns, float(latency_ns))
 
 
@@ -124,11 +87,9 @@ class Mean:
 
     @property
     def latency_ns(self) -> float:
-        """Return the mean."""
         return self.sum_ns / max(self.count, 1)
 
     def learn(self, latency_ns: int, *, stalled: bool) -> None:  # noqa: ARG002 - what counts is the latency
-        """Count one more."""
         self.sum_ns += latency_ns
         self.count += 1
 
@@ -145,53 +106,127 @@ class Tracked:
 
     @staticmethod
     def begin(latency_ns: Iterable[float], epsilon: float = EPSILON, **options: Any) -> Tracked:
-        """Begin with the latencies of a calibration; ``options`` are the tracker's."""
         return Tracked(Tracker(map(float, latency_ns), epsilon, **options))
 
     @property
     def latency_ns(self) -> float:
-        """Return the latency that the recent ones exceed as often as they may."""
         return self.tracker.caution
 
     def learn(self, latency_ns: int, *, stalled: bool) -> None:
-        """Move the level, and forget the oldest latency."""
         self.tracker.learn(float(latency_ns), stalled=stalled)
 
 
-@dataclass(frozen=True, slots=True)
-class Followed:
-    """What a rule did cycle by cycle: arrays of shape (R,)."""
+def follow(rule: Rule, latency_ns: Ints, setting: Setting, most: int) -> Ints:
+    """Return the trigger of each request where a rule learns every latency, shape (R,), after the cycle it decided.
 
-    trigger: Ints
-    beta: Floats
-    """By how much the actions left at the request were slowed down."""
-    stall_ticks: Ints
-    """In ticks of that length."""
-
-
-def follow(rule: Rule, latency_ns: Ints, setting: Setting, most: int, slowest: float = 1.0) -> Followed:
-    """Follow a robot whose rule learns every latency, shape (R,), after the cycle that it decided.
-
-    Its trigger is at most ``most``, and where that is not enough its actions are up to ``slowest`` times slower
-    (time-scaling; 1 for never). The stalls are those of `closed.queue_stall_ticks`, for ``most`` below s.
+    A trigger is at most ``most``, below s; the robot stalls for max(0, d - m) ticks.
     """
-    import numpy as np
-
-    triggers, betas, stalls = np.empty(latency_ns.size, np.int64), np.ones(latency_ns.size), np.zeros_like(latency_ns)
+    triggers = np.empty(latency_ns.size, np.int64)
     for place, latency in enumerate(latency_ns.tolist()):
-        ready = rule.latency_ns
-        chosen = Trigger(most, slowest) if math.isinf(ready) else trigger(ready, setting, most)
-        slowed = setting
-        if chosen.beta > 1 and slowest > 1:
-            betas[place] = min(chosen.beta, slowest)
-            slowed = setting.slowed(betas[place])
-        triggers[place] = chosen.ticks
-        stalls[place] = max(0, _ticks(latency, slowed) - chosen.ticks)
-        rule.learn(latency, stalled=bool(stalls[place]))
-    return Followed(triggers, betas, stalls)
+        triggers[place] = trigger(rule.latency_ns, setting, most).ticks
+        rule.learn(latency, stalled=_ticks(latency, setting) > int(triggers[place]))
+    return triggers
 
 
 def _ticks(latency_ns: float, setting: Setting) -> int:
     """Return d of a latency that need not be whole."""
     whole = math.ceil(latency_ns)
     return whole // setting.period_ns if setting.rounding == "floor" else -(-whole // setting.period_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen(Mode):
+    """How another mode acts whose trigger is chosen request by request."""
+
+    mode: Mode
+
+    @property
+    def name(self) -> str:
+        return self.mode.name
+
+    @property
+    def gap_ns(self) -> int:
+        return self.mode.gap_ns
+
+    @property
+    def weight(self) -> float:
+        return self.mode.weight
+
+
+@dataclass(slots=True)
+class ChosenStepper(ChunkStepper):
+    """Tells a stepper the trigger before it is asked."""
+
+    stepper: ChunkStepper
+    choose: Callable[[], int]
+    asked_at: int = 0
+    triggers: list[int] = field(default_factory=list)
+
+    def arrived(self, request: int, actions: int, tick: int) -> None:
+        self.stepper.arrived(request, actions, tick)
+        self.past = self.stepper.past
+
+    def ask(self, tick: int) -> bool:
+        self.stepper.trigger = self.choose()
+        asks = self.stepper.ask(tick)
+        if asks:
+            self.asked_at = tick
+            self.triggers.append(self.stepper.trigger)
+        return asks
+
+    def act(self, tick: int) -> Action | None:
+        return self.stepper.act(tick)
+
+
+@dataclass(frozen=True, slots=True)
+class Varied(Chosen):
+    """Ask for chunk r when ``triggers[r]`` actions are left, the last one ever after."""
+
+    triggers: tuple[int, ...]
+
+    def stepper(self, setting: Setting) -> ChunkStepper:
+        def choose() -> int:
+            return self.triggers[min(len(stepper.triggers), len(self.triggers) - 1)]
+
+        stepper = ChosenStepper(self.mode.stepper(setting), choose)
+        return stepper
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Learning(Chosen):
+    """Ask when as few actions are left as a rule says, which ``begin`` makes.
+
+    What `follow` says of recorded latencies, a robot does here as it goes. It sees whole ticks, and learns the middle
+    of what a delay of d ticks can have been: no matter to a quantile or a maximum, and right for a mean.
+    """
+
+    begin: Callable[[], Rule]
+
+    def stepper(self, setting: Setting) -> LearningStepper:
+        rule, length = self.begin(), self.mode.execution_horizon(setting)
+
+        def choose() -> int:
+            return trigger(rule.latency_ns, setting, max(1, length - 1)).ticks
+
+        return LearningStepper(self.mode.stepper(setting), choose, rule=rule, setting=setting, length=length)
+
+
+@dataclass(slots=True, kw_only=True)
+class LearningStepper(ChosenStepper):
+    """A stepper whose rule learns the delay of every answer."""
+
+    rule: Rule
+    setting: Setting
+    length: int
+    """Actions of a chunk that are to be executed: when the last one is there the delay is known."""
+    learnt: int = 0
+    """Requests of which it is."""
+
+    def arrived(self, request: int, actions: int, tick: int) -> None:
+        ChosenStepper.arrived(self, request, actions, tick)
+        if self.learnt <= request == len(self.triggers) - 1 and actions >= self.length:
+            self.learnt = request + 1
+            delay = tick - self.asked_at
+            stalled = request > 0 and delay > self.triggers[-1]
+            half_ticks = 2 * delay + (1 if self.setting.rounding == "floor" else -1)
+            self.rule.learn(max(half_ticks, 0) * self.setting.period_ns // 2, stalled=stalled)

@@ -47,7 +47,6 @@ def differences(baseline: Run, other: Run) -> list[Difference]:
     sides = baseline.manifest, other.manifest
     machines = [manifest.get("environment", {}) for manifest in sides]
     models = [manifest.get("model") or {} for manifest in sides]
-    ways = [(manifest.get("flash_attention") or {}).get("chosen") for manifest in sides]
     found = [
         *_of("", *({name: facts[name] for name in _MACHINE if name in facts} for facts in machines), fatal=True),
         *_of("", *(_gpus(facts, "name") for facts in machines), fatal=True),
@@ -57,7 +56,6 @@ def differences(baseline: Run, other: Run) -> list[Difference]:
         *_of("", *(_rest(facts, (*_MACHINE, *_PASSING)) for facts in machines), fatal=False),
         *_of("", *(_gpus(facts, "driver") for facts in machines), fatal=False),
         *_of("package ", *(facts.get("packages", {}) for facts in machines), fatal=False),
-        *_of("flash attention ", *({"chosen": way} for way in ways), fatal=False),
         *_of("configuration ", *(_flat(manifest.get("configuration", {})) for manifest in sides), fatal=False),
     ]
     return sorted(found, key=lambda difference: not difference.fatal)
@@ -87,13 +85,11 @@ def _tuning(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _origin(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return where the numbers come from; nothing of a folder from before that was written down."""
-    every = Origins.of_manifest(manifest).every if "provenance" in manifest else ()
-    return {name: ", ".join(dict.fromkeys(getattr(each, name) for each in every)) for name in _ORIGIN if every}
+    every = Origins.of_manifest(manifest).every
+    return {name: ", ".join(dict.fromkeys(getattr(each, name) for each in every)) for name in _ORIGIN}
 
 
 def _gpus(facts: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return one fact of all GPUs."""
     gpus = facts.get("gpus") or []
     return {f"GPU {key}": ", ".join(str(gpu.get(key)) for gpu in gpus)} if gpus else {}
 

@@ -1,4 +1,4 @@
-"""The comparison of two runs, or of two sets of launches: which cells belong together, what changed, by which test."""
+"""The comparison of two runs, or of two sets of launches: its cells, changes, test and warnings."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.compare.alike import Difference, differences, in_words
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.stats.change import Change, change_between, holm
+from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import Run, fits, read_run
 
 if TYPE_CHECKING:
     from s2a_bench.experiments import Rows
+
 
 LEVEL: Final = 0.05
 """The chance to call any difference one where there is none, over all comparisons together."""
@@ -33,7 +35,6 @@ class Pair:
 
     @property
     def name(self) -> str:
-        """Name the cell."""
         return self.baseline[0].name
 
 
@@ -55,7 +56,6 @@ class Comparison:
 
     @property
     def name(self) -> str:
-        """Name the metric with its statistic."""
         return f"{self.metric.name}.{self.statistic}"
 
 
@@ -88,12 +88,10 @@ class ComparedRuns:
 
     @property
     def origins(self) -> Origins:
-        """Return where the numbers of both sides come from."""
         return joined(run.origins for run in (*self.baseline, *self.other))
 
     @property
     def command(self) -> str:
-        """Name the command whose runs these are."""
         return str(self.baseline[0].manifest["command"])
 
 
@@ -265,3 +263,46 @@ def read_side(text: str, flag: str) -> list[Run]:
     if len(set(folders)) < len(folders):
         raise UsageError(f"{flag}: a folder is named twice; every launch counts once")
     return [read_run(Path(folder)) for folder in folders]
+
+
+def warnings_of(compared: ComparedRuns) -> list[RunWarning]:
+    """Return what a reader must know besides the numbers, each with what to do, the weightiest first."""
+    found = [RunWarning(*each) for each in (*_of_runs(compared), *_of_cells(compared))]
+    if harmless := [one for one in compared.differences if not one.fatal]:
+        found.append(RunWarning("differs", in_words(harmless), "this may be what you compare"))
+    return found
+
+
+def _of_runs(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
+    """Yield code, message and advice."""
+    if fatal := [one for one in compared.differences if one.fatal]:
+        yield "unlike", f"the runs are unlike: {in_words(fatal)}", "read a change as that of all this together"
+    for run in (*compared.baseline, *compared.other):
+        if (state := run.manifest["state"]) != "finished":
+            yield "state", f"{run.path} is {state}, not finished", "its samples so far count; run it again"
+        if codes := sorted({warning["code"] for warning in run.manifest.get("warnings", [])}):
+            yield "warnings", f"{run.path} has warnings: {', '.join(codes)}", "look at them in its manifest"
+    if compared.one_launch:
+        yield (
+            "one-launch",
+            "one launch a side: what differs from launch to launch alone is not in the intervals",
+            "measure both with --launches 5, or repeat the launches, A and B in turn, and name them with commas",
+        )
+
+
+def _of_cells(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
+    """Yield code, message and advice."""
+    if names := sorted({one.pair.name for one in compared.comparisons if one.change.dependent}):
+        yield (
+            "dependent",
+            f"neighbouring requests are so alike that the intervals are too narrow ({', '.join(names)})",
+            "measure longer, or repeat the launches",
+        )
+    for side, cells in zip(("A", "B"), compared.only, strict=True):
+        if cells:
+            yield "only", f"only in {side}: {', '.join(cells)}", "they are not compared"
+    for pair in compared.pairs:
+        for side, subjects in (("A", pair.baseline), ("B", pair.other)):
+            if failed := sum(subject.errors for subject in subjects):
+                total = failed + sum(subject.n for subject in subjects)
+                yield "errors", f"{pair.name}: {failed} of {total} requests failed in {side}", "see samples.csv"

@@ -86,7 +86,6 @@ def judge(compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool) -> lis
 
 
 def _concerned(compared: ComparedRuns, gate: Gate) -> list[Comparison]:
-    """Return the comparisons that a gate is about."""
     metric, statistic = metric_of(compared, gate.metric, _FLAG)
     every = list(changes(compared, metric, statistic))
     found = [one for one in every if not gate.cells or fnmatchcase(one.pair.name, gate.cells)]

@@ -2,51 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from s2a_bench.errors import UsageError
+from s2a_bench.options import Options, option
 
-    from s2a_bench.experiments.chunks.view.lanes import Lane
-    from s2a_bench.experiments.timeline.view.cells import Timelines
-    from s2a_bench.store.run import Run
-    from s2a_bench.writers.csv_text import CsvTable
-    from s2a_bench.writers.tables import TextTable
+GENERATOR = "s2a-bench report"
+"""What the page says it was made by: such a file may be written over."""
+_HEAD_CHARS = 4096
+"""Where a file says who made it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Content:
-    """What a command's run shows: sentences, tables and figures by their files' names, and what to look into.
+class ReportConfig(Options):
+    """Runs, and where everything about them goes; None: it is not wanted."""
 
-    ``csvs`` are tables for programs by file name. ``main`` are the tables that stand open on the page, in that order.
-    """
-
-    summary: Sequence[str] = ()
-    tables: Mapping[str, TextTable] = field(default_factory=dict)
-    main: Sequence[str] = ()
-    csvs: Mapping[str, CsvTable] = field(default_factory=dict)
-    figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
-    timelines: Sequence[Timelines] | Sequence[Lane] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Chapter:
-    """One run on the page, or several of a sweep as one.
-
-    ``name`` is its files' folder, ``command`` what was typed to get it, ``attached`` texts that it needs, by file name.
-    """
-
-    name: str
-    title: str
-    run: Run
-    content: Content
-    command: str
-    caveats: Sequence[str] = ()
-    attached: Mapping[str, str] = field(default_factory=dict)
+    runs: list[Path] = option(..., "run folders, or the folder of a sweep; several side by side", argument=True)
+    output: Path | None = option(None, "the page, one HTML file [default: report.html, if nothing else is asked for]")
+    latex: Path | None = option(None, "folder for LaTeX tables (booktabs, siunitx) and figures as PDF")
+    csv: Path | None = option(None, "folder for CSV tables with every digit")
+    markdown: Path | None = option(None, "all tables as one Markdown file")
+    against: str = option("", "paper: put the paper's claims beside ours, each with a verdict and its evidence")
 
     @property
-    def manifest(self) -> dict[str, Any]:
-        """Return the run's manifest."""
-        return self.run.manifest
+    def page(self) -> Path | None:
+        return self.output if self.output or self.latex or self.csv or self.markdown else Path("report.html")
+
+    def check(self) -> None:
+        """Refuse, before any work, to write over what no report wrote; raises UsageError naming the field."""
+        if self.against not in {"", "paper"}:
+            raise UsageError(
+                f"`against`: '{self.against}' should be paper; two runs are compared with s2a-bench compare"
+            )
+        for name, path in (("output", self.page), ("markdown", self.markdown)):
+            if path is not None:
+                _check_file(f"`{name}`", path)
+        for name, path in (("latex", self.latex), ("csv", self.csv)):
+            if path is not None and path.exists() and not path.is_dir():
+                raise UsageError(f"`{name}`: {path} is a file; name a folder")
+
+
+def _check_file(field: str, path: Path) -> None:
+    if path.is_dir():
+        raise UsageError(f"{field}: {path} is a folder; name a file")
+    if not path.exists():
+        return
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            ours = GENERATOR in file.read(_HEAD_CHARS)
+    except OSError as error:
+        raise UsageError(f"{field}: cannot read {path}: {error.strerror}; name another file") from error
+    if not ours:
+        raise UsageError(f"{field}: {path} is there, and s2a-bench report did not write it; name another file")

@@ -1,26 +1,44 @@
-"""From folders to chapters: a run is one, a sweep an overview and what its cells' runs come to."""
+"""From folders to chapters and what they show: a run is one, a sweep an overview and what its cells' runs come to."""
 
 from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from s2a_bench.errors import StoreError
+from s2a_bench.experiments import Shown, experiment_of
 from s2a_bench.report.compare.alike import differences
-from s2a_bench.report.page import Chapter, Content
-from s2a_bench.report.page.contents import content_of
 from s2a_bench.report.page.sweeps import overview, pooled, words_of
 from s2a_bench.store.run import Run, fits, read_run
 from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep
-
-if TYPE_CHECKING:
-    from s2a_bench.report.compare.alike import Difference
+from s2a_bench.writers.tables import Note, TextTable
 
 MOST_CHAPTERS = 12
 """Runs of a sweep that get a chapter each; the others stand in the overview only."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chapter:
+    """One run on the page, or several of a sweep as one.
+
+    ``name`` is its files' folder, ``command`` what was typed to get it, ``attached`` texts that it needs, by file name.
+    """
+
+    name: str
+    title: str
+    run: Run
+    content: Shown
+    command: str
+    caveats: Sequence[str] = ()
+    attached: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        return self.run.manifest
 
 
 def read_chapters(paths: Sequence[Path], *, against_paper: bool) -> list[Chapter]:
@@ -57,18 +75,13 @@ def mixed_machines(chapters: Sequence[Chapter]) -> list[str]:
     first = chapters[0]
     said = []
     for chapter in chapters[1:]:
-        unlike = [found for found in differences(first.run, chapter.run) if _of_machine(found)]
-        if unlike:
-            what = "; ".join(map(str, unlike))
+        found = [each for each in differences(first.run, chapter.run) if each.fatal]
+        if what := "; ".join(str(each) for each in found if not each.what.startswith("model ")):
             said.append(
                 f"{chapter.title} ran on another machine than {first.title} ({what}): "
                 "their numbers stand side by side, and none is made of both."
             )
     return said
-
-
-def _of_machine(found: Difference) -> bool:
-    return found.fatal and not found.what.startswith("model ")
 
 
 def _chapter(run: Run, title: str, against_paper: bool, **more: Any) -> Chapter:
@@ -81,7 +94,7 @@ def _chapter(run: Run, title: str, against_paper: bool, **more: Any) -> Chapter:
     except StoreError:
         if not caveats:
             raise
-        content = Content(summary=("What there is of this run is not enough for its tables; its CSV files hold it.",))
+        content = Shown(("What there is of this run is not enough for its tables; its CSV files hold it.",))
     command = more.pop("command", repeat_command(manifest))
     return Chapter(_slug(run.path.name), title, run, content, command, caveats, **more)
 
@@ -91,7 +104,6 @@ def _slug(name: str) -> str:
 
 
 def _unfinished(manifest: Mapping[str, Any]) -> Iterator[str]:
-    """Say that a run did not come to its end."""
     state = manifest.get("state")
     if state == "running":
         yield "This run has not finished: it is still running, or was killed. What follows are its rows so far."
@@ -126,8 +138,22 @@ def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
 
 def _named(chapter: Chapter, place: int, chapters: Sequence[Chapter]) -> Chapter:
     """Give a chapter a name that no other has: two of one folder, or of folders of one name, are numbered."""
-    from dataclasses import replace
-
     same = [other for other in chapters if other.name == chapter.name]
     number = sum(other.name == chapter.name for other in chapters[: place + 1])
     return chapter if len(same) == 1 or number == 1 else replace(chapter, name=f"{chapter.name}-{number}")
+
+
+def content_of(run: Run, *, against_paper: bool) -> Shown:
+    """Return what a run shows; of a run without rows nothing, of an unknown command the names of its tables."""
+    if not run.row_counts():
+        return Shown(("The run has no rows: it ended before anything was measured.",))
+    if (experiment := experiment_of(str(run.manifest["command"]))) is not None:
+        return experiment.show(run, against="paper" if against_paper else "")
+    rows = [f"{name} ({count} rows)" for name, count in run.row_counts().items()]
+    return Shown((f"There is no view of {run.manifest['command']} runs; this one holds {', '.join(rows)}.",))
+
+
+def labels_of(tables: Iterable[TextTable]) -> list[str]:
+    """Return the labels that a run carries, since the notes of its tables do."""
+    notes = [note for table in tables for note in table.notes if isinstance(note, Note)]
+    return list(dict.fromkeys(label for note in notes for label in note.labels))

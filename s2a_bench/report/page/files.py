@@ -1,29 +1,83 @@
-"""What a report writes: the page, and tables and figures for papers and programs, in a folder a run."""
+"""What a report writes: figures drawn once, the page, and tables for papers and programs, in a folder a run."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import io
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2a_bench.errors import StoreError
-from s2a_bench.provenance import joined
-from s2a_bench.report.claims.verdicts import Judged, claim_table, judge_claims
-from s2a_bench.report.page.chapters import mixed_machines
-from s2a_bench.report.page.page import GENERATOR, render, tally
-from s2a_bench.report.page.plots import draw
+from s2a_bench.provenance import Origins, joined
+from s2a_bench.report.claims import Judged, claim_table
+from s2a_bench.report.claims.table import judge_claims
+from s2a_bench.report.page import GENERATOR, ReportConfig
+from s2a_bench.report.page.chapters import Chapter, mixed_machines
+from s2a_bench.report.page.page import render, tally
 from s2a_bench.store.run import fits
 from s2a_bench.text import visible
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.latex import document, escape, to_siunitx
-from s2a_bench.writers.tables import markdown_text, to_markdown
+from s2a_bench.writers.style import WIDTH_IN, paper_column
+from s2a_bench.writers.tables import TextTable, markdown_text, to_markdown
 
 if TYPE_CHECKING:
-    from s2a_bench.report.page import Chapter
-    from s2a_bench.report.page.config import ReportConfig
-    from s2a_bench.report.page.plots import Drawn
-    from s2a_bench.writers.tables import TextTable
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """One figure: SVG to be put into HTML, and PDF where it was asked for.
+
+    ``alt`` is its title; a ``wide`` one takes both columns of a paper.
+    """
+
+    svg: str
+    alt: str
+    wide: bool
+    pdf: bytes | None
+
+
+def draw(name: str, builders: Mapping[str, Callable[[], Figure]], *, pdf: bool) -> dict[str, Drawn]:
+    """Build each figure once; ``name`` makes the ids of its parts differ from those of all other figures."""
+    import matplotlib as mpl
+
+    found = {}
+    for place, (figure_name, build) in enumerate(builders.items()):
+        prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', name)}-{place}-"
+        with paper_column(), mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": prefix}):
+            figure = build()
+            svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
+            found[figure_name] = Drawn(
+                inline(svg[svg.index("<svg") :], prefix),
+                _alt(figure),
+                figure.get_figwidth() > WIDTH_IN,
+                _saved(figure, "pdf", "CreationDate") if pdf else None,
+            )
+    return found
+
+
+def _saved(figure: Figure, suffix: str, *without: str) -> bytes:
+    out = io.BytesIO()
+    figure.savefig(out, format=suffix, metadata=dict.fromkeys(without))
+    return out.getvalue()
+
+
+def inline(svg: str, prefix: str) -> str:
+    """Make an SVG fit for HTML: no namespaces, metadata and styles (they would be the page's), ids like no others."""
+    svg = re.sub(r"<!--.*?-->\s*|<(metadata|style)\b.*?</\1>\s*", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg)
+    svg = svg.replace("xlink:href=", "href=")
+    return re.sub(r'(\bid="|href="#|url\(#)', lambda found: found[1] + prefix, svg)
+
+
+def _alt(figure: Figure) -> str:
+    """Return the title in one line, its mathematics as plain as it goes."""
+    title = " ".join(figure.get_suptitle().split())
+    return re.sub(r"\\mathrm\{(\w+)\}", r"\1", title.replace("$", ""))
+
 
 _MARK = f"<!-- {GENERATOR} -->"
 _LONG_ROWS = 30
@@ -38,6 +92,10 @@ class Report:
     judged: Sequence[Judged]
     caveats: Sequence[str]
 
+    @property
+    def origins(self) -> Origins:
+        return joined(chapter.run.origins for chapter in self.chapters)
+
 
 def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
     """Judge the claims where that is wanted, and look for runs of unlike machines."""
@@ -49,10 +107,11 @@ def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
 
 def write_report(report: Report, config: ReportConfig) -> list[Path]:
     """Write what is wanted and return the files; figures are drawn once. Raises StoreError."""
-    drawn = {}
-    if config.page or config.latex:
-        for chapter in report.chapters:
-            drawn[chapter.name] = draw(chapter.name, chapter.content.figures, pdf=config.latex is not None)
+    drawn = {
+        chapter.name: draw(chapter.name, chapter.content.figures, pdf=config.latex is not None)
+        for chapter in report.chapters
+        if config.page or config.latex
+    }
     texts: dict[Path, str | bytes] = {}
     if config.page:
         with fits(*(chapter.run for chapter in report.chapters)):
@@ -94,17 +153,13 @@ def _latex(report: Report, drawn: dict[str, dict[str, Drawn]]) -> Iterator[tuple
 
 
 def _csv(report: Report) -> Iterator[tuple[str, str]]:
-    """Yield CSV texts by their paths."""
     if report.judged:
         rows = [
             (each.verdict, each.claim.where, each.claim.text, each.claim.rule, each.required, " ".join(each.evidence))
             for each in report.judged
         ]
-        origins = joined(chapter.run.origins for chapter in report.chapters)
-        yield (
-            "claims.csv",
-            CsvTable.of(("verdict", "where", "claim", "rule", "required", "evidence"), rows).text(origins),
-        )
+        header = ("verdict", "where", "claim", "rule", "required", "evidence")
+        yield "claims.csv", CsvTable.of(header, rows).text(report.origins)
     for chapter in report.chapters:
         for name, table in chapter.content.csvs.items():
             yield f"{chapter.name}/{name}", table.text(chapter.run.origins)
@@ -112,19 +167,17 @@ def _csv(report: Report) -> Iterator[tuple[str, str]]:
 
 def _claims(report: Report) -> TextTable:
     """Lay out the verdicts, with where the numbers of the judged runs come from."""
-    origins = joined(chapter.run.origins for chapter in report.chapters)
-    return replace(claim_table(report.judged), provenance=origins.line)
+    return replace(claim_table(report.judged), provenance=report.origins.line)
 
 
 def _markdown(report: Report) -> str:
-    """Return everything but the figures as one Markdown text."""
     parts = [_MARK, *(f"> {markdown_text(caveat)}" for caveat in report.caveats)]
     if report.judged:
         parts += [f"## The paper's claims\n\n{tally(report.judged)}.", to_markdown(_claims(report))]
     for chapter in report.chapters:
         parts.append(f"## {markdown_text(chapter.title)}")
         parts += [f"> {markdown_text(caveat)}" for caveat in chapter.caveats]
-        parts.append("\n".join(f"- {markdown_text(text)}" for text in chapter.content.summary))
+        parts.append("\n".join(f"- {markdown_text(text)}" for text in chapter.content.sentences))
         parts.append(f"```sh\n{visible(chapter.command)}\n```")
         parts += [to_markdown(table) for table in chapter.content.tables.values()]
     return "\n\n".join(part for part in parts if part) + "\n"

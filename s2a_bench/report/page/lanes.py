@@ -1,10 +1,14 @@
-"""Timelines as what the page draws: panels of lanes of bars, in seconds from the request."""
+"""Timelines of plans and control ticks of chunks as the page draws them: panels of lanes of bars, in seconds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from s2a_bench.experiments.chunks.view.figures import COLOURS, runs_of
+from s2a_bench.experiments.chunks.view.figures import Lane as ChunkLane
 from s2a_bench.experiments.timeline.view.cells import Timelines, panels
 from s2a_bench.experiments.timeline.view.figures import policy_colours
 from s2a_bench.experiments.timeline.view.tables import seconds
@@ -116,3 +120,45 @@ def _lane(cell: Timelines, colour: str, *, own_tokens: bool) -> Lane:
 
 def _complete_s(cell: Timelines) -> tuple[float, ...]:
     return tuple(cell.skills["arrival_ns"].to_numpy(dtype="float64") / 1e9)
+
+
+def panels_of_chunks(lanes: Sequence[ChunkLane]) -> list[Panel]:
+    """Lay out the first ticks of every mode, in seconds from the first request."""
+    groups: dict[str, list[ChunkLane]] = {}
+    for lane in lanes:
+        groups.setdefault(lane.source, []).append(lane)
+    return [_chunk_panel(source, group) for source, group in groups.items()]
+
+
+def _chunk_panel(source: str, lanes: Sequence[ChunkLane]) -> Panel:
+    end_s = max(len(lane.ticks) * lane.period_s for lane in lanes)
+    return Panel(f"Latency {source}", end_s, ticks_of(end_s), tuple(map(_chunk_lane, lanes)), (), ())
+
+
+def _chunk_lane(lane: ChunkLane) -> Lane:
+    bars = tuple(_chunk_bars(lane))
+    stalled = int(lane.ticks["stalled"].sum())
+    begin = next((bar.start_s for bar in bars), 0.0)
+    words = f"{stalled} of the first {len(lane.ticks)} ticks stall" if stalled else "no stall"
+    return Lane(lane.title, COLOURS[0], bars, begin, None, (), (), words)
+
+
+def _chunk_bars(lane: ChunkLane) -> Iterator[Bar]:
+    """Yield a bar for every stretch of actions of one chunk, and for every stall."""
+    chunk = lane.ticks["chunk"].fillna(-1).to_numpy(dtype="int64")
+    index = lane.ticks["index"].fillna(-1).to_numpy(dtype="int64")
+    age = lane.ticks["age_ticks"].fillna(-1).to_numpy(dtype="int64")
+    stalled = lane.ticks["stalled"].to_numpy(dtype="bool")
+    unused = dict(zip(lane.requests["request"], lane.requests["thrown_away"], strict=True))
+    for first, last in runs_of(np.where(stalled, -2, chunk)):
+        span = f"ticks {first} to {last - 1}"
+        start_s, width_s = first * lane.period_s, (last - first) * lane.period_s
+        if stalled[first]:
+            yield Bar("stall", start_s, width_s, f"{lane.title}: stall of {last - first} ticks, {span}")
+        elif chunk[first] >= 0:
+            text = (
+                f"{lane.title}: chunk {chunk[first]}, actions {index[first]} to {index[last - 1]}, {span}, "
+                f"observation {age[first]} to {age[last - 1]} ticks old"
+            )
+            away = f", {unused[chunk[first]]} actions thrown away" if unused.get(chunk[first]) else ""
+            yield Bar("skill", start_s, width_s, text + away, COLOURS[chunk[first] % len(COLOURS)])

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench import __version__
-from s2a_bench.experiments.chunks.view.lanes import Lane as ChunkLane
-from s2a_bench.report.claims.verdicts import Judged
-from s2a_bench.report.page.chapters import when
-from s2a_bench.report.page.chunk_lanes import panels_of_chunks
-from s2a_bench.report.page.contents import labels_of
-from s2a_bench.report.page.lanes import MOST_PANELS, panels_of
+from s2a_bench.experiments.chunks.view.figures import Lane as ChunkLane
+from s2a_bench.report.claims import Judged
+from s2a_bench.report.page import GENERATOR
+from s2a_bench.report.page.chapters import labels_of, when
+from s2a_bench.report.page.lanes import MOST_PANELS, panels_of, panels_of_chunks
 from s2a_bench.store.manifest import utc_now
 from s2a_bench.store.sweep import is_sweep
 from s2a_bench.text import visible
 
 if TYPE_CHECKING:
-    from s2a_bench.report.page import Chapter
-    from s2a_bench.report.page.plots import Drawn
-
-GENERATOR = "s2a-bench report"
-"""What the page says it was made by: such a file may be written over."""
+    from s2a_bench.report.page.chapters import Chapter
+    from s2a_bench.report.page.files import Drawn
 
 
 def render(
@@ -64,13 +59,10 @@ def render(
 
 def title_of_page(chapters: Sequence[Chapter]) -> str:
     """Name the page after its only folder, or count them: a sweep's chapters are of one."""
-    folders = [chapter for chapter in chapters if not any(top in chapter.run.path.parents for top in _sweeps(chapters))]
+    sweeps = {chapter.run.path for chapter in chapters if is_sweep(chapter.manifest)}
+    folders = [chapter for chapter in chapters if sweeps.isdisjoint(chapter.run.path.parents)]
     names = {chapter.run.path: chapter.title for chapter in reversed(folders)}
     return next(iter(names.values())) if len(names) == 1 else f"{len(names)} runs, side by side"
-
-
-def _sweeps(chapters: Sequence[Chapter]) -> list[Path]:
-    return [chapter.run.path for chapter in chapters if is_sweep(chapter.manifest)]
 
 
 def tally(judged: Sequence[Judged]) -> str:
@@ -80,7 +72,6 @@ def tally(judged: Sequence[Judged]) -> str:
 
 
 def _view(chapter: Chapter, figures: dict[str, Drawn]) -> dict[str, Any]:
-    """Return what the template shows of a chapter."""
     content, manifest = chapter.content, chapter.manifest
     main = [content.tables[name] for name in content.main]
     return {
@@ -90,12 +81,12 @@ def _view(chapter: Chapter, figures: dict[str, Drawn]) -> dict[str, Any]:
         "state": manifest.get("state", "unknown"),
         "started": when(manifest),
         "labels": list(dict.fromkeys((*chapter.run.origins.labels, *labels_of(content.tables.values())))),
-        "summary": content.summary,
+        "summary": content.sentences,
         "caveats": chapter.caveats,
         "warnings": manifest.get("warnings", []),
         "tables": main,
         "more": [table for name, table in content.tables.items() if name not in content.main],
-        **_panels(content.timelines),
+        **_panels(content.lanes),
         "figures": figures,
         "command": chapter.command,
         "attached": chapter.attached,

@@ -11,24 +11,24 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from s2a_bench.experiments import Shown
 from s2a_bench.experiments.latency.view import against_bytes
-from s2a_bench.experiments.latency.view.cells import split, stand_ins
-from s2a_bench.experiments.latency.view.tables import TITLES
-from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
+from s2a_bench.experiments.requests import Cell, spelled, split, stand_ins
+from s2a_bench.experiments.timeline.rows import TIMELINES
+from s2a_bench.policy import Floats
 from s2a_bench.provenance import Origins
-from s2a_bench.report.page import Content
-from s2a_bench.stats import summary_of
-from s2a_bench.store.requests import TOKENS
+from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import Run
+from s2a_bench.store.sweep import Sweep
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import marked
-from s2a_bench.writers.tables import ABSENT, TextTable, mean_sd, number
+from s2a_bench.writers.tables import MEAN_SD, TextTable, entries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.latency.view.cells import Cell, Floats, Split
-    from s2a_bench.store.sweep import Sweep
+    from s2a_bench.experiments.requests import Split
+
 
 Runs = Sequence[tuple[dict[str, Any], Run]]
 
@@ -36,7 +36,7 @@ _AXES: Final = ("policies", "profiles", "rates", "tokens_per_skill", "n_skills",
 """What may differ between timelines that belong together: the name of a timeline's cell tells these apart."""
 
 
-def overview(sweep: Sweep, runs: Runs) -> Content:
+def overview(sweep: Sweep, runs: Runs) -> Shown:
     """Return the cells of a sweep with what became of them, and the numbers of measured ones side by side."""
     states = sweep.cells["state"].value_counts().to_dict()
     asked = int(sweep.manifest["configuration"].get("cells", len(sweep.cells)))
@@ -53,7 +53,8 @@ def overview(sweep: Sweep, runs: Runs) -> Content:
     tables = {name: replace(table, provenance=line) for name, table in (lines | tables).items()}
     csvs = {"cells.csv": CsvTable.of_frame(sweep.cells)}
     drawn = {name: partial(_marked, build, line) for name, build in figures.items()}
-    return Content(said, tables, [*lines, *(["overview"] if measured else [])], csvs, drawn)
+    main = [*lines, *(["overview"] if measured else [])]
+    return Shown(said, tables, main, csvs=csvs, figures=drawn)
 
 
 def _marked(build: Callable[[], Figure], line: str) -> Figure:
@@ -112,12 +113,11 @@ def pooled(sweep: Sweep, runs: Runs) -> tuple[list[Run], Runs]:
 
 
 def _is_virtual(run: Run) -> bool:
-    rows = run.table(TIMELINES)
-    return run.manifest["command"] == "timeline" and len(rows) > 0 and bool((rows["mode"] == "virtual").all())
+    return run.manifest["command"] == "timeline" and set(run.table(TIMELINES)["mode"]) == {"virtual"}
 
 
 def _overlap(one: Run, other: Run) -> bool:
-    return bool(set(one.table(TIMELINES)["cell"]) & set(other.table(TIMELINES)["cell"]))
+    return not set(one.table(TIMELINES)["cell"]).isdisjoint(other.table(TIMELINES)["cell"])
 
 
 def _joined(sweep: Sweep, runs: Sequence[Run]) -> Run:
@@ -142,13 +142,11 @@ def _joined(sweep: Sweep, runs: Sequence[Run]) -> Run:
 
 
 def _measured(words: str, run: Run, cells: Sequence[Cell]) -> Iterator[tuple[str, ...]]:
-    """Yield a row a cell of a measured run."""
     if run.samples.empty:
         return
     for cell in cells:
         what, values = _quantity(cell, run)
-        found = summary_of(values)
-        numbers = [mean_sd(found), number(found.median), number(found.p99)] if found else [ABSENT] * 3
+        numbers = entries(values, MEAN_SD, "median", "p99")
         host = str(run.manifest.get("host", ""))
         yield words, cell.name, what, host, str(cell.n), str(cell.errors), *numbers
 
@@ -156,8 +154,6 @@ def _measured(words: str, run: Run, cells: Sequence[Cell]) -> Iterator[tuple[str
 def _quantity(cell: Cell, run: Run) -> tuple[str, Floats]:
     """Return what a cell is judged by: tokens/s of a throughput run, else e2e without inference where it is known."""
     if run.manifest["command"] == "throughput":
-        from s2a_bench.experiments.throughput.view.cells import Speed
-
-        return "tokens/s", Speed(cell).values("tokens_per_s")
+        return "tokens/s", cell.values("tokens_per_s")
     metric = next((name for name in ("e2e_without_inference", "e2e") if cell.values_ms(name).size), "e2e")
-    return f"{TITLES[metric]}, ms", cell.values_ms(metric)
+    return f"{spelled(metric)}, ms", cell.values_ms(metric)

@@ -1,10 +1,6 @@
 """Car-to-car rear braking (Euro NCAP CCRb) with a car behind: its options, laws, studies and words.
 
-    asked = CcrbOptions(front_gap_m=30.0)             # the operating point: options.py, cars.py
-    schedule = policy("naive").schedule(plans)        # when each skill runs
-    found = drive(simulator("longitudinal"), asked.cars, asked.driving, schedule)  # drive.py
-    found.outcomes.name(0), found.outcomes.min_front_gap_m
-
+A scenario is `options.CcrbOptions`; `drive.drive` carries a schedule out in a simulator and says what came of it.
 Whole planes of scenarios, and random ones, are in studies.py; how results are worded in words.py.
 """
 

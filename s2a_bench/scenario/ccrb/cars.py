@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.plan.skillset import Gap
+from s2a_bench.policy import Floats
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
-
-    from s2a_bench.policy import Floats
 
 KMH: Final = 1 / 3.6
 NCAP_SPEED_MPS: Final = 50 * KMH
@@ -121,5 +120,4 @@ def start_deadline(cars: Cars, plan_decel_mps2: ArrayLike) -> Floats:
     harder = np.maximum(own - lead, 0.0)
     meeting = np.sqrt(2 * room * harder / (lead * own))
     meets_at = np.divide(own * meeting, harder, out=np.full(own.shape, np.inf), where=harder > 0)
-    deadline: Floats = np.where(meets_at < speed / lead, meeting, at_rest)
-    return deadline
+    return np.asarray(np.where(meets_at < speed / lead, meeting, at_rest))

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from s2a_bench.errors import UsageError
-from s2a_bench.policy import Schedule
+from s2a_bench.policy import Floats, Schedule
 from s2a_bench.scenario import EGO, LEAD, REAR, Command, Simulator, State
-from s2a_bench.scenario.ccrb.cars import LEAD_JERK_MPS3, Cars, DrivingPlan
+from s2a_bench.scenario.ccrb.cars import LEAD_JERK_MPS3, LEAST_IMPACT_MPS, Cars, DrivingPlan
 from s2a_bench.scenario.ccrb.ego import DONE, Ego
 from s2a_bench.scenario.ccrb.follower import Motion, Seen, follower
 from s2a_bench.scenario.ccrb.outcome import Outcomes, Watch
-from s2a_bench.scenario.lockstep import LockStep
+from s2a_bench.scenario.longitudinal import LockStep, Longitudinal, each
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from s2a_bench.policy import Floats
-
+NOBODY_M: Final = 1e6
+"""With the lead so far away nothing but the plan slows the ego down."""
 AFTER_S: Final = 25.0
 """How long after the plan a roll-out goes on at most; nearly all are decided earlier."""
 RECORD_S: Final = 0.01
@@ -81,15 +79,29 @@ def drive(
     return _Drive(simulator, cars, plan, schedule, rollouts).run(record=record, resting_mps=resting_mps)
 
 
-class _Drive:
-    """The loop and its memory."""
+def follower_survives(cars: Cars, plan: DrivingPlan, n_skills: ArrayLike, t_nom_s: ArrayLike) -> NDArray[np.bool_]:
+    """Return whether the trailing car never hits an ego whose tokens come at once, at the same gap; shape (M,).
+
+    Skill follows skill, each as long as planned, with nobody ahead; a plan shorter than the longest ends earlier.
+    """
+    count, nominal_s = np.broadcast_arrays(np.atleast_1d(n_skills), np.atleast_1d(np.asarray(t_nom_s, float)))
+    place = np.arange(count.max())[:, np.newaxis]
+    schedule = Schedule(np.minimum(place, count) * nominal_s, np.where(place < count, nominal_s, 0.0))
+    alone = replace(cars, front_gap_m=NOBODY_M, onset_s=0.0, reflex=False)
+    along = DrivingPlan(plan.set_point_mps, (0,) * len(plan.lane))
+    found = drive(Longitudinal(), alone, along, schedule, resting_mps=LEAST_IMPACT_MPS).outcomes
+    return np.asarray(found.code & 2 == 0)
+
+
+class _Drive(LockStep):
+    """The loop and its memory; `LockStep.keep` reaches the laws, the delay, the watch and the simulator too."""
 
     def __init__(self, simulator: Simulator, cars: Cars, plan: DrivingPlan, schedule: Schedule, rollouts: int) -> None:
         self._simulator = simulator
         self._ego = Ego(cars, plan, schedule, rollouts)
         self._rear = follower(cars, rollouts)
-        self._lead_decel = np.broadcast_to(np.asarray(cars.lead_decel_mps2, float), (rollouts,))
-        self._onset_s = np.broadcast_to(np.asarray(cars.onset_s, float), (rollouts,))
+        self._lead_decel = each(cars.lead_decel_mps2, rollouts)
+        self._onset_s = each(cars.onset_s, rollouts)
         self._begin_s = min(float(self._onset_s.min()), 0.0)
         position, speed = np.zeros((3, rollouts)), np.empty((3, rollouts))
         position[LEAD], position[REAR] = cars.front_gap_m, -np.asarray(cars.rear_gap_m, float)
@@ -104,7 +116,6 @@ class _Drive:
         self._records: list[tuple[State, Floats, NDArray[np.int64], NDArray[np.int64]]] = []
 
     def run(self, *, record: bool, resting_mps: float) -> Driven:
-        """Step until all is decided."""
         step_s = self._simulator.step_s
         every = max(round(RECORD_S / step_s), 1)
         last = int((float(self._ego.end_s.max()) + AFTER_S - self._begin_s) / step_s)
@@ -130,20 +141,11 @@ class _Drive:
             return True
         self._outcomes.put(self._left, self._watch.outcomes())
         columns = np.flatnonzero(~decided)
-        self._simulator.keep(columns)
-        for part in (self._ego, self._rear, self._delay, self._watch):
-            part.keep(columns)
-        self._left = self._left[columns]
-        self._seen_at_rest = self._seen_at_rest[columns]
-        self._lead_decel = self._lead_decel[columns]
-        self._onset_s = self._onset_s[columns]
-        self._acceleration = self._acceleration[:, columns]
-        now = self._state
-        self._state = State(now.position_m[:, columns], now.speed_mps[:, columns], now.lateral_m[:, columns])
+        self.keep(columns)
+        self._state = self._state.keep(columns)
         return True
 
     def _decide(self, now_s: float) -> None:
-        """Ask the three cars' laws for the next step."""
         state, step_s, acceleration = self._state, self._simulator.step_s, self._acceleration
         seen = self._delay.see(state, self._ego.acceleration_mps2, acceleration[REAR])
         self._seen_at_rest = seen.ego_then.speed_mps <= 0
@@ -166,20 +168,18 @@ class _Drive:
         behind = self._watch.rear.crashed | calm
         resting = over & (speed[EGO] <= 0) & behind
         passed = over & (self._watch.front.gap_m < -PASSED_M)
-        decided: NDArray[np.bool_] = self._watch.front.crashed | resting | passed
-        return decided
+        return np.asarray(self._watch.front.crashed | resting | passed)
 
     def _trajectory(self, step_s: float) -> Trajectory:
-        """Stack the records."""
-        states = [state for state, *_ in self._records]
+        states, accelerations, phases, skills = zip(*self._records, strict=True)
         return Trajectory(
             time_s=self._begin_s + np.arange(len(states), dtype=np.float64) * step_s,
             position_m=np.stack([state.position_m for state in states]),
             speed_mps=np.stack([state.speed_mps for state in states]),
             lateral_m=np.stack([state.lateral_m for state in states]),
-            acceleration_mps2=np.stack([acceleration for _, acceleration, *_ in self._records]),
-            phase=np.stack([phase for *_, phase, _ in self._records]),
-            skill=np.stack([skill for *_, skill in self._records]),
+            acceleration_mps2=np.stack(accelerations),
+            phase=np.stack(phases),
+            skill=np.stack(skills),
         )
 
 
@@ -201,7 +201,6 @@ class Delay(LockStep):
         self._head = -1
 
     def keep(self, columns: NDArray[np.int64]) -> None:
-        """Go on with these roll-outs only."""
         self._past = np.ascontiguousarray(self._past[:, columns])
         self._steps = self._steps[columns]
         self._columns = np.arange(len(columns))

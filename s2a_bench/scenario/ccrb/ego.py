@@ -7,21 +7,17 @@ limits of jerk and acceleration. Before the first skill, and after a plan that d
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench.errors import UsageError
 from s2a_bench.plan.skillset import GAPS, Gap
-from s2a_bench.policy import Schedule
-from s2a_bench.scenario.ccrb.braking import needed
+from s2a_bench.policy import Floats, Schedule
 from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, EGO_LOOP_S, EGO_MOST_MPS2, Cars, DrivingPlan
-from s2a_bench.scenario.lockstep import LockStep
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from s2a_bench.policy import Floats
+from s2a_bench.scenario.ccrb.follower import needed
+from s2a_bench.scenario.longitudinal import LockStep, each
 
 WAITING, ACTING, GAP, DONE = 0, 1, 2, 3
 PHASES: Final = ("waiting", "acting", "gap", "done")
@@ -50,11 +46,12 @@ class Ego(LockStep):
         self._points = np.broadcast_to(plan.set_point_mps, (shape[0] + 1, rollouts))
         self._lanes = (0, *plan.lane)
         self._gaps = gaps
-        self._hard_mps2 = np.broadcast_to(np.asarray(cars.gap_decel_mps2, float), (rollouts,))
-        self._jerk_mps3 = np.broadcast_to(np.asarray(cars.ego_jerk_mps3, float), (rollouts,))
+        self._hard_mps2 = each(cars.gap_decel_mps2, rollouts)
+        self._jerk_mps3 = each(cars.ego_jerk_mps3, rollouts)
         self._between = {gap: rule for gap, rule in BETWEEN.items() if (gaps == gap).any()}
         self._reflex = Reflex(rollouts) if cars.reflex else None
-        self._index = np.full(rollouts, -1)
+        self.index = np.full(rollouts, -1)
+        """The skill that runs or ran last, from 0 on; -1 before the first."""
         self._next_s = self._start_s[0].copy()
         self._from_s, self._until_s = np.zeros(rollouts), np.full(rollouts, -np.inf)
         self._level, self._slope = self._points[0].copy(), np.zeros(rollouts)
@@ -63,14 +60,8 @@ class Ego(LockStep):
         self.end_s = self._start_s[-1] + self._duration_s[-1]
 
     @property
-    def index(self) -> NDArray[np.int64]:
-        """Return the skill that runs or ran last, from 0 on; -1 before the first."""
-        return self._index
-
-    @property
     def lane(self) -> NDArray[np.int64]:
-        """Return the lane to steer for."""
-        return np.take(self._lanes, self._index + 1)
+        return np.take(self._lanes, self.index + 1)
 
     def decide(
         self, now_s: float, speed: Floats, gap_m: Floats, lead_mps: Floats, lead_decel: Floats, step_s: float
@@ -100,8 +91,8 @@ class Ego(LockStep):
         now_s += 1e-12
         while (due := now_s >= self._next_s).any():
             columns = np.flatnonzero(due)
-            index = self._index[columns] + 1
-            self._index[columns] = index
+            index = self.index[columns] + 1
+            self.index[columns] = index
             duration = self._duration_s[index, columns]
             self._from_s[columns] = self._start_s[index, columns]
             self._until_s[columns] = self._from_s[columns] + duration
@@ -114,7 +105,7 @@ class Ego(LockStep):
             )
         after = np.where(np.isinf(self._next_s), DONE, GAP)
         running = np.where(now_s < self._until_s, ACTING, after)
-        self.phase = np.where(self._index < 0, WAITING, running)
+        self.phase = np.where(self.index < 0, WAITING, running)
 
 
 class Reflex(LockStep):
@@ -124,7 +115,6 @@ class Reflex(LockStep):
         self._braking = np.zeros(rollouts, bool)
 
     def limit(self, wish: Floats, speed: Floats, gap_m: Floats, lead_mps: Floats, lead_decel: Floats) -> Floats:
-        """Return the plan's wish, or full braking."""
         closing = speed - lead_mps
         alarm = (needed(speed, gap_m, lead_mps, lead_decel) > REFLEX_MPS2) | (gap_m < closing * REFLEX_TTC_S)
         self._braking = (self._braking | alarm) & (closing > 0)

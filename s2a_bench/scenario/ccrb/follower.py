@@ -1,7 +1,7 @@
 """The car behind: laws by their published names, all with one brake; the rear outcome hangs on them.
 
 ``careful`` (ours, in the manner of UN Regulation 157): from the ego's state tau ago, extrapolated over tau with the
-deceleration it had then, it computes the braking it needs to stay 1 m behind (`braking.needed`), and brakes with that,
+deceleration it had then, it computes the braking it needs to stay 1 m behind (`needed`), and brakes with that,
 at most 7 m/s^2, once the ego brakes by more than .5 or more than .7 is needed, until it is no faster than the ego.
 
 ``idm``: the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62 (2000) 1805): no delay.
@@ -21,25 +21,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, ClassVar, Final, Protocol
+from typing import ClassVar, Final
 
 import numpy as np
 
 from s2a_bench.errors import UsageError
+from s2a_bench.policy import Floats
 from s2a_bench.scenario.ccrb import FOLLOWERS
-from s2a_bench.scenario.ccrb.braking import BRAKES_MPS2, needed
 from s2a_bench.scenario.ccrb.cars import Cars
-from s2a_bench.scenario.lockstep import LockStep
+from s2a_bench.scenario.longitudinal import LockStep, each
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from s2a_bench.policy import Floats
-
+BRAKES_MPS2: Final = 0.5
+"""Above this a car ahead counts as braking."""
+LEAST_ROOM_M: Final = 0.05
 MOST_MPS2: Final = 7.0
 RELEASE_S: Final = 0.2
 SPARE_M: Final = 1.0
 """How far behind the ego the careful driver means to stay."""
+LEAST_MPS2: Final = 1e-6
+"""Less is no deceleration."""
 ACTS_MPS2: Final = 0.7
 """The careful driver brakes once this much is needed."""
 CATCH_UP_MPS2: Final = 1.0
@@ -73,7 +73,7 @@ class Seen:
     own_then: Motion
 
 
-class Follower(Protocol):
+class Follower(LockStep):
     """A law for the trailing car of M roll-outs; it remembers from step to step."""
 
     law: ClassVar[str]
@@ -81,18 +81,14 @@ class Follower(Protocol):
 
     def acceleration(self, seen: Seen, step_s: float) -> Floats:
         """Return the acceleration in m/s^2 for the next step, shape (M,)."""
-        ...
-
-    def keep(self, columns: NDArray[np.int64]) -> None:
-        """Go on with these roll-outs only."""
-        ...
+        raise NotImplementedError
 
 
 class Brake(LockStep):
     """The trailing car's brake: its force builds up slowly and goes fast."""
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
-        self._build_mps3 = MOST_MPS2 / np.broadcast_to(np.asarray(cars.build_s, float), (rollouts,))
+        self._build_mps3 = MOST_MPS2 / each(cars.build_s, rollouts)
         self.force_mps2 = np.zeros(rollouts)
 
     def press(self, want_mps2: Floats, step_s: float) -> Floats:
@@ -102,7 +98,7 @@ class Brake(LockStep):
         return self.force_mps2.copy()
 
 
-class Careful(LockStep):
+class Careful(Follower):
     """The careful driver."""
 
     law: ClassVar[str] = (
@@ -111,21 +107,15 @@ class Careful(LockStep):
     )
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
-        self._reaction_s = np.broadcast_to(np.asarray(cars.reaction_s, float), (rollouts,))
-        self._far_m = np.broadcast_to(np.asarray(cars.rear_gap_m, float), (rollouts,))
+        self._reaction_s = each(cars.reaction_s, rollouts)
+        self._far_m = each(cars.rear_gap_m, rollouts)
         self._braking = np.zeros(rollouts, bool)
         self._brake = Brake(cars, rollouts)
 
     def acceleration(self, seen: Seen, step_s: float) -> Floats:
-        """Predict the ego, and brake as needed."""
         ego, own = seen.ego_then, seen.own
         decel = np.maximum(-ego.acceleration_mps2, 0.0)
-        until_rest = np.divide(
-            ego.speed_mps,
-            decel,
-            out=np.full(decel.shape, np.inf),
-            where=decel > 1e-6,  # noqa: PLR2004 - none
-        )
+        until_rest = np.divide(ego.speed_mps, decel, out=np.full(decel.shape, np.inf), where=decel > LEAST_MPS2)
         ahead_s = np.minimum(self._reaction_s, until_rest)
         ahead_m = ego.position_m + ego.speed_mps * ahead_s - decel * ahead_s * ahead_s / 2
         ahead_mps = np.maximum(ego.speed_mps - decel * ahead_s, 0.0)
@@ -140,21 +130,20 @@ class Careful(LockStep):
         return np.where(idle, CATCH_UP_MPS2, -force)
 
 
-class Idm(LockStep):
+class Idm(Follower):
     """The Intelligent Driver Model, without delay."""
 
     law: ClassVar[str] = f"IDM follower on the present, without delay; {AT_EASE}; {BRAKE}"
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
-        speed = np.broadcast_to(np.asarray(cars.speed_mps, float), (rollouts,))
-        self._reaction_s = np.broadcast_to(np.asarray(cars.reaction_s, float), (rollouts,))
+        speed = each(cars.speed_mps, rollouts)
+        self._reaction_s = each(cars.reaction_s, rollouts)
         self._desired_mps = IDM_HASTE * speed
         at_ease_m = np.asarray(cars.rear_gap_m, float) * np.sqrt(1 - IDM_HASTE**-IDM_EXPONENT)
         self._headway_s = np.maximum((at_ease_m - IDM_STANDSTILL_M) / speed, IDM_LEAST_HEADWAY_S)
         self._brake = Brake(cars, rollouts)
 
     def acceleration(self, seen: Seen, step_s: float) -> Floats:
-        """Balance the urge to go against the gap."""
         gap_m, speed, closing, ahead = self._perceived(seen)
         wish = idm_acceleration(gap_m, speed, closing, self._desired_mps, self._headway_s)
         force = self._brake.press(np.maximum(-wish, 0.0), step_s)
@@ -195,6 +184,23 @@ class Hybrid(Idm):
         ego, own = seen.ego_then, seen.own
         gap_m = ego.position_m + ego.speed_mps * self._reaction_s - own.position_m
         return gap_m, own.speed_mps, own.speed_mps - ego.speed_mps, ego
+
+
+def needed(speed_mps: Floats, room_m: Floats, ahead_mps: Floats, ahead_decel_mps2: Floats) -> Floats:
+    """Return the deceleration in m/s^2 that just avoids the car ahead, which goes on braking as it does.
+
+    With room r, own speed v, the other's w and A: where it brakes (A > .5) and stops first, v^2 / (2 (r + w^2/(2A)));
+    where it would still move when the speeds meet, A + c^2 / (2 r), c = v - w; where it does not brake, c^2 / (2 r).
+    """
+    room = np.maximum(room_m, LEAST_ROOM_M)
+    closing = np.maximum(speed_mps - ahead_mps, 0.0)
+    kinetic = closing * closing / (2 * room)
+    brakes = ahead_decel_mps2 > BRAKES_MPS2
+    decel = np.where(brakes, ahead_decel_mps2, 1.0)
+    to_rest = speed_mps * speed_mps / (2 * (room + ahead_mps * ahead_mps / (2 * decel)))
+    stops_later = speed_mps * decel > ahead_mps * np.maximum(to_rest, 1e-9)
+    moving = np.where(stops_later, to_rest, decel + kinetic)
+    return np.asarray(np.where(brakes, moving, kinetic))
 
 
 def idm_acceleration(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, one_of, option
+from s2a_bench.plan import Skill, load_skills
 from s2a_bench.plan.skillset import GAPS, Durations, Gap
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import (
@@ -19,9 +20,6 @@ from s2a_bench.scenario.ccrb.cars import (
     start_deadline,
 )
 from s2a_bench.scenario.ccrb.words import law
-
-if TYPE_CHECKING:
-    from s2a_bench.plan import Skill
 
 SKILL_SET: Final = "driving"
 
@@ -61,7 +59,6 @@ class CcrbOptions(Options):
 
     @cached_property
     def lane_durations(self) -> Durations:
-        """Return how long a lane change takes."""
         return _skill("change_lane").durations
 
     @property
@@ -71,7 +68,6 @@ class CcrbOptions(Options):
 
     @property
     def cars(self) -> Cars:
-        """Return the three cars as they begin."""
         return Cars(
             front_gap_m=self.front_gap_m,
             lead_decel_mps2=self.lead_decel_mps2,
@@ -91,7 +87,7 @@ class CcrbOptions(Options):
     @cached_property
     def follower_survives(self) -> bool:
         """Return whether the car behind stops behind an ego whose tokens come at once."""
-        from s2a_bench.scenario.ccrb.check import follower_survives
+        from s2a_bench.scenario.ccrb.drive import follower_survives
 
         return bool(follower_survives(self.cars, self.driving, self.skills, self.durations.nominal_s)[0])
 
@@ -104,7 +100,6 @@ class CcrbOptions(Options):
 
     @property
     def driving(self) -> DrivingPlan:
-        """Return the plan's set-points and lanes."""
         nominal_s = self.durations.nominal_s
         return braking_plan(
             self.cars, self.n_skills, nominal_s, decel_mps2=self.decel_mps2, lane_change=self.lane_change
@@ -136,6 +131,4 @@ class CcrbOptions(Options):
 
 
 def _skill(name: str) -> Skill:
-    from s2a_bench.plan import load_skills
-
     return next(skill for skill in load_skills(SKILL_SET).skills if skill.name == name)

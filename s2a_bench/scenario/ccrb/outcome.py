@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from s2a_bench.policy import Floats
 from s2a_bench.scenario import EGO, LEAD, REAR, State
 from s2a_bench.scenario.ccrb.cars import CAR_WIDTH_M, LEAST_IMPACT_MPS, OUTCOMES
-from s2a_bench.scenario.lockstep import LockStep
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from s2a_bench.policy import Floats
+from s2a_bench.scenario.longitudinal import LockStep
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +31,6 @@ class Outcomes:
     """The greatest closing speed^2 / (2 gap) towards the lead (DRAC); NaN with a front impact."""
 
     def put(self, rollouts: NDArray[np.int64], found: Outcomes) -> None:
-        """Write down what became of some roll-outs."""
         for item in fields(self):
             getattr(self, item.name)[rollouts] = getattr(found, item.name)
 
@@ -44,7 +39,7 @@ class Outcomes:
         return OUTCOMES[int(self.code[rollout])]
 
     @property
-    def impact_mps(self) -> Floats:
+    def impact_speed_mps(self) -> Floats:
         """Return the speed of the harder impact; NaN without one."""
         return np.fmax(self.front_impact_mps, self.rear_impact_mps)
 
@@ -62,7 +57,6 @@ class Pair(LockStep):
         self.drac = np.zeros(self.gap_m.shape)
 
     def watch(self, state: State, live: NDArray[np.bool_]) -> None:
-        """Take one more state into account, of the roll-outs that are ``live``."""
         gap, closing = self._look(state)
         beside = np.abs(state.lateral_m[self._ahead] - state.lateral_m[self._behind]) >= CAR_WIDTH_M
         counts = live & ~self.crashed & ~beside
@@ -81,7 +75,6 @@ class Pair(LockStep):
         self.gap_m, self._closing = gap, closing
 
     def _look(self, state: State) -> tuple[Floats, Floats]:
-        """Return gap and closing speed."""
         ahead, behind = self._ahead, self._behind
         return state.position_m[ahead] - state.position_m[behind], state.speed_mps[behind] - state.speed_mps[ahead]
 
@@ -97,13 +90,11 @@ class Watch(LockStep):
         self.front, self.rear = Pair(LEAD, EGO, state), Pair(EGO, REAR, state)
 
     def see(self, state: State) -> None:
-        """Take one more state into account."""
         live = ~self.front.crashed
         self.front.watch(state, live)
         self.rear.watch(state, live)
 
     def outcomes(self) -> Outcomes:
-        """Return what was seen."""
         return Outcomes(
             code=self.front.crashed.astype(np.int64) + 2 * self.rear.crashed,
             front_impact_mps=self.front.impact_mps,

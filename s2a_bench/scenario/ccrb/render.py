@@ -1,26 +1,29 @@
-"""Pictures of the three cars from above: highway-env's own drawing, without a screen."""
+"""Pictures of the three cars from above, by highway-env without a screen; and as frames, what a model is shown."""
 
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench import extras
+from s2a_bench.clock import now_ns
+from s2a_bench.frames import check_size
+from s2a_bench.policy import Floats
 from s2a_bench.scenario import EGO, LEAD, REAR
-from s2a_bench.scenario.roads import LANE_WIDTH_M, MIDDLE_M, build_road, centre
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from s2a_bench.policy import Floats
+from s2a_bench.scenario.ccrb.cars import Cars
+from s2a_bench.scenario.embedded import LANE_WIDTH_M, MIDDLE_M, build_road, centre
+from s2a_bench.types import Encoding, Frame
 
 COLOURS: Final = {LEAD: (230, 159, 0), EGO: (0, 158, 115), REAR: (0, 114, 178)}
 CRASHED: Final = (213, 94, 0)
 PIXELS_A_M: Final = 8.0
 AHEAD_M: Final = 15.0
 """How far ahead of the ego the middle of the picture lies."""
+LOOP_FRAMES: Final = 1000
+"""After so many frames the cars are back where they began: a road has an end."""
 
 
 class TopView:
@@ -59,3 +62,38 @@ class TopView:
         self._draw.display(self._road, self._surface)
         self._draw.display_traffic(self._road, self._surface, offscreen=True)
         return np.ascontiguousarray(self._pixels_of(self._surface).swapaxes(0, 1))
+
+
+class RoadSource:
+    """A FrameSource of a single scenario, seen from above as in the animation, the ego and what is round it.
+
+    All three drive on at v0 with the gaps that they have at t = 0; every frame is one period further down the road.
+    read() renders and never waits. Raises UsageError for a tiny size.
+    """
+
+    encoding: Encoding = "rgb8"
+    name = "scenario"
+
+    def __init__(self, cars: Cars, width: int, height: int, *, fps: float = 30.0) -> None:
+        """Draw once, as the first picture takes longer."""
+        check_size(width, height, smallest=16)
+        self.width, self.height = width, height
+        self._view = TopView(width, height)
+        self._gaps_m = np.zeros(3)
+        self._gaps_m[LEAD], self._gaps_m[REAR] = float(cars.front_gap_m), -float(cars.rear_gap_m)  # type: ignore[arg-type]
+        self._ahead_m = float(cars.speed_mps) / fps  # type: ignore[arg-type]
+        self._index = 0
+        self._picture(0)
+
+    def read(self) -> Frame:
+        stamp_ns = now_ns()
+        index = self._index
+        self._index += 1
+        return Frame(index, stamp_ns, self.width, self.height, self.encoding, self._picture(index))
+
+    def close(self) -> None:
+        """Hold nothing: the surface is memory."""
+
+    def _picture(self, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+        flat = np.zeros(3)
+        return self._view.picture(self._gaps_m + self._ahead_m * (index % LOOP_FRAMES), flat, flat)

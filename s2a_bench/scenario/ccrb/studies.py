@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from s2a_bench.policy import Schedule
+from s2a_bench.policy import Floats, Schedule
 from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, LEAST_IMPACT_MPS, Cars, DrivingPlan, braking_plan, plan_decel
-from s2a_bench.scenario.ccrb.check import follower_survives
-from s2a_bench.scenario.ccrb.drive import drive
+from s2a_bench.scenario.ccrb.drive import drive, follower_survives
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.outcome import Outcomes
 from s2a_bench.scenario.longitudinal import Longitudinal
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from s2a_bench.policy import Floats
 
 RESTING_MPS: Final = LEAST_IMPACT_MPS
 """The trailing car counts as stopped: at rest the ego cannot be hit any more, but the gap still shrinks."""
@@ -49,7 +44,6 @@ class Scenes:
         return len(self.numbers["n_skills"])
 
     def cut(self, part: slice) -> Scenes:
-        """Return some of them."""
         return Scenes({name: values[part] for name, values in self.numbers.items()})
 
     def times(self, count: int) -> Scenes:

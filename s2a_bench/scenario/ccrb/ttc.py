@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from s2a_bench.policy import Plans, Schedule
+from s2a_bench.policy import Floats, Plans, Schedule
 from s2a_bench.policy.schedule import align, safe_start, work_conserving
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from s2a_bench.policy import Floats
 
 NAME: Final = "s2a-ttc"
 """How the rule is called beside the policies."""

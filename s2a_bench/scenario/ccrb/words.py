@@ -10,6 +10,7 @@ from s2a_bench.scenario.ccrb import FOLLOWERS
 
 PAPER: Final = {"naive": "rear", "wait-then-act": "front", "stream-to-act": "none"}
 """The outcomes that the paper states (section V-F)."""
+NAIVE, WAIT, OURS = PAPER
 ORDERING: Final = "The paper's ordering: naive hit from behind, wait-then-act hits the lead, stream-to-act nobody."
 NO_SCORE: Final = "The scenario is in the manner of Euro NCAP's CCRb; nothing here is an NCAP score."
 MARK: Final = "\N{DAGGER}"

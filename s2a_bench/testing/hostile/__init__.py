@@ -35,12 +35,11 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import RequestFailed
 from s2a_bench.harness.processes import OwnServer
 from s2a_bench.harness.serving import ServerJob
-from s2a_bench.inference import EngineConfig
-from s2a_bench.testing.hostile.asker import TOKENS
-from s2a_bench.testing.hostile.usage import forget_peak, usage
+from s2a_bench.inference import STAND_IN, EngineConfig
+from s2a_bench.testing.hostile.asker import TOKENS, forget_peak, usage
 from s2a_bench.testing.transport import ask, wiring
-from s2a_bench.transport import TRANSPORTS, Client, Wiring, open_client
-from s2a_bench.transport.bounds import PIECES, PIECES_A_TOKEN
+from s2a_bench.transport import Client, Wiring, open_client
+from s2a_bench.transport.limits import PIECES, PIECES_A_TOKEN
 from s2a_bench.types import Request
 
 Attack: TypeAlias = "Callable[[Wiring[Any]], str]"
@@ -75,7 +74,6 @@ class Asker:
     """The process that asks hostile servers; one that hangs is ended, and the next question starts another."""
 
     def __init__(self) -> None:
-        """Start nothing yet."""
         self._process: subprocess.Popen[str] | None = None
 
     def ask(self, told: Wiring[Any], seconds: float) -> dict[str, Any]:
@@ -100,7 +98,6 @@ class Asker:
         return answer
 
     def close(self) -> None:
-        """End the process."""
         if self._process is not None:
             with self._process:
                 self._process.kill()
@@ -130,7 +127,6 @@ class Target:
         self._expected = answer_of(honest)
 
     def attacked(self, case: Case[Attack]) -> Attacked:
-        """Return what comes of one hostile client."""
         pid = self._server.pid
         before = usage(pid)
         forget_peak(pid)
@@ -256,8 +252,8 @@ def _at_once(
 @contextmanager
 def own_server(told: Wiring[Any], log: Path, **engine: Any) -> Iterator[OwnServer]:
     """Run a server in a process of its own, with the echo engine, which may be told more."""
-    can = TRANSPORTS[told.transport].answers(told.variant, told.options)
-    config = EngineConfig(**{"name": "echo", "answer": can[0], **engine})
+    can = told.capabilities.answer_kinds
+    config = EngineConfig(**{"name": STAND_IN, "answer": can[0], **engine})
     server = OwnServer("hostile", ServerJob(told, config), log)
     with server:
         server.wait_ready()

@@ -1,6 +1,7 @@
-"""A process that asks one server after the other: a wiring a line on standard input, what came of it on its output.
+"""A process that asks one server after the other, and what processes use: a wiring a line on standard input.
 
-It is a process of its own so that its memory is its own, and so that it can be ended where it hangs.
+What came of it goes to standard output. It is a process of its own so that its memory is its own, and so that it can be
+ended where it hangs.
 """
 
 from __future__ import annotations
@@ -9,14 +10,65 @@ import json
 import os
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError
-from s2a_bench.testing.hostile.usage import forget_peak, usage
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Wiring, open_client
 from s2a_bench.types import Request
+
+PROC = Path("/proc")
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """Of a process and its children together."""
+
+    rss_mib: float
+    peak_mib: float
+    """The most resident memory (VmHWM) since the start, or since `forget_peak`."""
+    threads: int
+    descriptors: int
+
+
+def family(pid: int) -> Iterator[int]:
+    """Yield a process and all its descendants that run."""
+    with suppress(OSError):
+        tasks = [*(PROC / str(pid) / "task").iterdir()]
+        yield pid
+        for task in tasks:
+            with suppress(OSError):
+                for child in (task / "children").read_text().split():
+                    yield from family(int(child))
+
+
+def usage(pid: int) -> Usage:
+    """Return what a process and its descendants use."""
+    rss, peak, threads, descriptors = 0, 0, 0, 0
+    for member in family(pid):
+        with suppress(OSError):  # it has just ended
+            lines = (PROC / str(member) / "status").read_text().splitlines()
+            said = {
+                name: value.split()[0] for name, _, value in (line.partition(":\t") for line in lines) if value.strip()
+            }
+            rss += int(said.get("VmRSS", 0))
+            peak += int(said.get("VmHWM", 0))
+            threads += int(said["Threads"])
+            descriptors += len([*(PROC / str(member) / "fd").iterdir()])
+    return Usage(rss / 1024, peak / 1024, threads, descriptors)
+
+
+def forget_peak(pid: int) -> None:
+    """Let the peak begin anew (proc(5), clear_refs), where that is allowed."""
+    for member in family(pid):
+        with suppress(OSError):
+            (PROC / str(member) / "clear_refs").write_text("5")
+
 
 TOKENS = 8
 

@@ -108,7 +108,6 @@ def answers(*pieces: Said, then: Then = "waits", scheme: str = "", again: Sequen
 
 
 def _answer(connection: socket.socket, pieces: Iterator[Said], then: Then, over: Event) -> None:
-    """Answer one connection."""
     with connection, suppress(OSError):
         connection.settimeout(0.5)
         heard = connection.recv(1 << 16)

@@ -16,22 +16,21 @@ from typing import Any
 import httpx
 
 from s2a_bench.clock import clock_id, now_ns
-from s2a_bench.errors import RequestFailed, ServerDied, TransportError
+from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageError
 from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, PROMPT_MS, RECONNECTS, THINKING_N
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.bounds import Bounds
-from s2a_bench.transport.credentials import read_key
 from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, blocks, own
-from s2a_bench.transport.http.bounded import BoundedClient
-from s2a_bench.transport.http.detect import body_of, detected, getter
-from s2a_bench.transport.http.dialects import OWN, Dialect, Event, Picture, open_dialect
+from s2a_bench.transport.http.clients import BoundedClient, HttpResponse, LeanClient
+from s2a_bench.transport.http.detect import body_of, met
+from s2a_bench.transport.http.dialects import OWN, Event, Picture, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
 from s2a_bench.transport.http.dialects.decoder import Decoder
-from s2a_bench.transport.http.lean import LeanClient, LeanResponse
 from s2a_bench.transport.http.merge import merged, read_patch
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.http.refusals import advice_for, refusal
+from s2a_bench.transport.limits import Bounds
+from s2a_bench.transport.listening import read_key
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Piece, Request, Token
 
@@ -45,49 +44,20 @@ class HttpClient:
     def __init__(self, wiring: Wiring[HttpOptions], alive: Callable[[], bool]) -> None:
         """Prepare to ask the server at ``wiring.address``; a black box of no known dialect is asked what it is."""
         self.camera = None
-        self._wiring, self._options = wiring, wiring.options
-        self._alive = alive
+        self._wiring, self._alive = wiring, alive
+        options, key = wiring.options, read_key(wiring.options.api_key_env)
         self._codec = own.CODECS[wiring.variant]
-        self._key = read_key(wiring.options.api_key_env)
-        self._client = self._new_client() if wiring.options.connection != "client-per-request" else None
-        self._dialect, self._url, self._model = self._met() if wiring.black_box else self._own()
-        self._options = wiring.options.model_copy(update={"served_model": self._model})  # for advice
-        self._extra = read_patch(wiring.options.extra_body)
-        self._headers = {"content-type": "application/json", **self._authorization()}
-        if wiring.options.connection != "keep-alive":
+        if wiring.black_box:
+            self._dialect, self._url, self._model = met(wiring.address, key, options.spoken, options.served_model)
+        else:
+            self._dialect, self._model = open_dialect(OWN), options.served_model or NO_MODEL
+            self._url = wiring.address.rstrip("/") + own.PATHS[wiring.variant]
+        self._options = options.model_copy(update={"served_model": self._model})  # for advice
+        self._extra = read_patch(options.extra_body)
+        self._headers = {"content-type": "application/json", **(self._dialect.authorization(key) if key else {})}
+        if options.connection != "keep-alive":
             self._headers["connection"] = "close"
-
-    def _own(self) -> tuple[Dialect, str, str]:
-        """Return dialect, URL and model of our own server."""
-        url = self._wiring.address.rstrip("/") + own.PATHS[self._wiring.variant]
-        return open_dialect(OWN), url, self._options.served_model or NO_MODEL
-
-    def _met(self) -> tuple[Dialect, str, str]:
-        """Return dialect, URL and model of a black box: as the options name them, else as the server says."""
-        spoken, base, model = self._options.spoken, self._wiring.address, self._options.served_model
-        with self._asking() as client:
-            if not spoken:
-                key = open_dialect("openai").authorization(self._key) if self._key else {}
-                spoken, first = detected(base, getter(client, key))
-                model = model or first or NO_MODEL
-            dialect = open_dialect(spoken)
-            key = dialect.authorization(self._key) if self._key else {}
-            base, model = dialect.met(base, model, getter(client, key))
-        return dialect, dialect.url(base, model), model
-
-    @contextmanager
-    def _asking(self) -> Iterator[BoundedClient]:
-        """Lend the kept client, or one for the moment."""
-        kept = self._client
-        client = kept if isinstance(kept, BoundedClient) else self._new_httpx()
-        try:
-            yield client
-        finally:
-            if client is not kept:
-                client.close()
-
-    def _authorization(self) -> dict[str, str]:
-        return self._dialect.authorization(self._key) if self._key else {}
+        self._client = self._new_client() if options.connection != "client-per-request" else None
 
     def describe(self) -> dict[str, str]:
         """Return who is asked, and how, for the manifest; the model where the server named it."""
@@ -95,24 +65,27 @@ class HttpClient:
         return {"url": self._url, "dialect": self._dialect.name, **found}
 
     def _new_client(self) -> BoundedClient | LeanClient:
-        """Build the client of the variant; over TLS, and maybe a proxy, httpx is that of all."""
-        lean = self._wiring.variant in {own.BEST_EFFORT, own.BINARY} and self._wiring.address.startswith("http:")
-        return LeanClient(self._bounds(0), self._wiring.timeout_s) if lean else self._new_httpx()
+        """Build the client of the variant; over TLS, and maybe a proxy, httpx is that of all.
 
-    def _new_httpx(self) -> BoundedClient:
-        """Build httpx's client; its TLS context alone takes about 20 ms, which is why it is normally built once."""
-        # a kept connection stays kept, however long a turn of the other cells takes
-        limits = httpx.Limits(keepalive_expiry=None)
-        # a cloud may be behind a proxy and with certificates that the environment names; what is measured here is not
-        trust_env = self._wiring.address.startswith("https:")
-        return BoundedClient(self._bounds(0), timeout=self._wiring.timeout_s, trust_env=trust_env, limits=limits)
+        The TLS context of httpx's alone takes about 20 ms, which is why it is normally built once.
+        """
+        bounds, timeout_s, tls = self._bounds(0), self._wiring.timeout_s, self._wiring.address.startswith("https:")
+        if self._wiring.variant in {own.BEST_EFFORT, own.BINARY} and not tls:
+            return LeanClient(bounds, timeout_s)
+        # a kept connection stays kept, however long a turn of the other cells takes; a cloud may be behind a proxy and
+        # with certificates that the environment names, what is measured here is not
+        return BoundedClient(bounds, timeout=timeout_s, trust_env=tls, limits=httpx.Limits(keepalive_expiry=None))
 
     def _bounds(self, max_tokens: int) -> Bounds:
         """Start the bounds of an answer."""
         return Bounds(self._wiring.address, self._wiring.deadline_of(max_tokens), max_tokens)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        """Encode and send the request and yield the streamed tokens."""
+        """Encode and send the request and yield the streamed tokens.
+
+        It is sent once more if the server had just closed the kept connection, as HTTP clients do: llama-server
+        announces keep-alive and yet closes after every streamed answer.
+        """
         body, headers = self._pack(request, trace)
         client = self._client
         if client is None:
@@ -122,15 +95,22 @@ class HttpClient:
         client.bounds = bounds = self._bounds(request.max_tokens)
         try:
             with self._translated(), ExitStack() as stack:
-                response = self._send(client, body, headers, stack, trace)
+
+                def asked() -> HttpResponse:
+                    answer: AbstractContextManager[HttpResponse] = client.stream(
+                        "POST", self._url, content=body, headers=headers
+                    )
+                    return stack.enter_context(answer)
+
+                try:
+                    response = asked()
+                except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
+                    if self._options.connection != "keep-alive":
+                        raise
+                    trace.facts[RECONNECTS] = 1.0
+                    response = asked()
                 headers_ns = now_ns()
-                kind = response.headers.get("content-type", "")
-                expected = self._dialect.media_type, *((blocks.MEDIA_TYPE,) if self._dialect.name == OWN else ())
-                if response.status_code != httpx.codes.OK or not kind.startswith(expected):
-                    text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
-                    raise refusal(self._url, response, text, self._options, self._dialect.media_type)
-                if (coding := response.headers.get("content-encoding", "identity")) != "identity":
-                    raise RequestFailed(f"{self._url} compressed its answer ({coding}), which nobody asked for")
+                self._check(response)
                 for token in self._tokens(response, trace, headers_ns, packed_ns):
                     bounds.piece()
                     yield token
@@ -138,27 +118,23 @@ class HttpClient:
             if client is not self._client:
                 client.close()
 
-    def _send(
-        self, client: BoundedClient | LeanClient, body: Any, headers: dict[str, str], stack: ExitStack, trace: Trace
-    ) -> httpx.Response | LeanResponse:
-        """Send the request; once more if the server had just closed the kept connection, as HTTP clients do.
-
-        llama-server announces keep-alive and yet closes after every streamed answer.
-        """
-
-        def asked() -> AbstractContextManager[httpx.Response | LeanResponse]:
-            return client.stream("POST", self._url, content=body, headers=headers)
-
-        try:
-            return stack.enter_context(asked())
-        except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
-            if self._options.connection != "keep-alive":
-                raise
-            trace.facts[RECONNECTS] = 1.0
-            return stack.enter_context(asked())
+    def _check(self, response: HttpResponse) -> None:
+        """Raise RequestFailed for an answer whose headers say that there is none, or not as it was asked for."""
+        kind = response.headers.get("content-type", "")
+        expected = self._dialect.media_type, *((blocks.MEDIA_TYPE,) if self._dialect.name == OWN else ())
+        if response.status_code != httpx.codes.OK or not kind.startswith(expected):
+            text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
+            raise refusal(self._url, response, text, self._options, self._dialect.media_type)
+        if (coding := response.headers.get("content-encoding", "identity")) != "identity":
+            raise RequestFailed(f"{self._url} compressed its answer ({coding}), which nobody asked for")
 
     def _pack(self, request: Request, trace: Trace) -> tuple[Any, dict[str, str]]:
         """Build the body, marking each stage."""
+        if request.grammar and not self._dialect.takes_grammar:
+            raise UsageError(
+                f"`grammar`: the dialect '{self._dialect.name}' has no field for a GBNF grammar; leave it out, or ask "
+                "a server of `dialect` llama-server or vllm"
+            )
         if self._wiring.variant == own.BINARY:
             body, headers = self._pack_binary(request, trace)
         else:
@@ -192,9 +168,7 @@ class HttpClient:
             return bodies, {**headers, "content-length": str(sum(map(len, bodies)))}
         return (bodies[0] if bodies else b""), headers
 
-    def _tokens(
-        self, response: httpx.Response | LeanResponse, trace: Trace, headers_ns: int, packed_ns: int
-    ) -> Iterator[Piece]:
+    def _tokens(self, response: HttpResponse, trace: Trace, headers_ns: int, packed_ns: int) -> Iterator[Piece]:
         """Yield the tokens of an answer; after the last, complete the trace."""
         first_ns, thinking_ns, thoughts, index, finished = 0, 0, 0, 0, False
         for event in self._events(response):
@@ -236,7 +210,7 @@ class HttpClient:
         else:
             trace.marks.append(("server", first_ns))
 
-    def _events(self, response: httpx.Response | LeanResponse) -> Iterator[Event]:
+    def _events(self, response: HttpResponse) -> Iterator[Event]:
         """Yield the events of an answer; comments and drops of an event do not count as a sign of life for ever."""
         if response.headers.get("content-type") == blocks.MEDIA_TYPE:
             decoder = Decoder(self._dialect, blocks.read, blocks.Blocks)
@@ -269,6 +243,5 @@ class HttpClient:
             raise TransportError(f"`url`: '{url}' is no URL: {error}") from error
 
     def close(self) -> None:
-        """Close the kept connection."""
         if self._client is not None:
             self._client.close()

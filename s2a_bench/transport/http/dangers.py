@@ -9,10 +9,8 @@ import httpx
 
 from s2a_bench.errors import S2AError, ServerDied
 from s2a_bench.machine.doctor import Finding
-from s2a_bench.transport.bounds import Bounds
-from s2a_bench.transport.dangers import PATIENCE_S, for_anybody, shown
-from s2a_bench.transport.http.bounded import BoundedClient
-from s2a_bench.transport.http.detect import getter
+from s2a_bench.transport.dangers import for_anybody, shown
+from s2a_bench.transport.http.detect import asker, getter
 from s2a_bench.transport.http.dialects.common import NO_LIST, first_model
 
 
@@ -20,7 +18,7 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
     """Ask for the list of models without a key."""
     url = urlunsplit(parts)
     try:
-        with BoundedClient(Bounds(url, PATIENCE_S, 0), timeout=PATIENCE_S, trust_env=parts.scheme == "https") as client:
+        with asker(url) as client:
             owner, model = first_model(url, getter(client, {}))
     except ServerDied as error:
         raise OSError(str(error).rpartition(": ")[2]) from error

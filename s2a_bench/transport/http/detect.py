@@ -13,11 +13,13 @@ import httpx
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied
 from s2a_bench.trace import FACT_LIMIT
-from s2a_bench.transport.bounds import Bounds
-from s2a_bench.transport.http.bounded import BoundedClient
-from s2a_bench.transport.http.dialects import OWN
-from s2a_bench.transport.http.dialects.common import NO_LIST, Get, first_model
-from s2a_bench.transport.http.lean import LeanResponse
+from s2a_bench.transport import Wiring
+from s2a_bench.transport.http.clients import BoundedClient, HttpResponse
+from s2a_bench.transport.http.dialects import OWN, open_dialect
+from s2a_bench.transport.http.dialects.common import NO_LIST, NO_MODEL, Dialect, Get, first_model
+from s2a_bench.transport.http.options import HttpOptions
+from s2a_bench.transport.limits import Bounds
+from s2a_bench.transport.listening import read_key
 
 OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": OWN}
 """``owned_by`` of the first model -> dialect. Ollama says ``library``, clouds their names: plain OpenAI."""
@@ -29,13 +31,23 @@ PATIENCE_S = 5.0
 LIMIT = 1 << 20
 
 
-def detected(base: str, get: Get) -> tuple[str, str]:
-    """Return a server's dialect and its first model, by its list of models; what makes no sense means a plain one.
+def met(base: str, key: str, spoken: str, model: str) -> tuple[Dialect, str, str]:
+    """Return the dialect, where to post, and the model of a black box: as told, else as the server says.
 
-    Raises ServerDied where nothing answers.
+    What makes no sense as a list of models means a plain server. Raises ServerDied where nothing answers.
     """
-    owner, model = first_model(base, get)
-    return OWNERS.get(owner, "openai"), model
+    with asker(base) as client:
+        if not spoken:
+            owner, first = first_model(base, getter(client, open_dialect("openai").authorization(key) if key else {}))
+            spoken, model = OWNERS.get(owner, "openai"), model or first or NO_MODEL
+        dialect = open_dialect(spoken)
+        base, model = dialect.met(base, model, getter(client, dialect.authorization(key) if key else {}))
+    return dialect, dialect.url(base, model), model
+
+
+def asker(url: str) -> BoundedClient:
+    """Return a client for questions that are not measured."""
+    return BoundedClient(Bounds(url, PATIENCE_S, 0), timeout=PATIENCE_S, trust_env=url.startswith("https:"))
 
 
 def cache_hits(base: str, key: str = "") -> Mapping[str, float]:
@@ -44,7 +56,7 @@ def cache_hits(base: str, key: str = "") -> Mapping[str, float]:
     try:
         parts = urlsplit(base)
         path = re.sub(r"/(v1|v1beta|api)(/.*)?$", "", parts.path.rstrip("/")) + "/metrics"
-        with BoundedClient(Bounds(base, PATIENCE_S, 0), trust_env=parts.scheme == "https") as client:
+        with asker(base) as client:
             headers = {"authorization": f"Bearer {key}"} if key else {}
             text = _text(urlunsplit((parts.scheme, parts.netloc, path, "", "")), client, headers)
         for name, value in HITS.findall(text):
@@ -53,6 +65,11 @@ def cache_hits(base: str, key: str = "") -> Mapping[str, float]:
     except (*NO_LIST, ServerDied, RequestFailed, httpx.HTTPError, httpx.InvalidURL):
         return {}
     return found
+
+
+def counted_hits(wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
+    """Return the counters of cache hits that the server of a wiring tells by its metrics."""
+    return cache_hits(wiring.address, read_key(wiring.options.api_key_env))
 
 
 def getter(client: BoundedClient, headers: dict[str, str]) -> Get:
@@ -71,14 +88,14 @@ def _text(url: str, client: BoundedClient, headers: dict[str, str]) -> str:
     """Return what a GET answers; raises ServerDied where nothing does, RequestFailed where it does not end."""
     client.bounds = Bounds(url, PATIENCE_S, 0)
     try:
-        with client.stream("GET", url, headers=headers, timeout=PATIENCE_S) as response:
+        with client.stream("GET", url, headers=headers) as response:
             response.raise_for_status()
             return body_of(response, LIMIT, PATIENCE_S)
     except httpx.ConnectError as error:
         raise ServerDied(f"nothing answers at {url}: {error}") from error
 
 
-def body_of(response: httpx.Response | LeanResponse, limit: int, patience_s: float) -> str:
+def body_of(response: HttpResponse, limit: int, patience_s: float) -> str:
     """Return a body's first ``limit`` bytes, or what came of it in time, as text."""
     pieces, size, deadline = [], 0, now_ns() + int(patience_s * 1e9)
     for piece in response.iter_raw():

@@ -9,17 +9,22 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, Final
 
 import orjson
 import pybase64
 
-from s2a_bench.errors import BadRequest, Busy, EngineError, Overdue, S2AError
+from s2a_bench.errors import BadRequest, Busy, EngineError, Overdue, S2AError, TooLarge
+from s2a_bench.transport.access import Access
 from s2a_bench.transport.http import VARIANTS
-from s2a_bench.transport.http.dialects.common import TEMPERATURE, TOP_P
+from s2a_bench.transport.http.dialects.common import sampled
 from s2a_bench.types import Request
+
+if TYPE_CHECKING:
+    from s2a_bench.transport.serving import Core, Queued
 
 AS_DEPLOYED, BEST_EFFORT, BINARY, LLAMA_SERVER = VARIANTS
 
@@ -29,6 +34,13 @@ PATHS = {
     BINARY: "/binary/v1/chat/completions",
 }
 """Variant -> path on our own server; a black box is always asked at the first."""
+
+SCHEME = "Bearer"
+HEALTH, MODELS = "/health", "/v1/models"
+KEEP_ALIVE_S: Final = 3600
+"""A client that waits for its turn in an interleaved run keeps its connection."""
+LINES: Final = 128
+"""The most lines of a head: each header costs a few hundred bytes of objects, however short it is."""
 
 PARAMETERS_HEADER = "s2a-request"
 """Binary variant: the parameters as ASCII JSON in this header, the picture's bytes as the body."""
@@ -64,7 +76,7 @@ FAST = Codec(
 CODECS = {AS_DEPLOYED: STANDARD, BEST_EFFORT: FAST, BINARY: FAST, LLAMA_SERVER: STANDARD}
 
 
-STATUSES = ((Busy, 503), (Overdue, 504), (BadRequest, 400), (EngineError, 500))
+STATUSES = ((Busy, 503), (TooLarge, 413), (Overdue, 504), (BadRequest, 400), (EngineError, 500))
 """By what an error is, the first that fits; every other one is 400."""
 
 
@@ -77,6 +89,57 @@ def error_json(status: int, message: str) -> dict[str, Any]:
     """Return an error in OpenAI's form."""
     shown = message.encode(errors="backslashreplace").decode()
     return {"error": {"message": shown, "type": "invalid_request_error", "code": status}}
+
+
+def headers_of(error: S2AError) -> dict[str, str]:
+    """Return the header that asks to come again later, where an error does."""
+    return {"retry-after": f"{error.retry_after_s:.0f}"} if isinstance(error, Busy) else {}
+
+
+def head_of(status: int, headers: Mapping[str, str], *, keep: bool) -> bytes:
+    """Return the head of an answer."""
+    lines = [f"HTTP/1.1 {status} {HTTPStatus(status).phrase}", *(f"{name}: {value}" for name, value in headers.items())]
+    return "\r\n".join([*lines, *([] if keep else ["connection: close"]), "", ""]).encode()
+
+
+def answer(status: int, value: Any, headers: Mapping[str, str] | None = None, *, keep: bool) -> bytes:
+    """Return an answer of JSON."""
+    body = FAST.dumps(value)
+    said = {"content-type": "application/json", **(headers or {}), "content-length": str(len(body))}
+    return head_of(status, said, keep=keep) + body
+
+
+class Refused(Exception):
+    """The request is not answered, and its connection closed: what follows on it is not known."""
+
+    def __init__(self, status: int, message: str, headers: Mapping[str, str] | None = None) -> None:
+        """Keep what the client is told, as bytes of HTTP."""
+        super().__init__(message)
+        self.answer = answer(status, error_json(status, message), headers, keep=False)
+
+    @classmethod
+    def because(cls, error: S2AError) -> Refused:
+        """Return the refusal of a request that goes beyond a limit."""
+        return cls(status_of(error), str(error), headers_of(error))
+
+
+def admit(access: Access, path: str, headers: Iterable[tuple[str, str]]) -> None:
+    """Raise Refused for a request that ``access`` does not let in; the names of its headers are in lower case."""
+    if refusal := access.refusal(path == HEALTH, headers):
+        status, message = refusal
+        raise Refused(status, message, {"www-authenticate": SCHEME} if status == HTTPStatus.UNAUTHORIZED else None)
+
+
+def health(core: Core) -> tuple[int, dict[str, str]]:
+    """Return how the engine is, and the status that says so."""
+    stuck = core.stuck()
+    return (503, {"status": "stuck", "reason": stuck}) if stuck else (200, {"status": "ok"})
+
+
+def models(queued: Queued) -> dict[str, Any]:
+    """Return OpenAI's list of models."""
+    model = {"id": "s2a", "object": "model", "owned_by": "s2a-bench", "s2a_provenance": queued.provenance}
+    return {"object": "list", "data": [model]}
 
 
 def data_uri(media_type: str, encoded: str) -> str:
@@ -98,10 +161,7 @@ def parameters(request: Request, model: str) -> dict[str, Any]:
         "model": model,
         "stream": True,
         "stream_options": {"include_usage": True},
-        "max_tokens": request.max_tokens,
-        "temperature": TEMPERATURE,
-        "top_p": TOP_P,
-        "seed": request.seed,
+        **sampled(request),
     }
 
 

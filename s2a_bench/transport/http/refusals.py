@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from datetime import datetime, timezone
-from email.utils import parsedate_to_datetime
+from contextlib import suppress
 from typing import Any
 
 import httpx
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.secrets import struck
+from s2a_bench.transport.http.clients import HttpResponse
 from s2a_bench.transport.http.dialects.decoder import error_in
-from s2a_bench.transport.http.lean import LeanResponse
 from s2a_bench.transport.http.options import HttpOptions
 
 NO_MODEL = re.compile(
@@ -26,9 +25,7 @@ QUOTED = 200
 """Characters that are shown of a body that is no error object."""
 
 
-def refusal(
-    url: str, response: httpx.Response | LeanResponse, body: str, options: HttpOptions, expected: str
-) -> RequestFailed:
+def refusal(url: str, response: HttpResponse, body: str, options: HttpOptions, expected: str) -> RequestFailed:
     """Describe an answer whose status or content type is wrong."""
     try:
         value = json.loads(body)
@@ -62,18 +59,13 @@ def advice_for(status: int, said: str, options: HttpOptions, *, moved: str = "")
     }.get(status, "")
 
 
-def _retry_after_s(response: httpx.Response | LeanResponse, body: Any) -> float | None:
-    """Return how long the server asks to wait: the header (RFC 9110, 10.2.3), or Google's RetryInfo in the body."""
-    text = response.headers.get("retry-after", "").strip()
-    try:
-        return max(0.0, float(text))
-    except ValueError:
-        pass
-    try:
-        until = parsedate_to_datetime(text)
-        return max(0.0, (until - datetime.now(timezone.utc)).total_seconds())
-    except (ValueError, TypeError):  # no date, or one without a zone
-        pass
+def _retry_after_s(response: HttpResponse, body: Any) -> float | None:
+    """Return how long the server asks to wait: seconds of the header, or Google's RetryInfo in the body.
+
+    A date (RFC 9110, 10.2.3) would be one of another host's clock.
+    """
+    with suppress(ValueError):
+        return max(0.0, float(response.headers.get("retry-after", "")))
     try:
         delays = [detail["retryDelay"] for detail in body["error"]["details"] if "retryDelay" in detail]
         return max(0.0, float(delays[0].removesuffix("s")))

@@ -1,46 +1,36 @@
-"""The HTTP server on uvicorn: FastAPI for *as deployed*, a lane beside it for the other variants, one handler.
+"""*As deployed*: FastAPI on uvicorn, as llama-cpp-python's own server and most robot code are.
 
-*As deployed* is written as llama-cpp-python's own server and most robot code are: a pydantic body, the standard
-library's Base64, a synchronous endpoint in the thread pool, which pulls the first token before it answers so that an
-error still gets its status code. *Best effort* and *binary* never reach the application: see `lane`.
+A pydantic body, the standard library's JSON and Base64, and an answer that is computed on a thread of the pool. What
+neither bounds `protocol` does.
 """
 
 from __future__ import annotations
 
 import asyncio
-import socket
-from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext, suppress
-from typing import Any, Literal
+from functools import partial
+from typing import Annotated, Any, Literal
 
+import anyio  # FastAPI's own
 import uvicorn
 from fastapi import FastAPI
 from fastapi import Request as HttpRequest
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from pydantic import BaseModel, StrictInt
-from starlette.requests import ClientDisconnect
+from pydantic import BaseModel, Field, StrictInt
 
-from s2a_bench.errors import Busy, S2AError
-from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
+from s2a_bench.transport.access import Access
+from s2a_bench.transport.connections import LINGER_S
 from s2a_bench.transport.http import own
-from s2a_bench.transport.http.access import keyed
-from s2a_bench.transport.http.answer import Answer
-from s2a_bench.transport.http.door import door
-from s2a_bench.transport.http.lane import Lane
+from s2a_bench.transport.http.chat import ChatExchange, of_fields
 from s2a_bench.transport.http.options import HttpOptions
-from s2a_bench.transport.http.reading import of_fields
-from s2a_bench.transport.http.reply import Reply
+from s2a_bench.transport.http.protocol import Protocol
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.listening import bound_socket
-from s2a_bench.transport.turns import STUCK_S, Queued
-
-KEEP_ALIVE_S = 3600
-"""A client that waits for its turn in an interleaved run keeps its connection."""
-
-CLOSING_S = 0.01
-"""Time for the loop to close what is broken off."""
+from s2a_bench.transport.serving import Core, Disconnected
+from s2a_bench.types import Request
 
 
 class ImageUrl(BaseModel):
@@ -61,56 +51,81 @@ class Message(BaseModel):
     """One message of the conversation."""
 
     role: str
-    content: str | list[Part]
+    content: str | Annotated[list[Part], Field(fail_fast=True)]
 
 
 class ChatRequest(BaseModel):
     """The body of ``POST /v1/chat/completions``, as far as it is understood here."""
 
-    messages: list[Message]
+    messages: Annotated[list[Message], Field(fail_fast=True)]
     stream: bool = False
     max_tokens: StrictInt | None = None
     grammar: str = ""
     seed: StrictInt | None = None
     request_id: str = "chatcmpl-0"
-    state: list[float] | None = None
+    state: Annotated[list[float], Field(fail_fast=True)] | None = None
 
 
-def _received(app: Callable[..., Awaitable[None]]) -> Callable[..., Awaitable[None]]:
-    """Wrap an ASGI application so that the last byte of a body ends the stage `network`."""
+class DeployedExchange(ChatExchange):
+    """One request whose body is there; what its thread writes goes to the loop as ASGI's messages."""
 
-    async def wrapped(scope: Any, receive: Any, send: Any) -> None:
-        if scope["type"] != "http":
-            await app(scope, receive, send)
-            return
-        trace = Trace()
-        scope.setdefault("state", {})["trace"] = trace
+    def __init__(self, body: ChatRequest, protocol: Protocol, limits: Limits) -> None:
+        """Keep `messages` on the loop that runs, for as long as the client is there."""
+        super().__init__(own.STANDARD, protocol.trace)
+        self.held = protocol.held.pop_all()
+        self.given_up = False
+        self.messages: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+        self._body, self._limits = body, limits
+        self._disconnected, self._loop = protocol.gone, asyncio.get_running_loop()
 
-        async def timed_receive() -> Any:
-            event = await receive()
-            if event["type"] == "http.request" and not event.get("more_body") and not trace.marks:
-                trace.mark("network")
-            return event
+    def gone(self) -> bool:
+        return self.given_up or self._disconnected()
 
+    def read(self) -> tuple[Request, bool]:
+        self.trace.mark("json_parse")
+        return of_fields(self._body.model_dump(), self.trace, self._limits, own.STANDARD)
+
+    def write(self, data: bytes, kind: str, *, last: bool) -> None:
+        if kind:
+            headers = [(b"content-type", kind.encode())]
+            self._put({"type": "http.response.start", "status": 200, "headers": headers})
+        self._put({"type": "http.response.body", "body": data, "more_body": not last})
+
+    def whole(self, status: int, value: Any, headers: dict[str, str]) -> None:
+        whole = JSONResponse(value, status, headers)
+        self._put({"type": "http.response.start", "status": status, "headers": whole.raw_headers})
+        self._put({"type": "http.response.body", "body": whole.body})
+
+    def _put(self, message: dict[str, Any]) -> None:
         try:
-            with suppress(asyncio.CancelledError, ClientDisconnect):  # uvicorn cancels what is under way when it stops
-                await app(scope, timed_receive, send)
+            self._loop.call_soon_threadsafe(self.messages.put_nowait, message)
+        except RuntimeError as error:  # the server has ended
+            raise Disconnected from error
+
+
+class Answer(Response):
+    """What a thread of the pool computes for an exchange."""
+
+    def __init__(self, exchange: DeployedExchange, most_s: float) -> None:
+        """Send for so long at most."""
+        super().__init__()
+        self._exchange, self._most_s = exchange, most_s
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:  # noqa: ARG002
+        try:
+            with anyio.move_on_after(self._most_s):
+                while (message := await self._exchange.messages.get()) is not None:
+                    await send(message)
+                return
+            scope["state"]["protocol"].transport.abort()  # it does not read
         finally:
-            if answer := scope["state"].get("answer"):
-                answer.abandon()  # whatever was raised, wherever: the engine is free again
-
-    return wrapped
+            self._exchange.given_up = True
 
 
-def application(queued: Queued, limits: Limits, *, documented: bool = False) -> FastAPI:
+def application(core: Core, *, documented: bool = False) -> FastAPI:
     """Build the application: chat completions as deployed, and what tools expect beside them."""
     app = FastAPI(title="s2a-bench", openapi_url="/openapi.json" if documented else None)  # /docs and /redoc follow it
-
-    @app.exception_handler(S2AError)
-    async def refuse(_: HttpRequest, error: S2AError) -> Response:
-        headers = {"Retry-After": f"{error.retry_after_s:.0f}"} if isinstance(error, Busy) else None
-        status = own.status_of(error)
-        return JSONResponse(own.error_json(status, str(error)), status, headers)
+    threads = ThreadPoolExecutor(core.limits.waiting + 2, "http")  # one is answered, and one is told that too many wait
 
     @app.exception_handler(RequestValidationError)
     async def invalid(_: HttpRequest, error: RequestValidationError) -> Response:
@@ -118,28 +133,21 @@ def application(queued: Queued, limits: Limits, *, documented: bool = False) -> 
         message = f"{'.'.join(str(step) for step in first['loc'])}: {first['msg']}"
         return JSONResponse(own.error_json(400, message), 400)
 
-    @app.get("/health")
+    @app.get(own.HEALTH)
     async def health() -> Response:
-        silent_s = queued.turns.silent_s()
-        if silent_s > STUCK_S:
-            said = f"the answer under way has shown no sign of life for {silent_s:.0f} s"
-            return JSONResponse({"status": "stuck", "reason": said}, 503)
-        return JSONResponse({"status": "ok"})
+        status, said = own.health(core)
+        return JSONResponse(said, status)
 
-    @app.get("/v1/models")
-    def models() -> dict[str, Any]:
-        model = {"id": "s2a", "object": "model", "owned_by": "s2a-bench", "s2a_provenance": queued.provenance}
-        return {"object": "list", "data": [model]}
+    @app.get(own.MODELS)
+    async def models() -> dict[str, Any]:
+        return own.models(core.queued)
 
     @app.post(own.PATHS[own.AS_DEPLOYED])
-    def as_deployed(body: ChatRequest, http_request: HttpRequest) -> Response:
-        trace: Trace = http_request.state.trace
-        trace.mark("json_parse")
-        request, stream = of_fields(body.model_dump(), trace, limits, own.STANDARD)
-        reply = Reply(queued, request, trace, own.STANDARD, stream=stream)
-        answer = http_request.state.answer = Answer(reply)
-        answer.begin()
-        return answer
+    async def as_deployed(body: ChatRequest, request: HttpRequest) -> Response:
+        exchange = DeployedExchange(body, request.scope["state"]["protocol"], core.limits)
+        answering = asyncio.get_running_loop().run_in_executor(threads, core.answer, exchange)
+        answering.add_done_callback(lambda _: exchange.messages.put_nowait(None))
+        return Answer(exchange, core.limits.answer_s + LINGER_S)
 
     return app
 
@@ -147,18 +155,8 @@ def application(queued: Queued, limits: Limits, *, documented: bool = False) -> 
 class _Server(uvicorn.Server):
     """uvicorn without its signal handlers: whoever runs the server has some."""
 
-    def __init__(self, config: uvicorn.Config, lane: Lane) -> None:
-        super().__init__(config)
-        self._lane = lane
-
     def capture_signals(self) -> AbstractContextManager[None]:  # type: ignore[override]
         return nullcontext()
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End what is under way, of the lane too, which uvicorn does not know."""
-        await super().shutdown(sockets)
-        self._lane.close()
-        await asyncio.sleep(CLOSING_S)
 
 
 class HttpServer:
@@ -170,28 +168,32 @@ class HttpServer:
         Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
         """
         self._socket, key = bound_socket(wiring.address, "http", wiring.options)
-        self.address = "http://{}:{}".format(*self._socket.getsockname())
-        queued = Queued.around(handler, wiring.limits)
-        app = application(queued, wiring.limits, documented=wiring.options.api_docs)
-        lane = Lane(queued, wiring.limits, key)
+        host, port = self._socket.getsockname()
+        self.address = f"http://{host}:{port}"
+        core = Core(handler, wiring.limits)
+        app = application(core, documented=wiring.options.api_docs)
+
+        async def ending(scope: Any, receive: Any, send: Any) -> None:
+            with suppress(asyncio.CancelledError):  # uvicorn's, when it stops
+                await app(scope, receive, send)
+
         config = uvicorn.Config(
-            keyed(_received(app), key),
+            ending,
             loop="uvloop",
-            http=door(wiring.limits, lane),
+            http=partial(Protocol, core, Access(wiring.options, host, key, own.SCHEME)),  # type: ignore[arg-type]
+            ws="none",
             log_level="warning",
             access_log=False,
             lifespan="off",
             timeout_graceful_shutdown=1,
-            timeout_keep_alive=KEEP_ALIVE_S,
+            timeout_keep_alive=own.KEEP_ALIVE_S,
         )
-        self._server = _Server(config, lane)
+        self._server = _Server(config)
 
     def describe(self) -> dict[str, str | int]:
-        """Say what serves."""
         return {"server": "uvicorn", "version": uvicorn.__version__, "loop": "uvloop", "http": "httptools"}
 
     def serve(self) -> None:
-        """Serve until stopped."""
         self._server.run(sockets=[self._socket])
 
     def stop(self) -> None:

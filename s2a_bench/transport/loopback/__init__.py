@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from s2a_bench.transport import Client, Handler, Server, Transport, Wiring
-from s2a_bench.transport.options import Options
+from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, Options, Server, Transport, Wiring
 
 
 class Loopback(Transport[Options]):
     """A call within the process; no picture travels, whatever the payload is."""
 
     name = "loopback"
-    for_policies = True
     options = Options
+    answer_kinds = (TOKENS, ACTIONS)
+    accepts_state = True
     stages = {"hand_over": "parse"}  # making of the request what the handler takes
     order = 100
-    looks = {"": ("#009E73", ":")}
+    style = {"": ("#009E73", ":")}
     compared_with = ()
     in_process = True
 

@@ -12,8 +12,7 @@ from threading import Event
 
 from s2a_bench.errors import EngineError, RequestFailed, ServerDied
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler, Wiring
-from s2a_bench.transport.options import Options
+from s2a_bench.transport import Handler, Options, Wiring
 from s2a_bench.transport.pictures import bgr_of, rgb_of
 from s2a_bench.types import Piece, Request
 

@@ -5,19 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import count
-from secrets import token_hex
 
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_STAMP_AGE_MS, PAYLOAD_BYTES, STALE_FRAMES, Fact
-from s2a_bench.ros.router import ROUTER
-from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, Server, Transport, Wiring
-from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
+from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, Handler, Server, Transport, Wiring
+from s2a_bench.transport.ros.options import RosOptions
 
 TOPIC, ACTION = VARIANTS = ("topic", "action")
 UNREADABLE_N = Fact("unreadable_n", "messages", "of strangers, that could not be read while the request was under way")
-LARGE_PICTURE = 640 * 480
-"""Pixels above which DDS needs more receive buffer than Linux gives by default."""
 
 
 class Ros(Transport[RosOptions]):
@@ -27,34 +22,26 @@ class Ros(Transport[RosOptions]):
     options = RosOptions
     variants = VARIANTS
     payloads = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
+    answer_kinds = (TOKENS, ACTIONS)
+    accepts_state = True
     stages = {
         "cdr_pack": "pack",
         "accept": "network",  # an action's goal is accepted before work starts
         "cdr_parse": "parse",
     }
-    tells = (PAYLOAD_BYTES, CAMERA_FRAMES, CAMERA_AGE_MS, CAMERA_STAMP_AGE_MS, STALE_FRAMES, UNREADABLE_N)
+    facts = (PAYLOAD_BYTES, CAMERA_FRAMES, CAMERA_AGE_MS, CAMERA_STAMP_AGE_MS, STALE_FRAMES, UNREADABLE_N)
     order = 20
-    looks = {TOPIC: ("#0072B2", "-"), ACTION: ("#56B4E9", "--")}
+    style = {TOPIC: ("#0072B2", "-"), ACTION: ("#56B4E9", "--")}
     packages = ("cyclonedds", "eclipse-zenoh", "rosbags")
     checks = {
-        "rmem-max": "s2a_bench.machine.doctor.robot:rmem_max",
+        "rmem-max": "s2a_bench.machine.doctor.host:rmem_max",
         "dds": "s2a_bench.transport.ros.checks:dds",
         "ros": "s2a_bench.transport.ros.checks:ros",
         "middleware": "s2a_bench.transport.ros.checks:middleware",
         "zenoh": "s2a_bench.transport.ros.checks:zenoh",
         "dds-buffers": "s2a_bench.transport.ros.buffers:check",
     }
-    watches_udp = True
-    elsewhere = ("action",)
-    serving = {
-        "namespace": "/llama",
-        "router": ROUTER,
-        "qos": "sensor_data",  # matches reliable cameras as well as best-effort ones
-        "feedback_interval": 0.002,
-        "max_tokens": 512,
-        "publish_tokens": True,
-        "node_api": True,
-    }
+    udp_checks = ("rmem-max",)
 
     def client(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> Client:
         """Join the domain and wait for the server under the namespace ``wiring.address``."""
@@ -72,23 +59,21 @@ class Ros(Transport[RosOptions]):
 
         return RosServer(wiring, handler)
 
-    def measured(self, options: RosOptions, chosen: Sequence[str], engine: str) -> Sequence[str]:  # noqa: ARG002
+    def measured(self, choice: Choice[RosOptions]) -> Sequence[str]:
         """Return topics unless told, and of somebody else's node its action."""
-        return (ACTION,) if options.action else chosen or (TOPIC,)
+        return (ACTION,) if choice.options.action else super().measured(choice)
 
-    def answers(self, variant: str, options: RosOptions) -> tuple[str, ...]:  # noqa: ARG002 - of all transports
-        """Return tokens alone for the action: llama_msgs has no field for a robot's."""
-        return (TOKENS,) if variant == ACTION else (TOKENS, ACTIONS)
+    def capabilities(self, choice: Choice[RosOptions]) -> Capabilities[RosOptions]:
+        """Return it without actions and state for the action: llama_msgs has no fields for a robot's."""
+        can = super().capabilities(choice)
+        return replace(can, answer_kinds=(TOKENS,), accepts_state=False) if choice.variant == ACTION else can
 
-    def takes_state(self, variant: str, options: RosOptions) -> bool:  # noqa: ARG002 - of all transports
-        """Whether it is the topic: a goal of llama_msgs has no field for it."""
-        return variant == TOPIC
-
-    def check(self, variant: str, options: RosOptions, *, mode: str, engine: str) -> None:  # noqa: ARG002
+    def require(self, choice: Choice[RosOptions]) -> None:
         """Refuse what a goal cannot carry, and a stream that nobody keeps."""
         from s2a_bench.ros.config import domain_id
         from s2a_bench.transport.ros.joining import is_routed
 
+        variant, options, mode = choice.variant, choice.options, choice.mode
         domain_id(os.environ)
         if options.router and not is_routed(options):
             raise UsageError("`router` is Zenoh's: choose `middleware` zenoh, or leave it out")
@@ -102,40 +87,15 @@ class Ros(Transport[RosOptions]):
                 f"ros/{ACTION}?payload=raw"
             )
 
-    def tuned(self, options: RosOptions) -> bool:
-        """Return False for DDS, and processes, as they come."""
-        return options.dds_tuning == "tuned"
-
-    def foreign(self, options: RosOptions) -> str:
-        """Return the name of somebody else's action."""
-        return options.action
-
-    def bind(self, options: RosOptions, taken: Sequence[str]) -> str:
-        """Return the namespace, with a number where another server of ours has it; unless told, one nobody else has."""
-        if not options.namespace:
-            return f"{NAMESPACE}_{token_hex(4)}"
-        numbered = (f"{options.namespace}_{number}" for number in count(2))
-        return options.namespace if options.namespace not in taken else next(n for n in numbered if n not in taken)
-
-    def before_run(self, width: int, height: int) -> tuple[str, ...]:
-        """Return the check of the receive buffer, where pictures are large."""
-        return ("rmem-max",) if width * height > LARGE_PICTURE else ()
-
-    def against_loss(self, options: RosOptions) -> str:
-        """Return what the middleware in use needs."""
-        from s2a_bench.transport.ros.buffers import against_loss
-
-        return against_loss(options.middleware, os.environ)
-
-    def ready(self, wiring: Wiring[RosOptions], address: str) -> str:
+    def ready(self, wiring: Wiring[RosOptions]) -> str:
         """Return the names of action and camera."""
         from s2a_bench.transport.ros.camera import CAMERA
         from s2a_bench.transport.ros.joining import AT, place_of, remapped
 
         names = remapped(wiring)
-        namespace, hosted, _ = address.partition(AT)
+        namespace, hosted, _ = wiring.address.partition(AT)
         action, camera = (names.get(name, name) for name in (f"{namespace}/generate_response", namespace + CAMERA))
-        where = place_of(replace(wiring, address=address)) + (", which this server is" if hosted else "")
+        where = place_of(wiring) + (", which this server is" if hosted else "")
         return f"serving action {action}, camera {camera}, in {where}"
 
 

@@ -10,18 +10,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from s2a_bench.clock import now_ns, realtime_offset_ns
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied, TransportError
 from s2a_bench.facts import PAYLOAD_BYTES
-from s2a_bench.ros import ActionClient, Feedback, QoS, Rejected, Result
+from s2a_bench.ros import ActionClient, ActionEvent, Feedback, QoS, Rejected, Result
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.trace import Trace
-from s2a_bench.transport import CameraSink, Wiring
-from s2a_bench.transport.bounds import Bounds
-from s2a_bench.transport.ros.camera import POLL_S, CameraPublisher, picture_message
-from s2a_bench.transport.ros.joining import join, namespace_of, place_of, wait_until
+from s2a_bench.transport import Wiring
+from s2a_bench.transport.limits import Bounds
+from s2a_bench.transport.ros.camera import POLL_S, picture_message
+from s2a_bench.transport.ros.joining import RosClient, join, namespace_of, place_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, READER_QOS, readable, remote_of, told_by
 from s2a_bench.types import Request, Token
@@ -33,18 +33,14 @@ MEDIA_MARKER = "<__media__>"
 MARKS_TIMEOUT_S = 2.0
 
 
-class GenerateClient:
+class GenerateClient(RosClient):
     """Sends goals and collects the feedback, from our own server or a llama_ros node."""
 
     def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
         """Join the domain and wait for the action; raises ServerDied if it does not appear."""
-        self._wiring = wiring
-        self._alive = alive
-        self._offset_ns = realtime_offset_ns()
-        self.middleware = join(wiring, "client")
+        super().__init__(wiring, alive)
         namespace = namespace_of(wiring)
         self._name = wiring.options.action or namespace + ACTION
-        self.camera: CameraSink | None = None
         try:
             self._client, self._version = self._connect()
             self._marks = None
@@ -53,9 +49,6 @@ class GenerateClient:
             )
             if not wiring.black_box:
                 self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, READER_QOS)
-                camera = CameraPublisher(self.middleware, namespace, wiring.options.payload, wiring.options.qos)
-                self.camera = camera
-                self._wait(lambda: bool(camera.matched()))
                 self._wait(lambda: bool(self._marks and self._marks.matched()))
         except TransportError:
             self.close()
@@ -91,7 +84,6 @@ class GenerateClient:
         wait_until(arrived, self._alive, absent)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
-        """Send a goal and yield its tokens."""
         payload = self._wiring.options.payload
         images = [picture_message(frame, payload, self._offset_ns, trace)[1] for frame in request.images]
         sampling: dict[str, Any] = {"grammar": request.grammar}
@@ -150,9 +142,8 @@ class GenerateClient:
 
     def _next(self, goal_id: bytes, bounds: Bounds) -> Any:
         """Wait for the next event of this goal."""
-        deadline = now_ns() + int(self._wiring.timeout_s * 1e9)
-        while now_ns() < deadline:
-            event = self._client.next_event(min(POLL_S, bounds.left_s()))
+        events: Iterator[ActionEvent | None] = self.taken(self._client.next_event, bounds)
+        for event in events:
             if event is not None and event.goal_id == goal_id:
                 return event
             if event is None and not (self._alive() and self._client.server_present()):
@@ -174,11 +165,3 @@ class GenerateClient:
                     trace.receive(remote_of(marks))
                     return True
         return False
-
-    def describe(self) -> dict[str, str]:
-        """Add nothing: the wiring tells all."""
-        return {}
-
-    def close(self) -> None:
-        """Leave the domain."""
-        self.middleware.close()

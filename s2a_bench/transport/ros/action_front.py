@@ -1,28 +1,51 @@
-"""The server's side of the ROS variant `action`: goals become jobs of the engine's, tokens feedback."""
+"""The server's side of the ROS variant `action`: goals become jobs of the engine's, tokens feedback.
+
+What a goal wants of sampling are the fields of ``llama_msgs/SamplingConfig`` that differ from their defaults: a client
+that does not care sends the defaults, and then the engine's own settings hold.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Collection
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import S2AError
+from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.ros import Middleware, QoS, ServerGoal
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.llama import GENERATE_RESPONSE, goal_images, text_result, token_feedback
+from s2a_bench.ros.llama import GENERATE_RESPONSE, goal_images, sampling_config, text_result, token_feedback
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.ros.action import ACTION, MARKS, MEDIA_MARKER
 from s2a_bench.transport.ros.camera import picture_of
+from s2a_bench.transport.ros.exchange import RosExchange, Shared
 from s2a_bench.transport.ros.joining import namespace_of
 from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.transport.ros.sampling import Wishes
 from s2a_bench.transport.ros.wire import TOKEN_QOS, marks_message, token_message
-from s2a_bench.types import Piece, Request
+from s2a_bench.types import Piece, Request, Sampling
 
 NO_SEED = 2**32 - 1
 """SamplingConfig.seed of a client that does not care."""
+BOUNDS: Final[dict[str, tuple[float, float]]] = {
+    "temp": (0, 100),
+    "top_k": (-1, 2**31 - 1),
+    "top_p": (0, 1),
+    "min_p": (0, 1),
+    "typical_p": (0, 1),
+    "penalty_last_n": (-1, 2**20),
+    "penalty_repeat": (0.01, 100),
+    "penalty_freq": (-100, 100),
+    "penalty_present": (-100, 100),
+    "mirostat": (0, 2),
+    "mirostat_eta": (0, 10),
+    "mirostat_tau": (0.01, 100),
+}
+"""Field -> what makes sense of it: the numbers that an engine may honour."""
+ELSEWHERE: Final = frozenset({"seed", "grammar", "dry_sequence_breakers"})
+"""What the goal says besides, and what ROS itself encodes in two ways."""
 _log = logging.getLogger(__name__)
 
 
@@ -38,7 +61,7 @@ class ActionFront:
         self._server = middleware.action_server(
             namespace + ACTION, GENERATE_RESPONSE, options.result_timeout, options.llama_msgs
         )
-        self.version = self._server.version
+        self.take, self.interrupt, self.version = self._server.next_goal, self._server.interrupt, self._server.version
         self.wishes = Wishes(honoured, self.version)
         self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS)
         self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if options.publish_tokens else None
@@ -48,25 +71,15 @@ class ActionFront:
         self.max_tokens = min(options.max_tokens or self._wiring.max_tokens, self._wiring.limits.answer_tokens)
         self.feedback_interval_ns = int(options.feedback_interval * 1e9)
 
-    def take(self, timeout_s: float) -> ServerGoal | None:
-        """Wait for the next goal."""
-        return self._server.next_goal(timeout_s)
-
-    def job(self, packed: ServerGoal, trace: Trace) -> GenerateJob | None:
-        """Unpack a goal; one that cannot be read, or is of another version, is rejected."""
+    def exchange(self, packed: ServerGoal, shared: Shared, trace: Trace) -> GoalExchange:
+        """Unpack a goal; raises TransportError for one that cannot be read, or is of another version."""
         if other := packed.other_version():
-            self.refuse(packed, f"its client speaks llama_msgs {other}, this server {self.version} (--llama-msgs)")
-            return None
-        try:
-            goal = packed.unpack()
-        except S2AError as error:
-            self.refuse(packed, str(error))
-            return None
+            raise RequestFailed(f"its client speaks llama_msgs {other}, this server {self.version} (--llama-msgs)")
+        goal = packed.unpack()
         trace.mark("cdr_parse")
-        return GenerateJob(self, packed, goal, trace)
+        return GoalExchange(self, packed, goal, shared, trace)
 
     def size_bytes(self, packed: ServerGoal) -> int:
-        """Return the size of a goal."""
         return packed.size_bytes
 
     def refuse(self, packed: ServerGoal, why: str) -> None:
@@ -83,70 +96,59 @@ class ActionFront:
         """Send a goal's marks, before its result."""
         self._marks.send(self._marks.pack(marks_message(goal_id, trace.to_remote())))
 
-    def interrupt(self) -> None:
-        """Make `take` return; callable from any thread."""
-        self._server.interrupt()
 
-
-class GenerateJob:
+class GoalExchange(RosExchange):
     """One goal: ACCEPTED while it waits, EXECUTING when its turn comes."""
 
-    def __init__(self, front: ActionFront, goal: ServerGoal, message: Any, trace: Trace) -> None:
-        """Remember the goal."""
-        self.trace = trace
-        self._front = front
-        self._goal = goal
-        self._message = message
+    def __init__(self, front: ActionFront, goal: ServerGoal, message: Any, shared: Shared, trace: Trace) -> None:
+        """Answer a goal of the front's."""
+        super().__init__(shared, trace)
+        self._front, self._goal, self._message = front, goal, message
         self._id = goal.id.hex()
         self._stop = [text for text in message.stop if text]
         self._tokens: list[Piece] = []
         self._held: list[str] = []
         self._fed_ns = 0
-        self._error = ""
         self._started = False
 
     def accept(self) -> None:
-        """Accept the goal; from here on only `end` ends it."""
+        """Accept the goal; from here on only `finish` ends it."""
         self._goal.accept()
         self.trace.mark("accept")
 
-    def prepare(self) -> Request | None:
-        """Decode the pictures."""
-        message, limits = self._message, self._front.limits
-        try:
-            images = tuple(picture_of(image, self.trace, limits) for image in goal_images(message))
-            wishes = self._front.wishes.of(message.sampling_config)
-        except Exception as error:  # noqa: BLE001 - the goal is accepted, so it has to end, whatever broke
-            self._error = str(error) or type(error).__name__
-            return None
-        sampling = message.sampling_config
+    def request(self) -> Request:
+        message, sampling = self._message, self._message.sampling_config
         seed = getattr(sampling, "seed", NO_SEED)
         return Request(
             id=self._id,
             prompt=message.prompt.replace(MEDIA_MARKER, ""),
-            images=images,
+            images=tuple(picture_of(image, self.trace, self._front.limits) for image in goal_images(message)),
             max_tokens=self._front.max_tokens,
             grammar=sampling.grammar,
             seed=0 if seed == NO_SEED else seed,
-            sampling=wishes,
+            sampling=self._front.wishes.of(sampling),
         )
 
-    def start(self) -> bool:
+    def cancelled(self) -> bool:
+        return self._goal.cancel_requested
+
+    def started(self) -> bool:
         """Let the goal be EXECUTING, unless a cancel came first."""
         self._started = self._goal.executing()
         self.trace.mark("accept")
         return self._started
 
-    def token(self, token: Piece) -> bool:
+    def piece(self, piece: Piece) -> bool:
         """Send a token as feedback; return False after a cancel or a stop word."""
         if self._goal.cancel_requested:
             return False
-        self._held.append(token.text)
-        self._tokens.append(token)
-        self._front.plot(self._id, token)
+        self._held.append(piece.text)
+        self._tokens.append(piece)
+        self._front.plot(self._id, piece)
         if now_ns() - self._fed_ns >= self._front.feedback_interval_ns:
             self._feed()
-        return not (self._stop and self._stopped())
+        text = self._text() if self._stop else ""
+        return not any(stop in text for stop in self._stop)
 
     def _feed(self) -> None:
         """Send what is held as one feedback: one token, or several that came faster than ROS clients' queues hold."""
@@ -155,25 +157,18 @@ class GenerateJob:
             self._held.clear()
             self._fed_ns = now_ns()
 
-    def unwanted(self) -> bool:
-        """Whether the goal was cancelled."""
-        return self._goal.cancel_requested
+    def _text(self) -> str:
+        return "".join(token.text for token in self._tokens)
 
-    def _stopped(self) -> bool:
-        text = "".join(token.text for token in self._tokens)
-        return any(stop in text for stop in self._stop)
-
-    def end(self, error: str = "") -> None:
+    def finish(self, error: str) -> None:
         """Send marks and result."""
-        error = error or self._error
         try:
             if self._started and not self._goal.cancel_requested:
                 self._feed()
             self._front.ended(self._id, self.trace)
         except S2AError as failure:
             error = error or str(failure)
-        text = error or "".join(token.text for token in self._tokens)
-        result = text_result(text, [token.id for token in self._tokens], self._front.version)
+        result = text_result(error or self._text(), [token.id for token in self._tokens], self._front.version)
         started = self._started or self._goal.executing()
         if self._goal.cancel_requested:
             self._goal.canceled(result)
@@ -181,3 +176,36 @@ class GenerateJob:
             self._goal.abort(result)
         else:
             self._goal.succeed(result)
+
+
+class Wishes:
+    """Reads what goals want, and logs once what the engine does not honour."""
+
+    def __init__(self, honoured: Collection[str], version: str) -> None:
+        """Know the fields that the engine honours, and a version's defaults."""
+        self._honoured = honoured
+        self._defaults = sampling_config(version)
+        self._said: set[str] = set()
+
+    def of(self, config: Any) -> Sampling:
+        """Return the wishes that the engine honours; raises RequestFailed for a number that makes no sense."""
+        defaults = vars(self._defaults).items()
+        wanted = [name for name, default in defaults if _differs(getattr(config, name, default), default)]
+        left_out = [name for name in wanted if name not in self._honoured and name not in self._said | ELSEWHERE]
+        if left_out:
+            self._said.update(left_out)
+            _log.warning("not honoured of goals' sampling_config: %s", ", ".join(left_out))
+        return tuple((name, _checked(name, getattr(config, name))) for name in wanted if name in self._honoured)
+
+
+def _differs(value: Any, default: Any) -> bool:
+    if isinstance(default, float):
+        return bool(np.float32(value) != np.float32(default))
+    return not np.array_equal(value, default) if isinstance(default, np.ndarray) else bool(value != default)
+
+
+def _checked(name: str, value: float) -> float:
+    least, most = BOUNDS[name]
+    if not least <= value <= most:
+        raise RequestFailed(f"sampling_config.{name}: {value:g} is not {least:g} to {most:g}")
+    return value

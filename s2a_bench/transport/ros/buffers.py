@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 
 from s2a_bench.machine.doctor import Finding, Machine
-from s2a_bench.machine.doctor.robot import RMEM_WANTED
+from s2a_bench.machine.doctor.host import RMEM_WANTED
 from s2a_bench.ros import default_middleware
 from s2a_bench.ros.config import TUNED_GENERAL, TUNED_INTERNAL
 

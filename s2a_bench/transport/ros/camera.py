@@ -7,6 +7,7 @@ camera feeds the cache.
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import dataclass, replace
 from threading import Lock, Thread
 from typing import Any, cast
@@ -16,7 +17,8 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_STAMP_AGE_MS, STALE_FRAMES
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
-from s2a_bench.trace import Mark, Trace
+from s2a_bench.ros.service import appeared
+from s2a_bench.trace import RESIDUAL, Mark, Trace
 from s2a_bench.transport.limits import LIMITS, Limits, check_pixels
 from s2a_bench.transport.pictures import bgr_of, decoded, encoded, rgb_of
 from s2a_bench.transport.ros.options import RosOptions
@@ -31,6 +33,8 @@ COLOURS = frozenset({"bgr8", "rgb8", "bgra8", "rgba8"})
 CAMERA_QOS = {"reliable": QoS(depth=1), "sensor_data": QoS(depth=5, reliable=False)}
 """By the names of ROS 2's profiles; a reliable subscription does not match a best-effort publisher."""
 POLL_S = 0.5
+FIRST_FRAME_S = 1.0
+"""The longest that a request waits for the first frame of a publisher."""
 _log = logging.getLogger(__name__)
 
 
@@ -92,7 +96,6 @@ class CameraPublisher:
         self._publisher.send(packed)
 
     def matched(self) -> int:
-        """Count the subscriptions."""
         return self._publisher.matched()
 
 
@@ -117,7 +120,7 @@ class CameraCache:
     def __init__(self, middleware: Middleware, namespace: str, options: RosOptions, limits: Limits = LIMITS) -> None:
         """Subscribe; `start` starts the threads."""
         self.limits = limits
-        self._max_age_s = options.max_frame_age
+        self._options = options
         topics = ((CAMERA, ros.IMAGE), (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE))
         self._cameras = [
             middleware.subscription(namespace + topic, kind, CAMERA_QOS[options.qos]) for topic, kind in topics
@@ -125,11 +128,14 @@ class CameraCache:
         self._threads = [Thread(target=self._watch, args=(camera,), daemon=True) for camera in self._cameras]
         self._newest: CachedFrame | None = None
         self._count = 0
+        self._unused = ""
+        """Why the last frame cannot be used."""
+        self._silent = self._logged = False
+        """Whether a request has waited for the first frame in vain, and whether the log has that there is no camera."""
         self._lock = Lock()
         self._stopped = False
 
     def start(self) -> None:
-        """Start watching."""
         for thread in self._threads:
             thread.start()
 
@@ -147,9 +153,10 @@ class CameraCache:
     def lend(self, trace: Trace) -> tuple[Frame, ...]:
         """Return the newest frame for a request that carries none; its trace is told which it is, and how old.
 
-        Raises RequestFailed for one that came more than ``max_frame_age`` ago.
+        It is () where no frame has come and the topics have no publisher. Raises RequestFailed where they have one,
+        after `FIRST_FRAME_S` at most, and for a frame that came more than ``max_frame_age`` ago.
         """
-        newest = self._newest
+        newest = self._newest or self._first(trace)
         if newest is None:
             return ()
         trace.frame_stamp_ns, trace.frame_marks = newest.frame.stamp_ns, newest.marks
@@ -159,16 +166,54 @@ class CameraCache:
         trace.facts[CAMERA_AGE_MS] = age_s * 1e3
         if newest.frame.stamp_ns:  # some cameras leave it out
             trace.facts[CAMERA_STAMP_AGE_MS] = (at_ns + realtime_offset_ns() - newest.frame.stamp_ns) / 1e6
-        if age_s > self._max_age_s:
+        if age_s > self._options.max_frame_age:
             trace.facts[STALE_FRAMES] = 1.0
             raise RequestFailed(
-                f"the camera's newest frame came {age_s:.1f} s ago, more than `max_frame_age` {self._max_age_s:g} s: "
-                "see whether the camera still publishes"
+                f"the camera's newest frame came {age_s:.1f} s ago, more than `max_frame_age` "
+                f"{self._options.max_frame_age:g} s: {self.silence() or 'see whether the camera still publishes'}"
             )
         return (newest.frame,)
 
+    def _first(self, trace: Trace) -> CachedFrame | None:
+        """Wait for the first frame; None where the topics have no publisher, which the log has once.
+
+        Raises RequestFailed where they have one: at once, after a request that has waited in vain.
+        """
+        if not self._silent:
+            wait_s = min(self._options.max_frame_age, FIRST_FRAME_S)
+            self._silent = not appeared(
+                lambda: bool(self._newest) or not self._publishers(), wait_s, lambda: self._stopped
+            )
+            trace.mark(RESIDUAL)
+        if self._newest is None and (silence := self.silence()):
+            raise RequestFailed(f"no picture: {silence}")
+        self._silent = False
+        if self._newest is None and not self._logged:
+            self._logged = True
+            topics = " or ".join(camera.topic for camera in self._cameras)
+            _log.warning("no camera: no publisher on %s; requests without a picture are answered from text", topics)
+        return self._newest
+
+    def silence(self) -> str:
+        """Return what to look at where no frame comes although the topics have publishers; "" where they have none."""
+        found = self._publishers()
+        present = ", ".join(f"{count} publisher{'s' * (count > 1)} on {topic}" for topic, count in found.items())
+        if not present:
+            return ""
+        if self._unused:
+            return f"{present}, none of its frames can be used: {self._unused}"
+        from s2a_bench.transport.ros.buffers import against_loss  # loads the doctor
+
+        buffers = against_loss(self._options.middleware, os.environ).replace("--", "")
+        other = "; a best-effort publisher is received with qos sensor_data" * (self._options.qos == "reliable")
+        return f"{present}, no frame comes: look at the buffers ({buffers}) and at what is published{other}"
+
+    def _publishers(self) -> dict[str, int]:
+        """Count the publishers of each topic that has some."""
+        return {camera.topic: count for camera in self._cameras if (count := camera.publishers())}
+
     def seen(self) -> tuple[int, int | None]:
-        """Return how many frames have come, and when the newest that can be used was received (CLOCK_MONOTONIC)."""
+        """Return how many frames have come, and when the newest usable one did (CLOCK_MONOTONIC)."""
         newest = self._newest
         return self._count, newest.received_ns if newest else None
 
@@ -179,9 +224,11 @@ class CameraCache:
                 packed = camera.take(POLL_S)
                 if packed is not None:
                     self._keep(camera, packed)
+                    self._unused = ""
             except Exception as error:  # noqa: BLE001 - a frame nobody can use is no reason to stop
-                if str(error) != said:  # once a kind of trouble, not thirty times a second
-                    said = str(error)
+                self._unused = str(error) or type(error).__name__
+                if self._unused != said:  # once a kind of trouble, not thirty times a second
+                    said = self._unused
                     _log.warning("camera frame not used: %s", said)
 
     def _keep(self, camera: Subscription, packed: Any) -> None:

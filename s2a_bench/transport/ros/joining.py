@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cached_property
+from typing import TypeVar
 
+from s2a_bench.clock import now_ns, realtime_offset_ns
 from s2a_bench.errors import MissingInterface, ServerDied, TransportError
 from s2a_bench.ros import ROUTED, Middleware, QoS, Tuning, default_middleware, open_middleware
 from s2a_bench.ros import messages as ros
@@ -13,11 +16,13 @@ from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE
 from s2a_bench.ros.remap import Remapped, table
 from s2a_bench.ros.router import ROUTER, Router, free_endpoint, listens, may_host
-from s2a_bench.ros.waiting import appeared
+from s2a_bench.ros.service import appeared
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA
+from s2a_bench.transport.limits import Bounds
+from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA, POLL_S, CameraPublisher
 from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
+T = TypeVar("T")
 AT = "@"
 """In an address, between the namespace and the router that the server is itself."""
 MATCH_TIMEOUT_S = 15.0
@@ -101,6 +106,18 @@ def wait_until(arrived: Callable[[], bool], alive: Callable[[], bool], what: str
         raise ServerDied(f"{what}; is ROS_DOMAIN_ID the same on both sides?")
 
 
+def open_camera(middleware: Middleware, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> CameraPublisher:
+    """Publish as the server's camera, which subscribes before this returns: what is sent earlier is lost.
+
+    Raises ServerDied. Made for a stream only: a server fails what comes without a picture where its camera is silent.
+    """
+    namespace = namespace_of(wiring)
+    camera = CameraPublisher(middleware, namespace, wiring.options.payload, wiring.options.qos)
+    absent = f"no server subscribed to {namespace}{CAMERA} in {place_of(wiring)}"
+    wait_until(lambda: bool(camera.matched()), alive, absent)
+    return camera
+
+
 def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
     """Raise TransportError if another server listens under ``namespace``: both would answer every request."""
     probe = join(wiring, "probe")
@@ -123,3 +140,31 @@ def _action_offered(probe: Middleware, name: str) -> Callable[[], bool]:
         return probe.action_client(name, GENERATE_RESPONSE).server_present
     except MissingInterface:
         return lambda: False
+
+
+class RosClient:
+    """What the clients of both variants have: a node, the server's camera, and messages that they wait for."""
+
+    def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
+        """Join the domain."""
+        self._wiring, self._alive = wiring, alive
+        self._offset_ns = realtime_offset_ns()
+        self.middleware = join(wiring, "client")
+
+    @cached_property
+    def camera(self) -> CameraPublisher | None:
+        """The server's camera, from the first use on; none of a server that is not ours."""
+        return None if self._wiring.black_box else open_camera(self.middleware, self._wiring, self._alive)
+
+    def taken(self, take: Callable[[float], T | None], bounds: Bounds) -> Iterator[T | None]:
+        """Yield what comes, None where nothing came for a moment, until the longest silence is over."""
+        deadline_ns = now_ns() + int(self._wiring.timeout_s * 1e9)
+        while now_ns() < deadline_ns:
+            yield take(min(POLL_S, bounds.left_s()))
+
+    def describe(self) -> dict[str, str]:
+        """Add nothing: the wiring tells all."""
+        return {}
+
+    def close(self) -> None:
+        self.middleware.close()

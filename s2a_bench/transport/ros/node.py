@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from threading import Event, Thread
@@ -13,15 +14,14 @@ from s2a_bench.errors import TransportError
 from s2a_bench.options import Options
 from s2a_bench.ros import Middleware, QoS
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.diagnostics import ARRAY, DIAGNOSTICS_QOS, Finding, Level, diagnostic_array
+from s2a_bench.ros.diagnostics import ARRAY, DIAGNOSTICS_QOS, Finding, Level, Rosout, diagnostic_array
 from s2a_bench.ros.diagnostics import TOPIC as DIAGNOSTICS
 from s2a_bench.ros.parameters import SERVICE, Parameter, Parameters, of_options
-from s2a_bench.ros.rosout import Rosout
-from s2a_bench.transport import Wiring
-from s2a_bench.transport.options import sides
-from s2a_bench.transport.ros.joining import domain_of, namespace_of, server_name
+from s2a_bench.transport import SERVER, SERVING, Wiring
+from s2a_bench.transport.limits import SET
+from s2a_bench.transport.ros.joining import domain_of, namespace_of
 from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.transport.turns import STUCK_S
+from s2a_bench.transport.serving import STUCK_S
 
 LIVE: Final = ("max_tokens", "feedback_interval")
 """The options that are read for each goal, and can be set while the node runs."""
@@ -31,6 +31,7 @@ PARAMETERS_QOS: Final = QoS(depth=1000)
 EVENT: Final = "rcl_interfaces/msg/ParameterEvent"
 EVENTS: Final = "/parameter_events"
 LOGGER: Final = "s2a_bench"
+NUMBER: Final = re.compile(r"\d+")
 
 _log = logging.getLogger(__name__)
 
@@ -46,16 +47,20 @@ class Activity:
         self._said = ""
 
     def failed(self, error: str, *, told: bool = False) -> None:
-        """Count a failure, and log it unless the log was ``told`` or it is the same again."""
+        """Count a failure, and log it unless the log was ``told`` or it is the same again, but for its numbers."""
         self.failures += 1
-        if not told and error != self._said:
-            self._said = error
+        kind = NUMBER.sub("", error)
+        if not told and kind != self._said:
+            self._said = kind
             _log.warning("a request failed: %s", error)
 
-    def findings(self, frames: int, frame_ns: int | None, oldest_s: float) -> Iterator[Finding]:
+    def findings(
+        self, frames: int, frame_ns: int | None, silence: Callable[[], str], oldest_s: float
+    ) -> Iterator[Finding]:
         """Yield how requests and camera have been since the last call.
 
-        ``frames`` have come from the camera, the last at ``frame_ns``; one older than ``oldest_s`` is a warning.
+        ``frames`` have come from the camera, the last at ``frame_ns``; none, where there is a publisher, and one older
+        than ``oldest_s`` are warnings, with `CameraCache.silence`.
         """
         now = (now_ns(), self.requests, self.tokens, self.failures, frames)
         seconds = max((now[0] - self._before[0]) / 1e9, 1e-9)
@@ -84,11 +89,13 @@ class Activity:
             },
         )
         if frame_ns is None:
-            yield Finding("camera", Level.OK, "no frame has come", {"frames": frames})
+            why = silence()
+            level = Level.WARN if why else Level.OK
+            yield Finding("camera", level, why or "no camera: no publisher on its topics", {"frames": frames})
             return
         age_s = (now[0] - frame_ns) / 1e9
         old = age_s > oldest_s
-        said = f"the newest frame is {age_s:.1f} s old" if old else "frames come"
+        said = ": ".join(filter(None, (f"the newest frame is {age_s:.1f} s old", silence()))) if old else "frames come"
         values = {"frames_per_s": came / seconds, "frame_age_s": age_s, "frames": frames}
         yield Finding("camera", Level.WARN if old else Level.OK, said, values)
 
@@ -121,21 +128,6 @@ class NodeApi:
         for handler in self._handlers:
             self._logger.addHandler(handler)
 
-    @classmethod
-    def of(
-        cls,
-        middleware: Middleware,
-        wiring: Wiring[RosOptions],
-        settings: Options | None,
-        change: Callable[[Mapping[str, Any]], None],
-        findings: Callable[[], Iterator[Finding]],
-    ) -> NodeApi | None:
-        """Return that of a server whose options are parameters, with its engine's ``settings``; None if not wanted."""
-        if not wiring.options.node_api:
-            return None
-        parameters = declared(wiring, settings)
-        return cls(middleware, server_name(wiring), parameters, change, findings, wiring.options.log_level)
-
     def start(self, stopped: Event) -> None:
         """Publish diagnostics until ``stopped``."""
         self._thread = Thread(target=self._publish, args=(stopped,), name="diagnostics", daemon=True)
@@ -149,8 +141,8 @@ class NodeApi:
 
     def _publish(self, stopped: Event) -> None:
         while not stopped.wait(PERIOD_S):
-            message = diagnostic_array(self._name, self._findings(), time.time_ns())
             try:
+                message = diagnostic_array(self._name, self._findings(), time.time_ns())
                 self._diagnostics.send(self._diagnostics.pack(message))
             except TransportError as error:
                 _log.warning("no diagnostics this time: %s", error)
@@ -163,11 +155,10 @@ class NodeApi:
 
 def declared(wiring: Wiring[RosOptions], settings: Options | None) -> list[Parameter]:
     """Return the options of `serve ros` as parameters: the transport's, the limits, and the engine's ``settings``."""
-    told = [name for name, side in sides(RosOptions) if side and name != "action"]
     options = wiring.options.but(namespace=namespace_of(wiring), domain_id=domain_of(wiring))
     return [
-        *of_options(options, told, LIVE),
-        *of_options(wiring.limits, type(wiring.limits).model_fields),
+        *of_options(options, RosOptions.of_sides(SERVER, SERVING), LIVE),
+        *of_options(wiring.limits, SET),
         *(of_options(settings, type(settings).model_fields) if settings else ()),
         Parameter("use_sim_time", False, "this node's clock is the system's"),
     ]

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
-from typing import Literal
+from collections.abc import Iterable, Mapping
+from itertools import count
+from secrets import token_hex
+from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
 from s2a_bench.options import Names, option
 from s2a_bench.ros.router import ROUTER, endpoint_of
-from s2a_bench.transport.options import SERVER, SERVING, Options
+from s2a_bench.transport import EXTERNAL, SERVER, SERVING, Options
 
 NAMESPACE = "/s2a_bench"
 """Where topics are unless told; servers of a run get this and something of their own."""
@@ -23,10 +27,24 @@ BASE_NAME = r"^[A-Za-z_][A-Za-z0-9_]*$"
 class RosOptions(Options):
     """Where topics and actions are, and what carries them."""
 
+    SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {
+        "namespace": "/llama",
+        "router": ROUTER,
+        "qos": "sensor_data",  # matches reliable cameras as well as best-effort ones
+        "feedback_interval": 0.002,
+        "max_tokens": 512,
+        "publish_tokens": True,
+        "node_api": True,
+    }
+    NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = (
+        *("qos", "dds_tuning", "result_timeout", "feedback_interval", "publish_tokens"),
+        *("remap", "node_api", "log_level", "max_frame_age"),
+    )
+
     action: str = option(
         "",
         "an action that runs already, as /llama/generate_response of llama_ros (a black box)",
-        side=SERVER,
+        side=EXTERNAL,
     )
     namespace: str = option("", "namespace of the topics [default: a new one for each run]", side=SERVER)
     domain_id: int | None = option(None, "DDS domain [default: ROS_DOMAIN_ID, else 0]", ge=0, le=232, side=SERVER)
@@ -34,14 +52,18 @@ class RosOptions(Options):
         "", "cyclonedds, zenoh, rclpy [default: rclpy in a sourced ROS 2 environment]", side=SERVER
     )
     router: str = option(
-        "", f"Zenoh's router, as {ROUTER}; a server starts it on loopback [default: one of the run's own]", side=SERVER
+        "",
+        f"Zenoh's router, as {ROUTER}; a server starts it on loopback [default: one of the run's own]",
+        side=SERVER,
+        risk="url",
     )
     qos: Literal["reliable", "sensor_data"] = option(
         "reliable", "the camera topic's: reliable, sensor_data (best effort)", side=SERVER
     )
     max_frame_age: float = option(
         1.0,
-        "seconds since a camera topic's frame came: requests without a picture fail on an older one",
+        "seconds since a camera topic's frame came: requests without a picture fail on an older one, "
+        "and where a publisher has sent none",
         gt=0,
         le=86_400,
         side=SERVER,
@@ -106,3 +128,24 @@ class RosOptions(Options):
         if name and name not in MIDDLEWARES:
             raise ValueError(f"'{name}' is none of {', '.join(MIDDLEWARES)}")
         return name
+
+    @property
+    def tuned(self) -> bool:
+        """Return False for DDS, and processes, as they come."""
+        return self.dds_tuning == "tuned"
+
+    @property
+    def against_loss(self) -> str:
+        """Return what the middleware in use needs."""
+        from s2a_bench.transport.ros.buffers import against_loss
+
+        return against_loss(self.middleware, os.environ)
+
+    def addresses(self) -> Iterable[str]:
+        """Yield the namespace, then it with a number; unless told, one that nobody else has."""
+        if not self.namespace:
+            yield f"{NAMESPACE}_{token_hex(4)}"
+            return
+        yield self.namespace
+        for number in count(2):
+            yield f"{self.namespace}_{number}"

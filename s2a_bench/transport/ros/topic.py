@@ -6,18 +6,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from s2a_bench.clock import now_ns, realtime_offset_ns
-from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, TransportError
+from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied, TransportError
 from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.chunks import state_of
-from s2a_bench.transport.limits import Limits, whole_number
-from s2a_bench.transport.ros.camera import POLL_S, CameraPublisher, picture_message, picture_of
-from s2a_bench.transport.ros.joining import join, namespace_of, place_of, wait_until
+from s2a_bench.transport.limits import Bounds, Limits, whole_number
+from s2a_bench.transport.ros.camera import picture_message, picture_of
+from s2a_bench.transport.ros.exchange import RosExchange, Shared
+from s2a_bench.transport.ros.joining import RosClient, namespace_of, place_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.wire import (
     READER_QOS,
@@ -35,20 +34,16 @@ from s2a_bench.transport.ros.wire import (
 from s2a_bench.types import Piece, Request, Token
 
 
-class TopicClient:
+class TopicClient(RosClient):
     """Publishes requests and collects the tokens that carry their id."""
 
     def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
         """Join the domain and wait for the server; raises ServerDied if it does not appear."""
-        self._wiring = wiring
-        self._alive = alive
-        self._offset_ns = realtime_offset_ns()
-        self.middleware = join(wiring, "client")
+        super().__init__(wiring, alive)
         namespace = namespace_of(wiring)
         self._publisher = self.middleware.publisher(namespace + "/request", ros.REQUEST, REQUEST_QOS)
         self._subscription = self.middleware.subscription(namespace + "/token", ros.TOKEN, READER_QOS)
-        self.camera = CameraPublisher(self.middleware, namespace, wiring.options.payload, wiring.options.qos)
-        ends = (self._publisher, self._subscription, self.camera)  # volatile: what is sent before they match is lost
+        ends = (self._publisher, self._subscription)  # volatile: what is sent before they match is lost
         absent = f"no server appeared under {namespace} in {place_of(wiring)}"
         try:
             wait_until(lambda: all(end.matched() for end in ends), alive, absent)
@@ -91,9 +86,7 @@ class TopicClient:
 
     def _next(self, name: str, trace: Trace, bounds: Bounds) -> Any:
         """Wait for the next token of this request, dropping what belongs to others and what is none."""
-        deadline = now_ns() + int(self._wiring.timeout_s * 1e9)
-        while now_ns() < deadline:
-            packed = self._subscription.take(min(POLL_S, bounds.left_s()))
+        for packed in self.taken(self._subscription.take, bounds):
             if packed is not None:
                 token = readable(self._subscription, packed, trace)
                 if token is not None and token.id == name:
@@ -103,33 +96,21 @@ class TopicClient:
                 raise ServerDied("the server's process is gone")
         raise RequestFailed(f"no token for {self._wiring.timeout_s:.0f} s")
 
-    def describe(self) -> dict[str, str]:
-        """Add nothing: the wiring tells all."""
-        return {}
-
-    def close(self) -> None:
-        """Leave the domain."""
-        self.middleware.close()
-
 
 class TopicFront:
     """The server's side of the variant: receives requests and turns each into a job for the engine's thread."""
 
     def __init__(self, middleware: Middleware, namespace: str, limits: Limits) -> None:
-        """Create the topics."""
         self.limits = limits
         self._requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
         self._tokens = middleware.publisher(namespace + "/token", ros.TOKEN, TOKEN_QOS)
+        self.take, self.interrupt = self._requests.take, self._requests.interrupt
 
-    def take(self, timeout_s: float) -> Any | None:
-        """Wait for the next request and return it packed; None on timeout or after `interrupt`."""
-        return self._requests.take(timeout_s)
-
-    def job(self, packed: Any, trace: Trace) -> TopicJob:
+    def exchange(self, packed: Any, shared: Shared, trace: Trace) -> TopicExchange:
         """Unpack a request; raises TransportError for bytes that are none."""
         message = self._requests.unpack(packed)
         trace.mark("cdr_parse")
-        return TopicJob(self, message, trace)
+        return TopicExchange(self, message, shared, trace)
 
     def size_bytes(self, packed: Any) -> int:
         """Return the size of its CDR."""
@@ -146,55 +127,29 @@ class TopicFront:
             self._tokens.pack(token_message(request_id, token, last=bool(marks), error=error, marks=marks))
         )
 
-    def interrupt(self) -> None:
-        """Make `take` return; callable from any thread."""
-        self._requests.interrupt()
 
-
-class TopicJob:
+class TopicExchange(RosExchange):
     """One request of the topic variant."""
 
-    def __init__(self, front: TopicFront, message: Any, trace: Trace) -> None:
-        """Remember the message."""
-        self.trace = trace
-        self._front = front
-        self._message = message
-        self._id: str = message.id
-        self._error = ""
+    def __init__(self, front: TopicFront, message: Any, shared: Shared, trace: Trace) -> None:
+        """Answer a message of the front's."""
+        super().__init__(shared, trace)
+        self._front, self._message, self._id = front, message, str(message.id)
         self._sent = 0
 
-    def accept(self) -> None:
-        """Tell nobody, as this variant has no word for it."""
-
-    def prepare(self) -> Request | None:
-        """Decode the pictures."""
+    def request(self) -> Request:
         message, limits = self._message, self._front.limits
-        try:
-            whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
-            pictures = (*message.images, *message.compressed_images)
-            images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
-            state = state_of(message.state)
-        except S2AError as error:
-            self._error = str(error)
-            return None
+        whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
+        pictures = (*message.images, *message.compressed_images)
+        images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
         said = message.max_tokens, message.grammar, message.seed
-        return Request(plain(message.id), message.prompt, images, *said, state=state)
+        return Request(plain(message.id), message.prompt, images, *said, state=state_of(message.state))
 
-    def start(self) -> bool:
-        """Begin, as the answer is always wanted."""
-        return True
-
-    def token(self, token: Piece) -> bool:
-        """Publish a piece; return whether more are wanted, which this variant cannot tell."""
-        self._front.send(self._id, token, [])
+    def piece(self, piece: Piece) -> bool:
+        self._front.send(self._id, piece, [])
         self._sent += 1
         return True
 
-    def unwanted(self) -> bool:
-        """Whether the answer is not wanted any more, which this variant cannot tell."""
-        return False
-
-    def end(self, error: str = "") -> None:
-        """Publish the end of the answer, with the marks."""
+    def finish(self, error: str) -> None:
         marks = marks_message(self._id, self.trace.to_remote())
-        self._front.send(self._id, Token(self._sent, "", -1), [marks], error or self._error)
+        self._front.send(self._id, Token(self._sent, "", -1), [marks], error)

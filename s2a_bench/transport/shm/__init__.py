@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import socket
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar
 
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import PAYLOAD_BYTES
+from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.options import option
-from s2a_bench.transport import Client, Handler, Server, Transport, Wiring
-from s2a_bench.transport.options import SERVER, Options
+from s2a_bench.transport import ACTIONS, SERVER, TOKENS, Choice, Client, Handler, Options, Server, Transport, Wiring
 
 
 class ShmOptions(Options):
@@ -22,19 +22,24 @@ class ShmOptions(Options):
         "", "path of the Unix socket where shared memory is handed over [default: a new one of this user]", side=SERVER
     )
 
+    def addresses(self) -> Iterable[str]:
+        """Return the socket that was asked for, and a new one."""
+        return self.socket, ""
+
 
 class Shm(Transport[ShmOptions]):
     """Request, picture and tokens lie in shared memory; nothing but their places goes through the kernel."""
 
     name = "shm"
-    for_policies = True
     options = ShmOptions
     payloads = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
+    answer_kinds = (TOKENS, ACTIONS)
+    accepts_state = True
     stages: ClassVar[Mapping[str, str]] = {"header_pack": "pack", "header_parse": "parse"}
-    tells = (PAYLOAD_BYTES,)
+    facts = (PAYLOAD_BYTES,)
     order = 90
-    looks: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#6A3D9A", "--")}
-    checks: ClassVar[Mapping[str, str]] = {"shared-memory": "s2a_bench.transport.shm.checks:shared_memory"}
+    style: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#6A3D9A", "--")}
+    checks: ClassVar[Mapping[str, str]] = {"shared-memory": "s2a_bench.transport.shm:shared_memory"}
 
     def client(self, wiring: Wiring[ShmOptions], alive: Callable[[], bool]) -> Client:
         """Connect to the server at ``wiring.address``."""
@@ -44,29 +49,36 @@ class Shm(Transport[ShmOptions]):
         return ShmClient(wiring, alive)
 
     def server(self, wiring: Wiring[ShmOptions], handler: Handler) -> Server:
-        """Bind a server."""
         _check_system()
         from s2a_bench.transport.shm.server import ShmServer
 
         return ShmServer(wiring, handler)
 
-    def check(self, variant: str, options: ShmOptions, *, mode: str, engine: str) -> None:  # noqa: ARG002
+    def require(self, choice: Choice[ShmOptions]) -> None:
         """Refuse systems without such memory."""
+        super().require(choice)
         _check_system()
 
-    def bind(self, options: ShmOptions, taken: Sequence[str]) -> str:
-        """Return the socket of a new server: the one that was asked for, a new one for a second server."""
-        return "" if options.socket in taken else options.socket
-
-    def ready(self, wiring: Wiring[ShmOptions], address: str) -> str:  # noqa: ARG002
+    def ready(self, wiring: Wiring[ShmOptions]) -> str:
         """Return where memory is handed over, and to whom."""
-        return f"serving shared memory at {address} for this user alone"
+        return f"serving shared memory at {wiring.address} for this user alone"
 
 
 def unavailable() -> str:
     """Return why memory without a name cannot be had or handed over here, or nothing."""
     there = hasattr(os, "memfd_create") and hasattr(socket, "SO_PEERCRED")
     return "" if there else f"it needs Linux (memfd_create, SO_PEERCRED); this is {sys.platform}"
+
+
+def shared_memory(machine: Machine) -> Finding | None:  # noqa: ARG001 - the system of this process
+    """Return what the doctor finds: that such memory cannot be had here, as a sandbox may forbid it."""
+    why = unavailable()
+    if not why:
+        try:
+            os.close(os.memfd_create("s2a_bench", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING))
+        except OSError as error:
+            why = f"memfd_create: {error.strerror}"
+    return Finding("shared-memory", "advice", f"--transport shm cannot run: {why}", "leave it out") if why else None
 
 
 def _check_system() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any, Final
 
 import orjson
@@ -12,16 +13,18 @@ from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.bounds import Bounds
+from s2a_bench.transport.connections import wait_at_most
+from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.pictures import bgr_of, encoded
 from s2a_bench.transport.shm import ShmOptions
-from s2a_bench.transport.shm.link import Link
-from s2a_bench.transport.shm.memory import PICTURES_AT
+from s2a_bench.transport.shm.door import connect
+from s2a_bench.transport.shm.memory import ANSWER_BYTES, PLACE, STEP_BYTES, Memory, accept, offer
 from s2a_bench.transport.shm.pieces import Said, unpacked
 from s2a_bench.types import Action, Frame, Piece, Request, Token
 
-STEP_BYTES: Final = 1 << 20
 """Memory for requests comes in steps; one holds a raw picture of 640x480."""
+NEARER_S: Final = 0.1
+"""A wait that ends later than it should by no more than this is left as it is: to change it is a system call."""
 
 
 class ShmClient:
@@ -37,21 +40,23 @@ class ShmClient:
         self._connect(STEP_BYTES)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        """Write the request, tell of it, yield the pieces."""
         bounds = Bounds(self._path, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
         link, at, length = self._lay_out(request, trace)
         done = False
         try:
             self._ask(link, at, length)
-            while isinstance(said := self._next(link, bounds), (Token, Action)):
-                if not said.index:
-                    trace.mark("return")
-                bounds.piece()
-                yield said
-            done = True
-            if isinstance(said, str):
-                raise RequestFailed(f"the server broke off: {said}")
-            trace.receive(said)
+            for said in self._said(link, bounds):
+                if isinstance(said, (Token, Action)):
+                    if not said.index:
+                        trace.mark("return")
+                    bounds.piece()
+                    yield said
+                    continue
+                done = True
+                if isinstance(said, str):
+                    raise RequestFailed(f"the server broke off: {said}")
+                trace.receive(said)
+                return
         finally:
             if not done:  # what was not read belongs to this request only
                 self.close()
@@ -79,13 +84,13 @@ class ShmClient:
         pictures = [self._picture(frame, trace) for frame in request.images]
         size = sum(about["bytes"] for about, _ in pictures)
         header = _header(request, [about for about, _ in pictures])
-        needed = PICTURES_AT + size + len(header)
+        needed = size + len(header)
         trace.mark("header_pack")
         link = self._link
         if link is None or link.requests.size < needed:
             link = self._connect(-(-needed // STEP_BYTES) * STEP_BYTES)
             trace.mark("connect")
-        at = PICTURES_AT
+        at = 0
         for about, frame in pictures:
             place = link.requests.pixels[at : at + about["bytes"]]
             if about["encoding"] == "bgr8":
@@ -117,12 +122,13 @@ class ShmClient:
         except OSError as error:
             raise self._gone(error) from error
 
-    def _next(self, link: Link, bounds: Bounds) -> Said:
-        """Return the next piece of the answer, or its end."""
+    def _said(self, link: Link, bounds: Bounds) -> Iterator[Said]:
+        """Yield the pieces of the answer, and its end."""
         try:
-            data = link.next(min(self._wiring.timeout_s, bounds.left_s()))
-            bounds.came(len(data))
-            return unpacked(data)
+            while True:
+                data = link.next(min(self._wiring.timeout_s, bounds.left_s()))
+                bounds.came(len(data))
+                yield from unpacked(data)
         except BlockingIOError as error:
             bounds.left_s()  # tells if it was the deadline
             raise RequestFailed(f"nothing came from {self._path} for {self._wiring.timeout_s:g} s") from error
@@ -139,7 +145,6 @@ class ShmClient:
 
 
 def _header(request: Request, pictures: list[dict[str, Any]]) -> bytes:
-    """Pack what is no picture."""
     return orjson.dumps(
         {
             "id": request.id,
@@ -151,3 +156,56 @@ def _header(request: Request, pictures: list[dict[str, Any]]) -> bytes:
             "images": pictures,
         }
     )
+
+
+class Link:
+    """A connection with memory for requests of ``size`` bytes."""
+
+    def __init__(self, path: str, size: int, patience_s: float) -> None:
+        """Connect and offer memory; raises OSError, TransportError."""
+        self._socket = connect(path, patience_s)
+        self._waits_s = patience_s
+        self._answers: Memory | None = None
+        try:
+            self.requests = offer(self._socket, size)
+        except BaseException as error:
+            with self._socket:
+                self._reason(error)
+            raise
+
+    def ask(self, at: int, length: int) -> None:
+        """Tell of a request whose header lies there; raises OSError, TransportError."""
+        try:
+            self._socket.send(PLACE.pack(at, length))
+        except OSError as error:
+            self._reason(error)
+            raise
+
+    def next(self, wait_s: float) -> bytes:
+        """Return the pieces that were written meanwhile; raises BlockingIOError after ``wait_s``.
+
+        Raises what `accept` does, too, and ValueError for a place that is none.
+        """
+        if not self._waits_s - NEARER_S <= wait_s <= self._waits_s + NEARER_S:
+            wait_at_most(self._socket, wait_s)
+            self._waits_s = wait_s
+        if self._answers is None:
+            self._answers = accept(self._socket, ANSWER_BYTES)
+        packet = self._socket.recv(PLACE.size + 1)
+        if not packet:
+            raise EOFError
+        if len(packet) != PLACE.size:
+            raise ValueError(f"a packet of {len(packet)} bytes is none of an answer")
+        begin, length = PLACE.unpack(packet)
+        if not 0 < length <= self._answers.size - begin:
+            raise ValueError(f"pieces of {length} bytes at {begin} cannot be")
+        return self._answers.map[begin : begin + length]
+
+    def _reason(self, error: BaseException) -> None:
+        """Raise what a server said that has closed a new link."""
+        if isinstance(error, BrokenPipeError | ConnectionResetError) and self._answers is None:
+            with suppress(OSError, EOFError):
+                accept(self._socket, ANSWER_BYTES)
+
+    def close(self) -> None:
+        self._socket.close()

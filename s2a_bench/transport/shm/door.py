@@ -6,44 +6,46 @@ namespace could connect, or take the name first. Both ends ask the kernel who th
 
 from __future__ import annotations
 
-import fcntl
 import os
 import socket
 import stat
 import struct
 import tempfile
-import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
-from errno import EAGAIN
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Final
 
 from s2a_bench.errors import PortInUse, TransportError
+from s2a_bench.transport.connections import wait_at_most
 
 ROOT: Final = 0
 _CREDENTIALS = struct.Struct("3i")
-_TIMEVAL = struct.Struct("@ll")
 _BACKLOG = 128
-_LOCK_TRIES, _LOCK_PAUSE_S = 100, 0.05
 
 
-def listen(path: str) -> socket.socket:
-    """Listen at a path, a new one in a folder of our own if there is none; raises PortInUse, TransportError."""
+def listen(path: str) -> tuple[socket.socket, str]:
+    """Listen at a path, a new one in a folder of our own if there is none; raises PortInUse, TransportError.
+
+    What has the path listens, so that no other server takes it for dead: it is bound under another name first.
+    """
     folder = Path(path).parent if path else _folder()
+    bound = folder / f".{os.urandom(3).hex()}"  # short: the name of a socket has at most 107 bytes
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
-        with _alone_in(folder):
-            for left in [Path(path)] if path else folder.glob("*.sock"):
-                _remove_if_dead(left)
-            path = path or str(folder / f"{os.urandom(6).hex()}.sock")
-            os.fchmod(listener.fileno(), 0o600)  # which the file will have
-            listener.bind(path)
+        for left in [Path(path)] if path else folder.glob("*.sock"):
+            _remove_if_dead(left)
+        path = path or str(folder / f"{os.urandom(6).hex()}.sock")
+        os.fchmod(listener.fileno(), 0o600)  # which the file will have
+        listener.bind(str(bound))
+        try:
             listener.listen(_BACKLOG)
+            os.link(bound, path)
+        finally:
+            bound.unlink()
     except OSError as error:
         listener.close()
         raise PortInUse(f"`socket`: {path or folder} cannot be had: {error.strerror or error}") from error
-    return listener
+    return listener, path
 
 
 def connect(path: str, patience_s: float) -> socket.socket:
@@ -59,14 +61,6 @@ def connect(path: str, patience_s: float) -> socket.socket:
         link.close()
         raise
     return link
-
-
-def wait_at_most(link: socket.socket, seconds: float) -> None:
-    """Let blocking calls end with BlockingIOError after so long, 0: never; `settimeout` would cost each a poll."""
-    whole = int(seconds)
-    value = _TIMEVAL.pack(whole, max(int((seconds - whole) * 1e6), int(seconds > 0 and not whole)))
-    link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
-    link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, value)
 
 
 def may_ask(link: socket.socket) -> bool:
@@ -91,23 +85,6 @@ def _folder() -> Path:
     if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or about.st_mode & 0o077:
         raise TransportError(f"{folder} is not a folder of ours alone: remove it, or name a `socket`")
     return folder
-
-
-@contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Keep others from cleaning up between our `bind` and `listen`, when nobody seems to listen there."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        for _ in range(_LOCK_TRIES):
-            with suppress(BlockingIOError):
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            time.sleep(_LOCK_PAUSE_S)
-        else:
-            raise BlockingIOError(EAGAIN, f"somebody keeps {folder} locked")
-        yield
-    finally:
-        os.close(handle)
 
 
 def _remove_if_dead(path: Path) -> None:

@@ -27,15 +27,17 @@ from s2a_bench.types import Pixels
 
 HELLO: Final = struct.Struct("<8sQ")
 """The first packet of each side: `MAGIC`, and the size of the memory that comes with it."""
-MAGIC: Final = b"S2A-SHM1"
+MAGIC: Final = b"S2A-SHM2"
+"""Its last letter is the version of what follows; both sides have to be of one."""
 REFUSED: Final = b"refused:"
 """Begins what a server says instead, with its reason."""
 PLACE: Final = struct.Struct("<QQ")
-"""All others, a client's: where a request's header lies, and its length. A server's: see `ring`."""
-PICTURES_AT: Final = 64
-"""Where a request's pictures begin, one after the other, its header behind them; first is how far answers were read."""
-ANSWER_BYTES: Final = 4 << 20
-"""What a server may be ahead of its client."""
+"""All others: where something lies, and its length. A client's tells of a request's header, behind its pictures, which
+begin at 0, one after the other. A server's tells of pieces of the answer, see `pieces`."""
+STEP_BYTES: Final = 1 << 20
+"""Memory for requests is offered in whole steps."""
+ANSWER_BYTES: Final = 64 << 20
+"""The longest answer with its marks, which lies there from 0 on until the next one; what is not written takes none."""
 
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
 _PACKET_BYTES: Final = 256
@@ -82,12 +84,16 @@ def accept(link: socket.socket, most: int) -> Memory:
             raise EOFError
         if data.startswith(REFUSED):
             raise RequestFailed(f"the link was refused: {data[len(REFUSED) :].decode(errors='replace')}")
+        if len(data) == HELLO.size and data.startswith(MAGIC[:-1]) and not data.startswith(MAGIC):
+            raise TransportError(
+                "the other side is of another version of s2a-bench: its shared memory is laid out otherwise"
+            )
         if len(data) != HELLO.size or not data.startswith(MAGIC):
             raise TransportError("what came first was no offer of shared memory")
         _, size = HELLO.unpack(data)
         if len(files) != 1:
             raise TransportError(f"memory should be one file; {len(files)} came (is the limit of open files met?)")
-        if not PICTURES_AT <= size <= most:
+        if not 0 < size <= most:
             raise TransportError(f"shared memory of {size} bytes was offered; at most {most} are taken")
         if not _is_sealed(files[0], size):
             raise TransportError("what was offered is no memory, or its size may change")
@@ -97,9 +103,9 @@ def accept(link: socket.socket, most: int) -> Memory:
             os.close(file)
 
 
-def refuse(link: socket.socket, why: str) -> None:
-    """Say why there will be no link, as far as the other side listens."""
-    link.send((REFUSED + why.encode())[:_PACKET_BYTES], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+def refusal(why: str) -> bytes:
+    """Return the packet that says why there will be no link."""
+    return (REFUSED + why.encode())[:_PACKET_BYTES]
 
 
 def _receive(link: socket.socket) -> tuple[bytes, list[int]]:

@@ -1,8 +1,9 @@
-"""What lies in the memory for answers, each with a head of 16 bytes: tokens, actions, and what ends an answer."""
+"""What lies in the memory for answers, each with a head of 20 bytes: tokens, actions, and what ends an answer."""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -12,8 +13,8 @@ from s2a_bench.trace import Remote
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.types import Action, Piece, Token
 
-_HEAD: Final = struct.Struct("<B3xIq")
-"""What it is, its index, and a token's id."""
+HEAD: Final = struct.Struct("<B3xIIq")
+"""What it is, the bytes that follow, its index, and a token's id."""
 _TOKEN, _ERROR, _END, _ACTION = 1, 2, 3, 4
 
 Said: TypeAlias = "Piece | Remote | str"
@@ -22,19 +23,30 @@ Said: TypeAlias = "Piece | Remote | str"
 
 def packed(said: Said) -> bytes:
     """Return what is written."""
+    kind, index, number = _ERROR, 0, 0
     if isinstance(said, Token):
-        return _HEAD.pack(_TOKEN, said.index, said.id) + said.text.encode()
-    if isinstance(said, Action):
-        return _HEAD.pack(_ACTION, said.index, 0) + said.values.astype("<f4", copy=False).tobytes()
-    if isinstance(said, Remote):
-        return _HEAD.pack(_END, 0, 0) + orjson.dumps(said)
-    return _HEAD.pack(_ERROR, 0, 0) + said.encode(errors="backslashreplace")
+        kind, index, number, body = _TOKEN, said.index, said.id, said.text.encode()
+    elif isinstance(said, Action):
+        kind, index, body = _ACTION, said.index, said.values.astype("<f4", copy=False).tobytes()
+    elif isinstance(said, Remote):
+        kind, body = _END, orjson.dumps(said)
+    else:
+        body = said.encode(errors="backslashreplace")
+    return HEAD.pack(kind, len(body), index, number) + body
 
 
-def unpacked(data: bytes) -> Said:
+def unpacked(data: bytes) -> Iterator[Said]:
     """Read what was written; RequestFailed, ValueError, KeyError, TypeError or struct.error for what cannot be."""
-    kind, index, number = _HEAD.unpack_from(data)
-    body = data[_HEAD.size :]
+    at = 0
+    while at < len(data):
+        kind, size, index, number = HEAD.unpack_from(data, at)
+        at += HEAD.size + size
+        if at > len(data):
+            raise ValueError(f"a piece of {size} bytes lies beyond the end")
+        yield _piece(kind, index, number, data[at - size : at])
+
+
+def _piece(kind: int, index: int, number: int, body: bytes) -> Said:
     if kind == _TOKEN:
         return Token(index, body.decode(), number)
     if kind == _ACTION:

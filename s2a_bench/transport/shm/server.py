@@ -1,30 +1,39 @@
-"""The server: a thread for each link reads a request where it lies, waits for its turn, and writes the pieces."""
+"""The server: a request is read where it lies, and the pieces of its answer are written into memory."""
 
 from __future__ import annotations
 
 import logging
+import select
 import socket
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
+from mmap import MADV_REMOVE
 from pathlib import Path
-from threading import Lock, Thread
+from threading import Event
 from typing import Final
 
-from s2a_bench.errors import EngineError, S2AError, TransportError
-from s2a_bench.trace import RESIDUAL, Remote, Trace
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import RequestFailed, S2AError, TransportError
+from s2a_bench.trace import Remote
 from s2a_bench.transport import Handler, Wiring
+from s2a_bench.transport.connections import Connections, Wire, wait_at_most
+from s2a_bench.transport.serving import Core, Disconnected, Exchange
 from s2a_bench.transport.shm import ShmOptions
-from s2a_bench.transport.shm.door import listen, may_ask, wait_at_most
-from s2a_bench.transport.shm.memory import ANSWER_BYTES, PICTURES_AT, PLACE, Memory, accept, offer, refuse
+from s2a_bench.transport.shm.door import listen, may_ask
+from s2a_bench.transport.shm.memory import (
+    ANSWER_BYTES,
+    PLACE,
+    STEP_BYTES,
+    Memory,
+    accept,
+    offer,
+    refusal,
+)
 from s2a_bench.transport.shm.pieces import packed
-from s2a_bench.transport.shm.reading import Header, Held
-from s2a_bench.transport.shm.ring import PIECE_BYTES, Writer, is_there
-from s2a_bench.transport.turns import Queued, Turn
+from s2a_bench.transport.shm.reading import request_at, size_of
+from s2a_bench.types import Piece, Request
 
-PAUSE_S: Final = 0.1
-"""Before the next link is taken, where one could not be: the limit of open files, or of threads, is met."""
-
+LAST_BYTES: Final = 1 << 12
+"""Room for what ends an answer; its marks may take what the pieces have left."""
 _log = logging.getLogger(__name__)
 
 
@@ -33,129 +42,136 @@ class ShmServer:
 
     def __init__(self, wiring: Wiring[ShmOptions], handler: Handler) -> None:
         """Bind; raises PortInUse, TransportError."""
-        self._limits = wiring.limits
-        self._queued = Queued.around(handler, wiring.limits)
-        self._held = Held(wiring.limits)
-        self._listener = listen(wiring.address)
-        self.address = self._listener.getsockname()
-        self._lock, self._links, self._stopped = Lock(), set[socket.socket](), False
+        self._core = Core(handler, wiring.limits)
+        listener, self.address = listen(wiring.address)
+        most = wiring.limits.connections
+        self._connections = Connections(listener, self._answer_all, most, refusal(f"{most} links are open already"))
+        self._stopped = Event()
 
     def describe(self) -> dict[str, str | int]:
-        """Return what carries the requests."""
         return {"server": "shared memory (memfd), Unix socket"}
 
     def serve(self) -> None:
-        """Serve until stopped."""
-        while not self._stopped:
-            try:
-                link, _ = self._listener.accept()
-            except OSError as error:
-                if not self._stopped:
-                    _log.warning("no link can be taken: %s", error)
-                    time.sleep(PAUSE_S)
-                continue
-            try:
-                Thread(target=self._answer_all, args=(link,), name="shm link", daemon=True).start()
-            except RuntimeError as error:
-                _log.warning("no link can be taken: %s", error)
-                link.close()
-                time.sleep(PAUSE_S)
+        self._connections.serve()
 
     def stop(self) -> None:
         """Stop listening, and end every link."""
-        if not self._stopped:
+        if not self._stopped.is_set():
             with suppress(OSError):
                 Path(self.address).unlink()  # while it is ours
-        self._stopped = True
-        with suppress(OSError):
-            self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        with self._lock:
-            links = list(self._links)
-        for link in links:
-            with suppress(OSError):
-                link.shutdown(socket.SHUT_RDWR)
+        self._stopped.set()
+        self._connections.stop()
 
-    def _answer_all(self, link: socket.socket) -> None:
+    def _answer_all(self, wire: Wire) -> None:
         """Welcome a client, and answer one request after the other."""
+        link, limits = wire.socket, self._core.limits
         try:
-            with link, self._counted(link):
-                try:
-                    requests, writer = self._welcome(link)
-                except TransportError as error:
-                    refuse(link, str(error))
-                    raise
-                while packet := link.recv(PLACE.size + 1):
-                    trace = Trace()
-                    trace.mark("network")
-                    if len(packet) != PLACE.size:
-                        raise TransportError(f"a packet of {len(packet)} bytes is none of a request")
-                    self._answer(link, requests, writer, PLACE.unpack(packet), trace)
-        except (OSError, EOFError):
-            pass  # the client has gone
+            wait_at_most(link, limits.head_s)
+            if not may_ask(link):
+                raise TransportError("this server answers its own user only")
+            requests = accept(link, -(-limits.body_bytes // STEP_BYTES) * STEP_BYTES)
+            writer = Writer(wire, offer(link, ANSWER_BYTES))
+            wait_at_most(link, 0)
         except TransportError as error:
+            wire.sendall(refusal(str(error)))
             _log.warning("a link was closed: %s", error)
+            return
+        while packet := link.recv(PLACE.size + 1):
+            if len(packet) != PLACE.size:
+                _log.warning("a link was closed: a packet of %d bytes is none of a request", len(packet))
+                return
+            exchange = ShmExchange(wire, requests, writer, PLACE.unpack(packet), self._core)
+            exchange.trace.mark("network")
+            if not self._core.answer(exchange):
+                return
 
-    @contextmanager
-    def _counted(self, link: socket.socket) -> Iterator[None]:
-        """Know a link for as long as it lasts."""
-        with self._lock:
-            self._links.add(link)
+
+class Writer:
+    """An answer in memory: it lies there whole, so that a client which is slow to read never holds the engine."""
+
+    def __init__(self, wire: Wire, answers: Memory) -> None:
+        """Write into ``answers``, and tell of it over the wire."""
+        self._wire, self._answers = wire, answers
+        self._told = self._end = 0
+
+    def begin(self) -> None:
+        """Begin at 0 again; the memory of a long answer is given back."""
+        if self._end > STEP_BYTES:
+            self._answers.map.madvise(MADV_REMOVE)
+        self._told = self._end = 0
+
+    def send(self, piece: bytes, room: int = LAST_BYTES) -> None:
+        """Write a piece and tell of it, with ``room`` left for more; raises Disconnected."""
+        end = self._end + len(piece)
+        if end + room > ANSWER_BYTES:
+            raise RequestFailed(
+                f"an answer of more than {ANSWER_BYTES - LAST_BYTES} bytes, and this wire carries no more"
+            )
+        self._answers.map[self._end : end] = piece
+        self._end = end
+        self._tell()
+
+    def end(self, piece: bytes) -> None:
+        """Write the last piece, which may be marks that are too long."""
+        fits = self._end + len(piece) <= ANSWER_BYTES
+        self.send(piece if fits else packed(f"{len(piece)} bytes of marks: too long an answer"), 0)
+
+    def finish(self, left_s: float) -> None:
+        """Tell of the rest, waiting for a slow client for so long; raises Disconnected."""
+        ends_ns = now_ns() + round(left_s * 1e9)
+        writable = select.poll()
+        writable.register(self._wire.socket, select.POLLOUT)
+        while self._told < self._end:
+            if not writable.poll(max(0, ends_ns - now_ns()) / 1e6):
+                raise Disconnected("the client does not read its answer")
+            self._tell()
+
+    def _tell(self) -> None:
+        """Tell of what was written, as far as the client has read what it was told before; raises Disconnected."""
         try:
-            yield
-        finally:
-            with self._lock:
-                self._links.discard(link)
+            place = PLACE.pack(self._told, self._end - self._told)
+            self._wire.socket.send(place, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            raise Disconnected from error
+        self._told = self._end
 
-    def _welcome(self, link: socket.socket) -> tuple[Memory, Writer]:
-        """Exchange memory; raises TransportError for who is none of ours."""
-        wait_at_most(link, self._limits.head_s)
-        if not may_ask(link):
-            raise TransportError("this server answers its own user only")
-        if self._stopped or len(self._links) > self._limits.connections:
-            raise TransportError(f"{self._limits.connections} links are open already")
-        requests = accept(link, PICTURES_AT + self._limits.body_bytes)
-        writer = Writer(link, offer(link, ANSWER_BYTES), requests)
-        wait_at_most(link, 0)
-        return requests, writer
 
-    def _answer(
-        self, link: socket.socket, requests: Memory, writer: Writer, place: tuple[int, int], trace: Trace
+class ShmExchange(Exchange):
+    """One request in a client's memory, and its answer in ours."""
+
+    def __init__(
+        self,
+        wire: Wire,
+        requests: Memory,
+        writer: Writer,
+        place: tuple[int, int],
+        core: Core,
     ) -> None:
-        """Read a request, wait for its turn, write the answer; raises OSError where the client has gone."""
-        turn: Turn | None = None
-        held = 0
-        said: Remote | str
+        """Answer what lies at a ``place`` in ``requests``."""
+        super().__init__()
+        self.gone = wire.gone  # type: ignore[method-assign]
+        self._requests, self._writer, self._place, self._core = requests, writer, place, core
         writer.begin()
-        try:
-            held = self._held.take(requests, *place)
-            header = Header.read(requests, *place, self._limits)
-            trace.mark("header_parse")
-            turn = self._queued.turns.join()
-            request = header.request(requests, trace)
-            if turn.come is not None:
-                trace.mark(RESIDUAL)
-                if not turn.wait(lambda: not is_there(link)):
-                    raise ConnectionAbortedError
-                trace.mark("queue")
-            tokens = self._queued.answer(request, trace, turn)
-            try:
-                for token in tokens:
-                    writer.send(packed(token))
-            finally:
-                tokens.close()
-            said = trace.to_remote()
-        except S2AError as error:
-            said = str(error)
-        except OSError:
-            raise
-        except Exception as error:  # noqa: BLE001 - who asked must hear of it, whatever broke
-            _log.error("a request failed", exc_info=error)
-            said = str(EngineError("Internal Server Error"))
-        finally:
-            self._held.give_back(held)
-            if turn is not None:
-                turn.leave()
-        end = packed(said)
-        writer.send(end if len(end) <= PIECE_BYTES else packed(f"{len(end)} bytes of marks: too long an answer"))
-        writer.finish(turn.left_s if turn is not None else lambda: self._limits.answer_s)
+
+    def request(self) -> Request:
+        size, limits = size_of(self._requests, *self._place), self._core.limits
+        if size > limits.body_bytes:
+            raise RequestFailed(f"the request is larger than {limits.body_bytes} bytes")
+        self.held.enter_context(self._core.in_flight.counted())(size)
+        return request_at(self._requests, *self._place, limits, self.trace)
+
+    def send(self, piece: Piece) -> bool:
+        self._writer.send(packed(piece))
+        return True
+
+    def end(self) -> None:
+        self._last(self.trace.to_remote())
+
+    def fail(self, error: S2AError) -> None:
+        self._last(str(error))
+
+    def _last(self, said: Remote | str) -> None:
+        self._writer.end(packed(said))
+        self._writer.finish(self.left_s())

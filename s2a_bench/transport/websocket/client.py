@@ -1,4 +1,4 @@
-"""The WebSocket client: fill the template, pack, mask, send, read the actions, and mark each step.
+"""The WebSocket client: fill the template, pack, send, read the actions, and mark each step.
 
 Our own server sends its marks in one more frame after an answer. A foreign one sends none: all from the last byte that
 was packed to the answer is the stage `server`, and where it tells ``infer_ms`` that much of it is `inference`.
@@ -7,6 +7,7 @@ was packed to the answer is the stage `server`, and where it tells ``infer_ms`` 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
+from contextlib import suppress
 from math import isfinite
 from typing import Any
 
@@ -15,18 +16,18 @@ import numpy as np
 from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import RequestFailed, ServerDied
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS
+from s2a_bench.provenance import Provenance
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring, ours
-from s2a_bench.transport.bounds import Bounds
+from s2a_bench.transport import Wiring, observed
 from s2a_bench.transport.chunks import actions_of
-from s2a_bench.transport.credentials import read_key
+from s2a_bench.transport.limits import Bounds
+from s2a_bench.transport.listening import read_key
 from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pictures import told
-from s2a_bench.transport.websocket import STREAM, STREAM_PATH, TIMING, own
+from s2a_bench.transport.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
 from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.transport.websocket.link import Broken, Link
-from s2a_bench.transport.websocket.options import WebsocketOptions
 from s2a_bench.types import Action, Piece, Request
 
 QUOTED = 500
@@ -45,11 +46,12 @@ class WebsocketClient:
         self._url = wiring.address + (STREAM_PATH if self._ours and self._streams else "")
         self._template = template_of(wiring.options.template)
         key = read_key(wiring.options.api_key_env)
-        self._headers = {"Authorization": f"{own.SCHEME} {key}"} if key else {}
+        self._headers = {"Authorization": f"{codec.SCHEME} {key}"} if key else {}
         if self._ours:
-            self._headers[own.MARKS_HEADER] = "1"
+            self._headers[codec.MARKS_HEADER] = "1"
         self._link: Link | None = None
         self._metadata: dict[str, str] = {}
+        self._provenance: dict[str, str] = {}
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Send the observation and yield the actions of its answer."""
@@ -58,6 +60,7 @@ class WebsocketClient:
         whole = False
         try:
             message, packed_ns = self._asked(body, bounds, trace)
+            trace.provenance = self._provenance
             for piece in self._answer(message, packed_ns, trace):
                 bounds.piece()
                 yield piece
@@ -67,15 +70,16 @@ class WebsocketClient:
                 raise ServerDied(f"the server is gone: {error}") from error
             raise RequestFailed(str(error)) from error
         finally:
-            if not whole:
-                self.close()
+            if not whole and self._link is not None:
+                self._link.close()
+                self._link = None
 
     def _pack(self, request: Request, trace: Trace) -> bytes:
         """Fill the template and write it as MessagePack, marking each stage."""
         pictures = [told(frame, self._wiring.options.payload, trace) for frame in request.images]
         observation = self._template.fill(pictures, request.state, request.prompt)
         if self._ours:
-            observation[ours.OWN] = ours.parameters(request)
+            observation[observed.OWN] = observed.parameters(request)
         body = packb(observation)
         trace.mark("msgpack_pack")
         trace.facts[PAYLOAD_BYTES] = len(body)
@@ -84,25 +88,20 @@ class WebsocketClient:
     def _asked(self, body: bytes, bounds: Bounds, trace: Trace) -> tuple[bytes, int]:
         """Send, once more if the server had just closed the kept connection; return the answer's first message."""
         if self._link is not None:
-            self._link.bounds = bounds
-            if self._link.alive():
-                try:
+            if self._link.alive(bounds):
+                with suppress(Broken):
                     return self._exchanged(self._link, body, trace)
-                except Broken:
-                    trace.facts[RECONNECTS] = 1.0
-            else:
-                trace.facts[RECONNECTS] = 1.0
-            self.close()
+            trace.facts[RECONNECTS] = 1.0
+            self._link.close()
+        self._link = None
         self._link = Link(self._url, self._headers, bounds, self._wiring.timeout_s)
         self._greeted(self._link)
         trace.mark("connect")
         return self._exchanged(self._link, body, trace)
 
     def _exchanged(self, link: Link, body: bytes, trace: Trace) -> tuple[bytes, int]:
-        pieces = link.pack(body)
-        trace.mark("frame_pack")
         packed_ns = trace.marks[-1][1]
-        link.send(pieces)
+        link.send(body)
         return self._message(link), packed_ns
 
     def _greeted(self, link: Link) -> None:
@@ -110,6 +109,8 @@ class WebsocketClient:
         metadata = unpackb(self._message(link))
         if not isinstance(metadata, dict):
             raise RequestFailed(f"{self._url}: its metadata is {type(metadata).__name__}, not a dictionary")
+        origin = metadata.get("provenance")
+        self._provenance = Provenance.from_dict(origin if isinstance(origin, dict) else {}).to_dict()
         plain = {name: value for name, value in metadata.items() if isinstance(value, (str, int, float, bool))}
         self._metadata = {str(name)[:64]: struck(str(value))[:64] for name, value in list(plain.items())[:32]}
 
@@ -127,10 +128,10 @@ class WebsocketClient:
         count, first_ns = 0, 0
         while True:
             answer = unpackb(message)
-            if not isinstance(answer, dict) or own.ACTIONS not in answer:
-                raise RequestFailed(f"{self._url}: an answer without {own.ACTIONS}: {_shown(answer)}")
-            last = not self._streams or answer.get(own.TYPE) != own.PARTIAL
-            actions = actions_of(answer[own.ACTIONS])
+            if not isinstance(answer, dict) or codec.ACTIONS not in answer:
+                raise RequestFailed(f"{self._url}: an answer without {codec.ACTIONS}: {_shown(answer)}")
+            last = not self._streams or answer.get(codec.TYPE) != codec.PARTIAL
+            actions = actions_of(answer[codec.ACTIONS])
             if not last:
                 actions = [Action(count + index, action.values) for index, action in enumerate(actions)]
             elif count > len(actions):
@@ -143,9 +144,9 @@ class WebsocketClient:
             if last:
                 break
             message = self._message(self._link)
-        self._learn(answer.get(own.TIMING), trace)
+        self._learn(answer.get(codec.TIMING), trace)
         if self._ours:
-            trace.receive(ours.remote_of(unpackb(self._message(self._link))))
+            trace.receive(observed.remote_of(unpackb(self._message(self._link))))
         self._mark(trace, packed_ns, first_ns)
 
     def _learn(self, timing: Any, trace: Trace) -> None:
@@ -169,9 +170,8 @@ class WebsocketClient:
         return {"url": self._url, "template": self._template.name, **self._metadata}
 
     def close(self) -> None:
-        """Close the kept connection."""
         if self._link is not None:
-            self._link.close()
+            self._link.close(orderly=True)
             self._link = None
 
 

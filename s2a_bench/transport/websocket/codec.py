@@ -1,24 +1,37 @@
-"""MessagePack with NumPy's arrays as openpi writes them, byte for byte.
+"""openpi's words, and MessagePack with NumPy's arrays as it writes them, byte for byte.
 
 An array is the map ``{b"__ndarray__": True, b"data": bytes, b"dtype": text, b"shape": [...]}``, one of NumPy's numbers
 ``{b"__npgeneric__": True, b"data": its value, b"dtype": text}``. Arrays are of numbers and texts: no objects (dtype
 kind O), no records (V), no complex numbers (c), which openpi refuses too.
+
+Our client says who it is in a header of its handshake, `MARKS_HEADER`. Then its observations have what
+`transport.observed` adds, and each answer is followed by one more frame with the server's marks.
 """
 
 from __future__ import annotations
 
+import logging
 import re
-from math import prod
 from typing import Any, Final
 
 import msgpack
 import numpy as np
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport.messagepack import unpacked
+from s2a_bench.transport.messagepack import array_in, unpacked
+
+MARKS_HEADER: Final = "S2A-Marks"
+SCHEME: Final = "Api-Key"
+"""Of the Authorization header, as openpi's client sends it."""
+HEALTH: Final = "/healthz"
+ACTIONS, TYPE, TIMING, INDICES = "actions", "type", "server_timing", "action_indices"
+PARTIAL, FINAL = "partial", "final"
+QUIET: Final = logging.getLogger("s2a_bench.websocket")
+"""websockets' logger: what it says of clients and servers, our errors say."""
+QUIET.addHandler(logging.NullHandler())
+QUIET.propagate = False
 
 ARRAY, GENERIC = b"__ndarray__", b"__npgeneric__"
-DIMENSIONS: Final = 8
 UNSAFE: Final = "VOc"
 """Kinds of dtypes that do not travel."""
 
@@ -58,19 +71,8 @@ def unpackb(data: bytes | bytearray | memoryview) -> Any:
 
 def _of_map(value: dict[Any, Any]) -> Any:
     if ARRAY in value:
-        return _array(value)
+        return array_in(value.get(b"data"), value.get(b"shape"), _dtype(value))
     return _generic(value) if GENERIC in value else value
-
-
-def _array(told: dict[Any, Any]) -> Any:
-    data, shape, dtype = told.get(b"data"), told.get(b"shape"), _dtype(told)
-    if not (isinstance(data, bytes) and isinstance(shape, list) and len(shape) <= DIMENSIONS):
-        raise ValueError("an array without bytes, or without a shape")
-    if not all(type(size) is int and size >= 0 for size in shape):
-        raise ValueError(f"an array of shape {str(shape)[:80]}")
-    if prod(shape) * dtype.itemsize != len(data):
-        raise ValueError(f"an array of shape {tuple(shape)} and type {dtype} in {len(data)} bytes")
-    return np.ndarray(shape, dtype, data)
 
 
 def _generic(told: dict[Any, Any]) -> Any:

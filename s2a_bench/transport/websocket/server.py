@@ -1,24 +1,28 @@
-"""Our policy server: openpi's protocol on uvloop, whose loop answers `/healthz` whatever the engine does."""
+"""Our policy server: openpi's protocol, whose health is told and whose pings are answered whatever the engine does."""
 
 from __future__ import annotations
 
-import asyncio
-from contextlib import suppress
+import socket
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
 
-import uvloop
+import numpy as np
 import websockets.version
+from websockets.server import ServerProtocol
 
-from s2a_bench.transport import Handler, Wiring
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import EngineError, S2AError
+from s2a_bench.facts import INFER_MS
+from s2a_bench.transport import Handler, Wiring, observed
+from s2a_bench.transport.access import Access
+from s2a_bench.transport.connections import Connections, Wire
 from s2a_bench.transport.listening import bound_socket
-from s2a_bench.transport.turns import Queued
-from s2a_bench.transport.websocket.call import Office, metadata_of
-from s2a_bench.transport.websocket.codec import packb
-from s2a_bench.transport.websocket.door import Door, House
-from s2a_bench.transport.websocket.options import WebsocketOptions
-
-GRACE_S = 1.0
-CLOSING_S = 0.01
-"""Time for the loop to close what is broken off."""
+from s2a_bench.transport.serving import Core, Disconnected, Exchange, Queued
+from s2a_bench.transport.websocket import PREV_TOTAL_MS, WebsocketOptions, codec
+from s2a_bench.transport.websocket.codec import packb, unpackb
+from s2a_bench.transport.websocket.connection import PolicyConnection
+from s2a_bench.types import Action, Piece, Request
 
 
 class WebsocketServer:
@@ -29,39 +33,96 @@ class WebsocketServer:
 
         Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
         """
-        self._socket, key = bound_socket(wiring.address, "ws", wiring.options)
-        self.address = "ws://{}:{}".format(*self._socket.getsockname())
-        queued = Queued.around(handler, wiring.limits)
-        self._house = House(Office(queued, wiring.limits), key, packb(metadata_of(queued)))
-        self._loop = uvloop.new_event_loop()
-        self._stopped = asyncio.Event()
+        listener, key = bound_socket(wiring.address, "ws", wiring.options)
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, 1)  # none is refused before it has asked
+        host, port = listener.getsockname()
+        self.address = f"ws://{host}:{port}"
+        self._core = Core(handler, wiring.limits)
+        self._access = Access(wiring.options, host, key, codec.SCHEME)
+        self._metadata = packb(metadata_of(self._core.queued))
+        most = wiring.limits.connections
+        full = ServerProtocol().reject(HTTPStatus.SERVICE_UNAVAILABLE, f"{most} connections are open already\n")
+        self._connections = Connections(listener, self._handle, most, full.serialize())
 
     def describe(self) -> dict[str, str | int]:
-        """Say what serves."""
-        return {"server": "websockets", "version": websockets.version.version, "loop": "uvloop"}
+        return {"server": "websockets", "version": websockets.version.version}
 
     def serve(self) -> None:
-        """Serve until stopped."""
-        try:
-            self._loop.run_until_complete(self._serve())
-        finally:
-            self._loop.close()
-
-    async def _serve(self) -> None:
-        server = await self._loop.create_server(lambda: Door(self._house, self._loop), sock=self._socket)
-        async with server:
-            await self._stopped.wait()
-            server.close()
-            for _ in range(round(GRACE_S / CLOSING_S)):
-                if not any(door.busy for door in self._house.doors):
-                    break
-                await asyncio.sleep(CLOSING_S)
-            for door in list(self._house.doors):
-                door.hang_up()
-            self._house.office.threads.shutdown(wait=False, cancel_futures=True)
-            await asyncio.sleep(CLOSING_S)
+        self._connections.serve()
 
     def stop(self) -> None:
         """Finish the requests under way, for a second at most."""
-        with suppress(RuntimeError):  # it has ended already
-            self._loop.call_soon_threadsafe(self._stopped.set)
+        self._connections.stop()
+
+    def _handle(self, wire: Wire) -> None:
+        PolicyConnection(wire, self._core, self._access, self._metadata, WebsocketExchange).serve()
+
+
+class WebsocketExchange(Exchange):
+    """One observation, and the chunk of actions that answers it."""
+
+    def __init__(self, connection: PolicyConnection, message: bytes) -> None:
+        """Answer a ``message`` that is whole."""
+        super().__init__()
+        self.trace.mark("network")
+        self.gone = connection.wire.gone  # type: ignore[method-assign]
+        self._connection, self._message = connection, message
+        self._began_ns = self.trace.marks[0][1]
+        self._actions: list[Any] = []
+
+    def request(self) -> Request:
+        observation, self._message = unpackb(self._message), b""
+        self.trace.mark("msgpack_parse")
+        told = observed.told_in(observation) if self._connection.ours else None
+        request = observed.request_of(observation, told, self.trace, self._connection.core.limits)
+        self.trace.mark("msgpack_parse")
+        return request
+
+    def begin(self, request: Request) -> Request:
+        self._started_ns = now_ns()
+        return request
+
+    def send(self, piece: Piece) -> bool:
+        """Keep an action, and send it where the chunk is streamed."""
+        if self.gone():
+            raise Disconnected
+        if not isinstance(piece, Action):
+            raise EngineError(
+                "the engine answers with tokens, and this protocol knows actions; choose `answer` actions"
+            )
+        self._actions.append(piece.values)
+        if self._connection.streams:
+            partial = {codec.TYPE: codec.PARTIAL, codec.ACTIONS: piece.values[None]}
+            partial[codec.INDICES] = np.array([len(self._actions) - 1])
+            self._connection.send(packb(partial))
+        return True
+
+    def end(self) -> None:
+        """Send the chunk, then to our own client the marks, which may take time to find."""
+        if not self._actions:
+            raise EngineError("the engine answered with no action at all")
+        connection, trace = self._connection, self.trace
+        if not connection.streams:
+            self.sent_whole()
+        ended_ns = trace.token_ns[-1] if trace.token_ns else now_ns()
+        timing = {str(INFER_MS): (ended_ns - self._started_ns) / 1e6}
+        if connection.previous_ms is not None:
+            timing[str(PREV_TOTAL_MS)] = connection.previous_ms
+        kind = {codec.TYPE: codec.FINAL} if connection.streams else {}
+        connection.send(packb({**kind, codec.ACTIONS: np.stack(self._actions), codec.TIMING: timing}))
+        connection.previous_ms = (now_ns() - self._began_ns) / 1e6
+        if connection.ours:
+            connection.send(packb(observed.remote_message(trace.to_remote())))
+        connection.flush(self.left_s())
+
+    def fail(self, error: S2AError) -> None:
+        """Say why in a text, and close, as openpi's server does."""
+        self._connection.fail(str(error) or type(error).__name__)
+
+
+def metadata_of(queued: Queued) -> Mapping[str, Any]:
+    """Return what a server says of itself to everybody who connects."""
+    settings = queued.settings.model_dump() if queued.settings is not None else {}
+    names = {"name": "engine", "horizon": "action_horizon", "action_dim": "action_dim"}
+    told = {said: settings[name] for name, said in names.items() if isinstance(settings.get(name), (str, int))}
+    return {"server": "s2a-bench", **told, "provenance": queued.provenance}

@@ -1,42 +1,70 @@
 """ZeroMQ and MessagePack as GR00T's policy servers speak it: an observation goes up, a chunk of actions comes back.
 
-Our server answers either layout, N1.5 or N1.6, and GR00T's own clients; our client asks foreign servers too, which are
-told what a template says (`transport.observation`). GR00T N1 unpickled what it received, so that a client could run any
-code in it: nothing here does, and whoever still serves it should not let others reach it.
+Our server answers all layouts, N1.5 to N1.7, and GR00T's own clients; our client asks foreign servers too, which are
+told what a template says (`transport.observation`). GR00T N1 unpickled what it received, and early N1.7 servers do so
+with arrays of kind O, so that a client can run any code in them: nothing here does, and such a server belongs where no
+other client reaches it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Literal
+from urllib.parse import urlsplit
+
+from pydantic import field_validator
 
 from s2a_bench import extras
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
-from s2a_bench.transport import ACTIONS, Client, Handler, Server, Wiring
-from s2a_bench.transport.listening import Listening
-from s2a_bench.transport.zmq.options import ZmqOptions
+from s2a_bench.options import option
+from s2a_bench.transport import SERVER, Client, Handler, Server, Urls, Wiring
+from s2a_bench.transport.observation import PolicyOptions, PolicyTransport, TemplateName
 
 GR00T = "gr00t"
 PACKAGES = ("msgpack", "zmq")
 """What the extra of its name brings, by the names under which they are imported."""
 
 
-class Zmq(Listening[ZmqOptions]):
+class ZmqOptions(PolicyOptions):
+    """How our policy server over ZeroMQ is reached, or somebody else's is asked."""
+
+    SCHEMES: ClassVar[tuple[str, ...]] = ("tcp",)
+    SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 5555}
+
+    layout: Literal["auto", "n1.7", "n1.6", "n1.5"] = option(
+        "auto",
+        "GR00T's form of observations and arrays: n1.7, n1.6, n1.5; auto: by the marks of the server's configurations",
+        side=SERVER,
+    )
+    template: TemplateName | Literal[""] = option(
+        "", "what the policy is told: a template's name, or a TOML or JSON file [default: that of the layout]"
+    )
+
+    @field_validator("url")
+    @classmethod
+    def _names_a_port(cls, url: str) -> str:
+        if url and (not urlsplit(url).port or url.partition("//")[2] != urlsplit(url).netloc):
+            raise ValueError(f"'{url.partition('?')[0]}' should look like tcp://HOST:PORT")
+        return url
+
+    @property
+    def template_name(self) -> str:
+        return self.template or ("gr00t-n1.5" if self.layout == "n1.5" else "gr00t-n1.6")
+
+
+class Zmq(PolicyTransport[ZmqOptions]):
     """Policies over ZeroMQ."""
 
     name = "zmq"
     options = ZmqOptions
     variants = (GR00T,)
-    payloads = ("raw", "jpeg", "jpeg-preencoded", "png")
-    schemes = ZmqOptions.SCHEMES
-    examines = "s2a_bench.transport.zmq.dangers:examine"
-    stages = {"msgpack_pack": "pack", "msgpack_parse": "parse"}
-    tells = (PAYLOAD_BYTES, RECONNECTS)
-    order = 22
-    looks = {GR00T: ("#8C510A", "-")}
+    urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.transport.zmq.dangers:examine")
+    modules = PACKAGES
     compared_with = ("ros", "loopback")
+    facts = (PAYLOAD_BYTES, RECONNECTS)
+    order = 22
+    style = {GR00T: ("#8C510A", "-")}
     packages = ("msgpack", "pyzmq")
-    elsewhere = ("url",)
-    serving = {"port": 5555}
 
     def client(self, wiring: Wiring[ZmqOptions], alive: Callable[[], bool]) -> Client:
         """Prepare to ask the server at ``wiring.address``, a URL."""
@@ -52,36 +80,10 @@ class Zmq(Listening[ZmqOptions]):
 
         return ZmqServer(wiring, handler)
 
-    def travels(self, variant: str, options: ZmqOptions) -> tuple[str, ...]:  # noqa: ARG002 - of all transports
-        """Return what a policy takes: pixels, unless its template says that it decodes files."""
-        from s2a_bench.transport.observation import template_of
-
-        if template_of(options.told_by).encoded:
-            return self.payloads[1:]
-        return self.payloads[:1] if options.url else self.payloads
-
-    def answers(self, variant: str, options: ZmqOptions) -> tuple[str, ...]:  # noqa: ARG002 - of all transports
-        """Return actions, which policies answer with."""
-        return (ACTIONS,)
-
-    def takes_state(self, variant: str, options: ZmqOptions) -> bool:  # noqa: ARG002 - of all transports
-        """Whether the template has a place for the robot's state."""
-        from s2a_bench.transport.observation import template_of
-
-        return template_of(options.told_by).takes_state
-
-    def check(self, variant: str, options: ZmqOptions, *, mode: str, engine: str) -> None:  # noqa: ARG002
-        """Refuse a key that is not there; raises MissingExtra too."""
-        from s2a_bench.transport.credentials import read_key
-
-        extras.need(self.name, *PACKAGES)
-        read_key(options.api_key_env)
-
-    def ready(self, wiring: Wiring[ZmqOptions], address: str) -> str:
+    def ready(self, wiring: Wiring[ZmqOptions]) -> str:
         """Return where policies are asked, and by whom."""
-        key, everybody = wiring.options.api_key_env, wiring.options.no_auth
-        whom = f" for who sends the key in ${key}" if key else " for all who reach it" * everybody
-        return f"serving GR00T's protocol at {address}{whom}"
+        address = wiring.address
+        return f"serving GR00T's protocol at {address}{wiring.options.callers('sends the key in {}')}"
 
 
 ZMQ = Zmq()

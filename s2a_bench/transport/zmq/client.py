@@ -8,6 +8,7 @@ thrown away, for it would wait for that answer for ever.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from typing import Any, Final
 
 import zmq
@@ -18,16 +19,15 @@ from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring, ours
-from s2a_bench.transport.bounds import Bounds
-from s2a_bench.transport.credentials import read_key
+from s2a_bench.transport import Wiring, observed
+from s2a_bench.transport.limits import Bounds
+from s2a_bench.transport.listening import read_key
 from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pictures import told
-from s2a_bench.transport.zmq import layouts, own
+from s2a_bench.transport.zmq import ZmqOptions, layouts
 from s2a_bench.transport.zmq.npy import Room
-from s2a_bench.transport.zmq.options import ZmqOptions
-from s2a_bench.transport.zmq.watch import ROOM, Watch
-from s2a_bench.transport.zmq.wire import pack, unpack
+from s2a_bench.transport.zmq.watch import Watch
+from s2a_bench.transport.zmq.wire import pack, read
 from s2a_bench.types import Frame, Piece, Pixels, Request
 
 ANSWER_BYTES: Final = 16 << 20
@@ -48,19 +48,34 @@ class ZmqClient:
     """Asks one policy server."""
 
     def __init__(self, wiring: Wiring[ZmqOptions], alive: Callable[[], bool]) -> None:
-        """Prepare to ask the server at ``wiring.address``; the first request connects."""
+        """Prepare for the server at ``wiring.address``; a foreign one tells its layout, unless the options do."""
         self.camera = None
         self._wiring, self._alive = wiring, alive
         self._ours = not wiring.black_box
-        self._template = template_of(wiring.options.told_by)
+        self._template = template_of(wiring.options.template_name)
         self._key = read_key(wiring.options.api_key_env)
         self._rooms: dict[tuple[int, int, int], Room] = {}
         self._link: Link | None = None
         self._connected = False
+        self._layout: str = wiring.options.layout
+        if self._layout == layouts.AUTO:
+            self._layout = layouts.N1_6 if self._ours else self._met()
+
+    def _met(self) -> str:
+        """Return the layout of a foreign server, by the marks of its modality configurations."""
+        bounds = self._bounds(1)
+        with closing(Link(self._wiring.address, self._wiring.timeout_s, self._alive)) as link:
+            link.greet(bounds)
+            _, marks = self._read(link.asked(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))
+        return layouts.marked(marks)
+
+    def _bounds(self, max_tokens: int) -> Bounds:
+        """Start the bounds of an answer."""
+        return Bounds(self._wiring.address, self._wiring.deadline_of(max_tokens), max_tokens)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Send the observation and yield the actions of its answer."""
-        bounds = Bounds(self._wiring.address, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
+        bounds = self._bounds(request.max_tokens)
         whole = False
         try:
             link = self._open(bounds, trace)
@@ -74,8 +89,8 @@ class ZmqClient:
                 yield action
             if self._ours:
                 whole = False
-                asked = {own.ENDPOINT: own.MARKS, ours.OWN: {"id": request.id}, **self._token()}
-                trace.receive(ours.remote_of(self._said(link.asked(pack(asked), bounds))))
+                asked = {layouts.ENDPOINT: layouts.MARKS, observed.OWN: {"id": request.id}, **self._token()}
+                trace.receive(observed.remote_of(self._said(link.asked(pack(asked), bounds))))
                 whole = True
             here = trace.remote is not None and trace.remote.clock == clock_id()
             trace.marks.append(("return" if here else "server", seen_ns))
@@ -100,11 +115,12 @@ class ZmqClient:
         """Fill the template and write it as MessagePack, marking each stage."""
         pictures = [self._told(frame, place, trace) for place, frame in enumerate(request.images)]
         observation = self._template.fill(pictures, request.state, request.prompt)
-        data = layouts.data_of(self._wiring.options.layout, observation)
-        message: dict[str, Any] = {own.ENDPOINT: own.GET_ACTION, own.DATA: data, **self._token()}
+        data = layouts.data_of(self._layout, observation)
+        message: dict[str, Any] = {layouts.ENDPOINT: layouts.GET_ACTION, layouts.DATA: data, **self._token()}
         if self._ours:
-            message[ours.OWN] = ours.parameters(request)
-        body = pack(message, {room.address: room for room in self._rooms.values()})
+            message[observed.OWN] = observed.parameters(request)
+        rooms = {room.address: room for room in self._rooms.values()}
+        body = pack(message, rooms, maps=self._layout == layouts.N1_7)
         trace.mark("msgpack_pack")
         trace.facts[PAYLOAD_BYTES] = len(body)
         return body
@@ -122,27 +138,30 @@ class ZmqClient:
         return room.pixels
 
     def _token(self) -> dict[str, str]:
-        return {own.TOKEN: self._key} if self._key else {}
+        return {layouts.TOKEN: self._key} if self._key else {}
+
+    def _read(self, message: bytes) -> tuple[Any, set[str]]:
+        """Return an answer, errors included, and its marks; raises RequestFailed for another protocol."""
+        if message == WRONG:
+            raise RequestFailed(f"{self._wiring.address} answered {WRONG.decode()}: it serves another kind of policy")
+        return read(message)
 
     def _said(self, message: bytes) -> Any:
         """Return an answer; raises RequestFailed for an error."""
         url = self._wiring.address
-        if message == WRONG:
-            raise RequestFailed(f"{url} answered {WRONG.decode()}: it serves another kind of policy")
-        answer = unpack(message)
-        if isinstance(answer, dict) and own.ERROR in answer:
-            said = " ".join(struck(str(answer[own.ERROR])).split())[-QUOTED:] or "an error without words"
-            wait_s = answer.get(own.RETRY)
+        answer, _ = self._read(message)
+        if isinstance(answer, dict) and layouts.ERROR in answer:
+            said = " ".join(struck(str(answer[layouts.ERROR])).split())[-QUOTED:] or "an error without words"
+            wait_s = answer.get(layouts.RETRY)
             patient = isinstance(wait_s, (int, float)) and 0 <= wait_s <= LONGEST_S
             raise RequestFailed(f"{url}: {said}", retry_after_s=wait_s if patient else None)
         return answer
 
     def describe(self) -> dict[str, str]:
-        """Return who is asked, and what for, for the manifest."""
-        return {"url": self._wiring.address, "template": self._template.name}
+        """Return where the server is, and how requests for it are packed, for the manifest."""
+        return {"url": self._wiring.address, "template": self._template.name, "layout": self._layout}
 
     def close(self) -> None:
-        """Close the kept connection."""
         if self._link is not None:
             self._link.close()
             self._link = None
@@ -197,15 +216,14 @@ class Link:
                 if not self._watch.connections:
                     raise self._broke()
                 self._check(ends_ns, bounds)
-            frames = self._socket.recv_multipart(zmq.NOBLOCK)
+            answer: bytes = self._socket.recv(zmq.NOBLOCK)
+            more = bool(self._socket.rcvmore)  # the rest goes with the socket
         except zmq.ZMQError as error:
             raise RequestFailed(f"{self._url}: {error.strerror}") from error
-        for connection in self._watch.connections.values():
-            connection.take([0, *map(len, frames)])
-        bounds.came(sum(map(len, frames)))
-        if len(frames) != 1:
-            raise RequestFailed(f"{self._url} answered with {len(frames)} frames, not one")
-        return frames[0]
+        bounds.came(len(answer))
+        if more:
+            raise RequestFailed(f"{self._url} answered with several frames, not one")
+        return answer
 
     def _check(self, ends_ns: int, bounds: Bounds) -> None:
         """Raise what says why waiting has to end."""
@@ -214,8 +232,6 @@ class Link:
             raise RequestFailed(f"{self._url} was silent for too long: {self._timeout_s:g} s")
         if not self._alive():
             raise ServerDied(f"the server at {self._url} is gone")
-        if sum(connection.look() for connection in self._watch.connections.values()) > ANSWER_BYTES + ROOM:
-            raise RequestFailed(f"{self._url} sent more than the {ANSWER_BYTES} bytes that an answer may have")
 
     def _broke(self, doubt: str = "") -> TransportError:
         if not self._alive():

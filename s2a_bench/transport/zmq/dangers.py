@@ -1,4 +1,4 @@
-"""What a foreign policy server over ZeroMQ does that is dangerous: it is sent a ping, which asks nothing of it."""
+"""What a foreign policy server over ZeroMQ does that is dangerous: the answers to two harmless requests tell."""
 
 from __future__ import annotations
 
@@ -7,53 +7,70 @@ from contextlib import closing
 from urllib.parse import SplitResult, urlunsplit
 
 from s2a_bench import extras
-from s2a_bench.errors import RequestFailed, ServerDied
+from s2a_bench.errors import RequestFailed
 from s2a_bench.machine.doctor import Finding
-from s2a_bench.transport.bounds import Bounds
 from s2a_bench.transport.dangers import PATIENCE_S, for_anybody, shown
-from s2a_bench.transport.zmq import PACKAGES
+from s2a_bench.transport.limits import Bounds
+from s2a_bench.transport.zmq import PACKAGES, layouts
 
 PORT = 5555
 """Where GR00T's servers listen unless told."""
+N1 = b"ERROR", b"PK\x03\x04", *(bytes((0x80, protocol)) for protocol in range(2, 6))
+"""How answers of GR00T N1 begin: its only error, which MessagePack is to it, an archive of torch.save, a pickle."""
 
 
 def examine(parts: SplitResult) -> Iterator[Finding]:
-    """Ping it without a key."""
+    """Ping it without a key; if it answers, read how its configurations are marked."""
     extras.need("zmq", *PACKAGES)
-    place = f"{parts.hostname}:{parts.port or PORT}"
-    try:
-        said = _pinged(urlunsplit((parts.scheme, place, "", "", "")))
-    except ServerDied as error:
-        raise OSError(str(error)) from error
-    if said:
-        yield Finding("server", "state", f"it answers, and tells nobody without a key anything: {shown(said)}")
-    else:
-        yield for_anybody(
-            parts,
-            "it answers everybody's ping; if it is GR00T's, everybody moves the robot, and ends the server by `kill`, "
-            "which is not tried here",
-            "let it listen on 127.0.0.1 alone (GR00T's listens on all unless told), reach it by ssh -L, give it an "
-            "api_token",
-        )
-    yield Finding(
+    from s2a_bench.transport.zmq.client import Link
+    from s2a_bench.transport.zmq.wire import pack, read
+
+    url = urlunsplit((parts.scheme, f"{parts.hostname}:{parts.port or PORT}", "", "", ""))
+    bounds = Bounds(url, 3 * PATIENCE_S, 0)
+    with closing(Link(url, PATIENCE_S, lambda: True)) as link:
+        link.greet(bounds)
+        pong = link.asked(pack({layouts.ENDPOINT: layouts.PING}), bounds)
+        if pong.startswith(N1):
+            yield _unpickles_all()
+            return
+        answer, marks = read(pong)
+        if not isinstance(answer, dict):
+            raise RequestFailed(f"{url} answers a ping with {type(answer).__name__}, which GR00T's servers do not")
+        if layouts.ERROR in answer:
+            error = shown(str(answer[layouts.ERROR]))
+            yield Finding("server", "state", f"it answers, and tells nobody without a key anything: {error}")
+        else:
+            yield for_anybody(
+                parts,
+                "it answers everybody's ping; if it is GR00T's, everybody moves the robot, and ends the server by "
+                "`kill`, which is not tried here",
+                "let it listen on 127.0.0.1 alone (GR00T's listens on all unless told), reach it by ssh -L, give it an "
+                "api_token",
+            )
+            _, marks = read(link.asked(pack({layouts.ENDPOINT: layouts.MODALITIES}), bounds))
+    yield _may_unpickle(marks)
+
+
+def _unpickles_all() -> Finding:
+    return Finding(
         "pickle",
-        "advice",
-        "GR00T N1 unpickles what anybody sends, so that who reaches the port runs code there; N1.5 and later do not, "
-        "and no ping tells them apart",
-        "look at which version serves; s2a-bench does not speak N1's protocol",
+        "warning",
+        "it answers a ping as GR00T N1 does, which unpickles (torch.load) what any client sends: a client that reaches "
+        "the port runs code there",
+        "serve N1.5 or later; until then let it listen on 127.0.0.1 alone, and reach it by ssh -L; s2a-bench does not "
+        "speak N1's protocol",
     )
 
 
-def _pinged(url: str) -> str:
-    """Return the error that a server answers a ping with, "" for none."""
-    from s2a_bench.transport.zmq import own
-    from s2a_bench.transport.zmq.client import Link
-    from s2a_bench.transport.zmq.wire import pack, unpack
-
-    bounds = Bounds(url, 2 * PATIENCE_S, 0)
-    with closing(Link(url, PATIENCE_S, lambda: True)) as link:
-        link.greet(bounds)
-        answer = unpack(link.asked(pack({own.ENDPOINT: own.PING}), bounds))
-    if not isinstance(answer, dict):
-        raise RequestFailed(f"{url} answers a ping with {type(answer).__name__}, which GR00T's servers do not")
-    return str(answer[own.ERROR]) if own.ERROR in answer else ""
+def _may_unpickle(marks: set[str]) -> Finding:
+    """Return what the layouts say that a server's configurations are marked with."""
+    if layouts.N1_6 in marks:
+        return Finding("pickle", "state", "its configurations are marked as N1.5's or N1.6's: they unpickle nothing")
+    which = "its configurations are marked as GR00T N1.7's" if marks else "no answer tells which GR00T it is"
+    return Finding(
+        "pickle",
+        "advice",
+        f"{which}: early N1.7 servers unpickle arrays of kind O, so that a client that reaches the port runs code "
+        "there; later ones refuse them, N1.5 and N1.6 unpickle nothing",
+        "update its gr00t to a version that refuses arrays of kind O",
+    )

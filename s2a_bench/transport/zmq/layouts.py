@@ -1,9 +1,12 @@
-"""What stands where in GR00T's messages: observations of a robot, and chunks of actions.
+"""GR00T's words, and what stands where in its messages: observations of a robot, and chunks of actions.
 
 N1.5 is flat: ``video.<camera>`` (T, H, W, 3) uint8, ``state.<part>`` (T, D), ``annotation.<...>`` [text]; its answer is
 ``action.<part>`` (H, D). N1.6 is nested: ``observation`` with ``video``, ``state`` and ``language``, all with a batch
-in front, as (B, T, H, W, 3), (B, T, D), [[text]]; its answer is [{part: (B, H, D)}, info]. Our server reads both,
-whichever comes, and answers in the same.
+in front, as (B, T, H, W, 3), (B, T, D), [[text]]; its answer is [{part: (B, H, D)}, info]. N1.7 nests as N1.6 does, and
+packs arrays and marks configurations in another way (`wire`). Our server reads all of them, and answers in the same.
+
+A request of our client has what `transport.observed` adds beside GR00T's keys. Once it is answered the client asks
+`MARKS`, by that request's id, for what the server marked; nothing of it is measured.
 """
 
 from __future__ import annotations
@@ -19,7 +22,12 @@ from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.types import Action, Piece
 
-N1_5, N1_6 = "n1.5", "n1.6"
+MARKS: Final = "s2a_marks"
+GET_ACTION, PING, RESET, MODALITIES, KILL = "get_action", "ping", "reset", "get_modality_config", "kill"
+ENDPOINT, DATA, TOKEN, ERROR, RETRY = "endpoint", "data", "api_token", "error", "retry_after_s"
+AUTO, N1_5, N1_6, N1_7 = "auto", "n1.5", "n1.6", "n1.7"
+CONFIG_MARKS: Final = {N1_6: "__ModalityConfig_class__", N1_7: "__ModalityConfig__"}
+"""Layout -> the key that marks a modality's configuration; N1.5's is N1.6's."""
 OBSERVATION: Final = "observation"
 NAMES: Final = {
     "video": "ego_view",
@@ -30,6 +38,11 @@ NAMES: Final = {
 """Modality -> the key that our server tells of; whatever the keys are, it reads them."""
 STATE_AXES, PICTURE_AXES = 2, 4
 """Of N1.5's arrays without a batch."""
+
+
+def marked(marks: set[str]) -> str:
+    """Return the layout of what the marks of a message say, see `wire.read`; N1.6's where they say nothing."""
+    return N1_7 if marks == {N1_7} else N1_6
 
 
 def data_of(layout: str, observation: dict[str, Any]) -> dict[str, Any]:
@@ -69,15 +82,16 @@ def actions_in(answer: Any) -> list[Action]:
 
 
 def modalities(layout: str) -> dict[str, Any]:
-    """Return what ``get_modality_config`` tells of our server."""
+    """Return what ``get_modality_config`` tells of our server; `AUTO` has the marks of N1.6 and of N1.7."""
     configs: dict[str, Any] = {}
+    marks = CONFIG_MARKS.values() if layout == AUTO else [CONFIG_MARKS.get(layout, CONFIG_MARKS[N1_6])]
     for modality, name in NAMES.items():
         key = f"{modality}.{name}" if layout == N1_5 and modality != "language" else name
         config: dict[str, Any] = {"delta_indices": [0], "modality_keys": [key]}
-        if layout == N1_6:
+        if layout != N1_5:
             config |= dict.fromkeys(("sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"))
         said = json.dumps(config) if layout == N1_5 else config
-        configs[modality] = {"__ModalityConfig_class__": True, "as_json": said}
+        configs[modality] = {**dict.fromkeys(marks, True), "as_json": said}
     return configs
 
 

@@ -1,42 +1,48 @@
 """Our policy server: GR00T's protocol on a ROUTER socket, so that one request does not block all other clients.
 
-One thread waits for messages; threads of a pool read and answer (`call`). libzmq allows a socket to one thread at a
-time, which a lock sees to: whoever answers sends by itself, so that no answer waits for the interpreter to change
-threads. So the waiting thread must not ask the socket, and waits for its descriptor, which tells of changes (ZMQ_FD).
+Its threads take turns in waiting for a message. libzmq allows a socket to one thread at a time, which a lock sees to:
+each sends its answer by itself. So the one that waits must not do so in the socket: it waits for the socket's
+descriptor, which tells of changes (ZMQ_FD).
 """
 
 from __future__ import annotations
 
+import hmac
 import select
 import socket
-from contextlib import suppress
-from threading import Lock
+from collections import OrderedDict
+from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NotYet
+from contextlib import ExitStack, suppress
+from functools import partial
+from threading import Event, Lock
 from typing import Any, Final
 
 import zmq
 
-from s2a_bench.clock import now_ns
-from s2a_bench.errors import Busy, TransportError
-from s2a_bench.machine.tuning import give_back_memory
+from s2a_bench.errors import Busy, RequestFailed, S2AError, TransportError
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler, Wiring
-from s2a_bench.transport.credentials import key_for
-from s2a_bench.transport.listening import cannot_bind, split
-from s2a_bench.transport.turns import Queued
-from s2a_bench.transport.zmq.call import Call, Office
-from s2a_bench.transport.zmq.options import ZmqOptions
-from s2a_bench.transport.zmq.watch import Watch
+from s2a_bench.transport import Handler, Wiring, observed
+from s2a_bench.transport.listening import cannot_bind, key_for, split
+from s2a_bench.transport.serving import RETRY_AFTER_S, Core, Exchange, Workers, told_of
+from s2a_bench.transport.zmq import ZmqOptions, layouts
+from s2a_bench.transport.zmq.watch import Connection, Watch
+from s2a_bench.transport.zmq.wire import pack, read
+from s2a_bench.types import Piece, Request
 
-LOOKS_MS: Final = 20
-"""How often connections are looked at: over loopback 60 MB may come meanwhile."""
+LOOKS_MS: Final = 100
+"""How often it is looked whether connections have begun or ended while nothing comes over them."""
 QUEUED: Final = 8
-"""Messages of one client that libzmq keeps for us; those beyond wait in its own machine."""
-LARGE_BYTES: Final = 1 << 22
-"""From here on memory that was held goes back to the system."""
-LINGER_NS: Final = 1_000_000_000
-"""How long no more than that is held before it does."""
+"""Messages of one client that libzmq keeps for us; those beyond wait at the client."""
+READING: Final = 16
+"""Requests under way beyond those that may wait for the engine."""
 ENVELOPE: Final = 4
-"""Most frames before a message."""
+"""Most frames before a message: the identity, those of proxies, an empty one."""
+KEPT: Final = 128
+"""Requests whose marks are kept until they are asked for, the latest; those of a long answer are half a megabyte."""
+ASKED_S: Final = 0.005
+"""How long marks wait to be found for a client that asks for them: the answer's way is not slowed meanwhile."""
 
 
 class ZmqServer:
@@ -48,9 +54,14 @@ class ZmqServer:
         Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
         """
         told, port = split(wiring.address, "tcp")
-        options, self._limits = wiring.options, wiring.limits
+        options, limits = wiring.options, wiring.limits
         host = _resolved(told)
-        key = key_for(host, options.api_key_env, everybody=options.no_auth)
+        self._key = key_for(host, options.api_key_env, everybody=options.no_auth).encode()
+        self._layout: str = options.layout
+        self._core = Core(handler, limits)
+        self._marks = Marks()
+        self._under_way = 0
+        self._stopped = Event()
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
         self._woken.setblocking(False)
@@ -59,8 +70,8 @@ class ZmqServer:
         self._router = self._context.socket(zmq.ROUTER)
         self._router.linger = 0
         self._router.rcvhwm = self._router.sndhwm = QUEUED
-        self._router.maxmsgsize = self._limits.body_bytes
-        self._router.handshake_ivl = round(self._limits.head_s * 1e3)
+        self._router.maxmsgsize = limits.body_bytes
+        self._router.handshake_ivl = round(limits.head_s * 1e3)
         self._watch = Watch(self._router)
         try:
             self._router.bind(f"tcp://{host}:{'*' if port == '0' else port}")
@@ -68,81 +79,130 @@ class ZmqServer:
             self._close()
             raise cannot_bind(host, port, error.errno, error.strerror) from error
         self.address: str = self._router.get_string(zmq.LAST_ENDPOINT)
-        self._office = Office(Queued.around(handler, wiring.limits), wiring.limits, key, options.layout, self._send)
-        self._stopped = False
-        self._much_ns = 0
+        self._poller = select.poll()
+        for readable in (self._router.FD, self._woken, self._watch.monitor.FD):
+            self._poller.register(readable, select.POLLIN)
 
     def describe(self) -> dict[str, str | int]:
-        """Say what serves."""
         return {"server": "pyzmq", "version": zmq.pyzmq_version(), "libzmq": zmq.zmq_version()}
 
     def serve(self) -> None:
-        """Serve until stopped."""
-        poller = select.poll()
-        for readable in (self._router.FD, self._woken, self._watch.monitor.FD):
-            poller.register(readable, select.POLLIN)
-        looked_ns, more = 0, True
-        try:
-            while not self._stopped:
-                busy = self._watch.connections or self._office.calls or self._much_ns
-                poller.poll(0 if more else LOOKS_MS if busy else None)
-                with suppress(BlockingIOError):
-                    self._woken.recv(4096)
-                more = self._hear()
-                self._watch.hear()
-                if (at_ns := now_ns()) - looked_ns > LOOKS_MS * 1e6:
-                    looked_ns = at_ns
-                    if self._watch.keep(self._limits, self._office.in_flight, at_ns) >= LARGE_BYTES:
-                        self._much_ns = at_ns
-                    elif self._much_ns and at_ns - self._much_ns > LINGER_NS:
-                        self._much_ns = 0
-                        give_back_memory()
-                    for call in list(self._office.calls):
-                        call.look(at_ns)
-        finally:
-            self._office.threads.shutdown(wait=False, cancel_futures=True)
-            self._close()
+        workers = Workers(self._next, self._stopped)
+        workers.start()
+        self._stopped.wait()
+        self._close()
 
-    def _hear(self) -> bool:
-        """Take the messages that are there; return whether there may be more."""
-        for _ in range(QUEUED):
-            with self._lock:
-                try:
-                    frames = self._router.recv_multipart(zmq.NOBLOCK, copy=False)
-                except zmq.Again:
-                    return False
-            trace = Trace()
-            trace.mark("network")
-            self._take(frames, trace)
-        return True
+    def stop(self) -> None:
+        """Break off what is under way."""
+        self._stopped.set()
+        self._rouse()
 
-    def _take(self, frames: list[Any], trace: Trace) -> None:
-        """Have a message answered: one frame, after an envelope that ends with an empty one."""
+    def _next(self) -> Callable[[], None] | None:
+        """Wait a moment for a message; return what answers it."""
+        frames = self._received()
+        if not frames:
+            self._poller.poll(LOOKS_MS)
+            with suppress(OSError):
+                self._woken.recv(4096)
+            frames = self._received()
+        trace = Trace()
+        trace.mark("network")
+        return self._taken(frames, trace) if frames else None
+
+    def _received(self) -> list[Any]:
+        """Return the frames of a message that is there, at most one more than a request may have."""
+        with self._lock:
+            if self._stopped.is_set():
+                return []
+            self._watch.hear()
+            self._watch.keep(self._core.limits.connections)
+            try:
+                frames = [self._router.recv(zmq.NOBLOCK, copy=False)]
+            except zmq.Again:
+                return []
+            while frames[-1].more and len(frames) <= ENVELOPE:
+                frames.append(self._router.recv(zmq.NOBLOCK, copy=False))
+            rest = frames[-1]
+            while rest.more:  # only reading it rids libzmq of a message; a million frames take .6 s
+                rest = self._router.recv(zmq.NOBLOCK, copy=False)
+        return frames
+
+    def _taken(self, frames: list[Any], trace: Trace) -> Callable[[], None] | None:
+        """Return what answers a message: one frame, after an envelope that ends with an empty one."""
         try:
             connection = self._watch.of(frames[-1].get(zmq.SRCFD))
         except zmq.ZMQError:
-            return  # before ZMTP 3 (2013) messages do not tell where they are from; so does noise that looks like it
-        sizes = [len(frame) for frame in frames[1:]]
-        connection.take(sizes)
-        if len(frames) > ENVELOPE or len(frames) < 3 or sizes[-2]:  # noqa: PLR2004 - identity, empty, message
-            return  # no REQ socket sent this, so that nobody waits for an answer
-        envelope = [frame.bytes for frame in frames[:-1]]
-        size = sizes[-1]
-        if size >= LARGE_BYTES:
-            self._much_ns = trace.marks[0][1]
-        try:
-            self._office.refuse_more(size)
-        except Busy as error:
-            Call(self._office, envelope, connection, 0).refuse(error)
-            return
-        Call(self._office, envelope, connection, size).start(frames[-1].buffer, trace)
+            return None  # before ZMTP 3 (2013) messages do not tell where they are from; so does noise like it
+        if len(frames) > ENVELOPE or len(frames) < 3 or len(frames[-2]):  # noqa: PLR2004 - identity, empty, message
+            error = RequestFailed("a request is one frame behind an empty one")
+            self._send([frames[0].bytes, b"", _error(error)])
+            return None
+        client = Client([frame.bytes for frame in frames[:-1]], connection, self._send)
+        with ExitStack() as held:
+            try:
+                held.enter_context(self._core.in_flight.counted())(len(frames[-1]))
+                if self._under_way >= self._core.limits.waiting + READING:
+                    raise Busy("too many requests are under way; come again later", retry_after_s=RETRY_AFTER_S)
+            except RequestFailed as error:
+                client.say(_error(error))
+                return None
+            with self._lock:
+                self._under_way += 1
+            held.callback(self._ended)
+            return partial(self._serve, client, frames[-1], trace, held.pop_all())
+
+    def _ended(self) -> None:
+        with self._lock:
+            self._under_way -= 1
+
+    def _serve(self, client: Client, frame: Any, trace: Trace, held: ExitStack) -> None:
+        """Read a message and answer it."""
+        with held:
+            try:
+                message, marks = read(frame.buffer)
+                trace.mark("msgpack_parse")
+                self._check(message)
+                endpoint, told = message.get(layouts.ENDPOINT, layouts.GET_ACTION), observed.told_in(message)
+                if endpoint == layouts.GET_ACTION:
+                    promised = self._marks.promise(client.name, str(told.get("id"))) if told is not None else None
+                    self._core.answer(ActionExchange(client, message, marks, told, trace, promised, self._core))
+                elif endpoint == layouts.MARKS and told is not None:
+                    client.say(self._marks.take(client.name, str(told.get("id")), self._core.limits.answer_s))
+                else:
+                    client.say(pack(self._reply(endpoint)))
+            except Exception as error:  # noqa: BLE001 - the client must hear of it, whatever broke
+                client.say(_error(told_of(error)))
+
+    def _check(self, message: Any) -> None:
+        """Raise RequestFailed for a message that is none, or has not the key, compared in constant time."""
+        if not isinstance(message, dict):
+            raise RequestFailed(f"a request is a map, not {type(message).__name__}")
+        said = message.get(layouts.TOKEN)
+        token = said.encode(errors="replace") if isinstance(said, str) else b""
+        if self._key and not hmac.compare_digest(token, self._key):
+            raise RequestFailed(f"Unauthorized: this server wants its key as {layouts.TOKEN}")
+
+    def _reply(self, endpoint: Any) -> Any:
+        """Return the answer of an endpoint that asks for no action."""
+        if endpoint == layouts.PING:
+            if stuck := self._core.stuck():
+                raise RequestFailed(stuck)
+            return {"status": "ok", "message": "Server is running"}
+        if endpoint == layouts.MODALITIES:
+            return layouts.modalities(self._layout)
+        if endpoint == layouts.RESET:
+            return {}
+        if endpoint == layouts.KILL:
+            raise RequestFailed("this server is not ended over the network: stop its process")
+        known = f"{layouts.GET_ACTION}, {layouts.PING}, {layouts.RESET}, {layouts.MODALITIES}"
+        raise RequestFailed(f"Unknown endpoint: {str(endpoint)[:80]!r} is none of {known}")
 
     def _send(self, frames: list[Any]) -> None:
         """Send an answer, from any thread."""
         with self._lock:
             if self._router.closed:
                 return
-            with suppress(zmq.ZMQError):  # who asked has gone, or does not read
+            with suppress(zmq.ZMQError):  # the client has gone, or does not read
                 self._router.send_multipart(frames, zmq.NOBLOCK)
             came = self._router.getsockopt(zmq.EVENTS) & int(zmq.POLLIN)  # type: ignore[operator]
         if came:  # sending has taken note of it, so that the descriptor no longer tells
@@ -159,10 +219,116 @@ class ZmqServer:
             self._woken.close()
             self._context.destroy(0)
 
-    def stop(self) -> None:
-        """Break off what is under way."""
-        self._stopped = True
-        self._rouse()
+
+class Client:
+    """Where an answer goes."""
+
+    def __init__(self, envelope: list[bytes], connection: Connection, send: Callable[[list[Any]], None]) -> None:
+        """Answer to the frames before a message, as long as the connection is there."""
+        self.name = envelope[0]
+        self.connection = connection
+        self._envelope, self._send = envelope, send
+
+    def say(self, message: bytes | memoryview) -> None:
+        self._send([*self._envelope, message])
+
+
+class ActionExchange(Exchange):
+    """One request for actions; the chunk goes back whole."""
+
+    def __init__(
+        self,
+        client: Client,
+        message: dict[Any, Any],
+        marks: set[str],
+        told: dict[Any, Any] | None,
+        trace: Trace,
+        promised: Promise | None,
+        core: Core,
+    ) -> None:
+        """Answer ``message``; its marks are ``promised`` to a client of ours, which ``told`` more."""
+        super().__init__(trace)
+        self._client, self._data, self._told, self._core = client, message.get(layouts.DATA), told, core
+        self._promised = promised
+        self._maps = layouts.marked(marks) == layouts.N1_7
+        self._pieces: list[Piece] = []
+
+    def request(self) -> Request:
+        self._observation, self._layout = layouts.observation_in(self._data)
+        request = observed.request_of(self._observation, self._told, self.trace, self._core.limits)
+        self.trace.mark("msgpack_parse")
+        return request
+
+    def send(self, piece: Piece) -> bool:
+        self._pieces.append(piece)
+        return not self.gone()
+
+    def end(self) -> None:
+        """Send the chunk, then find the marks, which may take time, for our own client."""
+        self.sent_whole()
+        self._client.say(pack(layouts.answer_of(self._observation, self._layout, self._pieces), maps=self._maps))
+        if self._promised is not None:
+            self._promised.asked.wait(ASKED_S)
+            self._promised.marks.set_result(bytes(pack(observed.remote_message(self.trace.to_remote()))))
+
+    def fail(self, error: S2AError) -> None:
+        self._client.say(_error(error))
+        if self._promised is not None and not self._promised.marks.done():
+            self._promised.marks.set_exception(_unknown())
+
+    def gone(self) -> bool:
+        return self._client.connection.gone
+
+
+class Promise:
+    """The marks of a request, once they are found, and whether its client has asked for them."""
+
+    __slots__ = ("asked", "marks")
+
+    def __init__(self) -> None:
+        """Promise marks that are still to be found."""
+        self.asked = Event()
+        self.marks: Future[bytes] = Future()
+
+
+def _unknown() -> RequestFailed:
+    return RequestFailed("marks of a request that is not known, or whose marks were asked for already")
+
+
+class Marks:
+    """The marks of the latest requests of our clients, each of which is asked for once."""
+
+    def __init__(self) -> None:
+        """Know of none."""
+        self._lock = Lock()
+        self._promises: OrderedDict[tuple[bytes, str], Promise] = OrderedDict()
+
+    def promise(self, name: bytes, request_id: str) -> Promise:
+        """Remember that a client will ask for a request's marks."""
+        promised = Promise()
+        with self._lock:
+            self._promises[name, request_id] = promised
+            if len(self._promises) > KEPT:
+                self._promises.popitem(last=False)
+        return promised
+
+    def take(self, name: bytes, request_id: str, seconds: float) -> bytes:
+        """Wait for the marks of a request; raises RequestFailed for one that is not known."""
+        with self._lock:
+            promised = self._promises.pop((name, request_id), None)
+        if promised is None:
+            raise _unknown()
+        promised.asked.set()
+        try:
+            return promised.marks.result(seconds)
+        except NotYet:
+            raise _unknown() from None
+
+
+def _error(error: S2AError) -> memoryview:
+    retry_s = error.retry_after_s if isinstance(error, RequestFailed) else None
+    told = {layouts.ERROR: str(error) or type(error).__name__}
+    return pack({**told, layouts.RETRY: retry_s} if retry_s else told)
 
 
 def _resolved(host: str) -> str:

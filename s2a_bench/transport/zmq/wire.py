@@ -1,25 +1,37 @@
-"""Messages as GR00T packs them: MessagePack in which an array of numbers is a map with a NumPy file."""
+"""Messages as GR00T packs them: MessagePack in which an array of numbers is a map.
+
+Up to N1.6 the map holds a NumPy file, ``{"__ndarray_class__": True, "as_npy"}``. From N1.7 on it is that of
+msgpack-numpy 0.4.8, ``{b"nd": True, b"type", b"kind", b"shape", b"data"}``, or ``{b"nd": False, b"type", b"data"}`` for
+NumPy's scalars, whose kinds O (a pickle) and V (records) are refused. Both are read wherever they stand.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any, Final
 
 import msgpack
 import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport.messagepack import unpacked
+from s2a_bench.transport.messagepack import array_in, unpacked
+from s2a_bench.transport.zmq.layouts import CONFIG_MARKS, N1_6, N1_7
 from s2a_bench.transport.zmq.npy import Room, array_of, file_of
 
 ARRAY, FILE = "__ndarray_class__", "as_npy"
+ND, TYPE, KIND, SHAPE, BYTES = "nd", "type", "kind", "shape", "data"
 SMALL: Final = 1 << 16
 """Bytes that a message without large pictures takes, or fewer."""
 NO_ROOMS: Final[Mapping[int, Room]] = {}
 
+_NUMBERS = re.compile(r"[<>|=](b1|[iu][1248]|f[248])")
+"""What msgpack-numpy calls types of numbers."""
 
-def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS) -> memoryview:
-    """Return a message; raises RequestFailed for values that cannot travel.
+
+def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS, *, maps: bool = False) -> memoryview:
+    """Return a message, its arrays as files or as ``maps`` of msgpack-numpy; raises RequestFailed for other values.
 
     An array whose pixels are in one of ``rooms``, by their address, is sent from there.
     """
@@ -27,6 +39,8 @@ def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS) -> memoryview:
     def plain(value: Any) -> Any:
         if not isinstance(value, np.ndarray):
             raise TypeError(f"{type(value).__name__} is none of its types")
+        if maps:
+            return _map_of(value)
         room = rooms.get(value.__array_interface__["data"][0])
         return {ARRAY: True, FILE: (room.file(value) if room else None) or file_of(value)}
 
@@ -41,4 +55,44 @@ def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS) -> memoryview:
 
 def unpack(data: Any) -> Any:
     """Return the message in a buffer, its arrays read-only; raises RequestFailed for any other bytes."""
-    return unpacked(data, lambda value: array_of(value.get(FILE)) if ARRAY in value else value)
+    return read(data)[0]
+
+
+def read(data: Any) -> tuple[Any, set[str]]:
+    """Return what `unpack` does, and the layouts that its arrays and configurations are marked with: N1.6, N1.7."""
+    marks: set[str] = set()
+
+    def plain(value: dict[Any, Any]) -> Any:
+        if ARRAY in value:
+            marks.add(N1_6)
+            return array_of(value.get(FILE))
+        if b"nd" in value or ND in value:
+            fields = {key.decode() if isinstance(key, bytes) else key: each for key, each in value.items()}
+            if fields.keys() >= {TYPE, BYTES}:
+                marks.add(N1_7)
+                return _array_in(fields)
+        marks.update(layout for layout, mark in CONFIG_MARKS.items() if mark in value)
+        return value
+
+    return unpacked(data, plain), marks
+
+
+def _map_of(array: NDArray[Any]) -> dict[bytes, Any]:
+    """Return an array as msgpack-numpy has it; its elements are packed from where they are."""
+    solid = np.ascontiguousarray(array)
+    data = solid.reshape(-1).view(np.uint8).data
+    fields = {ND: True, TYPE: solid.dtype.str, KIND: b"", SHAPE: array.shape, BYTES: data}
+    return {key.encode(): value for key, value in fields.items()}
+
+
+def _array_in(fields: Mapping[str, Any]) -> Any:
+    """Return the read-only array, or scalar, in a map of msgpack-numpy; raises RequestFailed for what is none."""
+    kind, descr, data = fields.get(KIND) or b"", fields[TYPE], fields[BYTES]
+    shape = fields.get(SHAPE) if fields[ND] else []
+    kind = kind.decode("latin-1") if isinstance(kind, bytes) else kind
+    if kind in ("O", "V") or not isinstance(descr, str) or not _NUMBERS.fullmatch(descr):
+        raise RequestFailed(
+            f"an array of kind {str(kind)[:8]!r} and type {str(descr)[:80]!r}: numbers are taken, nothing is unpickled"
+        )
+    array = array_in(data, shape, np.dtype(descr))
+    return array if fields[ND] else array[()]

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.live.asking import Asking, Job
+from s2a_bench.experiments.chunks.asking import Asking, Job
+from s2a_bench.harness.config import RequestsConfig
+from s2a_bench.harness.plan import RequestPlan, resolve
 from s2a_bench.harness.session import Asked, Measured, Place, Session
 from s2a_bench.types import Action, Vector
 
@@ -25,6 +27,7 @@ class Server:
     """Actions, and the error."""
     places: list[Place] = field(default_factory=list)
     cell: Any = field(default_factory=lambda: SimpleNamespace(name="fake"))
+    request: RequestPlan = field(default_factory=lambda: resolve(RequestsConfig(transports="loopback")).request)
 
     def measure(self, place: Place, asked: Asked) -> Measured:
         self.places.append(place)

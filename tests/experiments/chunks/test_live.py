@@ -14,8 +14,7 @@ from s2a_bench.errors import EngineError, RequestFailed, RobotError, S2AError, U
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.chunks.view import show
-from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.chunk import chunk
+from s2a_bench.inference import EngineConfig, chunk
 from s2a_bench.library import Run
 from s2a_bench.progress import NullProgress
 from s2a_bench.store.run import read_run
@@ -77,7 +76,9 @@ def test_a_live_run_is_shown_and_its_latencies_are_a_source(tmp_path: Path) -> N
     assert {"lanes", "reactions"} <= set(shown.figures)
     assert {len(lane.ticks) for lane in shown.lanes} == {20}
     assert not any("EMULATED" in str(note) for note in shown.notes)
-    assert shown.json()["cells"][0]["emulated"] is False
+    cell = json.loads(json.dumps(shown.json()))["cells"][0]
+    assert cell["emulated"] is False
+    assert {"agreement", "jitter_s_p99", "blocked_s_max", "late_ticks", "bytes_up_per_s"} <= set(cell)
     assert "as virtual time has them" in " ".join(shown.sentences)
     assert Run(folder).table("loop").shape[0] == 2
     again = ChunksConfig(latency=f"{folder}#loopback", modes="queue?trigger=3", rules="")
@@ -143,20 +144,15 @@ def test_a_plant_moves_and_the_policy_is_told_where_it_is(tmp_path: Path, monkey
     monkeypatch.setattr("s2a_bench.inference.echo.chunk", chunk_of)
     rows = act(tmp_path, modes="replace?execute=8")
     assert rows["jerk_rms"].item() > 0
-    assert rows["boundary_jump_p99"].item() >= rows["boundary_jump_mean"].item()
-    assert rows["action_step_mean"].item() > 0
+    assert rows["jump_max"].item() == 0  # echo's chunks are one trajectory
+    assert rows["boundary_jump_p99"].item() >= rows["boundary_jump_mean"].item() > 0
+    assert rows["boundary_jump_mean"].item() == pytest.approx(rows["action_step_mean"].item(), rel=0.2)
     assert rows["tracking_rms"].isna().item()  # nobody knows what the policy follows
     table = show(read_run(folder_of(tmp_path))).tables["smoothness"]
     assert table.header == ("mode", "jerk", "jump", "p99", "step")
     assert not any("EMULATED" in note for note in table.notes)
     assert {len(state) for state in told[2:]} == {7}
     assert len(set(told[2:])) > 1
-
-
-def test_without_jumps_in_timing_echos_chunks_are_one_trajectory(tmp_path: Path) -> None:
-    rows = act(tmp_path, modes="replace?execute=8")
-    assert rows["jump_max"].item() == 0
-    assert rows["boundary_jump_mean"].item() == pytest.approx(rows["action_step_mean"].item(), rel=0.2)
 
 
 def test_a_function_is_called_with_every_action(tmp_path: Path) -> None:
@@ -199,7 +195,9 @@ def test_an_answer_that_has_not_come_by_the_end_counts_as_a_stall_to_the_end(tmp
     first_tick = round(row["first_action_s"] * 50) - 1
     assert row["ticks"] == 75 - first_tick
     assert row["stall_ticks"] > 30
-    assert (row["boundaries"], row["stalled_cycles"], row["p_stall_cycle"]) == (2, 1, 0.5)
+    assert row["boundaries"] == 2
+    assert row["stalled_cycles"] >= 1  # a busy machine may be late for the first boundary as well
+    assert row["p_stall_cycle"] == row["stalled_cycles"] / 2
     assert row["agreement"] >= 0.99
     assert row["latency_s_p99"] > 2  # it came after all
 
@@ -249,10 +247,9 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         ),
         ({"live": True, "control_hz": 1e6}, "`control_hz`: 1e[+]06: live no loop of ours keeps up above 10000"),
         ({"live": True, "control_hz": 0.1, "seconds": 1}, "`seconds`: 1 s are less than two ticks at `control_hz` 0.1"),
-        ({"live": True, "stability": 5}, "`stability` is for virtual time"),
+        ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
         ({"seconds": 5}, "`seconds` is for a control loop"),
         ({"control_hz": 1e-300}, "`control_hz`"),
-        ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
         ({"requests": {"transports": "http"}}, "`transports` is for a control loop"),
         ({"live": True, "requests": {"transports": "nothing"}}, "nothing"),
         ({"live": True, "requests": {"engine": {"name": "llama"}}}, "echo or replay"),
@@ -263,13 +260,6 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_what_makes_no_sense_is_refused(asked: dict[str, object], said: str) -> None:
     with pytest.raises(UsageError, match=said):
         ChunksConfig(**asked)
-
-
-def test_json_has_what_is_measured(tmp_path: Path) -> None:
-    act(tmp_path, modes="sync")
-    cell = show(read_run(folder_of(tmp_path))).json()["cells"][0]
-    json.dumps(cell)
-    assert {"agreement", "jitter_s_p99", "blocked_s_max", "late_ticks", "bytes_up_per_s"} <= set(cell)
 
 
 def test_without_websockets_packages_it_goes_over_http() -> None:

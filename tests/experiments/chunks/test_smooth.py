@@ -10,17 +10,14 @@ import numpy as np
 import pytest
 from scipy.special import gammainc
 
+from s2a_bench.act.plant import Plant, PlantMotion
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.cells import draw
 from s2a_bench.experiments.chunks.config import ChunksConfig
-from s2a_bench.experiments.chunks.metrics import METRICS
-from s2a_bench.experiments.chunks.rows import CHUNKS, SMOOTHNESS
+from s2a_bench.experiments.chunks.rows import CHUNKS, MEANS, METRICS
 from s2a_bench.experiments.chunks.run import run_chunks
-from s2a_bench.experiments.chunks.smooth import Follower, executed, follower, smoothness_rows
-from s2a_bench.experiments.chunks.target import RATE, Target, draw_target
+from s2a_bench.experiments.chunks.smooth import RATE, Follower, Target, draw_target, executed, follower, smoothness
 from s2a_bench.policy.chunks import Setting, Ticks, mode
 from s2a_bench.policy.chunks.aggregate import WEIGHTS, Aggregate
-from s2a_bench.robots.plant import Plant
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
 
@@ -123,7 +120,7 @@ class TestWhatIsExecuted:
         made = Aggregate(9, "conservative")
         cycles = made.cycles(latency_ns, SETTING)
         total = np.zeros(cycles.ticks)
-        for tick, _, _, share in made.blend(cycles):
+        for tick, _, _, share in made.blend(cycles, made.ticks(latency_ns, SETTING)):
             total[tick] += share
         np.testing.assert_allclose(total, made.ticks(latency_ns, SETTING).chunk >= 0)
 
@@ -161,7 +158,7 @@ class TestNumbers:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return ran(tmp_path_factory.mktemp("smooth"), cycles=400, stability=5)
+    return ran(tmp_path_factory.mktemp("smooth"), cycles=400)
 
 
 class TestRuns:
@@ -172,27 +169,24 @@ class TestRuns:
         assert (table["boundary_jump_p99"] > table["boundary_jump_mean"]).all()
         assert (table["boundary_jump_mean"] > table["action_step_mean"]).all()
 
-    def test_the_diagram_is_that_of_the_cells(self, run: Run) -> None:
-        table = run.table(SMOOTHNESS)
-        assert len(table) == 4 * 5
-        assert sorted(table["latency_s"].unique()) == pytest.approx([0, 0.08, 0.16, 0.24, 0.32])
+    def test_at_the_sources_own_mean_a_mode_does_what_its_cell_does(self, run: Run) -> None:
+        table = run.table(MEANS)
+        assert len(table) == 4 * 33
+        assert sorted(table["latency_s"].unique()) == pytest.approx(np.linspace(0, 0.32, 33))
         cells = run.table(CHUNKS).query("rule == 'given'").set_index("mode")
         same = table[table["latency_s"] == 0.08].set_index("mode")
-        ratio = same["tracking_rms"] / cells["tracking_rms"]
-        assert ratio.to_numpy() == pytest.approx(1, rel=0.1)  # the mean that was drawn is not quite 80 ms
+        for name in ("tracking_rms", "stall_share"):
+            both = same[name], cells[name]
+            np.testing.assert_allclose(*both, rtol=0.1, atol=0.01)  # the mean that was drawn is not quite 80 ms
 
     def test_without_a_robot_there_are_none(self, tmp_path: Path) -> None:
         run = ran(tmp_path, cycles=50, robot="")
         assert run.table(CHUNKS)[NAMES].isna().all().all()
-        assert not len(run.table(SMOOTHNESS))
-
-    def test_without_diagrams_there_is_none(self) -> None:
-        config = ChunksConfig(stability=0)
-        assert not list(smoothness_rows(config, draw(config, config.sources[0]), follower(config)))
+        assert run.table(MEANS)["tracking_rms"].isna().all()
 
     def test_no_target_waits_for_actions_that_are_slowed_down(self, tmp_path: Path) -> None:
         assert follower(ChunksConfig(slow_down=2)) is None
-        run = ran(tmp_path, latency="400", modes="queue", rules="calibrated", slowest=4.0, cycles=100, stability=0)
+        run = ran(tmp_path, latency="400", modes="queue", rules="calibrated", slowest=4.0, cycles=100)
         table = run.table(CHUNKS).set_index("rule")
         assert table.loc["given", NAMES].notna().all()
         assert table.loc["calibrated", NAMES].isna().all()
@@ -202,10 +196,30 @@ class TestRuns:
         [
             ("ros", "`robot`: ros: virtual time has no actions to send; name a plant, or nothing"),
             ("plant?frequency_hz=0", "`robot`: plant: frequency_hz = '0': input should be greater than 0"),
-            ("arm", "`robot`: 'arm' is none of plant, ros, call"),
+            ("timed", "`robot`: timed takes no actions; plant, ros, call do"),
         ],
     )
     def test_a_robot_that_cannot_be_is_refused(self, robot: str, message: str) -> None:
         with pytest.raises(UsageError) as error:
             ChunksConfig(robot=robot)
         assert message in str(error.value)
+
+
+class TestSmoothness:
+    def test_each_is_what_its_docstring_says(self) -> None:
+        actions = np.array([[0.0, 0], [1, 0], [1, 0], [4, 4], [4, 4], [4, 6]])
+        chunk = np.array([0, 0, -1, 1, 2, 2])
+        motion = PlantMotion(np.ones((6, 4, 2)), *np.zeros((3, 6, 4, 2)))
+        motion.jerk[0, 0] = 2  # of both joints
+        found = smoothness(motion, actions, chunk, np.tile([1.0, 3.0], (6, 1)))
+        assert found["tracking_rms"] == pytest.approx(math.sqrt(2))
+        assert found["jerk_rms"] == pytest.approx(math.sqrt(2 * 2**2 / 48))
+        assert found["boundary_jump_mean"] == 2.5
+        assert 4.9 < found["boundary_jump_p99"] < 5
+        assert found["action_step_mean"] == pytest.approx(1.5)
+
+    def test_one_chunk_has_no_boundary_and_nothing_is_tracked_without_a_reference(self) -> None:
+        found = smoothness(Plant().respond(np.ones((3, 1)), 0.1), np.ones((3, 1)), np.zeros(3, np.int64))
+        assert math.isnan(found["boundary_jump_mean"])
+        assert "tracking_rms" not in found
+        assert (found["jerk_rms"], found["action_step_mean"]) == (0, 0)

@@ -1,4 +1,4 @@
-"""What is varied besides: triggers, the stability diagram, and the closed form of reaction times."""
+"""What is varied besides: triggers, the mean latency, and the closed form of reaction times."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.experiments.chunks.cells import draw
-from s2a_bench.experiments.chunks.closed import Closed, closed
 from s2a_bench.experiments.chunks.config import ChunksConfig
+from s2a_bench.experiments.chunks.run import mean_age, mean_rows, trigger_rows
 from s2a_bench.experiments.chunks.to_rows import reactions_s
-from s2a_bench.experiments.chunks.varying import mean_age, stability_rows, trigger_rows
 from s2a_bench.policy.chunks import Setting, mode
-from s2a_bench.policy.chunks.closed import mean_reaction_s, replace_stall_ticks
+from s2a_bench.policy.chunks.closed import Closed, closed, mean_reaction_s
+from tests.policy.chunks.forms import replace_stall_ticks
 
 MS = 1_000_000
 
@@ -76,25 +76,21 @@ def test_a_greater_trigger_stalls_less_and_acts_on_older_observations() -> None:
 
 
 @pytest.mark.parametrize("under_way", ["one", "many"])
-def test_at_constant_latency_the_diagram_is_the_closed_form(under_way: str) -> None:
-    config = ChunksConfig(modes=f"replace?under_way={under_way}", latency="70", stability=17)
-    setting = config.setting
-    points = {
-        (row.execution_horizon, row.latency_s): row for row in stability_rows(config, draw(config, config.sources[0]))
-    }
-    assert len(points) == 16 * 17
-    for (execute, latency_s), row in points.items():
-        delay = np.array([round(latency_s / 0.02)])
+def test_at_constant_latency_replace_stalls_as_the_closed_form_says(under_way: str) -> None:
+    tried = {execute: f"replace?execute={execute}&under_way={under_way}" for execute in range(1, 17)}
+    config = ChunksConfig(modes=tuple(tried.values()), latency="70", cycles=500)
+    execute_of = dict(zip(config.made, tried, strict=True))
+    points = list(mean_rows(config, draw(config, config.sources[0]), None))
+    assert len(points) == 16 * 33
+    for row in points:
+        if round(row.latency_s * 100) % 2:
+            continue  # between two ticks
+        execute, delay = execute_of[row.mode], np.array([round(row.latency_s / 0.02)])
         cycle = max(execute, int(delay[0])) if under_way == "one" else execute
         if delay[0] >= 16 or row.stall_share is None or (under_way == "many" and delay[0] > execute):
             continue
-        stall = int(replace_stall_ticks(delay, max(cycle, 1), setting.horizon)[0])
+        stall = int(replace_stall_ticks(delay, max(cycle, 1), config.setting.horizon)[0])
         assert (row.stall_share > 0) == (stall > 0)
         assert row.stall_share == pytest.approx(stall / max(cycle, 1), abs=0.03)
         if under_way == "many":
             assert (row.stall_share > 0) == (execute > 16 - delay[0])
-
-
-def test_the_diagram_can_be_left_out() -> None:
-    config = ChunksConfig(stability=0)
-    assert not list(stability_rows(config, draw(config, config.sources[0])))

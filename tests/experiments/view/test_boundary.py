@@ -9,15 +9,12 @@ from hypothesis import strategies as st
 from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.figure import Figure
 
-from s2a_bench.experiments.boundary import EXPERIMENT
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.run import rows, run_boundary
-from s2a_bench.experiments.boundary.view.figure import build_boundary
-from s2a_bench.experiments.boundary.view.tables import board_table, boundary_csv, disagreements, line_table
+from s2a_bench.experiments.boundary.view import board_table, boundary_csv, build_boundary, disagreements, line_table
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
-from s2a_bench.writers.figures import save
 from s2a_bench.writers.style import paper_column
 
 
@@ -84,7 +81,9 @@ def test_with_jitter_the_line_is_a_slope(jittery: Run) -> None:
 
 
 def test_the_figure_draws_both_lines_every_trial_and_every_board(even: Run) -> None:
-    axes = drawn(even).axes[0]
+    figure = drawn(even)
+    assert "the paper's rates (not measured here)" in figure.get_suptitle().replace("\n", " ")
+    axes = figure.axes[0]
     lines = {line.get_label(): line for line in axes.lines}
     nominal = next(line for label, line in lines.items() if "T_\\mathrm{nom}" in label)
     least = next(line for label, line in lines.items() if "T_\\mathrm{min}" in label)
@@ -105,17 +104,6 @@ def test_with_jitter_the_share_is_shaded_and_has_a_scale(jittery: Run) -> None:
     assert mesh.get_clim() == (0, 1)
     assert len(figure.axes) == 2
     assert "200 plans a point" in figure.get_suptitle()
-
-
-def test_the_title_says_whose_rates_are_marked(even: Run) -> None:
-    assert "the paper's rates (not measured here)" in drawn(even).get_suptitle().replace("\n", " ")
-
-
-def test_the_figure_is_written_as_png_and_pdf(even: Run) -> None:
-    assert [path.name for path in save(even.path / "figures", EXPERIMENT.show(even).figures)] == [
-        "boundary.png",
-        "boundary.pdf",
-    ]
 
 
 def test_tables_give_the_formula_and_the_first_rate_that_passed(even: Run) -> None:

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
 from s2a_bench.experiments.chunks import EXPERIMENT
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
-from s2a_bench.experiments.chunks.view.figures import build_reactions, build_stability, build_triggers
-from s2a_bench.experiments.chunks.view.lanes import build_lanes, lanes_of, short
-from s2a_bench.experiments.chunks.view.smoothness import build_smoothness
+from s2a_bench.experiments.chunks.view import chunk_sentences
+from s2a_bench.experiments.chunks.view.figures import (
+    build_lanes,
+    build_reactions,
+    build_smoothness,
+    build_stability,
+    build_triggers,
+    lanes_of,
+    short,
+)
 from s2a_bench.experiments.chunks.view.tables import (
     action_table,
-    chunk_sentences,
     delay_table,
     smoothness_table,
     stall_table,
 )
 from s2a_bench.store.run import Run, read_run
 from s2a_bench.testing import NullProgress
-from s2a_bench.writers.figures import save
 from s2a_bench.writers.style import paper_column
 
 
@@ -84,13 +90,14 @@ def test_lanes_show_the_modes_and_the_calibrated_trigger(run: Run) -> None:
     assert any(text.get_text() == "\N{MINUS SIGN}8" for text in axes.texts)
 
 
-def test_the_diagram_has_the_line_and_a_shade_a_point(run: Run) -> None:
-    axes = drawn(run, build_stability).axes[0]
-    (mesh,) = [found for found in axes.collections if isinstance(found, QuadMesh)]
-    assert mesh.get_array().size == 16 * 33
-    line = next(line for line in axes.lines if line.get_label() == "$s = H - d$")
-    ms, execute = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
-    assert execute == pytest.approx(16 - ms / 20)
+def test_stalls_are_a_line_a_mode_over_mean_latency(run: Run) -> None:
+    (axes,) = drawn(run, build_stability).axes
+    assert [line.get_label() for line in axes.lines] == ["sync", "queue?trigger=6", "replace", "aggregate?trigger=6"]
+    share = {line.get_label(): np.asarray(line.get_ydata()) for line in axes.lines}
+    ms = np.asarray(axes.lines[0].get_xdata())
+    assert (ms[0], ms[-1], ms.size) == (0, 320, 33)
+    assert share["sync"][12] == pytest.approx(6 / 22, rel=0.01)  # of d + H ticks at 120 ms, d
+    assert (share["queue?trigger=6"] > 0).tolist() == (ms >= 140).tolist()  # d above the trigger
 
 
 def test_triggers_are_a_line_a_source_with_a_mark_a_rule(run: Run) -> None:
@@ -131,24 +138,14 @@ def test_smoothness_is_a_line_a_mode_and_the_ideal_dashed(run: Run) -> None:
     assert (ideal < np.min(tracking, axis=0)).all()
 
 
-def test_every_figure_is_written_and_says_where_its_numbers_come_from(run: Run) -> None:
-    written = save(run.path / "figures", EXPERIMENT.show(run).figures)
-    assert [path.name for path in written if path.suffix == ".png"] == [
-        "lanes.png",
-        "stability.png",
-        "triggers.png",
-        "reactions.png",
-        "smoothness.png",
-    ]
-
-
 def test_a_long_name_is_cut_and_a_short_one_is_not() -> None:
     assert short("bimodal:mean_ms=80", 30) == "bimodal:mean_ms=80"
     assert short("bimodal:mean_ms=80", 10) == "bimodal..."
 
 
-def test_what_a_run_has_no_rows_for_is_not_drawn(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_what_a_run_has_no_rows_for_is_not_drawn(run: Run, tmp_path: Path) -> None:
+    assert list(EXPERIMENT.show(run).figures) == ["lanes", "stability", "triggers", "reactions", "smoothness"]
     config = ChunksConfig(modes="sync", cycles=20, shown_ticks=0, robot="")
-    run = read_run(run_chunks(config, tmp_path_factory.mktemp("one"), NullProgress()))
-    assert list(EXPERIMENT.show(run).figures) == ["reactions"]
+    run = read_run(run_chunks(config, tmp_path, NullProgress()))
+    assert list(EXPERIMENT.show(run).figures) == ["stability", "reactions"]
     assert "smoothness" not in EXPERIMENT.show(run).tables

@@ -7,24 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from s2a_bench.experiments.latency.view.frame_path import frame_table
-from s2a_bench.experiments.latency.view.tables import latency_tables
-from s2a_bench.store.requests import FrameRow, SampleRow
+from s2a_bench.experiments.latency.view import latency_tables
+from s2a_bench.store.requests import FrameRow
 from s2a_bench.store.run import Run, RunWriter, read_run
 from s2a_bench.trace import Mark
+from tests.made_runs import STAGES, row_of
 
 MS = 1_000_000
 PROMPT: list[Mark] = [("", 0), ("cdr_pack", MS), ("network", 2 * MS), ("inference", 4 * MS), ("return", 5 * MS)]
-SAMPLE = SampleRow(
-    "ros/topic", "ros", "topic", "bgr", "", "echo", "stream", "64x48", 0, 0, False, "r0", 3, marks=PROMPT,
-    frame_age_ns=12 * MS,
-)  # fmt: skip
+SAMPLE = row_of("ros/topic", {}, 0, mode="stream", request_id="r0", marks=PROMPT, frame_age_ns=12 * MS)
 FRAME: list[Mark] = [("", 10 * MS), ("capture", 11 * MS), ("convert", 13 * MS), ("", 14 * MS), ("network", 17 * MS)]
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
-    with RunWriter.create(tmp_path, "latency", {}) as writer:
+    with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as writer:
         writer.sample(SAMPLE)
         writer.sample(replace(SAMPLE, request_id="r1", warmup=True))
         writer.frame(FrameRow("ros/topic", 3, 9 * MS, FRAME, "r0"))
@@ -34,9 +31,7 @@ def run(tmp_path: Path) -> Run:
 
 
 def test_only_frames_of_counted_samples_count(run: Run) -> None:
-    table = frame_table(run)
-    assert table is not None
-    assert table.rows == [
+    assert latency_tables(run)["frames"].rows == [
         ("capture", "capture", "1.00"),
         ("encode", "convert", "2.00"),
         ("network", "network", "3.00"),
@@ -47,11 +42,7 @@ def test_only_frames_of_counted_samples_count(run: Run) -> None:
     ]
 
 
-def test_the_table_is_one_of_the_runs(run: Run) -> None:
-    assert list(latency_tables(run))[-1] == "frames"
-
-
 def test_a_run_without_a_stream_has_no_such_table(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {}) as writer:
+    with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as writer:
         writer.sample(SAMPLE)
-    assert frame_table(read_run(writer.path)) is None
+    assert "frames" not in latency_tables(read_run(writer.path))

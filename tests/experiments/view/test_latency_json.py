@@ -2,20 +2,20 @@ import copy
 import json
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
 
-from s2a_bench.experiments.latency.view.as_json import latency_json
+from s2a_bench.experiments.latency import EXPERIMENT
+from s2a_bench.experiments.latency.metrics import latency_json
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run
 from s2a_bench.trace import GROUPS, path_of
 from s2a_bench.transport import TRANSPORTS
+from tests.made_runs import SCHEMA
 
 MakeRun = Callable[..., Run]
-SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schema/s2a-bench-1.json").read_text())
 WARNING = {"code": "cpu-governor", "message": "the governor is powersave", "advice": "set it to performance"}
 
 
@@ -44,6 +44,10 @@ def test_real_output_is_strict_json_and_valid(make_run: MakeRun, plausible: Any,
     assert len(whole["cells"]) == 6
     # 3 HTTP over ROS, 4 over loopback; and for e2e the black box over both besides
     assert len(whole["ratios"]) == 7 + 9
+    (cell,) = (cell for cell in whole["cells"] if cell["cell"] == "http/black-box")
+    assert cell["stages_ms"]["server"]["n"] == cell["e2e_ms"]["n"] == 5
+    assert not {"e2e_without_inference_ms", "residual_share"} & set(cell)
+    assert "inference" not in cell["stages_ms"]
 
 
 def test_one_cell_by_hand(make_run: MakeRun) -> None:
@@ -89,6 +93,7 @@ def test_one_cell_by_hand(make_run: MakeRun) -> None:
         "ttft_ms": exactly(107),
         "frame_age_ms": exactly(7),
         "itl_ms": exactly(2),
+        "residual_ms": exactly(0.25),
         "residual_share": exactly(0.03125),
     }
 
@@ -102,17 +107,6 @@ def test_a_ratio_carries_its_interval(make_run: MakeRun) -> None:
     assert low < 7.33 / 1.37 < high
 
 
-def test_a_black_box_has_neither_e2e_without_inference_nor_a_residual_share(make_run: MakeRun, black_box: Any) -> None:
-    whole = latency_json(make_run({"http/black-box": black_box}, n=3, spread=0))
-    validate(whole)
-    (cell,) = whole["cells"]
-    assert cell["e2e_ms"]["median"] == 302.5
-    assert "e2e_without_inference_ms" not in cell
-    assert "residual_share" not in cell
-    assert cell["stages_ms"]["server"]["median"] == 300.0
-    assert "inference" not in cell["stages_ms"]
-
-
 def test_a_cell_in_which_everything_failed_is_still_a_cell(
     make_run: MakeRun, make_row: Callable[..., SampleRow]
 ) -> None:
@@ -124,10 +118,12 @@ def test_a_cell_in_which_everything_failed_is_still_a_cell(
     assert "e2e_ms" not in cell
 
 
-def test_a_run_without_samples_is_valid(make_run: MakeRun) -> None:
-    whole = latency_json(make_run({}))
+def test_a_run_without_samples_is_valid_and_has_no_figures(make_run: MakeRun) -> None:
+    run = make_run({})
+    whole = latency_json(run)
     validate(whole)
     assert whole["cells"] == whole["ratios"] == []
+    assert EXPERIMENT.show(run).figures == {}
 
 
 @pytest.mark.parametrize("path", [("cells", 0, "e2e_ms"), ("ratios", 0, "value"), ("cells", 0, "n"), ("state",)])

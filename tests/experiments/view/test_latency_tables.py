@@ -10,17 +10,17 @@ import pytest
 from rich.console import Console
 
 from s2a_bench.errors import StoreError
-from s2a_bench.experiments.files import write_shown
+from s2a_bench.experiments import write_shown
 from s2a_bench.experiments.latency import EXPERIMENT
-from s2a_bench.experiments.latency.view import show
-from s2a_bench.experiments.latency.view.as_csv import csv_texts
-from s2a_bench.experiments.latency.view.tables import group_table, stage_table, summary_table
+from s2a_bench.experiments.latency.metrics import latency_csv
+from s2a_bench.experiments.latency.view import group_table, show, stage_table, summary_table
 from s2a_bench.stats import Ratio, Summary
-from s2a_bench.store.requests import EARLIER_STAGES, SampleRow
+from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run
 from s2a_bench.trace import path_of
-from s2a_bench.writers.tables import interval, mean_sd, number, to_latex, to_markdown
-from s2a_bench.writers.terminal import lay_out
+from s2a_bench.writers.latex import to_latex
+from s2a_bench.writers.tables import interval, lay_out, mean_sd, number, to_markdown
+from tests.made_runs import STAGES
 
 MakeRun = Callable[..., Run]
 NONE = "\N{EN DASH}"
@@ -46,7 +46,7 @@ def test_without_model_reads_as_a_sum_where_it_is_told(make_run: MakeRun) -> Non
     ours = {"capture": 1, "network": 3, "preprocess": 20, "inference": 80, "return": 0.5}
     theirs = {"capture": 1, "json_pack": 2, "ingest": 30, "inference": 81}
     cells = {"http/llama-server": theirs, "ros/topic": ours}
-    run = make_run(cells, n=4, spread=0, manifest={"stages": path_of([EARLIER_STAGES])}, server_prompt_ms=80.0)
+    run = make_run(cells, n=4, spread=0, manifest={"stages": path_of([STAGES])}, server_prompt_ms=80.0)
     assert stage_table(run, full=False).rows[-5:] == [
         ("", "e2e without inference", "33.0", "4.50"),
         ("", "preprocess", NONE, "20.0"),
@@ -176,7 +176,7 @@ def test_markdown_and_latex_are_tables(make_run: MakeRun) -> None:
 
 def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -> None:
     run = make_run(HAND, n=4, spread=0)
-    texts = {name: table.text(run.origins) for name, table in csv_texts(run).items()}
+    texts = {name: table.text(run.origins) for name, table in latency_csv(run).items()}
     stages = list(csv.DictReader(io.StringIO(texts["stages.csv"])))
     ros = {row["stage"]: row for row in stages if row["cell"] == "ros/topic"}
     assert list(ros) == ["capture", "cdr_pack", "network", "inference", "return", "residual"]
@@ -199,12 +199,14 @@ def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -
         "e2e_ms",
         "ttft_ms",
         "itl_ms",
+        "residual_ms",
         "residual_share",
     }
     ratio = next(csv.DictReader(io.StringIO(texts["ratios.csv"])))
     assert ratio["emulated"] == "False"
-    for table in csv_texts(make_run(HAND, n=4, engine="replay")).values():
-        text = table.text(run.origins)
+    replayed = make_run(HAND, n=4, engine="replay", manifest={"model": {"engine": "replay", "emulated": True}})
+    for table in latency_csv(replayed).values():
+        text = table.text(replayed.origins)
         assert {row["emulated"] for row in csv.DictReader(io.StringIO(text))} == {"True"}
     assert (ratio["of"], ratio["to"], float(ratio["value"])) == ("http/as-deployed", "ros/topic", 26 / 4.5124)
 
@@ -213,7 +215,7 @@ def test_a_cell_in_which_everything_failed_is_in_the_summary(
     make_run: MakeRun, make_row: Callable[..., SampleRow]
 ) -> None:
     run = make_run({}, extra=(make_row("ros/topic", {"capture": 1}, 1, error="lost"),))
-    assert csv_texts(run)["summary.csv"].rows == [("ros/topic", "", 1, 0, 0, *[None] * 5, False)]
+    assert latency_csv(run)["summary.csv"].rows == [("ros/topic", "", 1, 0, 0, *[None] * 5, False)]
     assert summary_table(run).rows == [("ros/topic", "0", "1", NONE, NONE, NONE, NONE)]
 
 
@@ -235,10 +237,11 @@ def test_the_files_are_written_below_the_run(make_run: MakeRun) -> None:
     assert all(path.parent == run.path / "tables" and path.stat().st_size > 50 for path in paths)
 
 
-def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun) -> None:
+@pytest.mark.parametrize("folder", ["tables", "figures"])
+def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun, folder: str) -> None:
     run = make_run(n=1)
-    (run.path / "tables").write_text("")
-    with pytest.raises(StoreError, match=r"cannot write .*tables"):
+    (run.path / folder).write_text("")
+    with pytest.raises(StoreError, match=f"cannot write .*{folder}"):
         write_shown(run, EXPERIMENT.show(run))
 
 
@@ -261,7 +264,7 @@ def test_an_empty_run_prints_a_line(make_run: MakeRun) -> None:
 
 def test_importing_the_tables_imports_no_heavy_library() -> None:
     code = (
-        "import sys; from s2a_bench.experiments.latency.view import as_json, figures;"
+        "import sys; from s2a_bench.experiments.latency.view import figures;"
         "print([n for n in ('pandas', 'pyarrow', 'matplotlib', 'scipy', 'numpy', 'rich') if n in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,28 +15,38 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from matplotlib.patches import Rectangle
+from rich.console import Console
 
-from s2a_bench.experiments.files import write_shown
 from s2a_bench.experiments.paper import paper_throughput
-from s2a_bench.experiments.throughput import EXPERIMENT
-from s2a_bench.experiments.throughput.rows import REFERENCE, ReferenceRow
-from s2a_bench.experiments.throughput.view.as_json import throughput_json
-from s2a_bench.experiments.throughput.view.cells import BIN, Speed, ratios_of, speeds_of
-from s2a_bench.experiments.throughput.view.figures import (
+from s2a_bench.experiments.requests import Cell
+from s2a_bench.experiments.throughput.metrics import (
+    BIN,
+    REFERENCE,
+    ReferenceRow,
+    joined,
+    rates_by_position,
+    ratios_of,
+    throughput_cells,
+    throughput_csv,
+    throughput_json,
+)
+from s2a_bench.experiments.throughput.view import (
     PAPER_LABEL,
     build_gap_distribution,
     build_rate_by_position,
     build_throughput_bars,
+    position_table,
+    speed_table,
     throughput_figures,
+    throughput_sentences,
+    throughput_tables,
 )
-from s2a_bench.experiments.throughput.view.sentences import throughput_sentences
-from s2a_bench.experiments.throughput.view.tables import position_table, speed_table, throughput_csv, throughput_tables
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
 from s2a_bench.writers.style import paper_column
-from s2a_bench.writers.terminal import lay_out
+from s2a_bench.writers.tables import lay_out
+from tests.made_runs import SCHEMA, known
 
-SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schema/s2a-bench-1.json").read_text())
 MakeRow = Callable[..., SampleRow]
 Make = Callable[..., Run]
 
@@ -57,14 +68,14 @@ def make(tmp_path: Path, make_row: MakeRow) -> Make:
         reference: Sequence[float] = (),
         **manifest: Any,
     ) -> Run:
-        with RunWriter.create(tmp_path, "throughput", manifest) as run:
+        with RunWriter.create(tmp_path, "throughput", known(manifest)) as run:
             for block in range(-1, n):
                 for name, ms in gaps.items():
                     engine = "llama-server" if name == "http/llama-server" else "llama"
                     row = make_row(name, PATHS.get(name, PATHS["http/as-deployed"]), block, engine=engine)
                     pipeline = "loopback" if name == "in-process" else name.partition("/")[0]
                     told = dict((facts or {}).get(name, {}))
-                    row = _with(row, pipeline=pipeline, warmup=block < 0, n_tokens=len(ms) + 1, facts=told)
+                    row = replace(row, pipeline=pipeline, warmup=block < 0, n_tokens=len(ms) + 1, facts=told)
                     run.sample(row)
                     times = [row.marks[-1][1]]
                     for gap in ms:
@@ -78,36 +89,30 @@ def make(tmp_path: Path, make_row: MakeRow) -> Make:
     return made
 
 
-def _with(row: SampleRow, **fields: Any) -> SampleRow:
-    from dataclasses import replace
-
-    return replace(row, **fields)
-
-
 @pytest.fixture(autouse=True)
 def style() -> Iterator[None]:
     with paper_column():
         yield
 
 
-def only(run: Run) -> Speed:
-    (speed,) = speeds_of(run)
-    return speed
+def only(run: Run) -> Cell:
+    (cell,) = throughput_cells(run)
+    return cell
 
 
 def test_both_rates_by_hand(make: Make) -> None:
     # 5 tokens, 4 gaps of 20 ms: 50/s at the client; the engine says 5 tokens in 125 ms: 40/s
     facts = {"predicted_n": 5.0, "predicted_ms": 125.0, "prompt_ms": 200.0, "prompt_eval_ms": 50.0, "prompt_n": 30.0}
-    speed = only(make({"in-process": [20] * 4}, facts={"in-process": {**facts, "energy_j": 2.5}}))
-    assert list(speed.values("decode_tokens_per_s")) == [50.0] * 3
-    assert list(speed.values("tokens_per_s")) == [40.0] * 3
-    assert list(speed.values("image_ms")) == [150.0] * 3
-    assert list(speed.values("prefill_tokens_per_s")) == [150.0] * 3
-    assert list(speed.values("prompt_tokens")) == [30.0] * 3
-    assert list(speed.values("tokens_per_joule")) == [2.0] * 3
-    assert list(speed.values("ttft_ms")) == [100.0] * 3  # without the capture
-    assert speed.told
-    assert list(speed.cell.itl_ms()) == [20.0] * 12
+    cell = only(make({"in-process": [20] * 4}, facts={"in-process": {**facts, "energy_j": 2.5}}))
+    assert list(cell.values("decode_tokens_per_s")) == [50.0] * 3
+    assert list(cell.values("tokens_per_s")) == [40.0] * 3
+    assert list(cell.values("image_ms")) == [150.0] * 3
+    assert list(cell.values("prefill_tokens_per_s")) == [150.0] * 3
+    assert list(cell.values("prompt_tokens")) == [30.0] * 3
+    assert list(cell.values("tokens_per_joule")) == [2.0] * 3
+    assert list(cell.values("ttft_ms")) == [100.0] * 3  # without the capture
+    assert cell.told
+    assert list(cell.values("itl")) == [20.0] * 12
 
 
 def test_the_parts_of_the_prompt_stand_side_by_side(make: Make) -> None:
@@ -139,10 +144,10 @@ def test_another_engine_is_compared_by_the_engines_own_figures_too(make: Make) -
 
 def test_a_server_that_tells_nothing_has_the_clients_rate_and_no_zeros(make: Make) -> None:
     run = make({"http/as-deployed": [10] * 4})
-    speed = only(run)
-    assert list(speed.values("tokens_per_s")) == list(speed.values("decode_tokens_per_s")) == [100.0] * 3
+    cell = only(run)
+    assert list(cell.values("tokens_per_s")) == list(cell.values("decode_tokens_per_s")) == [100.0] * 3
     for absent in ("prompt_ms", "image_ms", "prompt_eval_ms", "prefill_tokens_per_s", "tokens_per_joule"):
-        assert speed.values(absent).size == 0
+        assert cell.values(absent).size == 0
     assert "the server does not tell T_eval" in " ".join(speed_table(run).notes)
     (cell,) = throughput_json(run)["cells"]
     assert cell["t_eval"] == "client"
@@ -151,16 +156,16 @@ def test_a_server_that_tells_nothing_has_the_clients_rate_and_no_zeros(make: Mak
 
 def test_tokens_that_come_together_are_counted_by_the_server(make: Make) -> None:
     run = make({"http/as-deployed": [30] * 2}, facts={"http/as-deployed": {"predicted_n": 7.0}})
-    speed = only(run)
-    assert list(speed.values("decode_tokens_per_s")) == [pytest.approx(100.0)] * 3  # 6 of 7 tokens in 60 ms
-    assert speed.joined == 12
+    cell = only(run)
+    assert list(cell.values("decode_tokens_per_s")) == [pytest.approx(100.0)] * 3  # 6 of 7 tokens in 60 ms
+    assert joined(cell) == 12
     assert "12 tokens came together with another one" in " ".join(speed_table(run).notes)
 
 
 def test_warm_ups_are_in_no_number(make: Make) -> None:
     run = make({"in-process": [10] * 3}, n=2, reference=[1.0, 80.0, 90.0])
-    assert only(run).cell.n == 2
-    assert only(run).cell.itl_ms().size == 6
+    assert only(run).n == 2
+    assert only(run).values("itl").size == 6
     reference = throughput_json(run)["reference"]
     assert reference["decode_tokens_per_s"]["n"] == 2
     assert reference["decode_tokens_per_s"]["mean"] == pytest.approx(85.0)
@@ -169,7 +174,7 @@ def test_warm_ups_are_in_no_number(make: Make) -> None:
 
 def test_a_slower_part_of_the_answer_shows_at_its_position(make: Make) -> None:
     gaps = [10.0] * (BIN - 1) + [20.0] * BIN + [40.0] * 3  # tokens 1..31, 32..63, 64..66
-    found = only(make({"in-process": gaps})).by_position()
+    found = rates_by_position(only(make({"in-process": gaps})))
     assert {place: list(rates) for place, rates in found.items()} == {
         (0, 31): [pytest.approx(100.0)] * 3,
         (32, 63): [pytest.approx(50.0)] * 3,
@@ -180,29 +185,29 @@ def test_a_slower_part_of_the_answer_shows_at_its_position(make: Make) -> None:
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.integers(1, 50), min_size=1, max_size=3 * BIN))
 def test_the_bins_hold_every_gap_once(make: Make, gaps: list[int]) -> None:
-    speed = only(make({"in-process": gaps}, n=1))
-    found = speed.by_position()
+    cell = only(make({"in-process": gaps}, n=1))
+    found = rates_by_position(cell)
     counts = [min(last, len(gaps)) - max(first, 1) + 1 for first, last in found]
     spent_s = sum(count / rates[0] for count, rates in zip(counts, found.values(), strict=True))
     assert sum(counts) == len(gaps)
     assert spent_s == pytest.approx(sum(gaps) / 1e3)
-    assert list(speed.values("decode_tokens_per_s")) == [pytest.approx(len(gaps) / (sum(gaps) / 1e3))]
+    assert list(cell.values("decode_tokens_per_s")) == [pytest.approx(len(gaps) / (sum(gaps) / 1e3))]
 
 
 def test_cells_are_compared_with_in_process_and_with_llama_bench(make: Make) -> None:
     run = make({"http/as-deployed": [20] * 4, "in-process": [10] * 4}, reference=[1.0, 50.0, 80.0, 100.0])
-    found = {(of, to): ratio.value for of, to, ratio in ratios_of(run, speeds_of(run))}
+    found = {(of, to): ratio.value for _, of, to, ratio in ratios_of(run, throughput_cells(run))}
     assert found == {
         ("in-process", "llama-bench"): pytest.approx(100 / 80),
         ("http/as-deployed", "llama-bench"): pytest.approx(50 / 80),
         ("http/as-deployed", "in-process"): pytest.approx(0.5),
     }
-    assert [speed.name for speed in speeds_of(run)] == ["in-process", "http/as-deployed"]
+    assert [cell.name for cell in throughput_cells(run)] == ["in-process", "http/as-deployed"]
 
 
 def test_a_reference_that_broke_off_is_compared_all_the_same(make: Make) -> None:
     run = make({"in-process": [10] * 4}, n=3, reference=[1.0, 50.0])
-    ((_, _, ratio),) = ratios_of(run, speeds_of(run))
+    ((*_, ratio),) = ratios_of(run, throughput_cells(run))
     assert ratio.value == pytest.approx(2.0)
 
 
@@ -222,9 +227,7 @@ def test_the_json_is_strict_and_valid(make: Make) -> None:
         jsonschema.validate(whole, SCHEMA, cls=jsonschema.Draft202012Validator)
 
 
-def test_the_tables_fit_a_terminal_and_are_written(make: Make) -> None:
-    from rich.console import Console
-
+def test_the_tables_fit_a_terminal(make: Make) -> None:
     gaps = {name: [10.0] * 69 for name in ("in-process", "http/as-deployed", "http/best-effort", "ros/topic")}
     run = make(gaps, reference=[900.0, 1000.0, 1000.0, 1000.0], model={"dummy": True})
     console = Console(width=100, record=True, file=io.StringIO())
@@ -238,9 +241,6 @@ def test_the_tables_fit_a_terminal_and_are_written(make: Make) -> None:
     notes = " ".join(tables["throughput"].notes)
     assert "Dummy weights." in notes
     assert "llama-bench decodes behind 42 tokens" in notes
-    write_shown(run, EXPERIMENT.show(run))
-    names = {path.name for path in (run.path / "tables").iterdir()}
-    assert {"throughput.md", "throughput.tex", "throughput.csv", "gaps.md", "positions.csv", "ratios.csv"} <= names
 
 
 def test_the_csv_keeps_every_digit(make: Make) -> None:
@@ -273,29 +273,12 @@ def test_bars_start_at_zero_and_the_papers_are_labelled(make: Make) -> None:
     assert not [patch for patch in beside.axes[0].patches if isinstance(patch, Rectangle)]  # no bar without a zero
 
 
-def test_the_paper_says_what_table_ii_says() -> None:
-    assert [(claim.name, claim.tokens_per_s) for claim in paper_throughput()] == [
-        ("RTX 4080", 34.2),
-        ("Jetson AGX Orin", 4.8),
-        ("Jetson Orin Nano", 0.58),
-    ]
-
-
 def test_one_late_burst_does_not_hide_the_rates(make: Make) -> None:
     run = make({"in-process": [10.0] * 40 + [0.001] * 23}, n=1)
     figure = build_rate_by_position(run)
+    assert build_gap_distribution(make({"in-process": [10.0] * 40})).axes[0].get_xscale() == "linear"
+    assert throughput_figures(make({"in-process": []})) == {}
     (line,) = figure.axes[0].get_lines()
     medians: Any = line.get_ydata()
     assert medians[0] == pytest.approx(100.0)
     assert figure.axes[0].get_ylim()[1] == pytest.approx(1.5 * max(medians))
-
-
-def test_the_figures_are_written_and_none_without_rates(make: Make) -> None:
-    run = make({"in-process": [10.0] * 40, "http/as-deployed": [1.0] * 40})
-    write_shown(run, EXPERIMENT.show(run, against="paper"))
-    names = sorted(path.name for path in (run.path / "figures").iterdir())
-    assert names == [
-        f"{name}.{suffix}" for name in ("gaps", "positions", "throughput_bars") for suffix in ("pdf", "png")
-    ]
-    assert build_gap_distribution(run).axes[0].get_xscale() == "linear"
-    assert throughput_figures(make({"in-process": []})) == {}

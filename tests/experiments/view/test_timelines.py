@@ -13,11 +13,9 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from s2a_bench.experiments.timeline import EXPERIMENT
-from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.experiments.timeline.to_rows import Setting, skill_rows, timeline_rows, token_rows
-from s2a_bench.experiments.timeline.view.as_json import timelines_json
-from s2a_bench.experiments.timeline.view.cells import timelines_of
+from s2a_bench.experiments.timeline.rows import TIMELINES
+from s2a_bench.experiments.timeline.to_rows import timeline_rows
+from s2a_bench.experiments.timeline.view.cells import timelines_json, timelines_of
 from s2a_bench.experiments.timeline.view.chrome_trace import TRACE, to_trace, write_trace
 from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours
 from s2a_bench.experiments.timeline.view.tables import (
@@ -26,14 +24,15 @@ from s2a_bench.experiments.timeline.view.tables import (
     skill_table,
     timeline_csv,
 )
+from s2a_bench.harness.timelines.config import Setting
+from s2a_bench.harness.timelines.rows import skill_rows, token_rows
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
-from s2a_bench.store.requests import TOKENS, TokenRow
+from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
-from s2a_bench.writers.figures import save
 from s2a_bench.writers.style import paper_column
-from s2a_bench.writers.tables import TextTable, to_markdown
+from s2a_bench.writers.tables import TextTable
 
 MakeRun: TypeAlias = Callable[..., Run]
 BOARD = {"name": "orin", "title": "Orin", "origin": "paper", "prompt_s": 0.5, "prompt_origin": "assumed"}
@@ -165,12 +164,6 @@ def test_requests_of_their_own_have_their_tokens_in_their_lanes(live: Run) -> No
     )
 
 
-def test_figures_are_written_as_png_and_pdf(computed: Run) -> None:
-    written = save(computed.path / "figures", EXPERIMENT.show(computed).figures)
-    assert [path.name for path in written] == ["timeline.png", "timeline.pdf"]
-    assert all(path.stat().st_size > 5000 for path in (computed.path / "figures").iterdir())
-
-
 def check_trace(trace: dict[str, Any]) -> None:
     """Check what ui.perfetto.dev and chrome://tracing are particular about."""
     events = trace["traceEvents"]
@@ -252,13 +245,6 @@ def test_the_skill_table_names_calls_and_stalls(live: Run) -> None:
     assert column(table, "skill")[:2] == ["pick(cup0)", "pick(cup1)"]
     assert column(table, "stall before") == ["0.00"] + ["0.25"] * 7
     assert column(table, "stretch")[-1] == "1.50"
-
-
-def test_every_table_is_whole_markdown(computed: Run) -> None:
-    for table in EXPERIMENT.show(computed).tables.values():
-        lines = [line for line in to_markdown(table).splitlines() if line.startswith("|")]
-        assert len({line.count("|") for line in lines}) == 1
-        assert len(lines) == len(table.rows) + 2
 
 
 def test_csv_keeps_every_digit_and_leaves_out_what_is_absent(computed: Run) -> None:

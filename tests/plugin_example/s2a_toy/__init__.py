@@ -1,1 +1,1 @@
-"""The example of a plug-in for s2a-bench: a transport, a dialect, a frame source, a policy and an experiment."""
+"""The example of a plug-in for s2a-bench: one of each kind, a transport, a dialect, an engine and so on."""

@@ -1,13 +1,17 @@
-"""How a run of `toy-clock` is shown: one metric, and everything that follows from it."""
+"""How a run of `toy-clock` is shown: its one metric, as a table, as JSON and in comparisons."""
 
 from __future__ import annotations
 
-from s2a_bench.experiments import Compared, Metric, Subject
-from s2a_bench.experiments.plain import plain_view
+from typing import Any
+
+from s2a_bench.experiments import Compared, Metric, Shown, Subject
+from s2a_bench.stats import summary_of
 from s2a_bench.store.run import Run
+from s2a_bench.writers.as_json import frame, summaries
+from s2a_bench.writers.tables import ABSENT, TextTable, number
 from s2a_toy.clock_run import READINGS
 
-METRICS = {"cost": Metric("cost", "ns", title="cost of a reading")}
+COST = Metric("cost", "ns", title="cost of a reading")
 
 
 def subjects(run: Run) -> list[Subject]:
@@ -17,5 +21,18 @@ def subjects(run: Run) -> list[Subject]:
     return [Subject("monotonic", {}, len(rows), 0, lambda _name: list(values))]
 
 
-COMPARED = Compared(METRICS, subjects, lambda _run: (), ("cost",))
-show = plain_view(COMPARED)
+COMPARED = Compared({"cost": COST}, subjects, lambda _run: (), ("cost",))
+
+
+def show(run: Run, **_: Any) -> Shown:
+    """Return a table of one row, and the same as JSON."""
+    costs = run.table(READINGS)["cost_ns"].to_numpy(dtype="float64")
+    found = summary_of(costs)
+    header = ("cell", "n", f"{COST.title} ({COST.unit}), median")
+    row = ("monotonic", str(len(costs)), number(found.median) if found else ABSENT)
+    cell = {"cell": "monotonic", "n": len(costs), **summaries([("cost", costs)])}
+    return Shown(
+        tables={"readings": TextTable("toy-clock", header, [row], 1)},
+        main=["readings"],
+        json=lambda: frame(run, [cell], []),
+    )

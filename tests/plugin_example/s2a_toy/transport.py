@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterable, Mapping
+from typing import ClassVar
 
 from s2a_bench.facts import PAYLOAD_BYTES, Fact
 from s2a_bench.options import option
-from s2a_bench.transport import Client, Handler, Server, Transport, Wiring
-from s2a_bench.transport.options import SERVER, Options
+from s2a_bench.transport import SERVER, Client, Handler, Options, Server, Transport, Wiring
 
 
 TOY_MESSAGES = Fact("toy_messages", "messages", "messages of the answer")
@@ -19,6 +18,10 @@ class ToyOptions(Options):
 
     toy_port: int = option(0, "port of the toy server; 0: any free one", ge=0, le=65535, side=SERVER)
 
+    def addresses(self) -> Iterable[str]:
+        """Return the address of a new server: the port that was asked for, and any free one."""
+        return f"127.0.0.1:{self.toy_port}", "127.0.0.1:0"
+
 
 class Toy(Transport[ToyOptions]):
     """Length-prefixed messages over TCP: a JSON header, then the picture's pixels."""
@@ -26,9 +29,9 @@ class Toy(Transport[ToyOptions]):
     name = "toy"
     options = ToyOptions
     payloads = ("raw",)
-    tells = (PAYLOAD_BYTES, TOY_MESSAGES)
+    facts = (PAYLOAD_BYTES, TOY_MESSAGES)
     stages: ClassVar[Mapping[str, str]] = {"toy_frame": "pack", "toy_unframe": "parse"}
-    looks: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#8C564B", "-")}
+    style: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#8C564B", "-")}
 
     def client(self, wiring: Wiring[ToyOptions], alive: Callable[[], bool]) -> Client:
         """Connect to the server at ``wiring.address``."""
@@ -41,10 +44,6 @@ class Toy(Transport[ToyOptions]):
         from s2a_toy.wire import ToyServer
 
         return ToyServer(wiring, handler)
-
-    def bind(self, options: ToyOptions, taken: Any) -> str:
-        """Return the address of a new server: the port that was asked for, any free one for a second server."""
-        return f"127.0.0.1:{0 if taken else options.toy_port}"
 
 
 TOY = Toy()

@@ -7,14 +7,20 @@ from contextlib import ExitStack
 from threading import Thread
 
 import pytest
-from s2a_toy.policy import ToyPolicy
+from s2a_toy.engine import ToyWords
+from s2a_toy.mode import ToyMode
+from s2a_toy.policy import ToyCareful, ToyPolicy
 from s2a_toy.source import Stripes
 from s2a_toy.transport import TOY, ToyOptions
 
 from s2a_bench.frames import FrameSource
+from s2a_bench.inference import Engine, EngineConfig
 from s2a_bench.policy import Policy
+from s2a_bench.policy.chunks import Mode
+from s2a_bench.testing.engine import EngineSuite
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 from s2a_bench.testing.hostile import HostileSuite, tcp
+from s2a_bench.testing.mode import ModeSuite
 from s2a_bench.testing.policy import PolicySuite
 from s2a_bench.testing.transport import Connect, TransportSuite
 from s2a_bench.transport import Client, Handler, Wiring
@@ -55,7 +61,24 @@ class TestStripes(FrameSourceSuite):
         return make
 
 
-class TestToyPolicy(PolicySuite):
+class TestToyPolicies(PolicySuite):
+    @pytest.fixture(params=[ToyPolicy(factor=2), ToyCareful(caution=1.0)], ids=lambda policy: policy.name)
+    def policy(self, request: pytest.FixtureRequest) -> Policy:
+        made: Policy = request.param
+        return made
+
+
+class TestToyMode(ModeSuite):
     @pytest.fixture
-    def policy(self) -> Policy:
-        return ToyPolicy(factor=2)
+    def mode(self) -> Mode:
+        return ToyMode(trigger=3)
+
+
+class TestToyWords(EngineSuite):
+    @pytest.fixture
+    def engine(self) -> Engine:
+        return ToyWords(EngineConfig())
+
+    @pytest.fixture
+    def fresh_engine(self) -> Engine:
+        return ToyWords(EngineConfig())

@@ -14,26 +14,22 @@ from scipy import stats
 from s2a_bench.policy.chunks import Mode, Rounding, Setting, mode
 from s2a_bench.policy.chunks.aggregate import Aggregate
 from s2a_bench.policy.chunks.append import Queue, Streamed, Sync
-from s2a_bench.policy.chunks.closed import (
+from s2a_bench.policy.chunks.closed import mean_reaction_s, replace_stall_share, slack_ticks, slow_down, stall_share
+from s2a_bench.policy.chunks.replace import Replace
+from tests.policy.chunks.drawn import plainly
+from tests.policy.chunks.forms import (
     jump_actions,
-    mean_reaction_s,
     queue_age_ticks,
     queue_stall_s,
     queue_stall_ticks,
     reaction_s,
     replace_age_ticks,
-    replace_stall_share,
     replace_stall_ticks,
-    slack_ticks,
-    slow_down,
-    stall_share,
     steady_stall_ticks,
     sync_motion_share,
 )
-from s2a_bench.policy.chunks.replace import Replace
-from s2a_bench.policy.chunks.skills import earliest_arrivals, safe_start_ticks
-from tests.policy.chunks.drawn import plainly
 from tests.policy.chunks.plain import Log
+from tests.policy.chunks.plans import earliest_arrivals, safe_start_ticks
 
 PERIOD = 20
 ROUNDINGS = st.sampled_from(["floor", "ceil"])

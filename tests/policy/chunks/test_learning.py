@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from s2a_bench.policy.chunks import Rounding, Setting
-from s2a_bench.policy.chunks.learning import Learning, LearningStepper
-from s2a_bench.policy.chunks.stepping import step
-from s2a_bench.policy.chunks.trigger import Maximum, Mean, Rule, Tracked, follow
+from s2a_bench.policy.chunks.append import Queue
+from s2a_bench.policy.chunks.cycles import step
+from s2a_bench.policy.chunks.trigger import Learning, LearningStepper, Maximum, Mean, Rule, Tracked, follow
 
 SETTING = Setting(20_000_000, 16)
 
@@ -36,7 +36,7 @@ def tracked() -> Rule:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[], Rule], seed: int) -> None:
     latency_ns = drawn(300, 100 + seed)
-    mode = Learning(begin)
+    mode = Learning(Queue(), begin)
     steppers: list[LearningStepper] = []
 
     class Watched(Learning):
@@ -44,18 +44,19 @@ def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[],
             steppers.append(mode.stepper(setting))
             return steppers[-1]
 
-    cycles, _ = step(Watched(begin), latency_ns, SETTING)
+    cycles, _ = step(Watched(Queue(), begin), latency_ns, SETTING)
     said = follow(begin(), latency_ns, SETTING, 15)
-    assert steppers[0].triggers[: latency_ns.size] == said.trigger.tolist()
+    assert steppers[0].triggers[: latency_ns.size] == said.tolist()
     late = cycles.settled
-    np.testing.assert_array_equal(cycles.stall_ticks[late], said.stall_ticks[late])
+    stall_ticks = np.maximum(0, SETTING.delay_ticks(latency_ns) - said)
+    np.testing.assert_array_equal(cycles.stall_ticks[late], stall_ticks[late])
 
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
 def test_a_mean_of_ticks_is_the_mean(rounding: Rounding) -> None:
     setting = Setting(SETTING.period_ns, 16, rounding)
     latency_ns = np.random.default_rng(7).lognormal(np.log(70e6), 0.5, 4000).astype(np.int64)
-    stepper = Learning(mean).stepper(setting)
+    stepper = Learning(Queue(), mean).stepper(setting)
     tick = 0
     for request, delay in enumerate(setting.delay_ticks(latency_ns).tolist()):
         while not stepper.ask(tick):
@@ -68,8 +69,8 @@ def test_a_mean_of_ticks_is_the_mean(rounding: Rounding) -> None:
 def test_a_rule_that_tracks_comes_back_after_a_slow_time() -> None:
     calm, slow = drawn(600, 2, 40e6), drawn(600, 3, 160e6)
     latency_ns = np.concatenate([calm, slow, calm, calm, calm])
-    stepper = Learning(lambda: Tracked.begin(calm.tolist(), 0.05)).stepper(SETTING)
-    stepper_of = {"maximum": Learning(maximum).stepper(SETTING)}
+    stepper = Learning(Queue(), lambda: Tracked.begin(calm.tolist(), 0.05)).stepper(SETTING)
+    stepper_of = {"maximum": Learning(Queue(), maximum).stepper(SETTING)}
     for each in (stepper, stepper_of["maximum"]):
         tick = 0
         for request, latency in enumerate(latency_ns.tolist()):
@@ -83,7 +84,7 @@ def test_a_rule_that_tracks_comes_back_after_a_slow_time() -> None:
 
 
 def test_each_robot_has_a_rule_of_its_own() -> None:
-    mode = Learning(maximum)
+    mode = Learning(Queue(), maximum)
     one, other = mode.stepper(SETTING), mode.stepper(SETTING)
     assert one.ask(0)
     one.arrived(0, 16, 9)

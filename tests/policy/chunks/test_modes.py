@@ -14,8 +14,8 @@ from s2a_bench.errors import UsageError
 from s2a_bench.policy.chunks import MODES, Mode, Setting, mode
 from s2a_bench.policy.chunks.aggregate import Aggregate
 from s2a_bench.policy.chunks.append import Queue, Streamed, Sync
+from s2a_bench.policy.chunks.cycles import step
 from s2a_bench.policy.chunks.replace import Replace
-from s2a_bench.policy.chunks.stepping import step
 from tests.policy.chunks.drawn import cases, latencies, plainly, settings_of_chunks
 
 named = pytest.mark.parametrize("name", MODES)

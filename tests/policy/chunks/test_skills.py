@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from s2a_bench.policy import policy
 from s2a_bench.policy.chunks import Setting
 from s2a_bench.policy.chunks.append import Streamed
-from s2a_bench.policy.chunks.closed import start_s
-from s2a_bench.policy.chunks.skills import as_plans, earliest_arrivals, safe_start_ticks, streamed_arrivals
 from s2a_bench.policy.schedule import safe_start
+from tests.policy.chunks.forms import start_s
+from tests.policy.chunks.plans import as_plans, earliest_arrivals, safe_start_ticks, streamed_arrivals
 
 PERIOD = 20_000_000
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.policy.chunks import Setting
-from s2a_bench.policy.chunks.append import Queue
-from s2a_bench.policy.chunks.stepping import step
-from s2a_bench.policy.chunks.varied import Varied
+from s2a_bench.policy.chunks.append import Queue, VariedQueue
+from s2a_bench.policy.chunks.cycles import step
+from s2a_bench.policy.chunks.trigger import Varied
 from tests.policy.chunks.drawn import latencies, settings_of_chunks
 
 
@@ -21,7 +21,7 @@ def varied(draw: st.DrawFn) -> tuple[Varied, Any, Setting]:
     setting = draw(settings_of_chunks())
     triggers = draw(st.lists(st.integers(0, setting.horizon), min_size=1, max_size=14))
     execute = draw(st.integers(0, setting.horizon))
-    return Varied(tuple(triggers), execute), draw(latencies(setting)), setting
+    return VariedQueue(Queue(0, execute), tuple(triggers)), draw(latencies(setting)), setting
 
 
 def agree(one: tuple[Any, ...], other: tuple[Any, ...]) -> None:
@@ -40,6 +40,14 @@ def test_its_arrays_and_its_stepper_agree(case: tuple[Varied, Any, Setting]) -> 
 @given(case=varied())
 def test_with_one_trigger_it_is_queue(case: tuple[Varied, Any, Setting]) -> None:
     mode, latency_ns, setting = case
-    queue = Queue(mode.triggers[0], mode.execute)
-    same = Varied(mode.triggers[:1], mode.execute)
+    queue = mode.mode.varied(mode.triggers[:1])
+    assert isinstance(queue, Queue)
+    same = VariedQueue(mode.mode, mode.triggers[:1])
     agree((same.cycles(latency_ns, setting),), (queue.cycles(latency_ns, setting),))
+
+
+@given(case=varied())
+def test_a_mode_without_arrays_of_its_own_does_the_same(case: tuple[Varied, Any, Setting]) -> None:
+    mode, latency_ns, setting = case
+    stepped = Varied(mode.mode, mode.triggers)
+    agree((stepped.cycles(latency_ns, setting),), (mode.cycles(latency_ns, setting),))

@@ -13,9 +13,8 @@ from s2a_bench.errors import UsageError
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
-from s2a_bench.policy.clairvoyant import Clairvoyant
 from s2a_bench.policy.naive import Naive
-from s2a_bench.policy.wait_then_act import WaitThenAct
+from s2a_bench.policy.wait_then_act import Clairvoyant, WaitThenAct
 from s2a_bench.scenario import EGO, LEAD, REAR, simulator
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import Cars, braking_plan
@@ -53,7 +52,11 @@ def test_the_operating_point_is_within_a_tenth_of_what_is_listed(world: str, pol
     outcome, impact, front, rear = LISTED[policy]
     found = driven(world, policy).outcomes
     assert found.name(0) == outcome
-    for value, wanted in ((found.impact_mps, impact), (found.min_front_gap_m, front), (found.min_rear_gap_m, rear)):
+    for value, wanted in (
+        (found.impact_speed_mps, impact),
+        (found.min_front_gap_m, front),
+        (found.min_rear_gap_m, rear),
+    ):
         if wanted is not None:
             assert value[0] == pytest.approx(wanted, rel=0.1)
 
@@ -127,7 +130,7 @@ def test_a_drive_that_ends_when_all_is_decided_has_the_outcome_of_a_long_one(fol
         short = drive(simulator("longitudinal"), cars, plan, many, resting_mps=0.5).outcomes
         long = drive(simulator("longitudinal"), cars, plan, many, resting_mps=-1.0).outcomes
         assert short.code.tolist() == long.code.tolist()
-        assert short.impact_mps == pytest.approx(long.impact_mps, nan_ok=True)
+        assert short.impact_speed_mps == pytest.approx(long.impact_speed_mps, nan_ok=True)
 
 
 def test_a_lane_change_needs_a_simulator_that_steers() -> None:
@@ -212,8 +215,8 @@ def test_physics_holds_in_any_scenario(seed: int, follower: str) -> None:
     front, rear = outcomes.code & 1 > 0, outcomes.code & 2 > 0
     assert (outcomes.min_front_gap_m[front] == 0).all()
     assert (outcomes.min_rear_gap_m[rear] == 0).all()
-    assert (np.isnan(outcomes.impact_mps) == (outcomes.code == 0)).all()
-    assert not (outcomes.impact_mps <= 0.5).any()
+    assert (np.isnan(outcomes.impact_speed_mps) == (outcomes.code == 0)).all()
+    assert not (outcomes.impact_speed_mps <= 0.5).any()
 
 
 @pytest.mark.slow

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.errors import StoreError
-from s2a_bench.experiments.ccrb.view.figures import path_of
-from s2a_bench.experiments.ccrb.view.outcomes import configuration, rollouts_of
-from s2a_bench.experiments.ccrb.view.sentences import tokens_line
-from s2a_bench.experiments.timeline.rows import SKILLS
+from s2a_bench.experiments.ccrb.view.figures import path_of, rest_of
+from s2a_bench.experiments.ccrb.view.outcomes import configuration, rollouts_of, tokens_line
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES
 from s2a_bench.scenario.ccrb.render import TopView
 from s2a_bench.scenario.ccrb.words import SAID, law
+from s2a_bench.store.requests import SKILLS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,7 +30,6 @@ WIDTH, ROAD_HEIGHT, TEXT_HEIGHT, FOOT_HEIGHT = 880, 96, 46, 40
 """Pixels; even numbers, as video codecs want."""
 LAST_S: Final = 2.0
 """How long the last picture stands."""
-_REST_MPS: Final = 0.1
 _PHASES: Final = {"waiting": "no skill yet: keeps its speed", "gap": "STALL: no skill is valid", "done": "plan done"}
 _HITS: Final[dict[str, frozenset[int]]] = {
     "front": frozenset({LEAD, EGO}),
@@ -77,9 +75,7 @@ class Panel:
         self._view = TopView(WIDTH, ROAD_HEIGHT)
         self._heading = _headings(self._path)
         self._hit_at = _first_impact(self._path, row["outcome"])
-        moving = self._path[[f"{car}_speed_mps" for car in ROLES]].max(axis=1) > _REST_MPS
-        resting = int(moving[moving].index[-1]) if moving.any() else 0
-        self._last = resting if self._hit_at is None else self._hit_at
+        self._last = rest_of(self._path) if self._hit_at is None else self._hit_at
         self.until_s = float(self._path["time_s"][self._last])
 
     def draw(self, at_s: float) -> tuple[NDArray[np.uint8], str, str, bool]:
@@ -100,7 +96,6 @@ class Panel:
         return picture, f"{self._row['policy']}   {facts}", self._said(now, hit=hit), hit
 
     def _said(self, now: Any, *, hit: bool) -> str:
-        """Return what the ego does, or what happened to it."""
         if hit:
             speed = self._row["rear_impact_mps" if self._row["outcome"] in {"rear", "both"} else "front_impact_mps"]
             first = "rear" if self._row["outcome"] == "both" else self._row["outcome"]
@@ -111,7 +106,6 @@ class Panel:
 
 
 def _frame(panels: list[Panel], at_s: float, foot: str) -> Image:
-    """Put the panels below one another."""
     from PIL import Image, ImageDraw
 
     height = len(panels) * (TEXT_HEIGHT + ROAD_HEIGHT) + FOOT_HEIGHT
@@ -144,7 +138,6 @@ def _headings(path: pd.DataFrame) -> NDArray[np.float64]:
 
 
 def _font(size: int) -> FreeTypeFont:
-    """Return the font that matplotlib brings."""
     from matplotlib import font_manager
     from PIL import ImageFont
 
@@ -153,22 +146,13 @@ def _font(size: int) -> FreeTypeFont:
 
 def _write_gif(path: Path, frames: list[Image]) -> None:
     """Write a GIF at half the frames: its times are hundredths, and viewers slow down what is faster."""
-    from PIL.Image import Dither
-
-    palette = _stacked(frames[0], frames[-1]).quantize(64)  # the colours of an impact come last
-    shown = [frame.quantize(palette=palette, dither=Dither.NONE) for frame in [*frames[::2], frames[-1]]]
-    times = [2000 // FRAMES_A_S] * (len(shown) - 1) + [round(1000 * LAST_S)]
-    shown[0].save(path, save_all=True, append_images=shown[1:], duration=times, loop=0, optimize=False)
-
-
-def _stacked(*frames: Image) -> Image:
-    """Put pictures below one another."""
     from PIL import Image
 
-    sheet = Image.new("RGB", (frames[0].width, sum(frame.height for frame in frames)))
-    for place, frame in enumerate(frames):
-        sheet.paste(frame, (0, place * frame.height))
-    return sheet
+    ends = np.vstack([np.asarray(frames[place]) for place in (0, -1)])  # the colours of an impact come last
+    palette = Image.fromarray(ends).quantize(64)
+    shown = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in [*frames[::2], frames[-1]]]
+    times = [2000 // FRAMES_A_S] * (len(shown) - 1) + [round(1000 * LAST_S)]
+    shown[0].save(path, save_all=True, append_images=shown[1:], duration=times, loop=0, optimize=False)
 
 
 def _write_film(path: Path, frames: list[Image]) -> None:

@@ -1,21 +1,33 @@
-"""Figure 3 of the paper as curves: positions, speeds and gaps under each policy, stalls and actions marked."""
+"""The figures of a CCRB run: the operating point as curves (figure 3 of the paper), phase diagram and sensitivity."""
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+import numpy as np
+
 from s2a_bench.experiments.ccrb.rows import SENSITIVITY, TRAJECTORIES
-from s2a_bench.experiments.ccrb.view.outcomes import configuration, has, rollouts_of, survives_of, token_times_s
-from s2a_bench.experiments.ccrb.view.phase_figure import build_phase
-from s2a_bench.experiments.ccrb.view.sentences import origin_notes
-from s2a_bench.experiments.ccrb.view.variations import build_sensitivity
-from s2a_bench.experiments.timeline.rows import SKILLS
-from s2a_bench.scenario.ccrb.words import operating_point, said
-from s2a_bench.writers.figures import LINE_CHARS, new_figure
-from s2a_bench.writers.style import WIDTH_IN
+from s2a_bench.experiments.ccrb.view.outcomes import (
+    VARIED_TITLES,
+    configuration,
+    has,
+    origin_notes,
+    plane_words,
+    rate_span_here,
+    rollouts_of,
+    scenes_of,
+    share_of,
+    survives_of,
+    token_times_s,
+)
+from s2a_bench.plan.skillset import GAPS
+from s2a_bench.scenario.ccrb.cars import Cars
+from s2a_bench.scenario.ccrb.words import NAIVE, NO_SCORE, ORDERING, PAPER, ahead, law, operating_point, said
+from s2a_bench.store.requests import SKILLS
+from s2a_bench.writers.figures import new_figure, wrapped
+from s2a_bench.writers.style import WIDE_IN
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,13 +36,12 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import Run
 
-WIDE_IN: Final = 7.16
 LOOKS: Final[dict[str, tuple[str, Literal["-", "--", ":"]]]] = {
     "lead": ("#0072B2", "--"),
     "ego": ("#000000", "-"),
     "rear": ("#D55E00", ":"),
 }
-GAPS: Final = {"front": ("#0072B2", "--"), "rear": ("#D55E00", ":")}
+_SIDES: Final = {"front": ("#0072B2", "--"), "rear": ("#D55E00", ":")}
 _PHASES: Final[dict[str, dict[str, Any]]] = {
     "waiting": {"facecolor": "#EEEEEE", "linewidth": 0},
     "acting": {"facecolor": "#BFE3D5", "edgecolor": "white", "linewidth": 0.6},
@@ -39,6 +50,15 @@ _PHASES: Final[dict[str, dict[str, Any]]] = {
 _CAPTIONS: Final = {"waiting": "no skill yet", "acting": "a skill runs", "gap": "stall: no skill is valid"}
 _REST_MPS: Final = 0.1
 _AFTER_S: Final = 1.0
+REGIONS: Final = {
+    "paper": ("the paper's ordering", "#009E73"),
+    "others": ("both others have an impact, in other ways", "#8FD3BE"),
+    NAIVE: ("only naive has an impact", "#E69F00"),
+    "wait": ("only wait-then-act has an impact", "#56B4E9"),
+    "nobody": ("nobody has an impact", "#FFFFFF"),
+    "all": ("all three have an impact", "#444444"),
+    "mine": ("stream-to-act has an impact, another does not", "#CC79A7"),
+}
 
 
 def build_scenario(run: Run) -> Figure:
@@ -47,10 +67,7 @@ def build_scenario(run: Run) -> Figure:
     survives, rows = survives_of(found), found.to_dict("records")
     paths = {row["policy"]: _path(run, row) for row in rows}
     skills = dict(list(run.table(SKILLS).groupby("cell", sort=False)))
-    chars = round(LINE_CHARS * WIDE_IN / WIDTH_IN)
-    lines = [_title(run), *origin_notes(run)]
-    title = "\n".join(textwrap.fill(line, chars, break_on_hyphens=False) for line in lines)
-    figure = new_figure(4.6, title, WIDE_IN)
+    figure = new_figure(4.6, wrapped((_title(run), *origin_notes(run)), WIDE_IN), WIDE_IN)
     grid = figure.subplots(3, len(rows), squeeze=False, sharex=True, sharey="row")
     token_s = token_times_s(run)
     until_s = max(float(path["time_s"].iloc[-1]) for path in paths.values())
@@ -97,12 +114,16 @@ def path_of(run: Run, cell: str) -> pd.DataFrame:
     return path
 
 
+def rest_of(path: pd.DataFrame) -> int:
+    """Return the last row in which a car moves."""
+    moving = path[[f"{car}_speed_mps" for car in LOOKS]].max(axis=1) > _REST_MPS
+    return int(moving[moving].index[-1]) if moving.any() else 0
+
+
 def _path(run: Run, row: dict[Any, Any]) -> pd.DataFrame:
     """Return a trajectory up to rest; after an impact from behind the trailing car is out."""
     path = path_of(run, row["cell"])
-    moving = path[[f"{car}_speed_mps" for car in LOOKS]].max(axis=1) > _REST_MPS
-    last = int(moving[moving].index[-1]) if moving.any() else 0
-    shown = path["time_s"] <= float(path["time_s"].iloc[last]) + _AFTER_S
+    shown = path["time_s"] <= float(path["time_s"].iloc[rest_of(path)]) + _AFTER_S
     path = path.loc[shown].copy()
     touched: Any = path.index[path["rear_gap_m"] <= 0] if row["outcome"] in {"rear", "both"} else []
     if len(touched):
@@ -125,14 +146,12 @@ def _shade(axes: Axes, path: pd.DataFrame, skills: pd.DataFrame) -> None:
 
 
 def _draw_cars(axes: Axes, path: pd.DataFrame, what: str) -> None:
-    """Draw a curve a car."""
     for car, (colour, style) in LOOKS.items():
         axes.plot(path["time_s"], path[f"{car}_{what}"], style, color=colour, linewidth=1.2)
 
 
 def _draw_gaps(axes: Axes, path: pd.DataFrame, row: dict[Any, Any]) -> None:
-    """Draw both gaps, and an impact where there is one."""
-    for side, (colour, style) in GAPS.items():
+    for side, (colour, style) in _SIDES.items():
         gap = path[f"{side}_gap_m"]
         axes.plot(path["time_s"], gap.clip(lower=0), style, color=colour, linewidth=1.2)
         if row["outcome"] in {side, "both"}:
@@ -165,3 +184,111 @@ def _legend() -> list[object]:
     ]
     lines.append(Line2D([], [], color="#555555", marker="|", linestyle="", label="a token arrives"))
     return lines + [Patch(label=_CAPTIONS[name], **look) for name, look in _PHASES.items()]
+
+
+def region_of(scenes: pd.DataFrame) -> list[str]:
+    """Name the region of each scenario."""
+    named = []
+    for row in scenes.to_dict("records"):
+        hit = tuple(row[name] != "none" for name in PAPER)
+        if row["paper"]:
+            named.append("paper")
+        elif hit[2]:
+            named.append("all" if all(hit) else "mine")
+        else:
+            named.append({(True, True): "others", (True, False): NAIVE, (False, True): "wait"}.get(hit[:2], "nobody"))
+    return named
+
+
+def build_phase(run: Run) -> Figure:
+    """Draw a panel a gap behaviour, the operating point marked, the findings above each."""
+    from matplotlib.patches import Patch
+
+    asked = configuration(run)
+    scene = (
+        f"{ahead(asked)}, reaction {asked['reaction_s']:g} s, N = {asked['n_skills']}, L = {asked['tokens_per_skill']}"
+    )
+    survives = scenes_of(run, "phase", GAPS[0])["survives"]
+    check = f" It survives an ego with fast tokens at {survives.mean():.0%}." if survives.notna().all() else ""
+    lines = [
+        f"Who has an impact? {scene[0].upper()}{scene[1:]}. {ORDERING}",
+        f"Rear: {law(asked)}.{check} EMULATED: tokens come evenly.",
+    ]
+    figure = new_figure(2.9, wrapped(lines, WIDE_IN), WIDE_IN)
+    grid = figure.subplots(1, len(GAPS), sharex=True, sharey=True)
+    seen: set[str] = set()
+    for axes, gap in zip(grid, GAPS, strict=True):
+        scenes = scenes_of(run, "phase", gap)
+        seen |= _draw_panel(axes, scenes, asked, run)
+        share = share_of(scenes, "paper").value
+        axes.set_title(f"{gap}: {share:.1%} paper's ordering\n{_here(run, gap, asked)}", loc="left")
+        axes.set_xlabel("R (tokens/s)")
+    grid[0].set_ylabel("rear gap (m)")
+    handles: list[object] = [
+        Patch(facecolor=colour, edgecolor="#888888", linewidth=0.4, label=label)
+        for name, (label, colour) in REGIONS.items()
+        if name in seen
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    return figure
+
+
+def _draw_panel(axes: Axes, scenes: pd.DataFrame, asked: dict[str, Any], run: Run) -> set[str]:
+    from matplotlib.colors import ListedColormap
+
+    named = region_of(scenes)
+    order = list(REGIONS)
+    codes = scenes.assign(code=[order.index(name) for name in named])
+    table = codes.pivot_table(index="rear_gap_m", columns="tokens_per_s", values="code")
+    rates = table.columns.to_numpy(dtype="float64")
+    axes.pcolormesh(
+        rates,
+        table.index.to_numpy(dtype="float64"),
+        table.to_numpy(dtype="float64"),
+        cmap=ListedColormap([colour for _, colour in REGIONS.values()]),
+        vmin=-0.5,
+        vmax=len(order) - 0.5,
+        shading="nearest",
+        rasterized=True,
+    )
+    axes.set_xscale("log")
+    ticks = [rate for rate in (0.5, 1, 2, 3, 4, 6, 8, 12, 20, 35) if rates[0] <= rate <= rates[-1]]
+    axes.set_xticks(ticks, [f"{rate:g}" for rate in ticks])
+    axes.set_xticks([], minor=True)
+    rate = run.manifest["boards"][0]["tokens_per_s"]
+    axes.plot(rate, asked["rear_gap_m"], "*", color="white", markeredgecolor="black", markersize=9)
+    return set(np.unique(named))
+
+
+def _here(run: Run, gap: str, asked: dict[str, Any]) -> str:
+    span = rate_span_here(run, gap)
+    where = f"R {span[0]:.1f}\N{EN DASH}{span[1]:.1f}" if span else "no R"
+    return f"at {asked['rear_gap_m']:g} m: {where}"
+
+
+def build_sensitivity(run: Run) -> Figure:
+    """Draw the ordering's share of the plane over each varied number, the range over the seeds as a band."""
+    found, asked = run.table(SENSITIVITY), configuration(run)
+    shares = found.assign(share=100 * found["paper"] / found["points"])
+    seeds, points = found["seed"].nunique(), int(found["points"].iloc[0])
+    held = f"The paper's ordering as a share of {plane_words(asked)}: {ahead(asked)}, gap behaviour {asked['gap']}."
+    lines = [
+        f"{held} Mean, least and most of {seeds} seeds of {points} points; dotted: the default.",
+        f"Rear: {law(asked)}. EMULATED: tokens come evenly. {NO_SCORE}",
+    ]
+    figure = new_figure(3.4, wrapped(lines, WIDE_IN), WIDE_IN)
+    grid = figure.subplots(2, 3, sharey=True)
+    for axes, varied in zip(grid.flat, VARIED_TITLES, strict=True):
+        _draw_share(axes, shares[shares["varied"] == varied], float(asked.get(varied, getattr(Cars(), varied))))
+        axes.set_xlabel(VARIED_TITLES[varied])
+    for axes in grid[:, 0]:
+        axes.set_ylabel("paper's ordering (%)")
+        axes.set_ylim(bottom=0)
+    return figure
+
+
+def _draw_share(axes: Axes, group: pd.DataFrame, default: float) -> None:
+    share = group.groupby("value")["share"].agg(["mean", "min", "max"]).astype("float64")
+    axes.fill_between(share.index, share["min"], share["max"], color="#0072B2", alpha=0.25, linewidth=0)
+    axes.plot(share.index, share["mean"], "o-", color="#0072B2", linewidth=1.2, markersize=3)
+    axes.axvline(default, color="#555555", linestyle=":", linewidth=1)

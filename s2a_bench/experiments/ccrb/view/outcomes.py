@@ -1,26 +1,31 @@
-"""What a CCRB run holds: the operating point, and where in its studies the paper's ordering of the policies holds."""
+"""What a CCRB run holds: the operating point, what its numbers are made of, and where the paper's ordering holds."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.experiments.ccrb.rows import ROLLOUTS
-from s2a_bench.experiments.timeline.rows import SKILLS
+from s2a_bench.experiments import TIME
+from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
-from s2a_bench.scenario.ccrb.words import PAPER
-from s2a_bench.store.requests import TOKENS
+from s2a_bench.scenario.ccrb.words import NAIVE, OURS, PAPER, WAIT, check, law
+from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.schema import PROVENANCE
+from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from s2a_bench.store.run import Run
 
-FOLLOWER_LAW: Final = "follower_law"
-"""What a manifest says since followers have their published names."""
-EARLIER_FOLLOWERS: Final = {"idm": "hybrid"}
-_TIMES: Final = ("start", "end", "stall", "deadline")
+VARIED_TITLES: Final = {
+    "gap_decel_mps2": "braking in gaps (m/s\N{SUPERSCRIPT TWO})",
+    "build_s": "follower's brake builds up in (s)",
+    "reaction_s": "follower's reaction (s)",
+    "ego_jerk_mps3": "ego's jerk (m/s\N{SUPERSCRIPT THREE})",
+    "rear_gap_m": "rear gap (m); over rates only",
+    "onset_s": "lead's onset after the request (s)",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +37,6 @@ class Share:
 
     @property
     def value(self) -> float:
-        """Return the share."""
         return self.k / self.n
 
     @property
@@ -47,8 +51,7 @@ class Share:
 def rollouts_of(run: Run, study: str) -> pd.DataFrame:
     """Return the roll-outs of the operating point (point), the phase diagram (phase) or random scenarios (random)."""
     rows = run.table(ROLLOUTS)
-    rows = rows[rows["study"] == study].reset_index(drop=True)
-    return rows if FOLLOWER_LAW in run.manifest else rows.replace({"follower": EARLIER_FOLLOWERS})
+    return rows[rows["study"] == study].reset_index(drop=True)
 
 
 def cells_of(run: Run) -> list[dict[str, Any]]:
@@ -62,14 +65,14 @@ def scenes_of(run: Run, study: str, gap: str) -> pd.DataFrame:
     ``paper``: naive is hit from behind only, wait-then-act hits the lead only, stream-to-act nobody. ``wait_worse``,
     ``wait_better``, ``naive_worse``, ``naive_better``: against stream-to-act, an impact faster by more than .5 m/s
     (none counts as 0); ``naive_rear_worse`` and ``naive_rear_better``: the same for impacts from behind alone.
-    ``survives``: the car behind stops behind an ego whose tokens come at once; null in folders from before.
+    ``survives``: the car behind stops behind an ego whose tokens come at once.
     """
     import pandas as pd
 
     rows = rollouts_of(run, study)
     rows = rows[rows["gap_behaviour"] == gap]
     policies = {name: group.set_index("draw").sort_index() for name, group in rows.groupby("policy")}
-    mine = policies["stream-to-act"]
+    mine = policies[OURS]
     found = mine[["tokens_per_s", "rear_gap_m", "front_gap_m", "reaction_s", "lead_decel_mps2"]].copy()
     for name, group in policies.items():
         found[name] = group["outcome"]
@@ -77,9 +80,9 @@ def scenes_of(run: Run, study: str, gap: str) -> pd.DataFrame:
         axis=1
     )
     found["survives"] = mine["follower_survives"]
-    for short, name in (("wait", "wait-then-act"), ("naive", "naive")):
+    for short, name in (("wait", WAIT), (NAIVE, NAIVE)):
         found[f"{short}_worse"], found[f"{short}_better"] = _compared(policies[name], mine, "impact_speed_mps")
-    found["naive_rear_worse"], found["naive_rear_better"] = _compared(policies["naive"], mine, "rear_impact_mps")
+    found["naive_rear_worse"], found["naive_rear_better"] = _compared(policies[NAIVE], mine, "rear_impact_mps")
     return found
 
 
@@ -89,15 +92,13 @@ def share_of(scenes: pd.DataFrame, ordering: str) -> Share:
 
 
 def survives_of(rows: pd.DataFrame) -> bool:
-    """Return whether the car behind passes its check at the operating point; True in folders from before."""
-    return bool(rows["follower_survives"].fillna(True).all())
+    """Return whether the car behind passes its check at the operating point."""
+    return bool(rows["follower_survives"].all())
 
 
 def rate_span(run: Run, gap: str) -> tuple[float, float] | None:
     """Return the least and greatest R of the phase diagram at which the paper's ordering holds; None where nowhere."""
-    scenes = scenes_of(run, "phase", gap)
-    rates = scenes[scenes["paper"]]["tokens_per_s"]
-    return (float(rates.min()), float(rates.max())) if len(rates) else None
+    return _span_of(scenes_of(run, "phase", gap))
 
 
 def rate_span_here(run: Run, gap: str) -> tuple[float, float] | None:
@@ -105,7 +106,11 @@ def rate_span_here(run: Run, gap: str) -> tuple[float, float] | None:
     scenes = scenes_of(run, "phase", gap)
     wanted = configuration(run)["rear_gap_m"]
     nearest = min(scenes["rear_gap_m"].unique(), key=lambda gap_m: abs(gap_m - wanted))
-    rates = scenes[scenes["paper"] & (scenes["rear_gap_m"] == nearest)]["tokens_per_s"]
+    return _span_of(scenes[scenes["rear_gap_m"] == nearest])
+
+
+def _span_of(scenes: pd.DataFrame) -> tuple[float, float] | None:
+    rates = scenes[scenes["paper"]]["tokens_per_s"]
     return (float(rates.min()), float(rates.max())) if len(rates) else None
 
 
@@ -115,11 +120,9 @@ def has(run: Run, study: str) -> bool:
 
 
 def configuration(run: Run) -> dict[str, Any]:
-    """Return what was asked for, the follower by the name that it has now."""
+    """Return what was asked for."""
     found: dict[str, Any] = run.manifest["configuration"]
-    if FOLLOWER_LAW in run.manifest:
-        return found
-    return {**found, "follower": EARLIER_FOLLOWERS.get(found["follower"], found["follower"])}
+    return found
 
 
 def token_times_s(run: Run) -> list[float]:
@@ -131,14 +134,12 @@ def token_times_s(run: Run) -> list[float]:
 
 
 def _cell(row: dict[Any, Any]) -> dict[str, Any]:
-    """Return one roll-out with the keys of the JSON object."""
     import pandas as pd
 
     plain = {str(name): value for name, value in row.items() if not pd.isna(value)}
     for name in ("study", "draw", "title", PROVENANCE):
         plain.pop(name, None)
-    for name in _TIMES:
-        plain[f"{name}_s"] = plain.pop(f"{name}_ns") / 1e9
+    plain |= {metric.name: plain.pop(metric.column) / 1e9 for metric in METRICS if metric.kind == TIME}
     plain["rate_tokens_per_s"] = plain.pop("tokens_per_s")
     plain["profile"] = plain.pop("board") or None
     return plain
@@ -148,3 +149,55 @@ def _compared(theirs: pd.DataFrame, mine: pd.DataFrame, column: str) -> tuple[pd
     """Return where a policy's impact is faster than stream-to-act's, and where slower."""
     difference = theirs[column].astype("float64").fillna(0.0) - mine[column].astype("float64").fillna(0.0)
     return difference > LEAST_IMPACT_MPS, difference < -LEAST_IMPACT_MPS
+
+
+def origin_notes(run: Run) -> tuple[str, ...]:
+    """Return what the numbers are made of, and which laws they hang on."""
+    asked = configuration(run)
+    notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
+    notes.append(f"Rear: {law(asked)}.")
+    notes.append(check(asked, survives_of(rollouts_of(run, "point"))))
+    reflex = "on" if asked["reflex"] else "off"
+    notes.append(f"Front: while no skill is valid the ego does '{asked['gap']}'; the reflex layer is {reflex}.")
+    return tuple(notes)
+
+
+def tokens_line(run: Run) -> Note:
+    """Say in one line where the tokens come from."""
+    if (live := run.manifest.get("live")) is None:
+        return Note(f"EMULATED tokens, {run.manifest['boards'][0]['tokens_per_s']:g}/s.", EMULATED)
+    kind = "EMULATED (replayed)" if live["emulated"] else "LIVE"
+    pace = live.get("paced_tokens_per_s")
+    paced = f", paced to {pace:g} tokens/s (the rate is set)" if pace else ""
+    line = f"{kind} tokens over {live['transport']}{paced}; car simulated."
+    return Note(line, *([EMULATED] if live["emulated"] else []))
+
+
+def _live_notes(run: Run) -> list[str]:
+    live = run.manifest["live"]
+    rate = rollouts_of(run, "point")["tokens_per_s"].iloc[0]
+    line = tokens_line(run)
+    if "paced_tokens_per_s" not in live:
+        line = Note(f"{line} {rate:g} tokens/s came.", *line.labels)
+    road = "Open loop: one request at t = 0 about the rendered scene; the road does not change the answer."
+    driven = "the set-points driven are those of the scenario."
+    if live.get("dummy"):
+        return [line, road, Note(f"Dummy weights: what the plan says means nothing; {driven}", DUMMY)]
+    return [line, road, f"What the plan says is not driven; {driven}"]
+
+
+def _emulated_notes(run: Run) -> list[str]:
+    board = run.manifest["boards"][0]
+    rates = {"paper": "the paper's rate (table II)", "measured": "a measured rate", "given": "a rate as given"}
+    rate = f"{rates[board['origin']]}, {board['tokens_per_s']:g}/s"
+    papers = [PAPERS] if board["origin"] == "paper" else []
+    notes: list[str] = [Note(f"EMULATED: no model answered; tokens come evenly at {rate}.", EMULATED, *papers)]
+    if board["prompt_origin"] == "assumed":
+        notes.append(Note(f"c = {board['prompt_s']:g} s before decoding is an assumption of ours.", ASSUMED))
+    return notes
+
+
+def plane_words(asked: dict[str, Any]) -> str:
+    """Return the plane's sides in words."""
+    (slow, fast), (near, far) = asked["phase_rates"], asked["phase_gaps_m"]
+    return f"the plane of R {slow:g} to {fast:g} tokens/s, rear gap {near:g} to {far:g} m"

@@ -1,34 +1,50 @@
-"""The tables of a CCRB run for people, and for programs as CSV and JSON."""
+"""How a CCRB run is shown: its sentences, tables for people, and CSV and JSON for programs."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from s2a_bench.experiments.ccrb.metrics import MARGINS, OUTCOMES
-from s2a_bench.experiments.ccrb.rows import FOLLOWER_STUDY, SENSITIVITY
-from s2a_bench.experiments.ccrb.view.cell import ORDERINGS
+from s2a_bench.experiments import TIME, Shown
+from s2a_bench.experiments.ccrb.rows import (
+    FOLLOWER_STUDY,
+    IMPACTS,
+    MARGINS,
+    METRICS,
+    MOTION,
+    SENSITIVITY,
+    TIMES,
+    FollowerRow,
+    RolloutRow,
+    SensitivityRow,
+)
+from s2a_bench.experiments.ccrb.view.animation import animation_files
+from s2a_bench.experiments.ccrb.view.figures import ccrb_figures
 from s2a_bench.experiments.ccrb.view.outcomes import (
+    VARIED_TITLES,
     Share,
     cells_of,
     configuration,
     has,
+    origin_notes,
+    plane_words,
     rate_span,
     rate_span_here,
     rollouts_of,
     scenes_of,
     share_of,
+    survives_of,
 )
-from s2a_bench.experiments.ccrb.view.sentences import origin_notes
-from s2a_bench.experiments.ccrb.view.variations import follower_tables
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.ccrb.words import NO_SCORE, ORDERING, law, operating_point, said
-from s2a_bench.store.schema import PROVENANCE
-from s2a_bench.writers.as_json import frame
+from s2a_bench.scenario.ccrb.cars import OUTCOMES as CODES
+from s2a_bench.scenario.ccrb.words import MARK, NAIVE, NO_SCORE, ORDERING, PAPER, law, marked, operating_point, said
+from s2a_bench.store.schema import PROVENANCE, Count, Facts, Fraction, Many, Positive, about
+from s2a_bench.writers.as_json import cell_of_row, frame
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, number
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable
 
     import pandas as pd
 
@@ -37,35 +53,172 @@ if TYPE_CHECKING:
     from s2a_bench.store.schema import Table
 
 
+def show(run: Run, *, animation: bool = False, **_: Any) -> Shown:
+    """Return what a CCRB run shows; the animation where it is asked for."""
+    tables = ccrb_tables(run)
+    return Shown(
+        sentences=ccrb_sentences(run),
+        tables=tables,
+        main=[name for name in ("outcomes", "phase", "random", "followers", "follower-shares") if name in tables],
+        notes=[*dict.fromkeys(note for table in tables.values() for note in table.notes), *ccrb_notes(run)],
+        csvs=ccrb_csv(run),
+        figures=ccrb_figures(run),
+        files=animation_files(run) if animation else {},
+        json=lambda: ccrb_json(run),
+    )
+
+
+def ccrb_sentences(run: Run) -> list[str]:
+    """Return what became of the cars, and where that ordering of the policies holds."""
+    rows = rollouts_of(run, "point")
+    survives = survives_of(rows)
+    told = [
+        f"{row['policy']}: {said(row['outcome'], survives)}, {row['stalls']} stalls of {row['stall_ns'] / 1e9:.2f} s."
+        for row in rows.to_dict("records")
+    ]
+    return told + [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
+
+
+def ccrb_notes(run: Run) -> list[str]:
+    """Return what the terminal says below the tables: findings, and the studies' speed."""
+    said = findings(run)
+    if len(run.table(SENSITIVITY)):
+        said.append(_sensitivity(run))
+    if studies := run.manifest.get("studies"):
+        speed = studies["rollouts_per_cpu_s"]
+        said.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time")
+    return said
+
+
+def findings(run: Run) -> list[str]:
+    """Return what the phase diagram shows, gap behaviour by gap behaviour."""
+    return [_finding(run, gap) for gap in GAPS] if has(run, "phase") else []
+
+
+def _finding(run: Run, gap: str) -> str:
+    share = share_of(scenes_of(run, "phase", gap), "paper")
+    said = f"{gap}: the paper's ordering holds at {share.value:.1%} of the diagram"
+    span, here = rate_span(run, gap), rate_span_here(run, gap)
+    if span is None:
+        return f"{gap}: the paper's ordering holds nowhere in the diagram."
+    at = f"at a rear gap of {configuration(run)['rear_gap_m']:g} m"
+    where = f"{at} for {here[0]:.1f} to {here[1]:.1f}" if here else f"{at} nowhere"
+    return f"{said}, for R = {span[0]:.1f} to {span[1]:.1f} tokens/s; {where}."
+
+
+def _sensitivity(run: Run) -> str:
+    """Return between which shares the ordering moves, number by number."""
+    found = run.table(SENSITIVITY)
+    summed = found.groupby(["varied", "value"], sort=False)[["paper", "points"]].sum()
+    share = 100 * summed["paper"] / summed["points"]
+    spans = share.groupby("varied", sort=False).agg(["min", "max"])
+    names = {varied: title.split(" (")[0] for varied, title in VARIED_TITLES.items()}
+    said = ", ".join(f"{names[varied]} {least:.0f} to {most:.0f} %" for varied, least, most in spans.itertuples())
+    return f"Sensitivity, the paper's ordering in the plane: {said}."
+
+
+ORDERINGS: Final = {
+    "paper": "the paper's ordering",
+    "wait_worse": "wait worse than stream",
+    "wait_better": "wait better",
+    "naive_worse": "naive worse than stream",
+    "naive_better": "naive better",
+    "naive_rear_worse": "naive worse behind",
+    "naive_rear_better": "naive better behind",
+}
+
+_SETTING: Final = ["follower", "front_gap_m", "lead_decel_mps2"]
+_ORDERING_NOTES: Final = (
+    Note(ORDERING, PAPERS),
+    "Worse, better: than stream-to-act, by an impact more than 0.5 m/s faster or slower; behind: from there alone.",
+    "Where the follower hits even an ego whose tokens come at once, a rear impact says nothing of the policy.",
+)
+
+_TIMES: Final = [metric for metric in METRICS if metric.kind == TIME]
+CcrbCell = cell_of_row(
+    "CcrbCell",
+    "A policy at the operating point.",
+    RolloutRow,
+    without=("study", "draw", "board", "title", "tokens_per_s", *(metric.column for metric in _TIMES)),
+    own={
+        "profile": str | None,
+        "rate_tokens_per_s": Positive,
+        **{metric.name: Annotated[float, Facts(metric.schema)] for metric in _TIMES},
+    },
+)
+
+CcrbFollower = cell_of_row(
+    "CcrbFollower",
+    "Counts of points of the plane under one policy, with one follower and lead; without a seed: the operating point.",
+    FollowerRow,
+    without=("cell",),
+)
+CcrbSensitivity = cell_of_row(
+    "CcrbSensitivity",
+    "At how many of the points that a seed drew the paper's ordering holds, one number changed.",
+    SensitivityRow,
+    without=("cell",),
+)
+
+
+@dataclass(frozen=True)
+class OrderingShare:
+    """In how many scenarios an ordering holds."""
+
+    k: Count
+    value: Fraction
+    ci95: Annotated[tuple[float, float] | None, about("Clopper-Pearson; random scenarios only.")] = None
+
+
+@dataclass(frozen=True)
+class CcrbStudy:
+    """The shares of one study under one gap behaviour.
+
+    Orderings: the paper's; a policy's impact is more than 0.5 m/s faster (worse) or slower (better) than
+    stream-to-act's, of any kind or from behind.
+    """
+
+    study: Literal["phase", "random"]
+    gap_behaviour: Annotated[str, {"enum": list(GAPS)}]
+    scenarios: Many
+    orderings: Annotated[
+        dict[str, OrderingShare], {"required": list(ORDERINGS), "propertyNames": {"enum": list(ORDERINGS)}}
+    ]
+    follower_survives: Annotated[
+        OrderingShare | None,
+        about("Where the car behind stops behind an ego whose tokens come at once; elsewhere rear says nothing."),
+    ] = None
+    paper_rates_tokens_per_s: Annotated[
+        tuple[float, float] | None,
+        about("Least and greatest R at which the paper's ordering holds; absent where it does nowhere."),
+    ] = None
+
+
 def outcome_table(run: Run) -> TextTable:
     """Lay out what became of the three cars under each policy."""
-    rows = []
+    rows, shown = [], [metric for metric in (*TIMES, *IMPACTS) if metric.title]
     for cell in cells_of(run):
-        outcome = said(cell["outcome"], cell.get("follower_survives", True)) + (" (late)" if cell.get("late") else "")
-        rows.append((cell["policy"], outcome, *(_entry(cell, metric) for metric in OUTCOMES)))
+        outcome = said(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
+        rows.append((cell["policy"], outcome, *(_entry(cell, metric) for metric in shown)))
     asked = configuration(run)
     title = f"CCRB with a car behind, {asked['simulator']} simulator: {operating_point(asked)}"
-    header = ("policy", "outcome", *map(_title, OUTCOMES))
+    header = ("policy", "outcome", *map(_title, shown))
     return TextTable(title, header, rows, 2, notes=(*origin_notes(run), *_deadline_note(run), NO_SCORE))
 
 
 def margin_table(run: Run) -> TextTable:
     """Lay out how near an impact was, and how smoothly the ego drove."""
-    rows = [(cell["policy"], *(_entry(cell, metric) for metric in MARGINS)) for cell in cells_of(run)]
+    rows = [(cell["policy"], *(_entry(cell, metric) for metric in (*MARGINS, *MOTION))) for cell in cells_of(run)]
     notes = (
         "TTC: least time to collision. DRAC: greatest deceleration required towards the lead, closing^2 / (2 gap).",
         "Motion: the ego's simulated speed until it rests (with the jolt then) or hits the lead: a crash looks smooth.",
     )
-    return TextTable("Margins and motion", ("policy", *map(_title, MARGINS)), rows, 1, notes=notes)
+    return TextTable("Margins and motion", ("policy", *map(_title, (*MARGINS, *MOTION))), rows, 1, notes=notes)
 
 
 def phase_table(run: Run) -> TextTable:
     """Lay out at which share of the diagram each ordering holds, a column a gap behaviour."""
-    scenes = {gap: scenes_of(run, "phase", gap) for gap in GAPS}
-    rows = [
-        (text, *(f"{share_of(scenes[gap], name).value:.1%}" for gap in GAPS))
-        for name, text in _shares(scenes.values()).items()
-    ]
+    rows = _share_rows(run, "phase", lambda share: f"{share.value:.1%}")
     asked = configuration(run)
     rows.append(("R of the paper's ordering", *(_span(rate_span(run, gap)) for gap in GAPS)))
     rows.append((f"  at a rear gap of {asked['rear_gap_m']:g} m", *(_span(rate_span_here(run, gap)) for gap in GAPS)))
@@ -74,25 +227,97 @@ def phase_table(run: Run) -> TextTable:
         f"Phase diagram: R {low:g} to {high:g} tokens/s, rear gap {near:g} to {far:g} m, {asked['follower']} follower"
     )
     rules = frozenset({len(rows) - 2})
-    return TextTable(title, ("share of the diagram", *GAPS), rows, 1, rules, _ordering_notes())
+    return TextTable(title, ("share of the diagram", *GAPS), rows, 1, rules, _ORDERING_NOTES)
 
 
 def random_table(run: Run) -> TextTable:
     """Lay out in which share of random scenarios each ordering holds, with its interval."""
-    scenes = {gap: scenes_of(run, "random", gap) for gap in GAPS}
-    rows = [
-        (text, *(_with_interval(share_of(scenes[gap], name)) for gap in GAPS))
-        for name, text in _shares(scenes.values()).items()
-    ]
     asked = configuration(run)
     title = f"{asked['random']} random scenarios: % [95 % Clopper-Pearson], {asked['follower']} follower"
-    return TextTable(title, ("ordering", *GAPS), rows, 1, notes=_ordering_notes())
+    return TextTable(title, ("ordering", *GAPS), _share_rows(run, "random", _with_interval), 1, notes=_ORDERING_NOTES)
 
 
-def _shares(scenes: Iterable[pd.DataFrame]) -> dict[str, str]:
-    """Return what is counted: the orderings, and the check on the car behind where the run has it."""
-    checked = all(found["survives"].notna().all() for found in scenes)
-    return {**ORDERINGS, **({"survives": "follower survives fast tokens"} if checked else {})}
+def _share_rows(run: Run, study: str, written: Callable[[Share], str]) -> list[tuple[str, ...]]:
+    """Return a row an ordering, and one of the check on the car behind where the run has it."""
+    scenes = {gap: scenes_of(run, study, gap) for gap in GAPS}
+    checked = all(found["survives"].notna().all() for found in scenes.values())
+    counted = {**ORDERINGS, **({"survives": "follower survives fast tokens"} if checked else {})}
+    return [(text, *(written(share_of(scenes[gap], name)) for gap in GAPS)) for name, text in counted.items()]
+
+
+def follower_tables(run: Run) -> dict[str, TextTable]:
+    """Lay out each follower at Euro NCAP's combinations: what came of the operating point, and shares of the plane."""
+    found, asked = run.table(FOLLOWER_STUDY), configuration(run)
+    rate = run.manifest["boards"][0]["tokens_per_s"]
+    where = f"R = {rate:g} tokens/s, rear gap {asked['rear_gap_m']:g} m, gap behaviour {asked['gap']}"
+    drawn = found[found["seed"].notna()]
+    seeds, points = drawn["seed"].nunique(), int(drawn["points"].iloc[0])
+    notes = (
+        "Survives: the follower stops behind an ego whose tokens come at once, at the same gap.",
+        f"{MARK} It does not: a rear outcome says nothing of the policy.",
+        *(f"{law({**asked, 'follower': follower})}." for follower in dict.fromkeys(found["follower"])),
+        NO_SCORE,
+    )
+    shares = (
+        Note(ORDERING, PAPERS),
+        f"Mean [least, most] of {seeds} seeds that draw {points} points of {plane_words(asked)} each.",
+        "naive*: of the points where the follower survives; nobody without stalls is hit there, as it brakes alike.",
+        "A front impact ends a roll-out.",
+        *notes,
+    )
+    header = ("follower", "lead", "ordering", "survives", "rear: naive", "wait", "stream", "naive*")
+    title = "Every follower at Euro NCAP's four CCRb combinations"
+    return {
+        "follower-shares": TextTable(f"{title}: % of the plane", header, _follower_rows(drawn), 2, notes=shares),
+        "followers": TextTable(
+            f"{title}: {where}",
+            ("follower", "lead", "survives", *PAPER),
+            _point_rows(found[found["seed"].isna()]),
+            2,
+            notes=notes,
+        ),
+    }
+
+
+def _point_rows(point: pd.DataFrame) -> list[tuple[str, ...]]:
+    rows = []
+    for key, group in point.groupby(_SETTING, sort=False):
+        here = {row["policy"]: row for row in group.to_dict("records")}
+        survives = "yes" if here[NAIVE]["survived"] else "no"
+        rows.append((*_names(key), survives, *(_outcome(here[policy]) for policy in PAPER)))
+    return rows
+
+
+def _follower_rows(drawn: pd.DataFrame) -> list[tuple[str, ...]]:
+    rows = []
+    for key, group in drawn.groupby(_SETTING, sort=False):
+        policies = {str(policy): mine for policy, mine in group.groupby("policy", sort=False)}
+        naive = policies[NAIVE]
+        of_all = (_range(naive[name], naive["points"]) for name in ("paper", "survived"))
+        rear = (_range(policies[policy]["rear"], policies[policy]["points"]) for policy in PAPER)
+        rows.append((*_names(key), *of_all, *rear, _range(naive["rear_survived"], naive["survived"])))
+    return rows
+
+
+def _names(setting: Any) -> tuple[str, str]:
+    follower, front_m, decel = setting
+    return str(follower), f"{front_m:g} m, -{decel:g}"
+
+
+def _outcome(row: dict[Any, Any]) -> str:
+    """Return an outcome of the operating point as its code, marked where it says nothing."""
+    outcome = CODES[int(row["front"]) + 2 * int(row["rear"])]
+    return outcome + marked(outcome, bool(row["survived"]))
+
+
+def _range(count: pd.Series[Any], of: pd.Series[Any]) -> str:
+    """Return shares of the seeds in percent: the mean, the least and the most."""
+    share = (100 * count[of > 0] / of[of > 0]).astype("float64")
+    if share.empty:
+        return ABSENT
+    if share.max() == share.min():
+        return f"{share.max():.0f}"
+    return f"{share.mean():.0f} [{share.min():.0f}, {share.max():.0f}]"
 
 
 def ccrb_tables(run: Run) -> dict[str, TextTable]:
@@ -142,13 +367,12 @@ def _counts(run: Run, table: Table[Any]) -> list[dict[str, Any]]:
 
 
 def _study(run: Run, study: str, gap: str) -> dict[str, Any]:
-    """Return the shares of one study under one gap behaviour."""
     scenes = scenes_of(run, study, gap)
-    shares = {}
-    for name in ORDERINGS:
-        share = share_of(scenes, name)
-        interval = {"ci95": list(share.interval)} if study == "random" else {}
-        shares[name] = {"k": share.k, "value": share.value, **interval}
+    found = {name: share_of(scenes, name) for name in ORDERINGS}
+    shares = {
+        name: {"k": share.k, "value": share.value, **({"ci95": list(share.interval)} if study == "random" else {})}
+        for name, share in found.items()
+    }
     check = {}
     if scenes["survives"].notna().all():
         survives = share_of(scenes, "survives")
@@ -158,16 +382,7 @@ def _study(run: Run, study: str, gap: str) -> dict[str, Any]:
     return {"study": study, "gap_behaviour": gap, "scenarios": len(scenes), "orderings": shares, **check, **rates}
 
 
-def _ordering_notes() -> tuple[str, ...]:
-    return (
-        Note(ORDERING, PAPERS),
-        "Worse, better: than stream-to-act, by an impact more than 0.5 m/s faster or slower; behind: from there alone.",
-        "Where the follower hits even an ego whose tokens come at once, a rear impact says nothing of the policy.",
-    )
-
-
 def _deadline_note(run: Run) -> tuple[str, ...]:
-    """Say by when a stall-free start is early enough."""
     deadline_s = float(rollouts_of(run, "point")["deadline_ns"].iloc[0]) / 1e9
     return (f"S_front = {deadline_s:.2f} s: who brakes as planned from then on keeps 2 m to the lead.",)
 
@@ -177,7 +392,6 @@ def _title(metric: Metric) -> str:
 
 
 def _entry(cell: dict[str, Any], metric: Metric) -> str:
-    """Return a metric of a cell as text."""
     value = cell.get(metric.name)
     if value is None:
         return ABSENT

@@ -1,10 +1,21 @@
-"""How a run of chunks is shown: its tables, figures, sentences and JSON."""
+"""How a run of chunks is shown: its sentences, tables, figures and JSON."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments import Shown
+from s2a_bench.experiments.chunks.view.figures import chunk_figures, lanes_of
+from s2a_bench.experiments.chunks.view.tables import (
+    chunk_csv,
+    chunk_json,
+    chunk_tables,
+    entry,
+    live,
+    rows_of,
+    sources_of,
+)
+from s2a_bench.writers.tables import number
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
@@ -12,10 +23,6 @@ if TYPE_CHECKING:
 
 def show(run: Run, **_: Any) -> Shown:
     """Return what a run of chunks shows."""
-    from s2a_bench.experiments.chunks.view.figures import chunk_figures
-    from s2a_bench.experiments.chunks.view.lanes import lanes_of
-    from s2a_bench.experiments.chunks.view.tables import chunk_csv, chunk_json, chunk_sentences, chunk_tables
-
     tables = chunk_tables(run)
     main = [name for name in ("chunks", "loop") if name in tables]
     return Shown(
@@ -28,3 +35,28 @@ def show(run: Run, **_: Any) -> Shown:
         json=lambda: chunk_json(run),
         lanes=lanes_of(run),
     )
+
+
+def chunk_sentences(run: Run) -> list[str]:
+    """Return what calibration costs over the oracle, what the other rules do, and how a control loop kept time."""
+    said = []
+    epsilon = float(run.manifest["configuration"]["epsilon"])
+    for name, rows in sources_of(rows_of(run)):
+        by_rule = {row["rule"]: row for row in rows if row["p_stall_cycle"] is not None}
+        parts = [
+            f"{rule} {row['p_stall_cycle']:.2%} at age {entry(row['age_ticks_mean'])}"
+            for rule, row in by_rule.items()
+            if rule != "given"
+        ]
+        if parts:
+            said.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(parts)} ticks.")
+        if live(run):
+            least, worst = min(row["agreement"] for row in rows), max(row["jitter_s_p99"] for row in rows)
+            said.append(
+                f"Control loop @ {name}: {least:.2%} of the ticks and more are as virtual time has them; "
+                f"p99 of the jitter {number(worst * 1e3)} ms at most."
+            )
+        slower = max((row["slow_down"] or 1 for row in rows if row["mode"].startswith("queue")), default=1)
+        if slower > 1:
+            said.append(f"@ {name} no trigger of queue is enough: actions would have to be {slower:.2f} times slower.")
+    return said

@@ -1,36 +1,36 @@
-"""The figures of a run of chunks: stability diagram, P(stall) against trigger, reactions; PNG and PDF."""
+"""The figures of a run of chunks: lanes of control ticks, stalls and smoothness over latency, triggers, reactions."""
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.chunks.rows import REACTIONS, SMOOTHNESS, STABILITY, TRIGGERS
-from s2a_bench.experiments.chunks.view.lanes import build_lanes, lanes_of, short
+from s2a_bench.experiments.chunks.rows import MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
 from s2a_bench.experiments.chunks.view.tables import rows_of, sources_of
-from s2a_bench.writers.figures import LINE_CHARS, new_figure
+from s2a_bench.writers.figures import LINE_CHARS, new_figure, wrapped
+from s2a_bench.writers.style import STALL_LOOK, WIDE_IN
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from s2a_bench.store.run import Run
 
-LOOKS: Final = (
-    ("#0072B2", "-", "o"),
-    ("#D55E00", "-", "s"),
-    ("#009E73", "-", "^"),
-    ("#CC79A7", "-", "D"),
-    ("#E69F00", "-", "v"),
-    ("#56B4E9", "-", "P"),
-    ("#000000", "-", "X"),
-    ("#999999", "-", "*"),
-)
-"""Colour, line, marker: of modes, of sources."""
+MOST_LANES: Final = 12
+"""More would not be legible; chunk_ticks.csv has all."""
+COLOURS: Final = ("#0072B2", "#56B4E9", "#009E73")
+"""Of chunks that follow one another."""
+_BAR: Final = 0.34
+_AGE: Final = 0.42
+"""Height of the greatest age."""
+LOOKS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+"""Of modes, of sources."""
 _RULES: Final = {"calibrated": "o", "tracked": "s", "maximum": "^", "mean": "v", "oracle": "*"}
 _INK: Final = "#222222"
 _MOST_PANELS: Final = 8
@@ -38,58 +38,168 @@ _BULK: Final = 0.985
 """The axis of reaction times ends a little behind this quantile; chunk_reactions.csv has the rest."""
 
 
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """The first ticks of one cell, and the requests that left in them."""
+
+    name: str
+    rule: str
+    source: str
+    ticks: pd.DataFrame
+    requests: pd.DataFrame
+    period_s: float
+
+    @property
+    def title(self) -> str:
+        return self.name if self.rule == "given" else f"{self.name}, {self.rule}"
+
+
+def lanes_of(run: Run) -> list[Lane]:
+    """Return the lanes of a run: the modes as given, and the calibrated trigger."""
+    ticks, requests = run.table(TICKS), run.table(REQUESTS)
+    shown = int(run.manifest["configuration"]["shown_ticks"])
+    ticks, requests = ticks[ticks["tick"] < shown], requests[requests["request_tick"] < shown]
+    found = []
+    for row in rows_of(run):
+        mine = ticks[ticks["cell"] == row["cell"]]
+        if len(mine) and row["rule"] in {"given", "calibrated"}:
+            asked = requests[requests["cell"] == row["cell"]]
+            found.append(Lane(row["mode"], row["rule"], row["latency"], mine, asked, row["delta_t_s"]))
+    return found[:MOST_LANES]
+
+
+def build_lanes(run: Run) -> Figure:
+    """Draw the lanes below one another: actions coloured by chunk, stalls hatched, requests above, ages below."""
+    lanes = lanes_of(run)
+    asked = run.manifest["configuration"]
+    several = len({lane.source for lane in lanes}) > 1
+    setting = f"H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {asked['rounding']}"
+    source = "" if several else f" @ {lanes[0].source}"
+    title = f"What each control tick executes{source}, {setting}"
+    figure = new_figure(0.75 + 0.55 * len(lanes), wrapped((title,), WIDE_IN), WIDE_IN)
+    axes = figure.subplots()
+    oldest = max(int(lane.ticks["age_ticks"].fillna(0).max()) for lane in lanes) or 1
+    for place, lane in enumerate(lanes):
+        draw_lane(axes, lane, place, oldest)
+    axes.set_yticks(range(len(lanes)), [_label(lane, several=several) for lane in lanes])
+    axes.tick_params(axis="y", length=0)
+    axes.set_ylim(len(lanes) - 0.33, -0.6)
+    axes.set_xlim(0, max(len(lane.ticks) for lane in lanes))
+    axes.set_xlabel("control tick")
+    figure.legend(handles=_legend(oldest), loc="outside lower center", ncols=5, columnspacing=1.0)
+    return figure
+
+
+def draw_lane(axes: Axes, lane: Lane, place: int, oldest: int) -> None:
+    """Draw one lane around y = ``place``; ``oldest`` is the age that the curve below reaches the next lane with."""
+    top = place - _BAR / 2
+    chunk = lane.ticks["chunk"].fillna(-1).to_numpy(dtype="int64")
+    stalled = lane.ticks["stalled"].to_numpy(dtype="bool")
+    for first, last in runs_of(np.where(stalled, -2, chunk)):
+        width = last - first
+        if stalled[first]:
+            axes.broken_barh([(first, width)], (top, _BAR), **STALL_LOOK)
+        elif chunk[first] >= 0:
+            axes.broken_barh([(first, width)], (top, _BAR), color=COLOURS[chunk[first] % len(COLOURS)], linewidth=0)
+    for row in lane.requests.to_dict("records"):
+        leaves, usable = row["request_tick"], row["request_tick"] + row["delay_ticks"]
+        axes.hlines(top - 0.07, leaves, usable, "#666666", linewidth=0.7)
+        axes.plot([leaves], [top - 0.07], "|", color="#666666", markersize=3, markeredgewidth=0.7)
+        if row["thrown_away"] and row["executed"] and row["start_tick"] + row["executed"] < len(chunk):
+            end = row["start_tick"] + row["executed"]
+            axes.annotate(
+                f"\N{MINUS SIGN}{row['thrown_away']}", (end, place), ha="right", va="center", fontsize=4, color="white"
+            )
+    age = lane.ticks["age_ticks"].to_numpy(dtype="float64", na_value=np.nan)
+    axes.step(
+        np.arange(age.size + 1),
+        place + _BAR / 2 + 0.03 + _AGE * np.append(age, age[-1]) / oldest,
+        where="post",
+        color="#D55E00",
+        linewidth=0.7,
+    )
+
+
+def runs_of(values: np.ndarray) -> list[tuple[int, int]]:
+    """Return from where to before where values are the same."""
+    edges = np.flatnonzero(np.diff(values)) + 1
+    bounds = [0, *edges.tolist(), values.size]
+    return list(pairwise(bounds))
+
+
+def _label(lane: Lane, *, several: bool) -> str:
+    parts = [lane.title, lane.source] if several else [lane.title]
+    return "\n".join(short(part, 30) for part in parts)
+
+
+def short(text: str, most: int) -> str:
+    """Return a text of ``most`` letters at most, cut off: `textwrap.shorten` leaves nothing of one long word."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def _legend(oldest: int) -> list[object]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    return [
+        Patch(color=COLOURS[0], label="actions of one chunk (\N{MINUS SIGN}k: thrown away)"),
+        Patch(**STALL_LOOK, label="stall"),
+        Line2D([], [], color="#666666", linewidth=0.7, marker="|", markersize=3, label="request to usable chunk"),
+        Line2D([], [], color="#D55E00", linewidth=0.7, label=f"age of the observation, down to {oldest} ticks"),
+    ]
+
+
 def chunk_figures(run: Run) -> dict[str, Callable[[], Figure]]:
     """Return each figure that the run has rows for, by its file's name."""
     found: dict[str, Callable[[], Figure]] = {}
     if lanes_of(run):
         found["lanes"] = partial(build_lanes, run)
-    if len(run.table(STABILITY)):
+    if len(means := run.table(MEANS)):
         found["stability"] = partial(build_stability, run)
     if len(run.table(TRIGGERS)):
         found["triggers"] = partial(build_triggers, run)
     if len(run.table(REACTIONS)):
         found["reactions"] = partial(build_reactions, run)
-    if len(run.table(SMOOTHNESS)):
-        from s2a_bench.experiments.chunks.view.smoothness import build_smoothness
-
+    if means["tracking_rms"].notna().any():
         found["smoothness"] = partial(build_smoothness, run)
     return found
 
 
 def build_stability(run: Run) -> Figure:
-    """Draw the stalled share of the ticks over mean latency and execution horizon, with the line s = H - d.
+    """Draw the stalled share of the ticks over mean latency, a line a mode."""
+    return _over_means(run, "Stalled share of the ticks", {"stall_share": "stalled share"})
 
-    Beside it what one request under way adds: L <= H Delta t / 2, as a cycle lasts for two delays then.
-    """
-    rows = run.table(STABILITY)
-    asked = run.manifest["configuration"]
-    horizon, period_s = int(asked["horizon"]), float(asked["period_ns"]) / 1e9
-    table = rows.pivot_table(index="execution_horizon", columns="latency_s", values="stall_share", dropna=False)
-    mode = str(rows["mode"].iloc[0])
-    figure = new_figure(
-        2.9, title_of(run, f"Stalled share of the ticks, {mode}", f"shape of {rows['latency'].iloc[0]}")
-    )
-    axes = figure.subplots()
-    mesh = axes.pcolormesh(
-        table.columns.to_numpy(dtype="float64") * 1e3,
-        table.index.to_numpy(dtype="float64"),
-        table.to_numpy(dtype="float64", na_value=np.nan),
-        cmap="Oranges",
-        vmin=0,
-        vmax=1,
-        shading="nearest",
-        rasterized=True,
-    )
-    figure.colorbar(mesh, ax=axes, label="stalled share", pad=0.02)
-    delay = np.arange(horizon + 1)
-    axes.plot(delay * period_s * 1e3, horizon - delay, color=_INK, label="$s = H - d$")
-    if "under_way=many" not in mode:
-        axes.axvline(horizon / 2 * period_s * 1e3, color=_INK, linestyle="--", label="$d = H / 2$: one under way")
-    axes.set_xlim(0, horizon * period_s * 1e3)
-    axes.set_ylim(0.5, horizon + 0.5)
-    axes.set_xlabel("mean latency, L (ms)")
-    axes.set_ylabel("execution horizon, s (ticks)")
-    figure.legend(loc="outside lower center", ncols=2)
+
+def build_smoothness(run: Run) -> Figure:
+    """Draw tracking error and jerk over mean latency; dashed what the plant alone does, asked in every tick."""
+    panels = {"tracking_rms": "tracking error (sd)", "jerk_rms": "jerk (sd/s$^3$)"}
+    return _over_means(run, "Following a target", panels)
+
+
+def _over_means(run: Run, what: str, shown: Mapping[str, str]) -> Figure:
+    """Draw columns, each with its label, a panel each; dashed the ideal of those that have one."""
+    rows = run.table(MEANS)
+    modes = [str(mode) for mode in rows["mode"].unique()][: len(LOOKS)]
+    columns = 2 if max(map(len, modes)) <= LINE_CHARS // 3 else 1
+    foot_in = 0.17 * -(-(len(modes) + 1) // columns)
+    title = _title(run, what, f"shape of {rows['latency'].iloc[0]}")
+    figure = new_figure(0.9 + 1.3 * len(shown) + foot_in, title)
+    panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
+    latency_ms = rows["latency_s"].to_numpy(dtype="float64") * 1e3
+    for axes, (name, label) in zip(panels, shown.items(), strict=True):
+        values = rows[name].to_numpy(dtype="float64", na_value=np.nan)
+        for mode, colour in zip(modes, LOOKS, strict=False):
+            mine = (rows["mode"] == mode).to_numpy()
+            axes.plot(latency_ms[mine], values[mine], color=colour, label=short(mode, LINE_CHARS - 8))
+        if f"{name}_ideal" in rows:
+            ideal = rows.groupby("latency_s")[f"{name}_ideal"].mean().to_numpy(dtype="float64")
+            axes.plot(np.unique(latency_ms), ideal, "--", color="black", label="asked in every tick, answered at once")
+        axes.set_ylim(bottom=0)
+        axes.ticklabel_format(axis="y", scilimits=(-3, 5))
+        axes.set_ylabel(label)
+    panels[-1].set_xlim(0, float(latency_ms.max()))
+    panels[-1].set_xlabel("mean latency, L (ms)")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=columns, columnspacing=1.0)
     return figure
 
 
@@ -99,19 +209,19 @@ def build_triggers(run: Run) -> Figure:
     epsilon = float(run.manifest["configuration"]["epsilon"])
     groups = sources_of(rows_of(run))[:_MOST_PANELS]
     more = "line: closed form; dots: simulated; 0 lies at the bottom"
-    figure = new_figure(2.6 + 0.16 * len(groups), title_of(run, "P(stall) against the trigger of queue", more))
+    figure = new_figure(2.6 + 0.16 * len(groups), _title(run, "P(stall) against the trigger of queue", more))
     axes = figure.subplots()
     sources: list[Any] = []
     rules: list[Any] = []
     floor = min(epsilon, 1 / max(int(rows["boundaries"].max()), 1)) / 2
     for place, (name, cells) in enumerate(groups):
-        colour, line, _ = LOOKS[place % len(LOOKS)]
+        colour = LOOKS[place % len(LOOKS)]
         mine = rows[rows["latency"] == name]
         told = mine[mine["p_stall_closed"].notna()]
         closed = np.maximum(told["p_stall_closed"].to_numpy(dtype="float64"), floor)
-        axes.plot(told["trigger"].to_numpy(dtype="float64"), closed, line, color=colour, linewidth=0.9)
+        axes.plot(told["trigger"].to_numpy(dtype="float64"), closed, color=colour, linewidth=0.9)
         label = short(name, LINE_CHARS - 8)
-        sources += axes.plot([], [], line, color=colour, label=label)
+        sources += axes.plot([], [], color=colour, label=label)
         share = mine["p_stall_cycle"].to_numpy(dtype="float64")
         above = share - mine["p_stall_low"].to_numpy(dtype="float64")
         below = mine["p_stall_high"].to_numpy(dtype="float64") - share
@@ -151,13 +261,14 @@ def build_reactions(run: Run) -> Figure:
     names = list(dict.fromkeys(_who(cell) for _, cells in groups for cell in cells if _drawn(cell)))
     what = "from an event to the first tick that knows of it"
     foot_in = 0.17 * -(-(len(names) + 1) // 2)
-    figure = new_figure(0.6 + foot_in + 1.6 * len(groups), title_of(run, "Reaction time", what))
+    figure = new_figure(0.6 + foot_in + 1.6 * len(groups), _title(run, "Reaction time", what))
     panels = figure.subplots(len(groups), 1, squeeze=False)[:, 0]
     for axes, (source, cells) in zip(panels, groups, strict=True):
         for cell in filter(_drawn, cells):
-            colour, line, _ = LOOKS[names.index(_who(cell)) % len(LOOKS)]
             mine = rows[rows["cell"] == cell["cell"]]
-            _draw_distribution(axes, mine, colour, line)
+            told = mine[mine["closed_s"].notna()]
+            axes.plot(mine["reaction_s"] * 1e3, mine["share"], color=LOOKS[names.index(_who(cell)) % len(LOOKS)])
+            axes.plot(told["closed_s"] * 1e3, told["share"], ":", color="black", linewidth=0.8)
         axes.set_title(short(source, LINE_CHARS), loc="left", pad=2)
         axes.set_ylim(0, 1)
         shown = rows[rows["cell"].isin([cell["cell"] for cell in cells if _drawn(cell)]) & (rows["share"] <= _BULK)]
@@ -165,25 +276,11 @@ def build_reactions(run: Run) -> Figure:
         axes.set_ylabel("share")
     panels[-1].set_xlabel("reaction time (ms)")
     handles: list[Any] = [
-        panels[-1].plot([], [], LOOKS[place % len(LOOKS)][1], color=LOOKS[place % len(LOOKS)][0], label=name)[0]
-        for place, name in enumerate(names)
+        panels[-1].plot([], [], color=LOOKS[place % len(LOOKS)], label=name)[0] for place, name in enumerate(names)
     ]
     handles += panels[-1].plot([], [], ":", color="black", label="closed form")
     figure.legend(handles=handles, loc="outside lower center", ncols=2, columnspacing=1.0)
     return figure
-
-
-def _draw_distribution(axes: Axes, rows: Any, colour: str, line: str) -> None:
-    share = rows["share"].to_numpy(dtype="float64")
-    axes.plot(rows["reaction_s"].to_numpy(dtype="float64") * 1e3, share, line, color=colour)
-    told = rows[rows["closed_s"].notna()]
-    axes.plot(
-        told["closed_s"].to_numpy(dtype="float64") * 1e3,
-        told["share"].to_numpy(dtype="float64"),
-        ":",
-        color="black",
-        linewidth=0.8,
-    )
 
 
 def _drawn(cell: dict[str, Any]) -> bool:
@@ -195,8 +292,7 @@ def _who(cell: dict[str, Any]) -> str:
     return str(cell["mode"]) if cell["rule"] == "given" else f"{cell['mode']}, {cell['rule']}"
 
 
-def title_of(run: Run, what: str, more: str) -> str:
-    """Return what is drawn, and under which setting."""
+def _title(run: Run, what: str, more: str) -> str:
     asked = run.manifest["configuration"]
     setting = f"H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {asked['rounding']}"
-    return "\n".join(textwrap.fill(line, LINE_CHARS) for line in (f"{what}, {setting}", more))
+    return wrapped((f"{what}, {setting}", more))

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from s2a_bench.experiments.chunks.rows import CHUNKS
-from s2a_bench.experiments.chunks.view.cell import ChunkCell
+from s2a_bench.experiments import SHARE
+from s2a_bench.experiments.chunks.rows import CHUNKS, METRICS, ChunkRow
+from s2a_bench.policy.chunks import streams
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import PROVENANCE
-from s2a_bench.writers.as_json import frame
+from s2a_bench.store.schema import PROVENANCE, about
+from s2a_bench.writers.as_json import cell_of_row, frame
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.tables import ABSENT, EMULATED, Note, TextTable, number
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
+
+ChunkCell = cell_of_row(
+    "ChunkCell",
+    "A mode of acting on chunks under one source of latencies.",
+    ChunkRow,
+    without=(),
+    own={
+        "emulated": Annotated[bool, about("Whether latencies were given or drawn, in virtual time or by the server.")]
+    },
+)
 
 Row = dict[str, Any]
 
@@ -24,16 +34,23 @@ _CONVENTION: Final = {
     "ceil": "d = ceil(L / Delta t): an action leaves at the start of its tick, as lerobot counts.",
 }
 
-_SMOOTHNESS: Final = {
-    "tracking_rms": "tracking",
-    "tracking_rms_ideal": "ideal",
-    "jerk_rms": "jerk",
-    "jerk_rms_ideal": "ideal",
-    "boundary_jump_mean": "jump",
-    "boundary_jump_p99": "p99",
-    "action_step_mean": "step",
-}
-_OF_A_TARGET: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms_ideal")
+_STALLS: Final = (
+    *("execution_horizon", "trigger", "stall_ticks_per_s", "p_stall_cycle", "p_stall_closed", "longest_stall_ticks"),
+    "margin_ticks",
+)
+_ACTIONS: Final = (
+    *("age_ticks_mean", "age_ticks_max", "reaction_s_mean", "reaction_s_closed", "reaction_s_p99", "control_rate_hz"),
+    *("thrown_away_share", "jump_mean"),
+)
+_LOOP: Final = (
+    *("agreement", "jitter_s_p50", "jitter_s_p99", "jitter_s_max", "late_ticks", "blocked_s_p99", "blocked_s_max"),
+    "bytes_up_per_s",
+)
+_MOTION: Final = ("jerk_rms", "boundary_jump_mean", "boundary_jump_p99", "action_step_mean")
+_FOLLOWING: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal", *_MOTION[1:])
+_TITLES: Final = {"execution_horizon": "s", "trigger": "m", **{name: metric.title for name, metric in METRICS.items()}}
+_SCALES: Final = {"s": 1e3, "bytes/s": 1e-6}
+"""Times are shown in ms, bytes in MB."""
 _EMULATED: Final = Note(
     "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
 )
@@ -61,25 +78,22 @@ def sources_of(rows: list[Row]) -> list[tuple[str, list[Row]]]:
 
 def stall_table(run: Run) -> TextTable:
     """Lay out how often each mode stalls, and what would have been safe."""
-    header = ("s", "m", "stalls/s", "P(stall), %", "form", "longest", "margin")
-    return _table(run, "Stalls", header, _stalls)
+    return _table(run, "Stalls", _STALLS)
 
 
 def action_table(run: Run) -> TextTable:
     """Lay out how old the actions are, how soon the robot reacts, and what is lost at boundaries."""
-    header = ("age", "max", "react (ms)", "form", "p99", "Hz", "unused, %", "jump")
-    return _table(run, "Actions: ages in ticks", header, _actions)
+    return _table(run, "Actions: ages in ticks", _ACTIONS)
 
 
 def loop_table(run: Run) -> TextTable:
     """Lay out how well the control loop of a live run kept time."""
-    header = ("alike, %", "jitter (ms)", "p99", "max", "late", "busy (ms)", "max", "MB/s up")
     note = (
         "alike: share of the ticks that virtual time has the same way, on the latencies that were measured; jitter: "
         "how long after it was due an action left; late: by a tick or more; busy: for how long asking and sending kept "
         "the loop in a tick, p99."
     )
-    return replace(_table(run, "Control loop", header, _loop), notes=(_convention(run), note))
+    return _table(run, "Control loop", _LOOP, (_convention(run), note))
 
 
 def live(run: Run) -> bool:
@@ -89,18 +103,16 @@ def live(run: Run) -> bool:
 
 def smoothness_table(run: Run) -> TextTable:
     """Lay out how smoothly a plant moves under each mode; in virtual time, how well it follows a target besides."""
-    names = {name: title for name, title in _SMOOTHNESS.items() if not live(run) or name not in _OF_A_TARGET}
-    table = _table(run, "Smoothness", tuple(names.values()), lambda row: (_number(row[name]) for name in names))
     robot = run.manifest["configuration"]["robot"]
     jump = "jump: from one action to the next across a boundary, step: within a chunk."
     if live(run):
         note = f"Jerk (root mean square) of {robot}, in the actions' unit and s. {jump}"
-        return replace(table, notes=(_convention(run), note))
+        return _table(run, "Smoothness", _MOTION, (_convention(run), note))
     note = (
         f"Tracking error and jerk (root mean squares) of {robot}, in the target's standard deviation and s; ideal: "
         f"asked in every tick and answered at once. {jump}"
     )
-    return replace(table, notes=(_convention(run), note, _EMULATED))
+    return _table(run, "Smoothness", _FOLLOWING, (_convention(run), note, _EMULATED))
 
 
 def chunk_tables(run: Run) -> dict[str, TextTable]:
@@ -113,17 +125,17 @@ def chunk_tables(run: Run) -> dict[str, TextTable]:
 
 def delay_table(run: Run) -> TextTable:
     """Lay out the realised delays of each source, live of each mode beside the d that it is ready for."""
+    names = ["delay_ticks_mean", "delay_ticks_p99", "delay_ticks_max"]
+    names += ["delay_assumed_ticks", "p_delay_above"] if live(run) else []
     rows = []
     for place, (name, group) in enumerate(sources_of(rows_of(run)), 1):
-        shared = next((row for row in group if not row["mode"].startswith("streamed")), group[0])
+        shared = next((row for row in group if not streams(row["mode"])), group[0])
         for one in group if live(run) else [shared]:
-            delays = (_number(one[f"delay_ticks_{part}"]) for part in ("mean", "p99", "max"))
             latency = (number(one[part] * 1e3) for part in ("latency_s", "latency_s_p99"))
-            told = (_number(one["delay_assumed_ticks"]), _percent(one["p_delay_above"])) if live(run) else ()
             who = (one["mode"],) if live(run) else (name, str(one["requests"]))
-            rows.append((str(place), *who, *latency, *delays, *told))
-    left, more = (("L", "mode"), ("assumed", "above, %")) if live(run) else (("L", "latency", "requests"), ())
-    header = (*left, "ms", "p99", "d", "p99", "max", *more)
+            rows.append((str(place), *who, *latency, *(_cell(one, name) for name in names)))
+    left = ("L", "mode") if live(run) else ("L", "latency", "requests")
+    header = (*left, "ms", "p99", *(_TITLES[name] for name in names))
     title = f"Delays, d = {_rounding(run)} of L over Delta t"
     return TextTable(title, header, rows, 2, notes=(_convention(run),))
 
@@ -141,48 +153,25 @@ def chunk_json(run: Run) -> dict[str, Any]:
     )
 
 
-def chunk_sentences(run: Run) -> list[str]:
-    """Return what calibration costs over the oracle, what the other rules do, and how a control loop kept time."""
-    said = []
-    epsilon = float(run.manifest["configuration"]["epsilon"])
-    for name, rows in sources_of(rows_of(run)):
-        by_rule = {row["rule"]: row for row in rows if row["p_stall_cycle"] is not None}
-        parts = [
-            f"{rule} {row['p_stall_cycle']:.2%} at age {_number(row['age_ticks_mean'])}"
-            for rule, row in by_rule.items()
-            if rule != "given"
-        ]
-        if parts:
-            said.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(parts)} ticks.")
-        if live(run):
-            least, worst = min(row["agreement"] for row in rows), max(row["jitter_s_p99"] for row in rows)
-            said.append(
-                f"Control loop @ {name}: {least:.2%} of the ticks and more are as virtual time has them; "
-                f"p99 of the jitter {number(worst * 1e3)} ms at most."
-            )
-        slower = max((row["slow_down"] or 1 for row in rows if row["mode"].startswith("queue")), default=1)
-        if slower > 1:
-            said.append(f"@ {name} no trigger of queue is enough: actions would have to be {slower:.2f} times slower.")
-    return said
-
-
-def _table(run: Run, title: str, header: tuple[str, ...], cells: Any) -> TextTable:
+def _table(run: Run, title: str, names: Sequence[str], notes: Iterable[str] | None = None) -> TextTable:
     """Lay out a line a row; of several sources the first column has the number that the table of delays names."""
-    rows: list[tuple[str, ...]] = []
-    rules = []
     found = sources_of(rows_of(run))
     several = len(found) > 1
     ruled = any(row["rule"] != "given" for row in rows_of(run))
     named = ("mode", "rule") if ruled or not live(run) else ("mode",)
-    for place, (_, group) in enumerate(found, 1):
-        rules.append(len(rows))
-        rows += [((str(place),) * several + (*(_named(row, name) for name in named), *cells(row))) for row in group]
+    groups = [
+        [
+            (*(str(place),) * several, *(_named(row, name) for name in named), *(_cell(row, name) for name in names))
+            for row in group
+        ]
+        for place, (_, group) in enumerate(found, 1)
+    ]
     asked = run.manifest["configuration"]
     of = "" if several else f" @ {found[0][0]}" if found else ""
     slower = f" / {asked['slow_down']:g}" if asked.get("slow_down", 1) > 1 else ""
     what = f"{title}{of}, H = {asked['horizon']}, {asked['control_hz']:g}{slower} Hz, d by {_rounding(run)}"
-    left = ("L",) * several + named
-    return TextTable(what, (*left, *header), rows, len(left), frozenset(rules[1:]), tuple(_notes(run)))
+    header = (*("L",) * several, *named, *(_TITLES[name] for name in names))
+    return TextTable.grouped(what, header, groups, several + len(named), _notes(run) if notes is None else notes)
 
 
 def _named(row: Row, column: str) -> str:
@@ -191,52 +180,25 @@ def _named(row: Row, column: str) -> str:
     return f"{row[column]}, {slower:.3g}x slower" if column == "rule" and slower > 1 else str(row[column])
 
 
-def _stalls(row: Row) -> Iterator[str]:
-    yield str(row["execution_horizon"])
-    yield _number(row["trigger"])
-    yield _number(row["stall_ticks_per_s"])
-    yield _interval(row)
-    yield _percent(row["p_stall_closed"])
-    yield _number(row["longest_stall_ticks"])
-    yield _number(row["margin_ticks"])
-
-
-def _actions(row: Row) -> Iterator[str]:
-    for name in ("age_ticks_mean", "age_ticks_max"):
-        yield _number(row[name])
-    for name in ("reaction_s_mean", "reaction_s_closed", "reaction_s_p99"):
-        yield ABSENT if row[name] is None else number(row[name] * 1e3)
-    yield _number(row["control_rate_hz"])
-    yield _percent(row["thrown_away_share"])
-    yield _number(row["jump_mean"])
-
-
-def _loop(row: Row) -> Iterator[str]:
-    yield _percent(row["agreement"])
-    for name in ("jitter_s_p50", "jitter_s_p99", "jitter_s_max"):
-        yield number(row[name] * 1e3)
-    yield str(row["late_ticks"])
-    for name in ("blocked_s_p99", "blocked_s_max"):
-        yield number(row[name] * 1e3)
-    yield number(row["bytes_up_per_s"] / 1e6)
-
-
-def _interval(row: Row) -> str:
-    if row["p_stall_cycle"] is None:
-        return ABSENT
-    share, low, high = (_percent(row[f"p_stall_{part}"]) for part in ("cycle", "low", "high"))
-    return f"{share} [{low}, {high}]"
-
-
-def _percent(value: float | None) -> str:
-    """Write a share in percent, without the sign."""
-    return ABSENT if value is None else _number(round(value * 100, 6))
-
-
-def _number(value: float | None) -> str:
-    """Write a number, a whole one without decimals."""
+def _cell(row: Row, name: str) -> str:
+    """Write one value of a row as tables show it: shares in percent without the sign, P(stall) with its interval."""
+    value, metric = row[name], METRICS.get(name)
     if value is None:
         return ABSENT
+    if metric is None:
+        return entry(value)
+    if metric.unit in _SCALES:
+        return number(value * _SCALES[metric.unit])
+    if metric.kind != SHARE:
+        return entry(value)
+    percent = entry(round(value * 100, 6))
+    if name != "p_stall_cycle":
+        return percent
+    return f"{percent} [{_cell(row, 'p_stall_low')}, {_cell(row, 'p_stall_high')}]"
+
+
+def entry(value: float) -> str:
+    """Write a number, a whole one without decimals."""
     return str(int(value)) if float(value).is_integer() else number(value)
 
 
@@ -249,14 +211,13 @@ def _convention(run: Run) -> str:
 
 
 def _notes(run: Run) -> Iterator[str]:
-    """Yield what a reader must know besides the numbers."""
     yield _convention(run)
     yield (
         "P(stall): share of the cycles, with its 95 % interval; form: what the closed form says, where it holds; "
         "margin: ticks that all latencies may be longer without a stall. Ages and stalls are in control ticks."
     )
     rows = rows_of(run)
-    if any(row["mode"].startswith("streamed") for row in rows):
+    if any(streams(row["mode"]) for row in rows):
         yield "streamed: the latency is that of the first action, d that of the last."
     if any(row["slow_down"] is not None and row["slow_down"] > 1 for row in rows):
         yield "Where no trigger is enough, actions have to be slower by beta (chunks.csv: slow_down)."

@@ -1,15 +1,41 @@
-"""How a latency run is shown: tables, figures, sentences and JSON, and what of them a terminal has room for."""
+"""How a latency run is shown: sentences and tables, and what of them a terminal has room for."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments import Shown
+from s2a_bench.experiments.latency.metrics import METRICS, latency_csv, latency_json
+from s2a_bench.experiments.latency.view.figures import latency_figures
+from s2a_bench.experiments.requests import (
+    Cell,
+    asked,
+    cells_of,
+    chunks,
+    engine_notes,
+    failure_notes,
+    groups_present,
+    launches_note,
+    numbers_ms,
+    pieces_of,
+    ratio_between,
+    ratios,
+    span_of,
+    spelled,
+    stages_present,
+)
+from s2a_bench.inference import declared as engine
+from s2a_bench.stats import summary_of
+from s2a_bench.trace import RESIDUAL_LIMIT
+from s2a_bench.transport import declared
+from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interval, number
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
+    from s2a_bench.experiments.requests import Floats, RequestMetric
+    from s2a_bench.stats import Ratio
     from s2a_bench.store.run import Run
 
 _FULL_CELLS = 2
@@ -18,17 +44,12 @@ _SUMMARY_COLUMNS = 9
 """With more columns than these, ratios to more than two cells, the spread is told in short."""
 _STAGE_CELLS = 5
 """With more cells than these the cells become rows."""
+_MOST = 6
+"""Sentences of one kind; the tables have the rest."""
 
 
 def show(run: Run, *, against: str = "", verbose: bool = False, **_: Any) -> Shown:
     """Return what a latency run shows."""
-    from s2a_bench.experiments.latency.view.as_csv import csv_texts
-    from s2a_bench.experiments.latency.view.as_json import latency_json
-    from s2a_bench.experiments.latency.view.cells import cells_of
-    from s2a_bench.experiments.latency.view.figures import latency_figures
-    from s2a_bench.experiments.latency.view.sentences import latency_sentences
-    from s2a_bench.experiments.latency.view.tables import group_table, latency_tables, stage_table, summary_table
-
     n = len(cells_of(run))
     tables = latency_tables(run)
     stages = group_table(run) if n > _STAGE_CELLS else stage_table(run, full=n <= _FULL_CELLS)
@@ -45,7 +66,7 @@ def show(run: Run, *, against: str = "", verbose: bool = False, **_: Any) -> Sho
         printed=[name for name in tables if name in printed],
         narrow=narrow,
         notes=[" ".join(dict.fromkeys((*stages.notes, *compared.notes))), *(_verbose(run) if verbose else ())],
-        csvs=csv_texts(run),
+        csvs=latency_csv(run),
         figures=latency_figures(run, against_paper=against == "paper"),
         json=lambda: latency_json(run),
     )
@@ -56,14 +77,12 @@ def _printed(run: Run) -> set[str]:
 
     Without model is printed where a llama-server stands beside our own, which it alone can be compared with.
     """
-    from s2a_bench.experiments.latency.view.cells import cells_of
-
     cells = cells_of(run)
     known = [bool(cell.values_ms("e2e_without_inference").size) for cell in cells]
     names = {"stages", "tokens", "frames"}
     if any(known):
         names.add("summary")
-    if not all(known) or any(cell.about["engine"] != "echo" for cell in cells):
+    if not all(known) or any(engine(cell.about["engine"]).computes for cell in cells):
         names.add("summary-e2e")
     if any(cell.has_ingest for cell in cells):
         names.add("summary-model")
@@ -71,9 +90,238 @@ def _printed(run: Run) -> set[str]:
 
 
 def _verbose(run: Run) -> Iterator[str]:
-    """Yield what measuring costs, and the environment."""
     yield f"a mark costs {run.manifest['mark_cost_ns']} ns"
     if sampled := run.manifest.get("resources"):
         share, edge_us = sampled["core_share"] or 0, sampled["edge_us"]
         yield f"sampling takes {share:.2%} of a core, and {edge_us} us before and after each request"
     yield from json.dumps(run.manifest["environment"], indent=2, ensure_ascii=False).splitlines()
+
+
+def latency_sentences(run: Run) -> list[str]:
+    """Return how long each cell takes, and how many times as long as ROS or loopback."""
+    if not (cells := cells_of(run)):
+        return []
+    about = cells[0].about
+    names = ", ".join(cell.name for cell in cells)
+    requests = span_of((cell.n for cell in cells), "request")
+    said = [f"{requests} a cell over {names}; frames of {asked(run, cells)}, {about['mode']} mode."]
+    comparable = any(cell.values_ms("e2e_without_inference").size for cell in cells)
+    metric = "e2e_without_inference" if comparable else "e2e"
+    medians = [
+        f"{cell.name} {number(middle.median)} ms" for cell in cells if (middle := summary_of(cell.values_ms(metric)))
+    ]
+    if medians:
+        said.append(f"{spelled(metric)}, medians: {', '.join(medians)}.")
+    found, beside = [], []
+    for of, cell, base, ratio in ratios(cells, run.bootstrap_seed):
+        if declared(base.pipeline).in_process:
+            continue
+        if of == metric:
+            found.append(_times(cell.name, base.name, ratio))
+        if of == "e2e_without_model" and cell.has_ingest:
+            beside.append(f"Without model, {_times(cell.name, base.name, ratio)}")
+    return said + found[:_MOST] + beside[:_MOST]
+
+
+def _times(cell: str, base: str, ratio: Ratio) -> str:
+    between = ""
+    if ratio.low is not None and ratio.high is not None:
+        over = f"over {ratio.launches} launches" if ratio.launches > 1 else "of one launch"
+        bounds = interval(ratio).partition(" ")[2][1:-1].replace(",", " to")
+        between = f" (ratio of medians {over}, 95 % interval {bounds})"
+    value = "an unknown number of" if ratio.value is None else number(ratio.value)
+    return f"{cell} takes {value} times as long as {base}{between}."
+
+
+_FOOT = ("residual", "e2e_without_inference", "preprocess", "e2e_without_model", "inference", "e2e")
+"""What stands below the stages, each sum below its parts; what the engines of a run do not tell is left out."""
+_HEADINGS = {"preprocess": "preproc.", "inference": "infer.", **{metric.name: metric.title for metric in METRICS}}
+
+_FRAME_FOOT = {
+    "residual": "residual",
+    "path": "frame path",
+    "latency": "frame path from the intended time",
+}
+"""What stands below the stages of frames."""
+
+
+def stage_table(run: Run, *, full: bool = True) -> TextTable:
+    """Lay out the stages in the order of the path, a column a cell: the median, and mean ± sd where ``full``.
+
+    Inference stands below the residual, so that what is compared, e2e without inference, reads as one sum, and so do
+    e2e without model and e2e below it.
+    """
+    cells = cells_of(run)
+    rows: list[tuple[str, ...]] = []
+    last = ""
+
+    def add(group: str, name: str, values: list[Floats]) -> None:
+        rows.append((group, name, *(_entry(found, full=full) for found in values)))
+
+    for stage in stages_present(cells):
+        if (group := run.stages[stage]) != "inference":
+            add("" if group == last else group, stage, [cell.values_ms(stage) for cell in cells])
+            last = group
+    below = len(rows)
+    for metric in _foot(cells):
+        add("", metric.replace("_", " "), [cell.values_ms(metric) for cell in cells])
+    title = "Stages in ms: median (mean ± sd)" if full else "Stages in ms: medians"
+    return TextTable(
+        title,
+        ("group", "stage", *(cell.name for cell in cells)),
+        rows,
+        2,
+        frozenset({below + 1}),
+        _notes(run, cells),
+    )
+
+
+def group_table(run: Run) -> TextTable:
+    """Lay out the groups as columns and the cells as rows: for runs of many cells."""
+    cells = cells_of(run)
+    groups = [group for group in groups_present(cells) if group != "inference"]
+    foot = _foot(cells)[1:]
+    rows = []
+    for cell in cells:
+        values = [cell.group_ms(group) for group in groups]
+        values += [cell.values_ms(metric) for metric in foot]
+        rows.append((cell.name, *(_entry(found) for found in values)))
+    header = ("cell", *groups, *(_HEADINGS[metric] for metric in foot))
+    return TextTable("Groups of stages in ms: medians", header, rows, 1, notes=_notes(run, cells))
+
+
+def summary_table(run: Run, metric: str = "e2e_without_inference", *, brief: bool = False) -> TextTable:
+    """Lay out what a publication quotes: n, spread, percentiles, and the ratios to what is compared with.
+
+    A ``brief`` one leaves room for more ratios than two: of the spread it has p99.
+    """
+    cells = cells_of(run)
+    bases = [
+        base for base in cells if base.values_ms(metric).size and any(cell.is_compared_with(base) for cell in cells)
+    ]
+    figures = ("median", "p99") if brief else (MEAN_SD, "median", "p90", "p99")
+    rows = []
+    found: list[Ratio] = []
+    for cell in cells:
+        over = {base.name: _ratio(cell, base, metric, run.bootstrap_seed) for base in bases}
+        found += [ratio for ratio in over.values() if ratio]
+        ratios = ("1" if cell.name == base else interval(ratio) for base, ratio in over.items())
+        counts = () if brief else (str(cell.n), str(cell.errors))
+        rows.append((cell.name, *counts, *entries(cell.values_ms(metric), *figures), *ratios))
+    header = ("cell", *(() if brief else ("n", "errors")), *figures, *(f"ratio to {base.name}" for base in bases))
+    title = f"{spelled(metric)} in ms; ratios of medians [95 % interval]"
+    return TextTable(title, header, rows, 1, notes=(*_notes(run, cells), *launches_note(found)))
+
+
+def token_table(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> TextTable | None:
+    """Lay out what happens to every token after it left the engine; None where no server tells when that was."""
+    cells = [cell for cell in cells_of(run) if cell.values("token_delay").size]
+    if not cells:
+        return None
+    columns = [metric for metric in metrics if metric.shown]
+    rows: list[tuple[str, ...]] = [
+        (cell.name, *(text for metric in columns for text in entries(cell.values(metric), *metric.shown)))
+        for cell in cells
+    ]
+    header = ("cell", *(f"{metric.title} {statistic}" for metric in columns for statistic in metric.shown))
+    title = f"{pieces_of(run).capitalize()} in ms: from one to the next (gap), and engine to client (delay)"
+    return TextTable(title, header, rows, 1, notes=engine_notes(run, cells))
+
+
+def fact_table(run: Run) -> TextTable | None:
+    """Lay out what was told of the requests besides their marks; None where nothing was."""
+    cells = cells_of(run) if run.facts else []
+    told = [[json.loads(str(facts)) for facts in cell.good["facts"]] for cell in cells]
+    rows = []
+    for fact, meant in run.facts.items():
+        values = [[facts[fact] for facts in of_cell if fact in facts] for of_cell in told]
+        if any(values):
+            entries = (number(median(found)) if found else ABSENT for found in values)
+            rows.append((fact, meant["unit"], *entries))
+    header = ("fact", "unit", *(cell.name for cell in cells))
+    return TextTable("Facts: medians", header, rows, 2, notes=_notes(run, cells)) if rows else None
+
+
+def _foot(cells: list[Cell]) -> list[str]:
+    """List what stands below the stages: preprocessing and e2e without model only where somebody tells them."""
+    told = {"preprocess", "e2e_without_model"}
+    return [name for name in _FOOT if name not in told or any(cell.values_ms(name).size for cell in cells)]
+
+
+def _entry(values: Floats, *, full: bool = False) -> str:
+    (middle,) = entries(values, "median")
+    return f"{middle} ({entries(values, MEAN_SD)[0]})" if full and values.size else middle
+
+
+def _ratio(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | None:
+    return ratio_between(cell, base, metric, seed) if cell.is_compared_with(base) else None
+
+
+def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
+    counts = span_of(cell.n for cell in cells)
+    notes = [f"n = {counts} samples a cell, warm-ups left out." if counts else "No samples."]
+    if cells:
+        payloads = dict.fromkeys(
+            f"{cell.pipeline} {cell.about['payload']}" for cell in cells if cell.about["payload"] not in {"none", ""}
+        )
+        notes.append(f"{asked(run, cells)}; payload: {', '.join(payloads) or 'none'}.")
+    if shape := chunks(run):
+        notes.append(f"Each answer is a chunk of {shape} numbers, not tokens.")
+    notes += engine_notes(run, cells)
+    if any(cell.has_ingest for cell in cells):
+        notes.append(
+            "A llama-server's ingest slices and resizes the picture, which our engine counts as inference: compare e2e "
+            "or e2e without model. Of a llama-server that is e2e less the prompt_ms it reports, assumed to be all that "
+            "its model computes before the first token that it sends."
+        )
+    if flagged := sum(cell.flagged() for cell in cells):
+        notes.append(
+            f"{flagged} of {sum(cell.n for cell in cells)} samples have a residual above {RESIDUAL_LIMIT:.0%}"
+            " of e2e without inference."
+        )
+    return (*notes, *failure_notes(cells, "samples"))
+
+
+def frame_table(run: Run) -> TextTable | None:
+    """Lay out the budget of the frames that a prompt was about: medians in ms, a column a cell; None without frames.
+
+    The last row is the age of the frame when inference starts, from the samples.
+    """
+    if run.frames.empty:
+        return None
+    cells = cells_of(run)
+    used = [_used(run, cell) for cell in cells]
+    rows = []
+    for stage, group in run.stages.items():
+        values = [frames[stage] for frames in used]
+        if any(found.size for found in values):
+            rows.append((group, stage, *(_entry(found) for found in values)))
+    rule = len(rows)
+    rows += [("", name, *(_entry(frames[column]) for frames in used)) for column, name in _FRAME_FOOT.items()]
+    rows.append(("", "age when inference starts", *(_entry(cell.values_ms("frame_age")) for cell in cells)))
+    return TextTable(
+        "Frame path in ms: medians over the frames that a prompt was about",
+        ("group", "stage", *(cell.name for cell in cells)),
+        rows,
+        2,
+        frozenset({rule + 1}),
+    )
+
+
+def _used(run: Run, cell: Cell) -> dict[str, Floats]:
+    frames = run.frames[run.frames["used_by"].isin(cell.good["request_id"])]
+    return {name: numbers_ms(frames[f"{name}_ns"]) for name in (*run.stages, *_FRAME_FOOT)}
+
+
+def latency_tables(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, TextTable]:
+    """Return every table of a latency run by its file's name."""
+    tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
+    if any(cell.values_ms("e2e_without_model").size for cell in cells_of(run)):
+        tables["summary-model"] = summary_table(run, "e2e_without_model")
+    if tokens := token_table(run, metrics):
+        tables["tokens"] = tokens
+    if frames := frame_table(run):
+        tables["frames"] = frames
+    if facts := fact_table(run):
+        tables["facts"] = facts
+    return tables

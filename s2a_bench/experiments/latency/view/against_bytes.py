@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from s2a_bench.experiments.latency.view.cells import Cell, stand_ins
+from s2a_bench.experiments.requests import Cell, stand_ins
 from s2a_bench.stats.line import Estimate, Line, crossing, fit_line
 from s2a_bench.transport import declared
 from s2a_bench.writers.figures import new_figure
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.latency.view.cells import Floats, Split
+    from s2a_bench.experiments.requests import Floats, Split
     from s2a_bench.store.run import Run
 
 METRIC = "e2e_without_inference"
@@ -168,7 +168,6 @@ def build_lines(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> Figur
 
 
 def _draw(axes: Axes, pipelines: Sequence[Pipeline], looks: Mapping[str, tuple[str, str]]) -> None:
-    """Draw one payload's lines, each with its medians."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     for each in pipelines:

@@ -6,51 +6,42 @@ import textwrap
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from s2a_bench.experiments.latency.view.cells import Cell, asked, cells_of, chunks, engine_note, groups_present
 from s2a_bench.experiments.paper import CAVEAT, LABEL, paper_latency
-from s2a_bench.stats import summary_of
-from s2a_bench.writers.figures import LINE_CHARS, WIDE_SPREAD, logarithmic, name_rows, new_figure, write_beside
-from s2a_bench.writers.style import GREY, GROUP_FILLS, RESIDUAL_FILL, cell_looks
+from s2a_bench.experiments.requests import Cell, asked, cells_of, chunks, groups_present, spelled, title_of
+from s2a_bench.stats import summarise
+from s2a_bench.writers.figures import (
+    LINE_CHARS,
+    WIDE_SPREAD,
+    Bar,
+    build_bars,
+    build_distribution,
+    name_rows,
+    new_figure,
+    write_beside,
+)
+from s2a_bench.writers.style import GROUP_FILLS, RESIDUAL_FILL, cell_looks
 from s2a_bench.writers.tables import mean_sd, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.latency.view.cells import Floats
+    from s2a_bench.experiments.requests import Floats
     from s2a_bench.store.run import Run
 
 
 def build_latency_bars(run: Run, *, against_paper: bool = False) -> Figure:
     """Draw mean ± sd of e2e without inference, a bar a cell (the paper's figure 4), from zero on a linear axis."""
-    from matplotlib.patches import Patch
-
     cells, metric = _shown(run)
     looks = cell_looks({cell.name: cell.path for cell in cells})
-    bars = [(_label(cell), summary_of(cell.values_ms(metric)), looks[cell.name][0]) for cell in cells]
-    rows = [(name, found.mean, found.sd or 0.0, mean_sd(found), colour) for name, found, colour in bars if found]
+    found = [(cell, summarise(cell.values_ms(metric))) for cell in cells]
+    bars = [Bar(_label(cell), each.mean, each.sd, mean_sd(each), looks[cell.name][0]) for cell, each in found]
     if against_paper:
-        rows += [
-            (f"paper:\n{claim.name}", claim.mean_ms, claim.sd_ms, f"{claim.mean_ms:g} ± {claim.sd_ms:.1f}", GREY)
+        bars += [
+            Bar(f"paper:\n{claim.name}", claim.mean_ms, claim.sd_ms, f"{claim.mean_ms:g} ± {claim.sd_ms:.1f}")
             for claim in paper_latency()
         ]
-    figure = new_figure(
-        0.75 + 0.34 * len(rows) + (0.45 if against_paper else 0), _title(run, cells, "Mean ± sd", metric)
-    )
-    axes = figure.subplots()
-    for place, (_, mean, sd, text, colour) in enumerate(rows):
-        axes.barh(place, mean, 0.62, color=colour, edgecolor="black", linewidth=0.5)
-        # A time is never below zero, whatever the standard deviation is.
-        axes.errorbar(mean, place, xerr=[[min(sd, mean)], [sd]], color="black", capsize=2, linewidth=0.8)
-        write_beside(axes, place, text)
-    name_rows(axes, [name for name, *_ in rows])
-    axes.set_xlim(left=0)
-    axes.set_xlabel(_axis_label(metric))
-    if against_paper:
-        text = f"{LABEL}\n" + textwrap.fill(CAVEAT, LINE_CHARS - 12)
-        figure.legend(
-            handles=[Patch(facecolor=GREY, edgecolor="black", linewidth=0.5, label=text)], loc="outside lower left"
-        )
-    return figure
+    paper = f"{LABEL}\n{textwrap.fill(CAVEAT, LINE_CHARS - 12)}" if against_paper else ""
+    return build_bars(_title(run, cells, "Mean ± sd", metric), bars, _axis_label(metric), paper)
 
 
 def build_stage_breakdown(run: Run) -> Figure:
@@ -78,8 +69,7 @@ def build_stage_breakdown(run: Run) -> Figure:
             left = 0.0
             for name, (colour, hatch) in fills.items():
                 width = part[name] * (100 / whole if share else 1)
-                edge = "black" if name == "residual" else "white"
-                axes.barh(place, width, 0.66, left, color=colour, hatch=hatch, edgecolor=edge, linewidth=0.3)
+                axes.barh(place, width, 0.66, left, color=colour, hatch=hatch, edgecolor=_edge(name), linewidth=0.3)
                 left += width
             if not share:
                 write_beside(axes, place, number(whole))
@@ -87,38 +77,19 @@ def build_stage_breakdown(run: Run) -> Figure:
         axes.set_xlim(0, 100 if share else None)
         axes.set_xlabel("share (%)" if share else _axis_label(metric))
     handles = [
-        Patch(
-            facecolor=colour,
-            hatch=hatch,
-            edgecolor="black" if name == "residual" else "white",
-            linewidth=0.3,
-            label=name,
-        )
+        Patch(facecolor=colour, hatch=hatch, edgecolor=_edge(name), linewidth=0.3, label=name)
         for name, (colour, hatch) in fills.items()
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, columnspacing=1.0)
     return figure
 
 
-def build_distribution(run: Run) -> Figure:
+def build_latency_distribution(run: Run) -> Figure:
     """Draw the empirical distribution of e2e without inference, a line a cell; logarithmic where it spreads widely."""
     cells, metric = _shown(run)
     looks = cell_looks({cell.name: cell.path for cell in cells})
-    figure = new_figure(2.35 + 0.14 * -(-len(cells) // 2), _title(run, cells, "Distribution", metric))
-    axes = figure.subplots()
-    every: list[Floats] = [cell.values_ms(metric) for cell in cells]
-    for cell, values in zip(cells, every, strict=True):
-        colour, line = looks[cell.name]
-        axes.ecdf(values, label=cell.name, color=colour, linestyle=line)
-    low, high = min(values.min() for values in every), max(values.max() for values in every)
-    if low > 0 and high > WIDE_SPREAD * low:
-        logarithmic(axes, high / low)
-    axes.set_ylim(0, 1.02)
-    axes.set_ylabel("share of samples")
-    axes.set_xlabel(_axis_label(metric))
-    axes.grid(visible=True, linewidth=0.3, color="#DDDDDD")
-    figure.legend(loc="outside lower center", ncols=2, columnspacing=1.2)
-    return figure
+    lines = {cell.name: (cell.values_ms(metric), looks[cell.name]) for cell in cells}
+    return build_distribution(_title(run, cells, "Distribution", metric), lines, "samples", _axis_label(metric))
 
 
 def latency_figures(run: Run, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
@@ -128,7 +99,7 @@ def latency_figures(run: Run, *, against_paper: bool = False) -> dict[str, Calla
     return {
         "latency_bars": lambda: build_latency_bars(run, against_paper=against_paper),
         "stage_breakdown": lambda: build_stage_breakdown(run),
-        "distribution": lambda: build_distribution(run),
+        "distribution": lambda: build_latency_distribution(run),
     }
 
 
@@ -142,16 +113,11 @@ def _shown(run: Run) -> tuple[list[Cell], str]:
 
 
 def _title(run: Run, cells: list[Cell], what: str, metric: str) -> str:
-    """Return what is drawn, from how many samples, of what size, and what did not really answer."""
-    counts = sorted({cell.n for cell in cells})
-    facts = [f"n = {' to '.join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))} a cell"]
-    facts += [asked(run, cells), *sorted({f"{cell.about['mode']} mode" for cell in cells})]
+    facts = [asked(run, cells), *sorted({f"{cell.about['mode']} mode" for cell in cells})]
     facts += [f"chunks of {shape}"] if (shape := chunks(run)) else []
-    facts += [note] if (note := engine_note(run, cells)) else []
-    left_out = [cell.name for cell in cells_of(run) if cell.name not in {shown.name for shown in cells}]
-    facts += [f"{name} not shown (inference unknown)" for name in left_out]
-    lines = [f"{what}: {'end to end without inference' if metric != 'e2e' else 'end to end'}", ", ".join(facts)]
-    return "\n".join(textwrap.fill(line, LINE_CHARS, break_on_hyphens=False) for line in lines)
+    shown = {cell.name for cell in cells}
+    left_out = [f"{cell.name} not shown (inference unknown)" for cell in cells_of(run) if cell.name not in shown]
+    return title_of(run, cells, f"{what}: {spelled(metric).lower()}", facts, left_out)
 
 
 def _axis_label(metric: str) -> str:
@@ -167,3 +133,7 @@ def _label(cell: Cell) -> str:
 
 def _part(cell: Cell, name: str) -> Floats:
     return cell.values_ms("residual") if name == "residual" else cell.group_ms(name)
+
+
+def _edge(name: str) -> str:
+    return "black" if name == "residual" else "white"

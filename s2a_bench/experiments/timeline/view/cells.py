@@ -1,22 +1,23 @@
-"""What a timeline run says about each of its cells, however its plans were run: computed, emulated or live."""
+"""The cells of a timeline run, computed, emulated or live: metrics, what they are made of, JSON and comparison."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from s2a_bench.experiments.timeline.metrics import METRICS, TIME
-from s2a_bench.experiments.timeline.rows import SKILLS, TIMELINES
-from s2a_bench.stats import summary_of
-from s2a_bench.store.requests import TOKENS
+from s2a_bench.experiments import TIME, Compared, Subject
+from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES
+from s2a_bench.store.manifest import present
+from s2a_bench.store.requests import SKILLS, TOKENS
+from s2a_bench.store.schema import Facts, Many, NonNegative, Positive, about, with_fields
+from s2a_bench.writers.as_json import frame
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from s2a_bench.experiments.latency.view.cells import Floats
-    from s2a_bench.stats import Summary
+    from s2a_bench.policy import Floats
     from s2a_bench.store.run import Run
 
 
@@ -37,7 +38,6 @@ class Timelines:
 
     @property
     def policy(self) -> str:
-        """Name the policy."""
         return str(self.about("policy"))
 
     @property
@@ -48,18 +48,13 @@ class Timelines:
 
     @property
     def n(self) -> int:
-        """Count the plans."""
         return len(self.rows)
 
     def values(self, metric: str) -> Floats:
         """Return a metric's values, times in s, one a plan that has it."""
-        about = METRICS[metric]
-        values: Floats = self.rows[about.column].dropna().to_numpy(dtype="float64")
-        return values / 1e9 if about.kind == TIME else values
-
-    def summary(self, metric: str) -> Summary | None:
-        """Summarise a metric; None where no plan has it."""
-        return summary_of(self.values(metric))
+        found = METRICS[metric]
+        values: Floats = self.rows[found.column].dropna().to_numpy(dtype="float64")
+        return values / 1e9 if found.kind == TIME else values
 
     def mean(self, metric: str) -> float | None:
         """Return a metric's mean over the plans; None where no plan has it."""
@@ -68,7 +63,6 @@ class Timelines:
 
     @property
     def p_any_stall(self) -> float:
-        """Return the share of plans that stall at all."""
         return self.mean("p_any_stall") or 0.0
 
     @property
@@ -77,7 +71,6 @@ class Timelines:
         return (self.tokens["client_ns"].to_numpy(dtype="float64") - float(self.about("requested_ns"))) / 1e9
 
     def moment_s(self, metric: str) -> float:
-        """Return a time of the shown plan in s."""
         return float(self.rows[METRICS[metric].column].iloc[0]) / 1e9
 
 
@@ -106,11 +99,7 @@ def origin_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
     boards = run.manifest.get("boards", [])
     notes = []
     if any(cell.about("emulated") and cell.about("mode") != "live" for cell in cells):
-        rates = {
-            "paper": "the paper's rates (table II)",
-            "measured": "measured rates",
-            "given": "rates as given",
-        }
+        rates = {"paper": "the paper's rates (table II)", "measured": "measured rates", "given": "rates as given"}
         whose = [rates[origin] for origin in dict.fromkeys(board["origin"] for board in boards)]
         virtual = all(cell.about("mode") == "virtual" for cell in cells)
         emulated = (
@@ -130,13 +119,11 @@ def origin_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
 
 
 def _jitter(run: Run) -> str:
-    """Return how evenly tokens come."""
     jitter = run.manifest.get("configuration", {}).get("jitter", "none")
     return {"none": "evenly", "profile": "with the profiles' jitter"}.get(jitter, f"with jitter {jitter}")
 
 
 def _live_notes(run: Run) -> list[Note]:
-    """Return what is real in a live run, and what is not."""
     live = run.manifest.get("live")
     if not live:
         return []
@@ -160,3 +147,75 @@ def jitter_notes(run: Run) -> tuple[str, ...]:
         return ()
     median, p99 = (f"{found[name]:.2f} ms" for name in ("median_ms", "p99_ms"))
     return (f"Start jitter on the system clock: median {median}, p99 {p99} over {found['starts']} starts.",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _About:
+    cell: str
+    policy: str
+    profile: Annotated[str | None, about("Null where only a rate was given, or a model answered.")]
+    mode: Annotated[str, about("virtual: computed; else what passed the time.")]
+    emulated: Annotated[bool, about("True where no model answered.")]
+    rate_tokens_per_s: Positive
+    prompt_s: Annotated[
+        NonNegative | None,
+        about("c: from the request to the start of decoding; absent where a model took what it took."),
+    ] = None
+    tokens_per_skill: Annotated[Many, about("L, the delimiter included.")]
+    n_skills: Many
+    t_nom_s: Positive
+    plans: Annotated[Many, about("Plans that the means are over.")]
+    caution: Annotated[
+        NonNegative | None, about("lambda; absent where the policy has none, or waits for the whole plan.")
+    ] = None
+
+
+TimelineCell = with_fields(
+    "TimelineCell",
+    "A policy in one setting: means over its plans.",
+    _About,
+    {
+        name: Annotated[float | None if metric.optional else float, Facts(metric.schema)]
+        for name, metric in METRICS.items()
+    },
+)
+
+
+_SETTING: Final = ("tokens_per_s", "prompt_s", "tokens_per_skill", "n_skills", "t_nom_s", "mode", "emulated")
+
+
+def timelines_json(run: Run) -> dict[str, Any]:
+    """Return the object that ``--json`` prints, as docs/schema/s2a-bench-1.json describes it."""
+    executed = {name: run.manifest[name] for name in ("live", "start_jitter") if run.manifest.get(name)}
+    return frame(run, [_cell(cell) for cell in timelines_of(run)], [], **executed)
+
+
+def _cell(cell: Timelines) -> dict[str, Any]:
+    """Return one cell: means over its plans; a metric that no plan has is an absent key."""
+    told = {name: cell.about(name) for name in ("cell", "policy", "caution", *_SETTING)}
+    told |= {"rate_tokens_per_s": told.pop("tokens_per_s"), "profile": cell.about("board") or None, "plans": cell.n}
+    return present(TimelineCell(**told, **{name: cell.mean(name) for name in METRICS}))
+
+
+def _subjects(run: Run) -> list[Subject]:
+    asked = run.manifest.get("configuration", {})
+    even = asked.get("jitter") == "none" and not asked.get("t_nom_cv")
+    return [
+        Subject(
+            str(cell.about("cell")),
+            {name: str(cell.about(name)) for name in ("policy", "board", *_SETTING)},
+            cell.n,
+            0,
+            lambda metric, cell=cell: list(cell.values(metric)[:, None]),  # type: ignore[misc]
+            exact=even and cell.about("mode") == "virtual",
+        )
+        for cell in timelines_of(run)
+    ]
+
+
+COMPARED: Final = Compared(
+    metrics=METRICS,
+    subjects=_subjects,
+    origin=lambda run: origin_notes(run, timelines_of(run)),
+    shown=("start_s", "end_s", "stall_s", "stalls", "start_regret", "end_regret"),
+)

@@ -43,7 +43,6 @@ def write_trace(run: Run, path: Path) -> None:
 
 
 def _events(cells: Sequence[Timelines]) -> Iterator[Event]:
-    """List the events, process by process."""
     threads = count(1)
     for pid, ((title, tokens, n_skills, t_nom_s), group) in enumerate(panels(cells), start=1):
         name = f"{title}, L = {tokens}, N = {n_skills}, T_nom = {t_nom_s:g} s"
@@ -63,7 +62,6 @@ def _events(cells: Sequence[Timelines]) -> Iterator[Event]:
 
 
 def _thread(pid: int, tid: int, name: str) -> Iterator[Event]:
-    """Name a thread, and place it."""
     yield {"ph": "M", "pid": pid, "tid": tid, "name": "thread_name", "args": {"name": name}}
     yield {"ph": "M", "pid": pid, "tid": tid, "name": "thread_sort_index", "args": {"sort_index": tid}}
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.paper import paper_colours
 from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, panels, timelines_of
-from s2a_bench.writers.figures import LINE_CHARS, new_figure
-from s2a_bench.writers.style import WIDTH_IN
+from s2a_bench.writers.figures import new_figure, wrapped
+from s2a_bench.writers.style import STALL_LOOK, WIDE_IN, WIDTH_IN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,14 +17,11 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import Run
 
-WIDE_IN: Final = 7.16
-"""Both columns of a two-column paper."""
 _LEGEND_COLUMNS: Final = {WIDTH_IN: 3, WIDE_IN: 6}
 
 _SHADES: Final = {"blue": "#0072B2", "orange": "#E69F00", "green": "#009E73"}
 """The paper's colours as Okabe and Ito have them: the eye tells them apart, and so does a grey copy."""
 _OTHERS: Final = ("#56B4E9", "#CC79A7", "#D55E00", "#999999")
-_STALL_LOOK: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
 _VISIBLE_NS: Final = 20_000_000
 """A stall or stretch below is rounding, or a real executor's jitter, and too narrow to be seen."""
 _LANE: Final = 0.7
@@ -116,7 +112,7 @@ def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: flo
     for skill in skills:
         start, end, stall, nominal = (skill[f"{name}_ns"] / 1e9 for name in ("start", "end", "stall", "nominal"))
         if skill["stall_ns"] > _VISIBLE_NS:
-            axes.barh(lane, stall, _LANE, start - stall, zorder=3, **_STALL_LOOK)
+            axes.barh(lane, stall, _LANE, start - stall, zorder=3, **STALL_LOOK)
         axes.barh(lane, end - start, _LANE, start, color=colour, edgecolor="white", linewidth=0.4, label="skill")
         if (end - start - nominal) * 1e9 > _VISIBLE_NS:
             axes.barh(lane, end - start - nominal, _LANE, start + nominal, color="white", alpha=0.5, linewidth=0)
@@ -153,31 +149,25 @@ def _legend(cells: Sequence[Timelines]) -> list[object]:
         Line2D([], [], color="black", linewidth=0.9, linestyle=(0, (2, 1.5)), label="$S_0$"),
     ]
     if any((cell.skills["stall_ns"] > _VISIBLE_NS).any() for cell in cells):
-        handles.append(Patch(label="stall", **_STALL_LOOK))
+        handles.append(Patch(label="stall", **STALL_LOOK))
     if any(_stretched(cell) for cell in cells):
         handles.append(Patch(facecolor="#B5B5B5", linewidth=0, label="stretched (paler)"))
     return handles
 
 
 def _stretched(cell: Timelines) -> bool:
-    """Return whether some skill is visibly longer than planned."""
     longer_ns = cell.skills["end_ns"] - cell.skills["start_ns"] - cell.skills["nominal_ns"]
     return bool((longer_ns > _VISIBLE_NS).any())
 
 
 def _title(run: Run, cells: Sequence[Timelines], width_in: float) -> str:
-    """Return what is drawn, and what it is made of."""
     n_skills, t_nom_s = cells[0].setting[2:]
     what = f"Execution timelines: N = {n_skills} skills, $T_\\mathrm{{nom}}$ = {t_nom_s:g} s"
     if (plans := max(cell.n for cell in cells)) > 1:
         what += f"; plan 1 of {plans}"
-    chars = round(LINE_CHARS * width_in / WIDTH_IN)
-    lines = [what, *origin_notes(run, cells)]
-    # Of mathematics less is drawn than written.
-    return "\n".join(textwrap.fill(line, chars + 14 * ("$" in line), break_on_hyphens=False) for line in lines)
+    return wrapped((what, *origin_notes(run, cells)), width_in)
 
 
 def _dark(colour: str) -> bool:
-    """Return whether white is read better on it than black."""
     red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
     return 0.299 * red + 0.587 * green + 0.114 * blue < 128  # noqa: PLR2004 - half way

@@ -1,23 +1,95 @@
-"""The tables of a timeline run for people, and for programs as CSV."""
+"""How timelines are shown, the same however they were run: sentences, tables for people, and CSV for programs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments.timeline.metrics import COUNT, FLAG, METRICS, SHARE, TIME, TimelineMetric
+from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Shown
+from s2a_bench.experiments.timeline.rows import METRICS, TimelineMetric
 from s2a_bench.experiments.timeline.view.cells import (
     Timelines,
     jitter_notes,
     origin_notes,
     panels,
+    timelines_json,
     timelines_of,
 )
+from s2a_bench.experiments.timeline.view.chrome_trace import TRACE, write_trace
+from s2a_bench.experiments.timeline.view.figures import timeline_figures
+from s2a_bench.options import Options, option
+from s2a_bench.policy import ONLINE
+from s2a_bench.stats import summary_of
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
+
+
+class Asked(Options):
+    """What is printed."""
+
+    per_skill: bool = option(False, "also print every skill of the shown plans")
+
+
+def show(run: Run, *, per_skill: bool = False, **_: Any) -> Shown:
+    """Return what a run of timelines shows; ``per_skill`` also prints the skills of several settings."""
+    cells = timelines_of(run)
+    tables = timeline_tables(run)
+    one_setting = len({cell.setting for cell in cells}) == 1
+    return Shown(
+        sentences=timeline_sentences(run),
+        tables=tables,
+        main=["timelines"],
+        printed=[name for name in tables if name != "skills" or per_skill or one_setting],
+        notes=tables["timelines"].notes,
+        csvs=timeline_csv(run),
+        figures=timeline_figures(run),
+        files={TRACE: partial(write_trace, run)},
+        json=lambda: timelines_json(run),
+        lanes=[cell for cell in cells if len(cell.skills)],
+    )
+
+
+def timeline_sentences(run: Run) -> list[str]:
+    """Say of each policy where it stalls, when it starts, and when it ends."""
+    cells = timelines_of(run)
+    by_policy: dict[str, list[Timelines]] = {}
+    for cell in cells:
+        by_policy.setdefault(cell.policy, []).append(cell)
+    settings = len({cell.setting for cell in cells})
+    counts = sorted({cell.n for cell in cells})
+    plans = f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} plan{'s' * (counts[-1] != 1)}"
+    said = [f"{settings} setting{'s' * (settings != 1)} of board and granularity, {plans} a policy in each."]
+    return said + [_policy_sentence(policy, mine) for policy, mine in by_policy.items()]
+
+
+def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
+    stalling = [cell for cell in cells if cell.p_any_stall > 0]
+    starts = sorted(cell.mean("start_s") or 0.0 for cell in cells)
+    ends = sorted(cell.mean("end_s") or 0.0 for cell in cells)
+    moved = f"starts after {_span(starts)} s and ends after {_span(ends)} s"
+    if not stalling:
+        return f"{policy} never stalls; it {moved}."
+    worst = max(stalling, key=lambda cell: cell.mean("stall_s") or 0.0)
+    stall_s, (title, tokens, *_) = worst.mean("stall_s") or 0.0, worst.setting
+    share = ""
+    if worst.n > 1:
+        from s2a_bench.policy.conformal import upper_bound
+
+        stalled = int(worst.rows["any_stall"].sum())
+        high = upper_bound(stalled, worst.n, 0.975)
+        share = f" there {worst.p_any_stall:.1%} of {worst.n} plans stall (95 % interval up to {high:.1%});"
+    where = f"{len(stalling)} of {len(cells)} settings" if len(cells) > 1 else "the one setting"
+    return f"{policy} stalls in {where}, most on {title} with L = {tokens}: {stall_s:.2f} s a plan;{share} it {moved}."
+
+
+def _span(values: Sequence[float]) -> str:
+    low, high = f"{values[0]:.2f}", f"{values[-1]:.2f}"
+    return low if low == high else f"{low} to {high}"
+
 
 _EXECUTION = ("start_s", "end_s", "stalls", "stall_s", "longest_stall_s", "start_regret", "end_regret")
 _WAITING = (
@@ -31,63 +103,50 @@ _WAITING = (
     "end_regret_elastic",
 )
 _MOTION = ("speed_distortion", "fluidity", "rms_jerk", "peak_jerk", "sparc")
+_WAITING_NOTES = (
+    "queued: from a skill's arrival to its start. age: from the request, as if pictured then, to a skill's start.",
+    "of wait: start regret over t_N - S0. over S_lo, E_lo: over the least start and end within T_min, T_max.",
+)
+_MOTION_NOTES = (
+    "distortion: durations over nominal ones. fluidity: share of deadlines met (Etalon).",
+    "Jerk and SPARC are a model's: a robot at unit speed flows from skill to skill and rests in stalls.",
+)
 
 
 def execution_table(run: Run) -> TextTable:
     """Lay out starts, ends, stalls and regrets: means over the plans, in s."""
     cells = timelines_of(run)
     random = any(cell.n > 1 for cell in cells)
-    header, rows, rules = _rows(cells, (*_EXECUTION, *(["p_any_stall"] if random else [])))
     title = f"Timelines{_common(cells)}: times in s{', means' if random else ''}"
     notes = [*origin_notes(run, cells), *_plan_notes(run, cells), *jitter_notes(run)]
     notes.append("stalls: those above 20 ms. late start, late end: regret over clairvoyant S0 and S0 + P_N.")
-    return TextTable(title, header, rows, 3, rules, tuple(notes))
-
-
-def waiting_table(run: Run) -> TextTable:
-    """Lay out how long skills lie ready, how old the picture is that is acted on, and further regrets."""
-    cells = timelines_of(run)
-    notes = (
-        "queued: from a skill's arrival to its start. age: from the request, as if pictured then, to a skill's start.",
-        "of wait: start regret over t_N - S0. over S_lo, E_lo: over the least start and end within T_min, T_max.",
-    )
-    header, rows, rules = _rows(cells, _WAITING)
-    return TextTable(f"Waiting and age{_common(cells)}: times in s", header, rows, 3, rules, notes)
-
-
-def motion_table(run: Run) -> TextTable:
-    """Lay out how even the motion is."""
-    cells = timelines_of(run)
-    notes = (
-        "distortion: durations over nominal ones. fluidity: share of deadlines met (Etalon).",
-        "Jerk and SPARC are a model's: a robot at unit speed flows from skill to skill and rests in stalls.",
-    )
-    header, rows, rules = _rows(cells, _MOTION)
-    return TextTable(f"Motion{_common(cells)}", header, rows, 3, rules, notes)
+    return _table(cells, title, (*_EXECUTION, *(["p_any_stall"] if random else [])), notes)
 
 
 def skill_table(cells: Sequence[Timelines]) -> TextTable:
     """Lay out every skill of the shown plan of some cells."""
-    rows: list[tuple[str, ...]] = []
-    rules = set()
+    groups = []
     for cell in cells:
-        rules.add(len(rows))
-        for place, skill in enumerate(cell.skills.to_dict("records")):
+        name = (cell.setting[0], str(cell.setting[1]), cell.policy)
+        rows: list[tuple[str, ...]] = []
+        for skill in cell.skills.to_dict("records"):
             times = [skill[f"{name}_ns"] / 1e9 for name in ("arrival", "start", "end", "stall", "queue_wait")]
-            title, tokens = (cell.setting[0], str(cell.setting[1])) if not place else ("", "")
-            name = [title, tokens, cell.policy if not place else "", skill["text"] or str(skill["index"] + 1)]
-            rows.append((*name, *(seconds(value) for value in times), f"{skill['stretch']:.2f}"))
+            text = skill["text"] or str(skill["index"] + 1)
+            rows.append((*name, text, *map(seconds, times), f"{skill['stretch']:.2f}"))
+        groups.append(rows)
     header = ("board", "L", "policy", "skill", "arrives", "starts", "ends", "stall before", "queue wait", "stretch")
     plan = "the first plan, times in s" if any(cell.n > 1 for cell in cells) else "times in s"
-    return TextTable(f"Skills{_common(cells)}: {plan}", header, rows, 4, frozenset(rules - {0}))
+    return TextTable.grouped(f"Skills{_common(cells)}: {plan}", header, groups, 4, once=3)
 
 
 def timeline_tables(run: Run) -> dict[str, TextTable]:
     """Return every table of a run by its file's name; what is compared comes last."""
+    cells = timelines_of(run)
+    shape = _common(cells)
     return {
-        "skills": skill_table(timelines_of(run)),
-        "motion": motion_table(run),
-        "waiting": waiting_table(run),
+        "skills": skill_table(cells),
+        "motion": _table(cells, f"Motion{shape}", _MOTION, _MOTION_NOTES),
+        "waiting": _table(cells, f"Waiting and age{shape}: times in s", _WAITING, _WAITING_NOTES),
         "timelines": execution_table(run),
     }
 
@@ -97,7 +156,7 @@ def timeline_csv(run: Run) -> dict[str, CsvTable]:
     summaries = []
     for cell in timelines_of(run):
         for name, metric in METRICS.items():
-            if found := cell.summary(name):
+            if found := summary_of(cell.values(name)):
                 parts = ("n", "mean") if metric.kind == FLAG else SUMMARY
                 values = (getattr(found, part) if part in parts else None for part in SUMMARY)
                 summaries.append((cell.about("cell"), name, *values))
@@ -109,27 +168,20 @@ def seconds(value: float) -> str:
     return f"{value:.2f}" if abs(value) < 99.995 else f"{value:.1f}"  # noqa: PLR2004 - five characters at most
 
 
-def _rows(
-    cells: Sequence[Timelines], metrics: Sequence[str]
-) -> tuple[tuple[str, ...], list[tuple[str, ...]], frozenset[int]]:
-    """Return header, rows and rules: a group of rows a board, L where it begins."""
-    rows: list[tuple[str, ...]] = []
-    rules = []
-    last = ""
-    for (title, tokens, n_skills, t_nom_s), group in panels(cells):
-        several = f", N {n_skills}, T {t_nom_s:g}" if len({cell.setting[2:] for cell in cells}) > 1 else ""
-        board = title + several
-        if board != last:
-            rules.append(len(rows))
+def _table(cells: Sequence[Timelines], title: str, metrics: Sequence[str], notes: Iterable[str]) -> TextTable:
+    """Lay out the means of metrics: a group of rows a board, L where it begins."""
+    several = len({cell.setting[2:] for cell in cells}) > 1
+    boards: dict[str, list[tuple[str, ...]]] = {}
+    for (name, tokens, n_skills, t_nom_s), group in panels(cells):
+        board = name + (f", N {n_skills}, T {t_nom_s:g}" if several else "")
         for place, cell in enumerate(group):
-            names = (board if board != last else "", str(tokens) if not place else "", cell.policy)
-            rows.append((*names, *(_entry(cell, METRICS[name]) for name in metrics)))
-            last = board
-    return ("board", "L", "policy", *(METRICS[name].title for name in metrics)), rows, frozenset(rules[1:])
+            row = (board, "" if place else str(tokens), cell.policy, *(_entry(cell, METRICS[name]) for name in metrics))
+            boards.setdefault(board, []).append(row)
+    header = ("board", "L", "policy", *(METRICS[name].title for name in metrics))
+    return TextTable.grouped(title, header, boards.values(), 3, notes, once=1)
 
 
 def _entry(cell: Timelines, metric: TimelineMetric) -> str:
-    """Write a metric's mean."""
     value = cell.mean(metric.name)
     if value is None:
         return ABSENT
@@ -145,7 +197,6 @@ def _entry(cell: Timelines, metric: TimelineMetric) -> str:
 
 
 def _common(cells: Sequence[Timelines]) -> str:
-    """Name plan length and duration where all cells share them."""
     shapes = {cell.setting[2:] for cell in cells}
     return "" if len(shapes) != 1 else ", N = {}, T_nom = {:g} s".format(*next(iter(shapes)))
 
@@ -160,7 +211,7 @@ def _promise(calibrations: Iterable[Mapping[str, Any]]) -> str:
     )
 
 
-ONLINE_LIVE = ("stream-to-act", "live")
+ONLINE_LIVE = (ONLINE, "live")
 
 
 def _plan_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
@@ -180,6 +231,6 @@ def _plan_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
     elif live_cautions := {cell.about("caution") for cell in cells if (cell.policy, cell.about("mode")) == ONLINE_LIVE}:
         span = ", ".join(f"{caution:g}" for caution in sorted(live_cautions))
         notes.append(f"stream-to-act: lambda {span}, not calibrated; its prior comes from the warm-ups, or the pace.")
-    elif any((cell.policy, cell.about("mode")) == ("stream-to-act", "virtual") for cell in cells):
+    elif any((cell.policy, cell.about("mode")) == (ONLINE, "virtual") for cell in cells):
         notes.append("Nothing varies, and stream-to-act's prior knows it: online it starts at S0.")
     return tuple(notes)

@@ -6,14 +6,16 @@ the `Decoder`'s; sending, marking stages and telling errors are the client's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
-from s2a_bench.facts import Fact
 from s2a_bench.registry import Registry
-from s2a_bench.trace import Remote, Trace
-from s2a_bench.types import Action, Frame, Pixels, Request
+from s2a_bench.trace import Remote
+from s2a_bench.types import Action
+
+if TYPE_CHECKING:
+    from s2a_bench.transport.http.dialects.common import Dialect
 
 OWN = "s2a"
 """The dialect of our own server, in all its variants."""
@@ -47,59 +49,6 @@ class Event:
     """Pieces of a policy's answer, which has no text."""
     status: int = 0
     """The HTTP status that the error would have had before the stream began, 0 if unknown."""
-
-
-class Framing(Protocol):
-    """How messages are cut out of a body."""
-
-    def feed(self, data: bytes) -> Iterator[str | bytes]:
-        """Yield the messages that these bytes complete; raises ValueError for one that is too large."""
-        ...
-
-    def end(self) -> Iterator[str | bytes]:
-        """Yield what is left when the body has ended."""
-        ...
-
-
-class Dialect(Protocol):
-    """One dialect: pure, without state."""
-
-    name: str
-    media_type: str
-    """What a good answer's content-type starts with."""
-    payloads: tuple[str, ...]
-    """How pictures can travel."""
-    framing: Callable[[], Framing]
-    tells: Sequence[Fact]
-    """The facts of its events."""
-
-    def met(self, base: str, model: str, get: Callable[[str], Any]) -> tuple[str, str]:
-        """Return the URL and the model to ask: as told, else as the server says; ``get`` returns the JSON at a URL."""
-        ...
-
-    def url(self, base: str, model: str) -> str:
-        """Return where to post, for the URL that a user gave."""
-        ...
-
-    def authorization(self, key: str) -> dict[str, str]:
-        """Return the headers that carry an API key."""
-        ...
-
-    def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
-        """Return the media type and the bytes of a picture, marking each stage."""
-        ...
-
-    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
-        """Return the request's body; raises UsageError for what the dialect cannot say."""
-        ...
-
-    def event(self, message: Any) -> Event:
-        """Return what one message means; whatever it raises for a message of another form is the Decoder's to catch."""
-        ...
-
-    def starts_with_headers(self, facts: dict[str, float]) -> bool:
-        """Return whether the response's headers are known to have left when inference started."""
-        ...
 
 
 DIALECTS: Final[Registry[Callable[[], Dialect]]] = Registry(

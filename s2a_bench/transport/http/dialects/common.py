@@ -1,4 +1,4 @@
-"""What the dialects share: joining URLs, reading numbers, and the class of those that take encoded pictures."""
+"""What a dialect is, and what dialects share: joining URLs, reading numbers."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from urllib.parse import urlsplit, urlunsplit
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CACHE_N, PROMPT_N, USAGE_ZERO, Fact
 from s2a_bench.trace import FACT_LIMIT, Trace
-from s2a_bench.transport.http.dialects import Framing
-from s2a_bench.transport.http.dialects.framing import ServerSentEvents
+from s2a_bench.transport.http.dialects import Event, Picture
+from s2a_bench.transport.http.dialects.framing import Framing, ServerSentEvents
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Frame, Pixels, Request
 
@@ -31,28 +31,52 @@ VOCABULARY = 1 << 31
 """Larger than any."""
 
 
-class Chat:
-    """A chat that streams server-sent events, takes JPEG or PNG, and a bearer token (RFC 6750)."""
+class Dialect:
+    """One dialect, pure and without state: a chat that streams server-sent events, unless a subclass says otherwise."""
 
+    name: str
+    root, path = "", ""
+    """Where it is asked, below a server's URL: the root of the API, and the rest."""
+    lists_models = True
+    """Whether a model is chosen among those that the server lists."""
+    takes_grammar = False
+    """Whether it has a field for a GBNF grammar."""
     media_type = "text/event-stream"
+    """What a good answer's content-type starts with."""
     payloads: tuple[str, ...] = ("jpeg", "jpeg-preencoded", "png")
-    framing: type[Framing] = ServerSentEvents
+    """How pictures can travel."""
+    framing: Callable[[], Framing] = ServerSentEvents
     tells: Sequence[Fact] = ()
+    """The facts of its events."""
+
+    def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
+        """Return the URL and the model to ask: as told, else the first that the server lists."""
+        if not self.lists_models:
+            return base, model
+        return base, model or first_model(base, get)[1] or NO_MODEL
+
+    def url(self, base: str, model: str) -> str:  # noqa: ARG002 - some have the model in the path
+        """Return where to post, for the URL that a user gave."""
+        return endpoint(base, self.root, self.path)
 
     def authorization(self, key: str) -> dict[str, str]:
-        """Return the usual header of an API key."""
+        """Return the headers that carry an API key (RFC 6750)."""
         return {"authorization": f"Bearer {key}"}
 
     def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
-        """Encode as the payload says."""
+        """Return the media type and the bytes of a picture, marking each stage."""
         return encoded(frame, payload, trace)
 
-    def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
-        """Return the URL as it is, and the first model that the server lists unless one is told."""
-        return base, model or first_model(base, get)[1] or NO_MODEL
+    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
+        """Return the request's body; raises UsageError for what the dialect cannot say."""
+        raise NotImplementedError
+
+    def event(self, message: Any) -> Event:
+        """Return what one message means; whatever it raises for a message of another form is the Decoder's to catch."""
+        raise NotImplementedError
 
     def starts_with_headers(self, facts: dict[str, float]) -> bool:  # noqa: ARG002 - llama-server's tell
-        """Most servers send their headers at some other moment."""
+        """Return whether the response's headers are known to have left when inference started."""
         return False
 
 
@@ -77,13 +101,9 @@ def first_model(base: str, get: Get) -> tuple[str, str]:
         return "", ""
 
 
-def refuse_grammar(request: Request, name: str) -> None:
-    """Raise UsageError for a grammar that the dialect has no field for."""
-    if request.grammar:
-        raise UsageError(
-            f"`grammar`: the dialect '{name}' has no field for a GBNF grammar; leave it out, or ask a server of "
-            "`dialect` llama-server or vllm"
-        )
+def sampled(request: Request, max_tokens: str = "max_tokens", top_p: str = "top_p") -> dict[str, Any]:
+    """Return how an answer is sampled, under a dialect's names."""
+    return {max_tokens: request.max_tokens, "temperature": TEMPERATURE, top_p: TOP_P, "seed": request.seed}
 
 
 def numbers(source: Any, names: dict[str, Fact], scale: float = 1.0) -> dict[str, float]:

@@ -13,7 +13,9 @@ from typing import Any
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.secrets import struck
-from s2a_bench.transport.http.dialects import Dialect, Event, Framing
+from s2a_bench.transport.http.dialects import Event
+from s2a_bench.transport.http.dialects.common import Dialect
+from s2a_bench.transport.http.dialects.framing import Framing
 
 DONE = "[DONE]"
 """OpenAI's last message, which is no JSON."""
@@ -42,7 +44,6 @@ class Decoder:
         yield from self._events(self._framing.feed(data))
 
     def end(self) -> Iterator[Event]:
-        """Yield what the end of the body completes."""
         yield from self._events(self._framing.end())
 
     def _events(self, messages: Iterator[str | bytes]) -> Iterator[Event]:
@@ -61,7 +62,6 @@ class Decoder:
             yield Event(error=f"the server sent {error}")
 
     def _event(self, message: str | bytes) -> Event:
-        """Return what one message means."""
         if message == DONE:
             return Event(finish="done")
         try:
@@ -85,14 +85,17 @@ def error_in(value: Any) -> str:
     OpenAI, llama-server and Gemini send ``{"error": {"message": ...}}`` (Gemini at times in a list), Ollama and TGI
     ``{"error": "..."}``, vLLM until 0.10 ``{"object": "error", "message": ...}``, FastAPI ``{"detail": ...}``.
     """
-    if isinstance(value, list) and value:
-        value = value[0]
-    if not isinstance(value, dict):
-        return ""
+    value = _first(value)
     error = value.get("error") or (value if value.get("object") == "error" else value.get("detail"))
     if isinstance(error, dict):
         error = error.get("message") or error
     return str(error) if error else ""
+
+
+def _first(value: Any) -> dict[str, Any]:
+    """Return an object, or the first of a list; an empty one for anything else."""
+    value = value[0] if isinstance(value, list) and value else value
+    return value if isinstance(value, dict) else {}
 
 
 ERROR_TYPES = {"overloaded": 429, "validation": 422, "generation": 424, "incomplete_generation": 500}
@@ -101,8 +104,7 @@ ERROR_TYPES = {"overloaded": 429, "validation": 422, "generation": 424, "incompl
 
 def status_in(value: Any) -> int:
     """Return the HTTP status that an error object stands for, 0 if it does not say."""
-    if isinstance(value, list) and value:
-        value = value[0]
+    value = _first(value)
     error = value.get("error")
     code = error.get("code") if isinstance(error, dict) else value.get("code")
     if isinstance(code, int) and 400 <= code < 600:  # noqa: PLR2004 - HTTP's errors

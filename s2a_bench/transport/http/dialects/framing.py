@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
+from typing import Protocol
 
 LIMIT = 4 << 20
 """Bytes of one message: far above any token, and a bound for a server that never ends its line."""
+
+
+class Framing(Protocol):
+    """How messages are cut out of a body."""
+
+    def feed(self, data: bytes) -> Iterator[str | bytes]:
+        """Yield the messages that these bytes complete; raises ValueError for one that is too large."""
+        ...
+
+    def end(self) -> Iterator[str | bytes]:
+        """Yield what is left when the body has ended."""
+        ...
 
 
 class Lines:
@@ -39,7 +51,6 @@ class Lines:
             raise ValueError(f"a line of more than {LIMIT} bytes")
 
     def end(self) -> Iterator[str]:
-        """Yield the line that has begun, complete or not."""
         line = b"".join(self._pieces)
         self._pieces, self._size = [], 0
         yield line.decode("utf-8", "replace")
@@ -53,11 +64,9 @@ class JsonLines:
         self._lines = Lines()
 
     def feed(self, data: bytes) -> Iterator[str]:
-        """Yield the lines that are not empty."""
         yield from filter(str.strip, self._lines.feed(data))
 
     def end(self) -> Iterator[str]:
-        """Yield a last line without its end."""
         yield from filter(str.strip, self._lines.end())
 
 
@@ -65,80 +74,61 @@ class ServerSentEvents:
     """The data of server-sent events (WHATWG HTML, 9.2.6), comments and other fields left out.
 
     Two liberties: a last event without its empty line counts, and JSON that stands bare between events, as Gemini and
-    some gateways send their errors, is a message too.
+    some gateways send their errors, is a message too, until an empty line or one of data.
     """
 
     def __init__(self) -> None:
         """Start at the beginning of a body."""
         self._lines = Lines()
         self._data: list[str] = []
-        self._bare: list[str] = []
         self._size = 0
+        self._bare = False
         self._first = True
 
     def feed(self, data: bytes) -> Iterator[str]:
-        """Yield the data of each event that ends here."""
         for line in self._lines.feed(data):
             yield from self._line(line)
 
     def end(self) -> Iterator[str]:
-        """Yield an event without its empty line, or bare JSON that stays broken."""
-        for line in self._lines.end():
+        """Yield an event without its empty line."""
+        for line in (*self._lines.end(), ""):
             yield from self._line(line)
-        yield from self._event()
-        if self._bare:
-            yield "\n".join(self._bare)
 
     def _line(self, line: str) -> Iterator[str]:
         if self._first:
             line = line.removeprefix("\ufeff")
             self._first = False
         name, _, value = line.partition(":")
-        if not line:
+        is_data = name == "data"
+        bare = bool(line) and not is_data and (self._bare or line.startswith(("{", "[")))
+        if not line or ((is_data or bare) and bare != self._bare):
             yield from self._event()
-        elif name == "data":
-            self._hold(self._data, value.removeprefix(" "))
-        elif self._bare or line.startswith(("{", "[")):
-            self._hold(self._bare, line)
-            if line.rstrip().endswith(("}", "]")):
-                yield from self._whole()
+        if is_data or bare:
+            self._bare = bare
+            self._hold(line if bare else value.removeprefix(" "))
 
-    def _hold(self, where: list[str], text: str) -> None:
-        where.append(text)
+    def _hold(self, text: str) -> None:
+        self._data.append(text)
         self._size += len(text) + 1
         if self._size > LIMIT:
             raise ValueError(f"an event of more than {LIMIT} characters")
 
     def _event(self) -> Iterator[str]:
-        """Yield the event that an empty line ends."""
+        """Yield what an empty line, or one of another kind, ends."""
         data = "\n".join(self._data)
-        self._data = []
-        if not self._bare:
-            self._size = 0
+        self._data, self._size, self._bare = [], 0, False
         if data:
             yield data
-
-    def _whole(self) -> Iterator[str]:
-        """Yield bare JSON once its last line is there."""
-        text = "\n".join(self._bare)
-        try:
-            json.loads(text)
-        except (ValueError, RecursionError):
-            return
-        self._bare, self._size = [], 0
-        yield text
 
 
 class WholeBody:
     """A body that is one message."""
 
     def __init__(self) -> None:
-        """Start at the beginning of a body."""
         self._pieces: list[bytes] = []
         self._size = 0
 
     def feed(self, data: bytes) -> Iterator[str]:
-        """Yield nothing yet."""
         self._pieces.append(data)
         self._size += len(data)
         if self._size > LIMIT:
@@ -146,5 +136,4 @@ class WholeBody:
         yield from ()
 
     def end(self) -> Iterator[str]:
-        """Yield the body."""
         yield b"".join(self._pieces).decode("utf-8", "replace")

@@ -10,14 +10,12 @@ from s2a_bench.transport.http.dialects import Event, Picture
 from s2a_bench.transport.http.dialects.common import (
     NO_LIST,
     NO_MODEL,
-    TEMPERATURE,
-    TOP_P,
-    Chat,
+    Dialect,
     Get,
     endpoint,
     evaluated,
     first_model,
-    refuse_grammar,
+    sampled,
     text_of,
     usage_of,
 )
@@ -35,7 +33,7 @@ COMPLETE = frozenset({"STOP", "MAX_TOKENS"})
 """Every other reason (SAFETY, RECITATION, ...) means that the answer was cut."""
 
 
-class Gemini(Chat):
+class Gemini(Dialect):
     """Google's API, by key."""
 
     name = "gemini"
@@ -57,7 +55,6 @@ class Gemini(Chat):
         return base, model or first_model(here.removesuffix("/v1beta"), get)[1] or NO_MODEL  # a gateway's list
 
     def url(self, base: str, model: str) -> str:
-        """Return the route, which has the model in it."""
         root = next((version for version in VERSIONS if base.rstrip("/").endswith(version)), VERSIONS[0])
         return endpoint(base, root, f"/models/{quote(model, safe='')}:streamGenerateContent", "alt=sse")
 
@@ -67,16 +64,9 @@ class Gemini(Chat):
 
     def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:  # noqa: ARG002
         """Return one turn of the user; how much the model thinks is left to its default."""
-        refuse_grammar(request, self.name)
         inline = [{"inline_data": {"mime_type": picture.media_type, "data": picture.base64}} for picture in pictures]
-        generation = {
-            "maxOutputTokens": request.max_tokens,
-            "temperature": TEMPERATURE,
-            "topP": TOP_P,
-            "seed": request.seed,
-        }
         return {
-            "generationConfig": generation,
+            "generationConfig": sampled(request, "maxOutputTokens", "topP"),
             "contents": [{"role": "user", "parts": [*inline, {"text": request.prompt}]}],
         }
 

@@ -6,15 +6,7 @@ from typing import Any
 
 from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_MS, Fact
 from s2a_bench.transport.http.dialects import Event, Picture
-from s2a_bench.transport.http.dialects.common import (
-    TEMPERATURE,
-    TOP_P,
-    Chat,
-    endpoint,
-    numbers,
-    refuse_grammar,
-    text_of,
-)
+from s2a_bench.transport.http.dialects.common import Dialect, numbers, sampled, text_of
 from s2a_bench.transport.http.dialects.framing import JsonLines
 from s2a_bench.types import Request
 
@@ -33,32 +25,26 @@ DURATIONS = {
 """``api/types.go``; all in ns, and left out where zero."""
 
 
-class Ollama(Chat):
+class Ollama(Dialect):
     """The native chat route, which alone tells timings."""
 
     name = "ollama"
+    root, path = "/api", "/chat"
     media_type = "application/x-ndjson"
     framing = JsonLines
     tells = (*COUNTS.values(), *DURATIONS.values(), OUTSIDE_MODEL_MS)
 
-    def url(self, base: str, model: str) -> str:  # noqa: ARG002 - other dialects have the model in the path
-        """Return the chat route."""
-        return endpoint(base, "/api", "/chat")
-
     def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
         """Return one user message; whether the model thinks is left to the server's default."""
-        refuse_grammar(request, self.name)
         message = {"role": "user", "content": request.prompt, "images": [picture.base64 for picture in pictures]}
-        options = {
-            "num_predict": request.max_tokens,
-            "temperature": TEMPERATURE,
-            "top_p": TOP_P,
-            "seed": request.seed,
+        return {
+            "model": model,
+            "stream": True,
+            "options": sampled(request, "num_predict"),
+            "messages": [message],
         }
-        return {"model": model, "stream": True, "options": options, "messages": [message]}
 
     def event(self, message: Any) -> Event:
-        """Read one line."""
         said = message.get("message") or {}
         finish = text_of(message.get("done_reason") or "stop") if message.get("done") else ""
         facts = {**numbers(message, COUNTS), **numbers(message, DURATIONS, 1e-6)}

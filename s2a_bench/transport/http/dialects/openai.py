@@ -32,11 +32,9 @@ from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http import own as dialect
 from s2a_bench.transport.http.dialects import OWN, Event, Picture
 from s2a_bench.transport.http.dialects.common import (
-    Chat,
-    endpoint,
+    Dialect,
     evaluated,
     numbers,
-    refuse_grammar,
     text_of,
     token_id,
     usage_of,
@@ -64,15 +62,12 @@ REASONING = {"reasoning_tokens": THINKING_N}
 TELLING = frozenset({"usage", "metrics", "timings"})
 
 
-class OpenAI(Chat):
+class OpenAI(Dialect):
     """Any server of the dialect."""
 
     name = "openai"
+    root, path = "/v1", "/chat/completions"
     tells = (*TIMINGS.values(), *METRICS.values(), THINKING_N, PREDICTED_STEPS, USAGE_ZERO)
-
-    def url(self, base: str, model: str) -> str:  # noqa: ARG002 - other dialects have the model in the path
-        """Return the chat route."""
-        return endpoint(base, "/v1", "/chat/completions")
 
     def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
         """Return standard fields and one user message."""
@@ -80,9 +75,8 @@ class OpenAI(Chat):
         uris = [dialect.data_uri(picture.media_type, picture.base64) for picture in pictures]
         return {**dialect.parameters(request, model), **extra, "messages": dialect.messages(request.prompt, uris)}
 
-    def _extra(self, request: Request) -> dict[str, Any]:
+    def _extra(self, request: Request) -> dict[str, Any]:  # noqa: ARG002 - for subclasses
         """Return the fields that are this server's own."""
-        refuse_grammar(request, self.name)
         return {}
 
     def event(self, message: Any) -> Event:
@@ -123,6 +117,7 @@ class LlamaServer(OpenAI):
     """llama.cpp's own server."""
 
     name = "llama-server"
+    takes_grammar = True
 
     def _extra(self, request: Request) -> dict[str, Any]:
         return {"cache_prompt": False, **({"grammar": request.grammar} if request.grammar else {})}
@@ -132,6 +127,7 @@ class Vllm(OpenAI):
     """vLLM; its metrics come with ``--enable-per-request-metrics``."""
 
     name = "vllm"
+    takes_grammar = True
     tells = (*OpenAI.tells, END_N)
 
     def _extra(self, request: Request) -> dict[str, Any]:
@@ -158,6 +154,7 @@ class Own(OpenAI):
     """Our own server: it wants the request's id, and sends empty tokens, token ids and its marks."""
 
     name = OWN
+    takes_grammar = True
     tells = (*LLAMA, LATENCY_DRAWN_MS)  # our engines behind it
     payloads = (*OpenAI.payloads, "raw")
 

@@ -16,7 +16,7 @@ from s2a_bench.facts import Fact
 from s2a_bench.frames.convert import to_rgb
 from s2a_bench.trace import Trace
 from s2a_bench.transport.http.dialects import Event, Picture
-from s2a_bench.transport.http.dialects.common import Chat, Get, endpoint, refuse_grammar
+from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.framing import WholeBody
 from s2a_bench.types import Frame, Pixels, Request
 
@@ -31,22 +31,16 @@ NUMBERS = re.compile(r"[<>|=]?[fiu][0-9]+")
 """The element types that are read."""
 
 
-class OpenVla(Chat):
+class OpenVla(Dialect):
     """An action server; the model's name of a request is its ``unnorm_key``."""
 
     name = "openvla"
+    path = "/act"
+    lists_models = False
     media_type = "application/json"
     payloads = ("raw",)
     framing = WholeBody
     tells = (ACTION_N,)
-
-    def met(self, base: str, model: str, get: Get) -> tuple[str, str]:  # noqa: ARG002 - a server has one model
-        """Ask for nothing."""
-        return base, model
-
-    def url(self, base: str, model: str) -> str:  # noqa: ARG002 - a server has one model
-        """Return the only route."""
-        return endpoint(base, "", "/act")
 
     def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:  # noqa: ARG002 - always pixels
         """Return the pixels as RGB, height x width x 3, marking `convert`."""
@@ -58,7 +52,6 @@ class OpenVla(Chat):
 
     def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
         """Return what ``json_numpy.dumps`` makes of the array, and the instruction."""
-        refuse_grammar(request, self.name)
         fields: dict[str, Any] = {"instruction": request.prompt}
         if model:
             fields["unnorm_key"] = model

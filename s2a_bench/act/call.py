@@ -1,0 +1,176 @@
+"""A robot of Python functions of its user's: called with each action, or for each skill on a thread of its own."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pkgutil import resolve_name
+from threading import Condition, Thread
+from typing import ClassVar, Final, TypeAlias
+
+from s2a_bench.act import ActionKind, ActionRobot, Report, Running, SkillKind
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import RobotError, UsageError
+from s2a_bench.plan import Call, Gap, SkillSet, Value
+from s2a_bench.types import Vector
+
+_FUNCTION: Final = re.compile(r"[\w.]+:[\w.]+")
+
+
+@dataclass(frozen=True, slots=True)
+class PythonCall(SkillKind, ActionKind):
+    """Call ``function``, written ``module:name``, with each action, float32 (D,), or with the `Motion` of each skill.
+
+    What it returns is not looked at. Actions are sent on the control loop's thread: meanwhile nothing else is executed.
+    A skill has a thread of its own; `CallableRobot` has a function for each skill, and one for the gaps.
+    """
+
+    risk: ClassVar[str] = "program"
+
+    function: str = ""
+
+    def __post_init__(self) -> None:
+        if not _FUNCTION.fullmatch(self.function):
+            raise UsageError(f"function = '{self.function}' should look like module:name")
+
+    def open_skills(self, skills: SkillSet) -> CallableRobot:
+        """Import the function, which is called for every skill of the set; raises UsageError where that fails."""
+        return CallableRobot(skills, dict.fromkeys((skill.name for skill in skills.skills), self._imported()))
+
+    def open_actions(self, dims: int, period_ns: int) -> CallableActions:
+        """Import the function; raises UsageError where that fails."""
+        del dims, period_ns  # the function's own business
+        return CallableActions(self.function, self._imported())
+
+    def _imported(self) -> Callable[..., object]:
+        try:
+            function: object = resolve_name(self.function)
+        except Exception as error:  # a module may raise anything while it is imported
+            raise UsageError(
+                f"`robot`: call: {self.function} does not load: {type(error).__name__}: {error}; "
+                "is its folder in PYTHONPATH?"
+            ) from error
+        if not callable(function):
+            raise UsageError(
+                f"`robot`: call: {self.function} cannot be called: it is of type {type(function).__name__}"
+            )
+        return function
+
+
+class CallableActions(ActionRobot):
+    """Calls a function."""
+
+    def __init__(self, name: str, function: Callable[[Vector], object]) -> None:
+        self._name, self._function = name, function
+
+    def send(self, action: Vector | None, at_ns: int) -> None:
+        """Call the function; raises RobotError for what it raises."""
+        del at_ns
+        if action is None:
+            return
+        try:
+            self._function(action)
+        except Exception as error:
+            raise RobotError(f"`robot`: call: {self._name}: {type(error).__name__}: {error}") from error
+
+    def state(self) -> tuple[float, ...]:
+        """Return nothing: the function does not say."""
+        return ()
+
+    def describe(self) -> dict[str, str]:
+        return {"robot": "call", "function": self._name}
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class Motion:
+    """What a skill's function is given: the call, and how long it may take, which can change on the way."""
+
+    def __init__(self, call: Call, end_ns: int) -> None:
+        """End at ``end_ns`` of CLOCK_MONOTONIC unless told otherwise."""
+        self.call = call
+        self._changed = Condition()
+        self._end_ns = end_ns
+        self._aborted = self._over = False
+
+    @property
+    def arguments(self) -> dict[str, Value]:
+        return self.call.arguments
+
+    @property
+    def aborted(self) -> bool:
+        return self._aborted
+
+    @property
+    def remaining_s(self) -> float:
+        """Return how long is left until the commanded end, in s; 0 when it is past."""
+        return max(self._end_ns - now_ns(), 0) / 1e9
+
+    def wait(self, longest_s: float | None = None) -> bool:
+        """Sleep until the end as it stands by then, at most ``longest_s``; return at once, False, on an abort."""
+        until_ns = None if longest_s is None else now_ns() + round(longest_s * 1e9)
+        with self._changed:
+            while not self._aborted:
+                end_ns = self._end_ns if until_ns is None else min(self._end_ns, until_ns)
+                left_ns = end_ns - now_ns()
+                if left_ns <= 0:
+                    return True
+                self._changed.wait(left_ns / 1e9)
+        return False
+
+    def retime(self, end_ns: int) -> None:
+        with self._changed:
+            self._end_ns = end_ns
+            self._changed.notify_all()
+
+    def ended(self) -> bool:
+        return self._over
+
+    def abort(self) -> None:
+        with self._changed:
+            self._aborted = True
+            self._changed.notify_all()
+
+    def run(self, function: SkillFunction, report: Report) -> None:
+        error = ""
+        try:
+            function(self)
+        except Exception as failure:  # noqa: BLE001 - the user's code; what it raises is the skill's outcome
+            error = f"{type(failure).__name__}: {failure}"
+        self._over = not error  # what failed has to be heard of
+        report(error)
+
+
+SkillFunction: TypeAlias = Callable[[Motion], object]
+"""A skill as a function: returns when the skill is done, raises where it fails, looks after ``motion.aborted``."""
+
+
+class CallableRobot:
+    """Calls one function a skill."""
+
+    def __init__(
+        self, skills: SkillSet, functions: Mapping[str, SkillFunction], hold: Callable[[Gap], None] | None = None
+    ) -> None:
+        """Take the functions by the skills' names; raises UsageError where a skill has none.
+
+        ``hold`` fills the time without a skill: stop, coast, hold or cruise. It runs on the executor's thread.
+        """
+        if missing := [skill.name for skill in skills.skills if skill.name not in functions]:
+            raise UsageError(f"`robot`: no function for the skills {', '.join(missing)} of '{skills.name}'")
+        self._functions = functions
+        self._fill = hold
+
+    def start(self, call: Call, end_ns: int, report: Report) -> Running:
+        """Call the skill's function on a new thread, which does not keep the process alive."""
+        motion = Motion(call, end_ns)
+        Thread(target=motion.run, args=(self._functions[call.skill.name], report), daemon=True).start()
+        return motion
+
+    def hold(self, gap: Gap) -> None:
+        if self._fill is not None:
+            self._fill(gap)
+
+    def close(self) -> None:
+        """Do nothing: functions end by themselves."""

@@ -1,0 +1,191 @@
+"""Acting on chunks of actions: a loop at control rate, on a thread of its own, that nothing blocks.
+
+Ticks begin at fixed times. What a tick does follows from what had arrived by its time, not by when the thread woke up:
+asking sees what had arrived when the tick began; an action leaves at the end of its tick where d is the floor of
+latency over control tick, at its start where d is the ceiling (`policy.chunks.Rounding`). So virtual time says what
+happens here (`policy.chunks.cycles.follow`), and lateness is a number beside it. A tick that is late is made up for.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from threading import Thread
+from typing import Final, TypeAlias
+
+from s2a_bench.clock import Clock, SystemClock
+from s2a_bench.policy.chunks import Ints, Mode, Setting
+from s2a_bench.types import Vector
+
+Send: TypeAlias = "Callable[[Vector | None, int], None]"
+"""Called in every tick with its action, None where there is none, and the time in ns when it is due."""
+Ask: TypeAlias = "Callable[[int, int], None]"
+"""Called on the loop's thread with a request's number, from 0, and the tick in which it leaves; should not block."""
+
+HEAD_START_NS: Final = 20_000_000
+"""From `ControlLoop.start` to the first tick."""
+SWITCH_S: Final = 0.0005
+"""How long another thread of this process may go on before a tick gets its turn (Python's default: 5 ms)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Acted:
+    """What a loop did: arrays of shape (K,), int64, one value a tick."""
+
+    start_ns: int
+    """When the first tick began."""
+    chunk: Ints
+    """Which request's chunk the action was from; -1 for no action."""
+    index: Ints
+    """Its place there; -1 for no action."""
+    late_ns: Ints
+    """How long after it was due the action left."""
+    busy_ns: Ints
+    """For how long the loop did something: asking and sending, and not waiting."""
+    asked_tick: Ints
+    """When each request left: shape (R,)."""
+    arrival_ns: Ints
+    """How long after that tick began each action was there: shape (R, H), -1 where it never was."""
+
+    @property
+    def whole(self) -> int:
+        """Return how many requests have been answered whole, counted up to the first that was not."""
+        missing = [request for request, arrivals in enumerate(self.arrival_ns) if arrivals[-1] < 0]
+        return missing[0] if missing else len(self.arrival_ns)
+
+
+class ControlLoop:
+    """One robot that acts on chunks for so many control ticks."""
+
+    def __init__(
+        self, mode: Mode, setting: Setting, send: Send, ask: Ask, ticks: int, clock: Clock | None = None
+    ) -> None:
+        self.stepper, self._setting = mode.stepper(setting), setting
+        self._weight = mode.weight
+        self._blended: deque[Vector] = deque()
+        self._send, self._ask = send, ask
+        self._ticks = ticks
+        self._clock = clock or SystemClock()
+        self._inbox: deque[tuple[int, int, int]] = deque()
+        self._actions: dict[int, Sequence[Vector]] = {}
+        self._executing = 0
+        """The request whose chunk is executed; older ones are not needed any more."""
+        self._arrivals: dict[int, list[int]] = {}
+        self._asked: list[int] = []
+        self._acts: list[tuple[int, int, int]] = []
+        """The action of each tick and how late it left: request and index, -1 for none, and ns."""
+        self._busy: list[int] = []
+        self._start_ns = 0
+        self._stopped = False
+        self._failure: BaseException | None = None
+        self._thread = Thread(target=self._guarded, name="control", daemon=True)
+
+    def start(self) -> None:
+        self._start_ns = self._clock.now_ns() + HEAD_START_NS
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopped = True
+
+    def join(self, timeout_s: float | None = None) -> bool:
+        """Wait for its end, and return whether it has come by then; raises what the loop raised."""
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            return False
+        if self._failure is not None:
+            raise self._failure
+        return True
+
+    def arrived(self, request: int, actions: Sequence[Vector], at_ns: int) -> None:
+        """Tell, from any thread, that a chunk has come as far as ``actions``, of shape (D,) each, at a time.
+
+        What has been told before is passed over.
+        """
+        arrivals = self._arrivals.setdefault(request, [])
+        if len(actions) <= len(arrivals):
+            return
+        arrivals += [at_ns] * (len(actions) - len(arrivals))
+        if request >= self._executing:
+            self._actions[request] = actions
+        self._inbox.append((at_ns, request, len(actions)))
+
+    def run(self) -> None:
+        """Run all ticks on this thread."""
+        period_ns, floor = self._setting.period_ns, self._setting.rounding == "floor"
+        for tick in range(self._ticks + floor):
+            begins_ns = self._start_ns + tick * period_ns
+            self._clock.sleep_until_ns(begins_ns)
+            if self._stopped:
+                return
+            woke_ns = self._clock.now_ns()
+            if floor and tick:
+                self._deliver(begins_ns, tick - 1)
+                self._act(tick - 1, begins_ns)
+            if tick < self._ticks:
+                self._deliver(begins_ns + 1, tick)
+                if self.stepper.ask(tick):
+                    self._asked.append(tick)
+                    self._ask(len(self._asked) - 1, tick)
+                if not floor:
+                    self._deliver(begins_ns + 1, tick)
+                    self._act(tick, begins_ns)
+            self._busy.append(self._clock.now_ns() - woke_ns)
+
+    def acted(self) -> Acted:
+        """Return what it has done, once nobody calls `arrived` any more."""
+        import numpy as np
+
+        asked, horizon = np.array(self._asked, np.int64), self._setting.horizon
+        arrival_ns = np.full((asked.size, horizon), -1)
+        for request, times in self._arrivals.items():
+            began_ns = self._start_ns + self._asked[request] * self._setting.period_ns
+            arrival_ns[request, : len(times)] = np.array(times[:horizon]) - began_ns
+        chunk, index, late_ns = np.array(self._acts, np.int64).reshape(-1, 3).T
+        busy_ns = np.array(self._busy[: len(self._acts)], np.int64)
+        return Acted(self._start_ns, chunk, index, late_ns, busy_ns, asked, arrival_ns)
+
+    def _guarded(self) -> None:
+        gc.freeze()  # what lives already is not looked through again between two ticks
+        switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
+        try:
+            self.run()
+        except BaseException as error:  # noqa: BLE001 - raised again where it is waited for
+            self._failure = error
+        finally:
+            sys.setswitchinterval(switch_s)
+            gc.unfreeze()
+
+    def _deliver(self, before_ns: int, tick: int) -> None:
+        """Tell the stepper what had arrived before a time; what its thread was late to put down comes with the next."""
+        for _ in range(len(self._inbox)):
+            arrival = self._inbox.popleft()
+            if arrival[0] < before_ns:
+                self.stepper.arrived(arrival[1], arrival[2], tick)
+                if self._weight < 1:
+                    self._blend(self._actions[arrival[1]])
+            else:
+                self._inbox.append(arrival)
+
+    def _blend(self, actions: Sequence[Vector]) -> None:
+        """Blend a chunk, from the action on that is due next, into what is left."""
+        due = actions[self.stepper.past :]
+        weight, left = self._weight, self._blended
+        self._blended = deque(
+            weight * new + (1 - weight) * left[place] if place < len(left) else new for place, new in enumerate(due)
+        )
+
+    def _act(self, tick: int, due_ns: int) -> None:
+        action = self.stepper.act(tick)
+        value = None
+        if action is not None:
+            value = self._blended.popleft() if self._weight < 1 else self._actions[action.request][action.index]
+            while self._executing < action.request:
+                self._actions.pop(self._executing, None)
+                self._executing += 1
+        self._send(value, due_ns)
+        request, index = (-1, -1) if action is None else (action.request, action.index)
+        self._acts.append((request, index, self._clock.now_ns() - due_ns))

@@ -1,0 +1,274 @@
+"""The executor: one policy's stepper on one live stream, its decisions carried out by a robot, everything recorded.
+
+Rules, held in this file:
+- Between two events it sleeps until the next time at which there is something to do; it never polls.
+- Only skills that the parser has emitted are started, in their order, one at a time, at most as many as announced.
+- A skill ends when it reports so, or at its commanded end if it obeys time. At its nominal end with the next skill
+  missing it is *extended* up to the policy's ``latest_s``; when the next arrives meanwhile it is *compressed* to now.
+- A skill that is done before its commanded end makes room for the next: waiting would only move idle time (T1).
+- Whenever no skill runs the robot is told to *hold* in the manner of the last skill's gap, the set's before the first.
+- When the stream breaks (error, silence, a line that is no skill) before the announced skills are all there, the skill
+  under way runs to its end, none is started after it, and the robot holds. Once all are there the stream is done with.
+- A skill that fails or overruns its end by more than the patience ends the plan the same way; abort ends it at once.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from typing import Final, TypeVar
+
+from s2a_bench.act import Running, SkillRobot
+from s2a_bench.act.events import (
+    AbortAsked,
+    Event,
+    Fault,
+    Inbox,
+    Requested,
+    SkillCame,
+    SkillOver,
+    StreamBroke,
+    StreamEnded,
+    TokenCame,
+)
+from s2a_bench.act.record import Command, Outcome, Record, SkillRun, What
+from s2a_bench.clock import Clock
+from s2a_bench.plan import Gap
+from s2a_bench.policy import PlanShape, Policy, Start, Timing
+
+SILENCE_S: Final = 60.0
+"""A stream without a token for so long is dead."""
+PATIENCE_S: Final = 10.0
+"""How long a skill may go on after its commanded end."""
+NEVER: Final = sys.maxsize
+"""No time to wake at: something has to happen first."""
+
+_T = TypeVar("_T")
+
+
+class Executor:
+    """Carries out one plan. `run` blocks; ``record`` can be looked at from other threads meanwhile."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        shape: PlanShape,
+        robot: SkillRobot,
+        inbox: Inbox,
+        clock: Clock,
+        *,
+        gap: Gap = "hold",
+        silence_s: float = SILENCE_S,
+        patience_s: float = PATIENCE_S,
+        name: str = "",
+    ) -> None:
+        """Follow the stream that ``inbox`` tells of, whose clock is ``clock``; ``gap`` is how to wait at first.
+
+        ``name`` is what the record calls the policy, its own name otherwise.
+        """
+        self.record = Record(name or policy.name)
+        self._stepper = policy.stepper(shape)
+        self._announced = shape.n_skills
+        self._robot, self._inbox, self._clock = robot, inbox, clock
+        self._gap = gap
+        self._silence_ns, self._patience_ns = round(silence_s * 1e9), round(patience_s * 1e9)
+        self._running: Running | None = None
+        self._open = True
+        self._holding = False
+        self._failure: tuple[Outcome, str] | None = None
+        self._heard_ns = 0
+        self._told_s = 0.0
+
+    def run(self) -> Record:
+        """Follow the plan to its end and return the record; errors of stream and robot are outcomes, not exceptions."""
+        due_ns = self._clock.now_ns()
+        while (wake_ns := self._act(due_ns)) is not None:
+            events = self._inbox.wait(None if wake_ns == NEVER else wake_ns)
+            for event in events:
+                self._hear(event)
+            # Of several events the first: they piled up because this thread was late, which is jitter too.
+            due_ns = min([wake_ns, *(event.at_ns for event in events)])
+        return self.record
+
+    def _hear(self, event: Event) -> None:
+        """Note what happened, and tell the policy what concerns it."""
+        record = self.record
+        match event:
+            case Requested(at_ns):
+                record.requested_ns = self._heard_ns = at_ns
+            case TokenCame(at_ns) if self._open:
+                record.token_ns.append(at_ns)
+                self._heard_ns = at_ns
+                self._stepper.token(self._tell(at_ns))
+            case SkillCame(at_ns, call) if self._open and not self._whole:
+                record.arrivals.append((at_ns, call))
+                times = call.skill.durations
+                self._stepper.fragment(self._tell(at_ns), Timing(times.nominal_s, times.least_s, times.most_s))
+            case SkillCame() if self._open:
+                record.extra += 1
+            case StreamEnded(at_ns):
+                self._close(at_ns)
+            case StreamBroke(at_ns, fault, why):
+                self._break(at_ns, fault, why)
+            case SkillOver(at_ns, index, error):
+                self._over(at_ns, index, error)
+            case AbortAsked(at_ns, why):
+                self._failure = ("aborted", why)
+                self._close(at_ns)
+
+    @property
+    def _whole(self) -> bool:
+        return len(self.record.arrivals) >= self._announced
+
+    def _tell(self, at_ns: int) -> float:
+        """Return a time as the policy is told it: s from the request, never before what it was told last."""
+        self._told_s = max((at_ns - (self.record.requested_ns or 0)) / 1e9, self._told_s)
+        return self._told_s
+
+    def _close(self, at_ns: int) -> None:
+        if self._open:
+            self._open = False
+            self.record.ended_ns = at_ns
+            self._stepper.end(self._tell(at_ns))
+
+    def _break(self, at_ns: int, fault: Fault, why: str) -> None:
+        """Start nothing more, unless the plan is whole."""
+        if self._open and not self._whole:
+            self._fail(fault, why)
+        self._close(at_ns)
+
+    def _fail(self, outcome: Outcome, why: str) -> None:
+        self._failure = self._failure or (outcome, why)
+
+    def _over(self, at_ns: int, index: int, error: str) -> None:
+        """End the skill that reports its end; a late word of one that was given up means nothing."""
+        if self._running is None or index != len(self.record.skills) - 1:
+            return
+        self._end(at_ns)
+        if error:
+            self._fail("skill-failed", f"{self.record.skills[index].call}: {error}")
+
+    def _act(self, due_ns: int) -> int | None:
+        """Do all that is due, for a reason that was there at ``due_ns``; return when to act again, None at the end."""
+        record = self.record
+        while record.outcome is None:
+            now_ns = self._clock.now_ns()
+            silent_ns = self._silent_ns()
+            if now_ns >= silent_ns:
+                self._break(now_ns, "silence", f"no token for {self._silence_ns / 1e9:g} s")
+                continue
+            wake_ns = self._decide(now_ns, min(due_ns, now_ns)) if self._running is None else self._steer(now_ns)
+            if wake_ns > now_ns:
+                return min(wake_ns, silent_ns)
+        return None
+
+    def _silent_ns(self) -> int:
+        waiting = self._open and not self._whole and self.record.requested_ns is not None
+        return self._heard_ns + self._silence_ns if waiting else NEVER
+
+    def _decide(self, now_ns: int, due_ns: int) -> int:
+        """Ask the policy while no skill runs; return when to act again, 0 for at once."""
+        started, requested_ns = len(self.record.skills), self.record.requested_ns
+        if self._failure is not None:
+            return self._settle(now_ns, *self._failure)
+        if started == self._announced:
+            return self._settle(now_ns, "completed")
+        answer = math.inf if requested_ns is None else self._stepper.decide(self._tell(now_ns))
+        if isinstance(answer, Start):
+            self._start(answer, due_ns)
+            return 0
+        self._hold(now_ns)
+        if requested_ns is not None and answer < math.inf:
+            return max(requested_ns + math.ceil(answer * 1e9), now_ns + 1)
+        return NEVER if self._open else self._settle(now_ns, "short", f"{started} of {self._announced} skills came")
+
+    def _steer(self, now_ns: int) -> int:
+        """See the running skill to its end; return when to act again, 0 for at once."""
+        run = self.record.skills[-1]
+        if self._failure is not None and self._failure[0] in {"aborted", "skill-failed"}:
+            return self._abort(now_ns)
+        end_ns = run.ordered_ns + run.duration_ns
+        if now_ns < end_ns:
+            return end_ns
+        if self._open and not self._whole and len(self.record.arrivals) == run.index + 1:
+            end_ns = run.ordered_ns + max(run.latest_ns, run.duration_ns)
+        if now_ns < end_ns:
+            if run.until_ns != end_ns:
+                self._retime("extend", end_ns)
+            return end_ns
+        if run.until_ns > now_ns:
+            self._retime("compress", now_ns)
+        if self._order(True, self._running.ended if self._running else bool):
+            self._end(now_ns)
+            return 0
+        limit_ns = run.until_ns + self._patience_ns
+        if now_ns >= limit_ns:
+            self._fail("skill-overran", f"{run.call} went on for {self._patience_ns / 1e9:g} s after its end")
+            return self._abort(now_ns)
+        return limit_ns
+
+    def _start(self, answer: Start, due_ns: int) -> None:
+        index = len(self.record.skills)
+        arrival_ns, call = self.record.arrivals[index]
+        duration_ns, latest_ns = round(answer.duration_s * 1e9), round(answer.latest_s * 1e9)
+
+        def report(error: str = "") -> None:
+            self._inbox.put(SkillOver(self._clock.now_ns(), index, error))
+
+        ordered_ns = self._clock.now_ns()
+        until_ns = ordered_ns + duration_ns
+        self._running = self._order(None, lambda: self._robot.start(call, until_ns, report))
+        if self._running is None:
+            return
+        start_ns = self._clock.now_ns()
+        self._holding = False
+        self._log(start_ns, "start", index)
+        self.record.skills.append(
+            SkillRun(index, call, arrival_ns, due_ns, ordered_ns, start_ns, duration_ns, latest_ns, until_ns)
+        )
+
+    def _retime(self, what: What, end_ns: int) -> None:
+        run = self.record.skills[-1]
+        run.until_ns = end_ns
+        self._log(self._clock.now_ns(), what, run.index)
+        if self._running is not None:
+            running = self._running
+            self._order(None, lambda: running.retime(end_ns))
+
+    def _end(self, at_ns: int, what: What = "end") -> None:
+        run = self.record.skills[-1]
+        run.end_ns = max(at_ns, run.start_ns)
+        self._running = None
+        self._log(run.end_ns, what, run.index)
+
+    def _abort(self, now_ns: int) -> int:
+        if self._running is not None:
+            self._order(None, self._running.abort)
+            self._end(now_ns, "abort")
+        return 0
+
+    def _hold(self, now_ns: int) -> None:
+        """Fill the time without a skill, once a gap."""
+        if not self._holding:
+            self._holding = True
+            skills = self.record.skills
+            gap = skills[-1].call.skill.gap if skills else self._gap
+            self._log(now_ns, "hold", len(skills) - 1)
+            self._order(None, lambda: self._robot.hold(gap))
+
+    def _settle(self, now_ns: int, outcome: Outcome, why: str = "") -> int:
+        self._hold(now_ns)
+        self.record.outcome, self.record.why = outcome, why
+        return 0
+
+    def _log(self, at_ns: int, what: What, index: int) -> None:
+        self.record.commands.append(Command(at_ns, what, index))
+
+    def _order(self, otherwise: _T, call: Callable[[], _T]) -> _T:
+        """Call the robot; what it raises fails the plan."""
+        try:
+            return call()
+        except Exception as error:  # noqa: BLE001 - a robot is the user's code, and must not take the executor along
+            self._fail("skill-failed", f"the robot: {type(error).__name__}: {error}")
+            return otherwise

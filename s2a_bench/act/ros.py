@@ -1,0 +1,250 @@
+"""A robot behind ROS 2: every action is a message on a topic, every skill a goal of an action.
+
+A message of trajectory_msgs/JointTrajectory has one point, to be reached one control period after it came: its header
+has no stamp, which by convention means "now". In a stall nothing is published: a controller holds what it has.
+
+A skill is a goal of ``<namespace>/execute_skill``, s2a_msgs/action/ExecuteSkill. Its duration cannot be changed once it
+is sent (ROS 2 has no message for it), so extending and compressing reach such a robot as waiting for its result and as
+nothing; abort cancels the goal. What fills the gaps is published on ``<namespace>/gap`` as std_msgs/msg/String: stop,
+coast, hold, cruise.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
+from threading import Lock, Thread
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+from pydantic import Field
+
+from s2a_bench.act import ActionKind, ActionRobot, Report, Running, SkillKind
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import RobotError, S2AError, TransportError, UsageError
+from s2a_bench.plan import Call, Gap, SkillSet
+from s2a_bench.ros import (
+    MIDDLEWARES,
+    ActionClient,
+    ActionEvent,
+    Middleware,
+    QoS,
+    Rejected,
+    Result,
+    open_middleware,
+)
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.action import Status
+from s2a_bench.ros.config import domain_id
+from s2a_bench.ros.router import ROUTER, Router, endpoint_of
+from s2a_bench.ros.service import appeared
+from s2a_bench.types import Vector
+
+TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"
+POINT: Final = "trajectory_msgs/msg/JointTrajectoryPoint"
+ARRAY: Final = "std_msgs/msg/Float64MultiArray"
+EXECUTE_SKILL: Final = "s2a_msgs/action/ExecuteSkill"
+STRING: Final = "std_msgs/msg/String"
+POLL_S: Final = 0.2
+FOR_ACTIONS: Final = ("topic", "type", "joints")
+FOR_SKILLS: Final = ("namespace",)
+_T = TypeVar("_T")
+_NAME: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+
+
+@dataclass(frozen=True, slots=True)
+class Ros(SkillKind, ActionKind):
+    """Publish each action on ``topic`` as a message of ``type``; send skills to the node in ``namespace``.
+
+    ``joints`` are the joints' names with colons between them; joint_1, joint_2, ... unless told. ``middleware``,
+    ``domain_id`` and ``router`` are those of the ROS transport: default_middleware, ROS_DOMAIN_ID, rmw_zenoh's. For
+    ``wait_s`` the peer is waited for, a subscription or an action server, without which there is no robot; 0: whoever
+    listens, listens.
+    """
+
+    topic: str = "/joint_trajectory"
+    type: Literal["JointTrajectory", "Float64MultiArray"] = "JointTrajectory"
+    joints: str = ""
+    namespace: str = "/robot"
+    middleware: str = ""
+    domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
+    router: str = ROUTER
+    wait_s: Annotated[float, Field(ge=0, le=3600)] = 10.0
+
+    def __post_init__(self) -> None:
+        for field in ("topic", "namespace"):
+            if not _NAME.fullmatch(value := getattr(self, field)):
+                raise UsageError(f"{field} = '{value}' should look like /name or /name/name")
+        if self.joints and self.type != "JointTrajectory":
+            raise UsageError(f"joints = '{self.joints}': {self.type} has no names of joints")
+        if self.joints and len(set(self.names)) < len(self.names):
+            raise UsageError(f"joints = '{self.joints}' names one twice")
+        if self.middleware and self.middleware not in MIDDLEWARES:
+            raise UsageError(f"middleware = '{self.middleware}' is none of {', '.join(MIDDLEWARES)}")
+        endpoint_of(self.router)
+
+    @property
+    def names(self) -> list[str]:
+        return self.joints.split(":") if self.joints else []
+
+    def open_skills(self, skills: SkillSet) -> RosSkills:
+        """Join the domain and find the robot's action; raises TransportError without one."""
+        del skills  # which skills there are is the server's business
+        self._refuse(FOR_ACTIONS, "actions, not skills")
+        return self._join("/s2a_bench/executor", lambda node: RosSkills(node, self.namespace, self.wait_s))
+
+    def open_actions(self, dims: int, period_ns: int) -> RosActions:
+        """Join the domain; raises UsageError for other joints than ``dims``, RobotError where nobody subscribes."""
+        self._refuse(FOR_SKILLS, "skills, not actions")
+        names = self.names or [f"joint_{joint}" for joint in range(1, dims + 1)]
+        if len(names) != dims:
+            raise UsageError(f"`robot`: ros: joints = '{self.joints}' names {len(names)} joints of {dims}")
+        return self._join("/s2a_bench/robot", lambda node: RosActions(self, node, names, period_ns))
+
+    def _refuse(self, names: Sequence[str], about: str) -> None:
+        """Refuse parameters that this robot would not look at."""
+        for field in fields(self):
+            if field.name in names and getattr(self, field.name) != field.default:
+                raise UsageError(f"`robot`: ros: {field.name} is about {about}")
+
+    def _join(self, node_name: str, opened: Callable[[Middleware], _T]) -> _T:
+        middleware = open_middleware(
+            self.middleware,
+            domain_id=domain_id(os.environ) if self.domain_id is None else self.domain_id,
+            node_name=node_name,
+            router=Router(self.router),
+        )
+        try:
+            return opened(middleware)
+        except BaseException:
+            middleware.close()
+            raise
+
+
+class RosActions(ActionRobot):
+    """Publishes actions."""
+
+    def __init__(self, asked: Ros, middleware: Middleware, joints: list[str], period_ns: int) -> None:
+        """Announce the topic and take over ``middleware``; raises RobotError where nobody subscribes in time."""
+        self._asked, self._middleware = asked, middleware
+        type_name = TRAJECTORY if asked.type == "JointTrajectory" else ARRAY
+        self._publisher = middleware.publisher(asked.topic, type_name, QoS(depth=1))
+        self._joints = joints
+        seconds, nanoseconds = divmod(period_ns, 1_000_000_000)
+        self._period = ros.default("builtin_interfaces/msg/Duration", sec=seconds, nanosec=nanoseconds)
+        if asked.wait_s and not appeared(lambda: self._publisher.matched() > 0, asked.wait_s):
+            raise RobotError(
+                f"`robot`: ros: nobody subscribed to {asked.topic} ({type_name}) in {asked.wait_s:g} s; start the "
+                "controller first, with the same ROS_DOMAIN_ID, or publish to nobody with wait_s=0"
+            )
+
+    def send(self, action: Vector | None, at_ns: int) -> None:
+        del at_ns
+        if action is not None:
+            self._publisher.send(self._publisher.pack(self._message(action)))
+
+    def _message(self, action: Vector) -> Any:
+        values = action.astype("float64")
+        if self._asked.type == "Float64MultiArray":
+            return ros.default(ARRAY, data=values)
+        point = ros.default(POINT, positions=values, time_from_start=self._period)
+        return ros.default(TRAJECTORY, joint_names=self._joints, points=[point])
+
+    def state(self) -> tuple[float, ...]:
+        return ()
+
+    def describe(self) -> dict[str, str]:
+        told = {name: value for name, value in asdict(self._asked).items() if name not in FOR_SKILLS}
+        told |= {"robot": "ros", "joints": ":".join(self._joints), **self._middleware.describe()}
+        return {name: str(value) for name, value in told.items()}
+
+    def close(self) -> None:
+        self._middleware.close()
+
+
+class RosSkills:
+    """Sends skills as goals; a thread of its own takes what comes back."""
+
+    def __init__(self, middleware: Middleware, namespace: str, wait_s: float) -> None:
+        """Find the action server and take over ``middleware``; raises TransportError where none appears in time."""
+        name = f"{namespace}/execute_skill"
+        self._middleware = middleware
+        self._client: ActionClient = middleware.action_client(name, EXECUTE_SKILL)
+        self._gaps = middleware.publisher(f"{namespace}/gap", STRING, QoS(depth=1))
+        if wait_s and not self._client.wait_for_server(wait_s):
+            raise TransportError(
+                f"`robot`: ros: no server of the action {name} ({EXECUTE_SKILL}) appeared in {wait_s:g} s; "
+                "start the robot's node first, with the same ROS_DOMAIN_ID"
+            )
+        self._reports: dict[bytes, Report] = {}
+        self._lock = Lock()
+        self._closed = False
+        self._thread = Thread(target=self._listen, name="skills", daemon=True)
+        self._thread.start()
+
+    def start(self, call: Call, end_ns: int, report: Report) -> Running:
+        """Send a goal with the time that is left until ``end_ns``."""
+        times = call.skill.durations
+        goal = ros.default(
+            EXECUTE_SKILL + "_Goal",
+            skill=call.skill.name,
+            arguments=[str(value) for value in call.values],
+            duration=max(end_ns - now_ns(), 0) / 1e9,
+            duration_least=times.least_s,
+            duration_most=times.most_s,
+        )
+        packed = self._client.pack(goal)
+        with self._lock:
+            goal_id = self._client.send(packed)
+            self._reports[goal_id] = report
+        return _Goal(self._client, goal_id)
+
+    def hold(self, gap: Gap) -> None:
+        self._gaps.send(self._gaps.pack(ros.default(STRING, data=gap)))
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self._client.interrupt()
+            self._thread.join()
+            self._middleware.close()
+
+    def _listen(self) -> None:
+        while not self._closed:
+            event = self._client.next_event(POLL_S)
+            if isinstance(event, (Rejected, Result)):
+                with self._lock:
+                    report = self._reports.pop(event.goal_id, None)
+                if report is not None:
+                    report(self._error(event))
+
+    def _error(self, event: ActionEvent) -> str:
+        """Return what went wrong with a goal; nothing if it went well."""
+        if not isinstance(event, Result):
+            return "the robot rejected the goal"
+        succeeded = event.status == Status.SUCCEEDED
+        try:
+            result = self._client.unpack_result(event.packed)
+        except S2AError as error:
+            return str(error) if succeeded else f"the goal ended {Status(event.status).name}"
+        if not succeeded:
+            return f"the goal ended {Status(event.status).name}" + (f": {result.message}" if result.message else "")
+        return "" if result.success else result.message or "the robot reports no success"
+
+
+class _Goal:
+    """A goal under way."""
+
+    def __init__(self, client: ActionClient, goal_id: bytes) -> None:
+        self._client, self._id = client, goal_id
+
+    def retime(self, end_ns: int) -> None:
+        """Let it be: a goal keeps the duration that it was sent with."""
+
+    def ended(self) -> bool:
+        """Leave it to the result to say so."""
+        return False
+
+    def abort(self) -> None:
+        self._client.cancel(self._id)

@@ -1,0 +1,111 @@
+"""Boards that stream tokens, evenly or with jitter, drawn from a seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from s2a_bench.boards.gaps import Constant, Floats, Gaps, Lognormal, Recorded, from_table, read_family
+from s2a_bench.boards.profile import Profile
+from s2a_bench.errors import UsageError
+from s2a_bench.provenance import NONE, Provenance
+
+if TYPE_CHECKING:
+    import numpy as np
+
+NO_JITTER: Final = "none"
+AS_PROFILE: Final = "profile"
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A source of tokens."""
+
+    name: str
+    """The profile's; empty for a rate."""
+    title: str
+    origin: str
+    """Where the rate is from: paper, measured or given."""
+    tokens_per_s: float
+    prompt_s: float
+    """c: tokens come evenly from there on, so that the time to first token is c + 1 / R."""
+    prompt_origin: str
+    """Where c is from: assumed, measured or given."""
+    gaps: Gaps
+    prompt_cv: float = 0.0
+    rate_cv: float = 0.0
+    weights: str = NONE
+    """Of the model that the rate was measured with: real, dummy; none for a bare rate."""
+
+    @property
+    def provenance(self) -> Provenance:
+        """Return where numbers come from that are computed with its tokens."""
+        return Provenance.computed(self.name or self.title, self.weights)
+
+    @property
+    def even(self) -> bool:
+        """Return whether every plan's tokens come at the same times."""
+        return isinstance(self.gaps, Constant) and self.prompt_cv == self.rate_cv == 0
+
+    def tokens(self, count: int, rng: np.random.Generator, plans: int) -> Floats:
+        """Draw when each token arrives, shape (count, plans), in s from the request: prompt time, rate, then gaps."""
+        import numpy as np
+
+        token_s = self.gaps.sample(rng, count, plans)
+        token_s *= _factors(self.rate_cv, rng, plans)
+        token_s[0] += self.prompt_s * _factors(self.prompt_cv, rng, plans)
+        np.cumsum(token_s, axis=0, out=token_s)
+        return token_s
+
+
+def board_of_profile(profile: Profile, jitter: str, prompt_s: float | None) -> Board:
+    """Take a profile's rate and, unless ``prompt_s`` is given, its c; its spreads only with ``--jitter profile``."""
+    assumed = "assumed" if "prompt_s" in profile.assumed else "measured"
+    gaps = _gaps(jitter, profile)
+    recorded = isinstance(gaps, Recorded)  # it holds each answer's own rate already
+    return Board(
+        name=profile.name,
+        title=profile.title,
+        origin=profile.origin,
+        tokens_per_s=profile.tokens_per_s,
+        prompt_s=profile.prompt_s if prompt_s is None else prompt_s,
+        prompt_origin=assumed if prompt_s is None else "given",
+        gaps=gaps,
+        prompt_cv=profile.prompt_cv if jitter == AS_PROFILE else 0.0,
+        rate_cv=profile.rate_cv if jitter == AS_PROFILE and not recorded else 0.0,
+        weights=profile.weights,
+    )
+
+
+def board_of_rate(tokens_per_s: float, jitter: str, prompt_s: float | None) -> Board:
+    """Make a board of a bare rate; raises UsageError where only a profile could tell its jitter."""
+    if jitter == AS_PROFILE:
+        raise UsageError(f"`jitter`: {AS_PROFILE} needs `profiles`; `rates` alone takes a family, as lognormal:cv=0.2")
+    return Board(
+        name="",
+        title=f"{tokens_per_s:g} tokens/s",
+        origin="given",
+        tokens_per_s=tokens_per_s,
+        prompt_s=prompt_s or 0.0,
+        prompt_origin="given" if prompt_s is not None else "assumed",
+        gaps=gaps_of(jitter, 1 / tokens_per_s),
+    )
+
+
+def gaps_of(jitter: str, mean_s: float) -> Gaps:
+    """Read ``none`` or ``FAMILY:key=value,...`` of `jitter.FAMILIES`; raises UsageError naming the field."""
+    table = read_family("constant" if jitter == NO_JITTER else jitter, "jitter")
+    try:
+        return from_table(table, mean_s)
+    except UsageError as error:
+        raise UsageError(f"`jitter` {jitter}: {error}") from error
+
+
+def _gaps(jitter: str, profile: Profile) -> Gaps:
+    if jitter != AS_PROFILE:
+        return gaps_of(jitter, 1 / profile.tokens_per_s)
+    return Recorded(1 / profile.tokens_per_s, profile.trace_s) if profile.trace_s else profile.gaps
+
+
+def _factors(cv: float, rng: np.random.Generator, plans: int) -> Floats | float:
+    return Lognormal(1.0, cv).sample(rng, 1, plans)[0] if cv else 1.0

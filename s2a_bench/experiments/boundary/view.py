@@ -1,0 +1,284 @@
+"""How a boundary run is shown: tables, JSON, and figure 2 of the paper, where naive is stall-free."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import numpy as np
+
+from s2a_bench.experiments import Shown
+from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
+from s2a_bench.store.schema import PROVENANCE, Positive, about
+from s2a_bench.writers.as_json import cell_of_row, frame
+from s2a_bench.writers.csv_text import CsvTable
+from s2a_bench.writers.figures import new_figure, wrapped
+from s2a_bench.writers.tables import ABSENT, EMULATED, PAPERS, Note, TextTable, number
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from s2a_bench.store.run import Run
+
+DURATIONS = ("t_nom", "t_min")
+"""As skills are executed, and as the paper draws the line."""
+_FREE, _BETWEEN, _STALLS = "#009E73", "#F0E442", "#D55E00"
+_SHADE: Final = 0.3
+_INK: Final = "#222222"
+_TRIALS: Final[dict[str, dict[str, Any]]] = {
+    "trial: no stall": {"marker": "o", "facecolors": "none", "edgecolors": _INK},
+    "trial: stalls": {"marker": "x", "color": _INK},
+}
+
+
+def show(run: Run, **_: Any) -> Shown:
+    """Return what a boundary run shows."""
+    tables = {"boundary": line_table(run), "boards": board_table(run)}
+    return Shown(
+        sentences=boundary_sentences(run),
+        tables=tables,
+        main=["boards"],
+        notes=tables["boards"].notes,
+        csvs=boundary_csv(run),
+        figures={"boundary": partial(build_boundary, run)},
+        json=lambda: frame(run, list(_cells(run)), []),
+    )
+
+
+BoundaryCell = cell_of_row(
+    "BoundaryCell",
+    "A point of the grid, or a board on it.",
+    BoundaryRow,
+    without=("duration", "tokens_per_s", "board"),
+    own={
+        "duration": Literal["t_nom", "t_min"],
+        "rate_tokens_per_s": Positive,
+        "profile": Annotated[str | None, about("The board that has this rate; null for a point of the grid.")],
+        "emulated": Literal[True],
+        "rho": Annotated[Positive, about("L / R over the duration: stall-free up to 1.")],
+    },
+)
+
+
+def grid_of(run: Run, duration: str) -> pd.DataFrame:
+    """Return the points of the grid for one duration."""
+    rows = run.table(BOUNDARY)
+    return rows[(rows["duration"] == duration) & (rows["board"] == "")]
+
+
+def marks_of(run: Run) -> list[tuple[str, float, pd.DataFrame]]:
+    """Return title and rate of each board with its points, in the order asked for."""
+    rows = run.table(BOUNDARY)
+    boards = run.manifest["boards"]
+    return [(board["title"], board["tokens_per_s"], rows[rows["board"] == board["name"]]) for board in boards]
+
+
+def is_random(run: Run) -> bool:
+    """Return whether plans differ at a point."""
+    return bool((run.table(BOUNDARY)["plans"] > 1).any())
+
+
+def board_table(run: Run) -> TextTable:
+    """Lay out the boards: gap between skills, and whether naive is stall-free there."""
+    groups = []
+    for title, rate, points in marks_of(run):
+        nominal, least = (points[points["duration"] == name].to_dict("records") for name in DURATIONS)
+        rows: list[tuple[str, ...]] = []
+        for one, other in zip(nominal, least, strict=True):
+            gap_s = one["tokens_per_skill"] / rate
+            verdicts = (_verdict(point, random=is_random(run)) for point in (one, other))
+            numbers = (str(one["tokens_per_skill"]), number(gap_s), number(gap_s / one["duration_s"]))
+            rows.append((title, *numbers, *verdicts))
+        groups.append(rows)
+    header = ("board", "L", "L/R (s)", "rho", "at T_nom", "at T_min")
+    return TextTable.grouped("Boards: is naive stall-free?", header, groups, 1, _notes(run), once=1)
+
+
+def line_table(run: Run) -> TextTable:
+    """Lay out the slowest stall-free rate: L / T, and the slowest of the grid's rates that passed the trial."""
+    rows = []
+    for tokens in sorted(grid_of(run, "t_nom")["tokens_per_skill"].unique()):
+        row = [str(tokens)]
+        for name in DURATIONS:
+            points = grid_of(run, name)
+            mine = points[points["tokens_per_skill"] == tokens].sort_values("tokens_per_s")
+            passed = mine[mine["p_stall"] == 0]["tokens_per_s"]
+            row += [number(tokens / float(mine["duration_s"].iloc[0])), number(passed.min()) if len(passed) else ABSENT]
+        rows.append(tuple(row))
+    header = ("L", "T_nom: formula", "trial", "T_min: formula", "trial")
+    return TextTable("Slowest rate without stalls under naive, in tokens/s", header, rows, 1)
+
+
+def boundary_csv(run: Run) -> dict[str, CsvTable]:
+    """Return file name -> CSV table: every point of the plane and of the boards."""
+    names = ("duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall")
+    return {"boundary.csv": CsvTable.of(names, run.table(BOUNDARY)[list(names)].itertuples(index=False, name=None))}
+
+
+def boundary_sentences(run: Run) -> list[str]:
+    """Return whether the formula holds, and what the paper's line leaves out."""
+    points = len(run.table(BOUNDARY))
+    said = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
+    if is_random(run):
+        shares = grid_of(run, DURATIONS[0])["p_stall"]
+        said.append(f"A plan stalls at {int((shares > 0).sum())} of {len(shares)} points of the grid, run for T_nom.")
+    else:
+        agree = points - disagreements(run)
+        said.append(f"The formula R >= L/T says whether it stalls, and is right at {agree} of {points} points.")
+    return said
+
+
+def disagreements(run: Run) -> int:
+    """Count the points where formula and trial differ; with jitter they must, so that only even tokens tell."""
+    rows = run.table(BOUNDARY)
+    return int(((rows["p_stall"] == 0) != rows["stall_free"]).sum())
+
+
+def _cells(run: Run) -> Iterator[dict[str, Any]]:
+    for row in run.table(BOUNDARY).drop(columns=PROVENANCE).to_dict("records"):
+        rate, board = row.pop("tokens_per_s"), row.pop("board")
+        rho = row["tokens_per_skill"] / rate / row["duration_s"]
+        named: dict[str, Any] = {str(name): value for name, value in row.items()}
+        yield asdict(BoundaryCell(**named, rate_tokens_per_s=rate, profile=board or None, rho=rho, emulated=True))
+
+
+def _verdict(point: dict[Any, Any], *, random: bool) -> str:
+    said = "stall-free" if point["stall_free"] else "stalls"
+    return f"{said}, P = {point['p_stall']:.1%}" if random else said
+
+
+def _notes(run: Run) -> tuple[str, ...]:
+    points = len(run.table(BOUNDARY))
+    notes = [
+        "Naive runs every skill for T_nom. The paper draws the line for T_min, which holds if skills may end early."
+    ]
+    if is_random(run):
+        plans = int(run.table(BOUNDARY)["plans"].max())
+        jitter = run.manifest["configuration"]["jitter"]
+        notes.append(f"P: share of {plans} drawn plans with a stall, jitter {jitter}; the formula is for even tokens.")
+    else:
+        notes.append(f"Formula and trial agree at {points - disagreements(run)} of {points} points.")
+    if any(board["origin"] == "paper" for board in run.manifest["boards"]):
+        rates = "EMULATED: the boards' rates are the paper's (table II); nothing was measured here."
+        notes.append(Note(rates, EMULATED, PAPERS))
+    return tuple(notes)
+
+
+def build_boundary(run: Run) -> Figure:
+    """Draw the lines R = L / T_nom and R = L / T_min, what trials found, and the boards.
+
+    Without jitter regions are shaded by the formula and every trial is a mark; with jitter P(a plan stalls) is shaded.
+    """
+    figure = new_figure(3.5, _title(run))
+    axes = figure.subplots()
+    nominal = grid_of(run, "t_nom")
+    low, high = float(nominal["tokens_per_s"].min()), float(nominal["tokens_per_s"].max())
+    most = int(nominal["tokens_per_skill"].max())
+    axes.set_yscale("log")
+    axes.set_xlim(0.5, most + 0.5)
+    axes.set_ylim(low, high)
+    lines = {name: float(grid_of(run, name)["duration_s"].iloc[0]) for name in ("t_nom", "t_min")}
+    tokens = np.linspace(0.5, most + 0.5, 200)
+    if is_random(run):
+        _shade_shares(figure, axes, run)
+    else:
+        _shade_regions(axes, tokens, lines, low, high)
+        _mark_trials(axes, run)
+    looks = {
+        "t_nom": ("-", r"$R = L\,/\,T_\mathrm{nom}$ (naive as it runs)"),
+        "t_min": ("--", r"$R = L\,/\,T_\mathrm{min}$ (the paper's line)"),
+    }
+    for name, duration_s in lines.items():
+        style, label = looks[name]
+        axes.plot(tokens, tokens / duration_s, style, color="black", label=label)
+    _mark_boards(axes, run)
+    axes.set_xticks(range(1, most + 1))
+    axes.yaxis.set_major_formatter(lambda value, _place: f"{value:g}")
+    axes.set_xlabel("tokens per skill, L")
+    axes.set_ylabel("rate, R (tokens/s)")
+    figure.legend(loc="outside lower center", ncols=2, columnspacing=1.0)
+    return figure
+
+
+def _shade_regions(axes: Axes, tokens: np.ndarray, lines: dict[str, float], low: float, high: float) -> None:
+    """Shade what the formula says, and write it into the regions."""
+    nominal, least = tokens / lines["t_nom"], tokens / lines["t_min"]
+    axes.fill_between(tokens, least, high, color=_FREE, alpha=_SHADE, linewidth=0)
+    axes.fill_between(tokens, nominal, least, color=_BETWEEN, alpha=_SHADE, linewidth=0)
+    axes.fill_between(tokens, low, nominal, color=_STALLS, alpha=_SHADE, linewidth=0)
+    box = {"facecolor": "white", "alpha": 0.85, "linewidth": 0, "pad": 1.5}
+    axes.text(0.03, 0.68, "stall-free", transform=axes.transAxes, color=_INK, bbox=box)
+    axes.text(0.97, 0.04, "naive stalls", transform=axes.transAxes, color=_INK, ha="right", bbox=box)
+
+
+def _mark_trials(axes: Axes, run: Run) -> None:
+    points = grid_of(run, "t_nom")
+    free = points["p_stall"] == 0
+    for chosen, (label, look) in zip((points[free], points[~free]), _TRIALS.items(), strict=True):
+        axes.scatter(chosen["tokens_per_skill"], chosen["tokens_per_s"], 7, linewidths=0.5, label=label, **look)
+
+
+def _shade_shares(figure: Figure, axes: Axes, run: Run) -> None:
+    """Shade the share of plans that stall, as executed at T_nom."""
+    table = grid_of(run, "t_nom").pivot_table(index="tokens_per_s", columns="tokens_per_skill", values="p_stall")
+    mesh = axes.pcolormesh(
+        table.columns.to_numpy(dtype="float64"),
+        table.index.to_numpy(dtype="float64"),
+        table.to_numpy(dtype="float64"),
+        cmap="Oranges",
+        vmin=0,
+        vmax=1,
+        shading="nearest",
+        rasterized=True,
+    )
+    figure.colorbar(mesh, ax=axes, label="P(a plan stalls), naive at $T_\\mathrm{nom}$", pad=0.02)
+
+
+def _mark_boards(axes: Axes, run: Run) -> None:
+    """Draw a line a board, with its granularities: filled where naive is stall-free at T_nom."""
+    for title, rate, points in marks_of(run):
+        nominal = points[points["duration"] == "t_nom"]
+        axes.axhline(rate, color=_INK, linewidth=0.5, linestyle=":")
+        box = {"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1}
+        axes.annotate(
+            f"{title}, {rate:g}",
+            (1, rate),
+            (-2, 3),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            ha="right",
+            va="bottom",
+            fontsize=6,
+            color=_INK,
+            bbox=box,
+        )
+        for free, face in ((True, _INK), (False, "white")):
+            chosen = nominal[nominal["stall_free"] == free]
+            axes.plot(
+                chosen["tokens_per_skill"],
+                chosen["tokens_per_s"],
+                "s",
+                markersize=4.5,
+                color=_INK,
+                markerfacecolor=face,
+                markeredgewidth=0.9,
+            )
+
+
+def _title(run: Run) -> str:
+    asked = run.manifest["configuration"]
+    t_nom_s = asked["t_nom_s"]
+    facts = [f"N = {asked['n_skills']}", f"$T_\\mathrm{{nom}}$ = {t_nom_s:g} s"]
+    facts += [f"$T_\\mathrm{{min}}$ = {asked['t_min'] * t_nom_s:g} s"]
+    facts += [f"{asked['plans']} plans a point" if is_random(run) else "tokens come evenly"]
+    lines = ["Stall-free region of naive execution", ", ".join(facts)]
+    lines += [f"jitter {asked['jitter']}"] if is_random(run) else []
+    if any(board["origin"] == "paper" for board in run.manifest["boards"]):
+        lines.append(
+            "Squares: boards at the paper's rates (not measured here), filled where the formula says stall-free"
+        )
+    return wrapped(lines)

@@ -1,0 +1,241 @@
+"""The live run: every mode acts at control rate on what a server answers, judged with the formulas of virtual time.
+
+A latency counts from the start of the tick in which a request left until its chunk was there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count, groupby, product
+from pathlib import Path
+from random import Random
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from s2a_bench.act import open_robot
+from s2a_bench.act.control import ControlLoop
+from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.experiments.chunks.asking import Asking, Job, warm_up
+from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells
+from s2a_bench.experiments.chunks.latencies import Source, delay_rows, measured, write_delays
+from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
+from s2a_bench.experiments.chunks.to_rows import stall_metrics, stalls_of, write_cell
+from s2a_bench.harness.plan import resolve
+from s2a_bench.harness.rounds import Launch, Task, keep_origin, run_requests
+from s2a_bench.harness.session import Place, Session
+from s2a_bench.policy.chunks.cycles import NEVER, follow, gather
+
+if TYPE_CHECKING:
+    from s2a_bench.act import ActionRobot
+    from s2a_bench.act.control import Acted
+    from s2a_bench.experiments.chunks.config import ChunksConfig
+    from s2a_bench.policy.chunks import Cycles, Ints, Setting, Ticks
+    from s2a_bench.progress import Progress
+    from s2a_bench.store.run import RunWriter
+    from s2a_bench.types import Vector
+CLIENTS: Final = 4
+"""Of a cell, where a mode has several requests under way."""
+LOOK_S: Final = 0.05
+"""How often who waits for a loop writes down what was measured."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Live:
+    """What a mode did over a pipeline; ``triggers`` are those that a rule chose as it went."""
+
+    cell: Cell
+    setting: Setting
+    session: Session
+    acted: Acted
+    asking: Asking
+    robot: ActionRobot | None
+    triggers: tuple[int, ...] = ()
+
+    @property
+    def judged(self) -> Cell:
+        """Return the cell with the latencies that it had, of whole answers, and the triggers."""
+        latency_ns = self.acted.arrival_ns[: self.acted.whole, 0 if self.cell.mode.streams else -1]
+        cell = replace(self.cell, drawn=replace(self.cell.drawn, judged=latency_ns))
+        triggers = self.triggers[: latency_ns.size]
+        return replace(cell, triggers=triggers, begin=None) if triggers else cell
+
+    def counted(self) -> tuple[Cycles, Ticks]:
+        """Return what it did in all of its ticks; an answer that never came is usable behind the last of them."""
+        acted, ticks = self.acted, self.acted.chunk.size
+        arrival_ns = acted.arrival_ns[:, -1]
+        delay = np.where(arrival_ns < 0, ticks, self.setting.delay_ticks(np.maximum(arrival_ns, 0)))
+        return gather(acted.asked_tick, acted.asked_tick + delay, acted.chunk, acted.index, self.setting.horizon)
+
+    def agreement(self) -> float:
+        """Return the share of the ticks in which it did what virtual time says of the same arrivals."""
+        acted = self.acted
+        arrival_ns = np.where(acted.arrival_ns < 0, NEVER, acted.arrival_ns)
+        _, said = follow(self.cell.acting, arrival_ns, self.setting, acted.chunk.size)
+        both = min(said.chunk.size, acted.chunk.size)
+        alike = (acted.chunk[:both] == said.chunk[:both]) & (acted.index[:both] == said.index[:both])
+        return float(alike.sum()) / acted.chunk.size
+
+    def smooth(self) -> dict[str, float]:
+        """Return how smoothly the robot moved, where that is known. Nobody knows what the policy follows."""
+        if self.robot is None or (moved := self.robot.moved(MOST_TICKS)) is None:
+            return {}
+        motion, actions = moved
+        first = int((self.acted.chunk >= 0).argmax())
+        chunk = self.acted.chunk[first : first + MOST_TICKS]
+        return smoothness(motion, actions, chunk)
+
+    def timing(self) -> dict[str, float | int]:
+        acted, period_ns = self.acted, self.setting.period_ns
+        late_s, busy_s = acted.late_ns / 1e9, acted.busy_ns / 1e9
+        return {
+            "agreement": self.agreement(),
+            "jitter_s_p50": float(np.quantile(late_s, 0.5)),
+            "jitter_s_p99": float(np.quantile(late_s, 0.99)),
+            "jitter_s_max": float(late_s.max()),
+            "late_ticks": int((acted.late_ns >= period_ns).sum()),
+            "blocked_s_p99": float(np.quantile(busy_s, 0.99)),
+            "blocked_s_max": float(busy_s.max()),
+            "bytes_up_per_s": self.asking.sent_bytes / (acted.chunk.size * period_ns / 1e9),
+        }
+
+
+def write(config: ChunksConfig, writer: RunWriter, live: Live) -> None:
+    """Write the rows of one mode over one pipeline; raises TransportError where too little was answered."""
+    if live.acted.whole < 2:  # noqa: PLR2004 - a boundary lies between two chunks
+        raise TransportError(f"{live.cell.cell}: {live.acted.whole} chunks in {config.seconds:g} s; act for longer")
+    cell = live.judged
+    keep_origin(writer, cell.cell, live.session.origin)
+    cycles, ticks = live.counted()
+    more: dict[str, Any] = live.timing() | live.smooth()
+    if ticks.stalled.any() and ticks.stalled[-1]:  # the boundary that it waits for at the end
+        found = stalls_of(cycles)
+        more |= stall_metrics(found["stalled_cycles"] + 1, found["boundaries"] + 1)
+    if cell.mode.streams:  # the closed forms are about a given gap between actions
+        more |= dict.fromkeys(("p_stall_closed", "reaction_s_closed", "margin_ticks"))
+    whole = ticks.chunk.size  # what is measured is kept
+    late_ns, names = live.acted.late_ns, live.asking.names
+    write_cell(config, writer, cell, cycles, ticks, whole, more=more, late_ns=late_ns, names=names)
+
+
+def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
+    """Act and return the run folder; raises S2AError for what a user can mend."""
+    plan = resolve(config.asked.answered(progress.say))
+    several = any(each.several for each in config.made.values())
+    asked = {**plan.manifest["configuration"], **config.to_manifest()}
+    plan = plan.telling(configuration=asked, cadence=f"a control loop at {config.control_hz:g} Hz")
+    task = Task("chunks", drive=partial(_drive, config), clients=CLIENTS if several else 1)
+    folder = run_requests(task, plan, output, progress)
+    if config.export_delays is not None:
+        source = next(measured(folder))
+        none = np.empty(0, np.int64)
+        rows = delay_rows(Drawn(source, none, none), next(iter(config.made.values())), config.setting)
+        write_delays(config.export_delays, rows)
+    return folder
+
+
+def _drive(config: ChunksConfig, launch: Launch) -> None:
+    """Let every mode act over every pipeline, in random order."""
+    blocks = count()
+    tried: list[tuple[Cell, list[Session], int]] = []
+    launch.progress.stage("warming up")
+    for _, of_cell in groupby(launch.sessions, lambda session: session.cell.name):
+        sessions = list(of_cell)
+        learnt, dims = _warm_up(config, launch, sessions, blocks)
+        source = Source(config.named(sessions[0].cell.name))
+        tried += [(cell, sessions, dims) for cell in cells(config, Drawn(source, learnt[:0], learnt))]
+    launch.progress.expect(len(tried))
+    for cell, sessions, dims in Random(config.seed).sample(tried, len(tried)):  # noqa: S311 - an order, not a secret
+        launch.progress.stage(f"acting for {config.seconds:g} s: {cell.cell}")
+        with robot_of(config, cell, dims) as robot:
+            launch.writer.update(robot={} if robot is None else robot.describe())
+            write(config, launch.writer, _act(config, cell, sessions, launch, blocks, robot))
+        launch.progress.advance()
+
+
+def _warm_up(
+    config: ChunksConfig, launch: Launch, sessions: Sequence[Session], blocks: Iterator[int]
+) -> tuple[Ints, int]:
+    """Return the latencies of requests before any loop starts, in ns, and of how many numbers an action is."""
+    latency_ns: list[int] = []
+    dims, error = 0, ""
+    for session, _ in product(sessions, range(launch.plan.blocks.warmup)):
+        warm, numbers = warm_up(session, Place(next(blocks), 0, warmup=True), config.horizon)
+        launch.keep(session, warm)
+        dims = dims or numbers
+        if not warm.sample.error and warm.sample.last_token_ns is not None:
+            latency_ns.append(warm.sample.last_token_ns - warm.sample.marks[0][1])
+        error = warm.sample.error
+    if not dims:
+        raise TransportError(f"no request of {sessions[0].cell.name} succeeded while warming up, at last with {error}")
+    return np.array(latency_ns, np.int64), dims
+
+
+@contextmanager
+def robot_of(config: ChunksConfig, cell: Cell, dims: int) -> Iterator[ActionRobot | None]:
+    """Open the robot for a cell, if there is one; raises S2AError."""
+    if not config.robot:
+        yield None
+        return
+    robot = open_robot(config.robot, dims, config.setting.slowed(cell.slower).period_ns)
+    try:
+        yield robot
+    finally:
+        robot.close()
+
+
+def _act(
+    config: ChunksConfig,
+    cell: Cell,
+    sessions: Sequence[Session],
+    launch: Launch,
+    blocks: Iterator[int],
+    robot: ActionRobot | None,
+) -> Live:
+    """Act in one mode, and write down every request as it is measured."""
+    setting = config.setting.slowed(cell.slower)
+    told = robot is not None and _takes_state(config, sessions[0], robot)
+
+    def heard(request: int, actions: Sequence[Any], at_ns: int) -> None:
+        loop.arrived(request, actions, at_ns)
+
+    asking = Asking(sessions, config.horizon, config.seed, cell.mode.streams, heard, blocks)
+
+    def ask(request: int, tick: int) -> None:
+        asking.jobs.put(Job(request, tick, robot.state() if robot is not None and told else ()))
+
+    send = _nowhere if robot is None else robot.send
+    loop = ControlLoop(cell.acting, setting, send, ask, max(2, round(config.seconds * 1e9 / setting.period_ns)))
+    with asking.running():
+        try:
+            loop.start()
+            while not loop.join(LOOK_S):
+                _keep(asking, launch)
+            if any(session.busy for session in sessions):
+                launch.progress.stage("waiting for the last answer")
+        finally:
+            loop.stop()
+    _keep(asking, launch)
+    return Live(cell, setting, sessions[0], loop.acted(), asking, robot, tuple(loop.stepper.triggers))
+
+
+def _nowhere(action: Vector | None, at_ns: int) -> None:
+    """Take actions that nobody executes."""
+
+
+def _takes_state(config: ChunksConfig, session: Session, robot: ActionRobot) -> bool:
+    """Return whether requests tell the policy of the robot; raises UsageError for another state than was asked for."""
+    cell, numbers, wanted = session.cell, len(robot.state()), config.requests.state
+    if numbers and wanted and numbers != wanted:
+        raise UsageError(f"`state`: `robot` {config.robot} has {numbers} numbers, not {wanted}; leave it out")
+    return bool(numbers) and cell.capabilities.accepts_state
+
+
+def _keep(asking: Asking, launch: Launch) -> None:
+    while not asking.done.empty():
+        launch.keep(*asking.done.get())
+    if asking.failure is not None:
+        raise asking.failure

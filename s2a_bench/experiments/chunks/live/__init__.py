@@ -1,1 +1,0 @@
-"""Chunks live: a control loop that acts on what a server answers, over any transport."""

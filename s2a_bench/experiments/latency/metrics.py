@@ -1,0 +1,129 @@
+"""What a latency run is measured by: the metric table, and from it JSON, CSV and comparison; times in ms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from s2a_bench.experiments.requests import (
+    TOKEN_METRICS,
+    Cell,
+    RequestMetric,
+    cell_class,
+    cell_json,
+    cells_of,
+    compared_by,
+    groups_present,
+    ratio_table,
+    ratios,
+    stages_present,
+    summarised,
+)
+from s2a_bench.stats import Summary, summary_of
+from s2a_bench.store.schema import Count, about
+from s2a_bench.trace import GROUPS
+from s2a_bench.writers.as_json import frame, ratio_entry, summaries
+from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
+
+if TYPE_CHECKING:
+    from s2a_bench.experiments import Compared
+    from s2a_bench.stats import Ratio
+    from s2a_bench.store.run import Run
+
+METRICS: Final = (
+    RequestMetric(
+        "e2e_without_inference",
+        "ms",
+        title="e2e w/o infer.",
+        about="Absent behind a black box that does not tell its inference time.",
+    ),
+    RequestMetric(
+        "e2e_without_model",
+        "ms",
+        title="e2e w/o model",
+        about="e2e less what the model computes up to the first token; preprocessing is left in. Of a llama-server: "
+        "e2e less the prompt_ms it reports.",
+    ),
+    RequestMetric("e2e", "ms", title="e2e"),
+    RequestMetric("ttft", "ms", about="From the prompt: e2e without capture."),
+    RequestMetric("frame_age", "ms", about="Age of the frame when inference starts."),
+    *TOKEN_METRICS,
+    RequestMetric("residual", "ms", title="residual", about="What lies between the stages."),
+    RequestMetric("residual_share", about="The residual as a share of e2e without inference."),
+)
+"""A metric is a row here: JSON and its schema, CSV, comparison and the tables have it from its row."""
+
+
+def compared(metrics: Sequence[RequestMetric] = METRICS) -> Compared:
+    """Return what latency runs are compared by: metrics, groups of stages, and the stages of a run."""
+    groups = [RequestMetric(f"group.{name}", "ms", of=partial(Cell.sums_ms, group=name)) for name in GROUPS]
+    shown = ("e2e_without_inference", "e2e", "itl")
+    return compared_by((*metrics, *groups), shown, own=lambda run: [RequestMetric(stage, "ms") for stage in run.stages])
+
+
+def latency_cell(metrics: Sequence[RequestMetric] = METRICS) -> type:
+    """Return the class of a cell of ``--json``."""
+    return cell_class(
+        "LatencyCell",
+        "One pipeline, stage by stage; what no sample has is an absent key.",
+        metrics,
+        residual_flagged=Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")],
+        stages_ms=Annotated[dict[str, Summary], {"propertyNames": {"pattern": "^[a-z][a-z0-9_]*$"}}],
+        groups_ms=Annotated[dict[str, Summary], {"propertyNames": {"enum": list(GROUPS)}}],
+    )
+
+
+COMPARED: Final = compared()
+LatencyCell: Final = latency_cell()
+
+
+def latency_json(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, Any]:
+    """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
+    cells = cells_of(run)
+    found = [
+        cell_json(
+            LatencyCell if metrics is METRICS else latency_cell(metrics),
+            cell,
+            run,
+            metrics,
+            residual_flagged=cell.flagged(),
+            stages_ms=summaries((stage, cell.values_ms(stage)) for stage in stages_present([cell])),
+            groups_ms=summaries((group, cell.group_ms(group)) for group in groups_present([cell])),
+        )
+        for cell in cells
+    ]
+    return frame(run, found, [ratio_entry(*ratio) for ratio in _ratios(cells, run)])
+
+
+def latency_csv(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, CsvTable]:
+    """Return file name -> CSV table in long form, one row a value, every digit kept; what is absent has no row."""
+    cells = cells_of(run)
+    return {
+        "stages.csv": CsvTable.of(("cell", "group", "stage", *SUMMARY, "emulated"), _stage_rows(cells)),
+        "summary.csv": CsvTable.of(
+            ("cell", "metric", "errors", "warmups", *SUMMARY, "emulated"), _rows(cells, metrics)
+        ),
+        "ratios.csv": ratio_table(cells, _ratios(cells, run)),
+    }
+
+
+def _ratios(cells: list[Cell], run: Run) -> Iterator[tuple[str, str, str, Ratio]]:
+    for metric, cell, base, ratio in ratios(cells, run.bootstrap_seed):
+        yield f"{metric}_ms", cell.name, base.name, ratio
+
+
+def _stage_rows(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
+    """Yield a row a cell and stage, the residual last."""
+    for cell in cells:
+        for stage in (*stages_present([cell]), "residual"):
+            if summary := summary_of(cell.values_ms(stage)):
+                yield cell.name, cell.stages.get(stage, ""), stage, *summary_values(summary), cell.emulated
+
+
+def _rows(cells: list[Cell], metrics: Sequence[RequestMetric]) -> Iterator[tuple[object, ...]]:
+    """Yield a row a cell and metric; a cell in which everything failed has one row, without numbers."""
+    for cell in cells:
+        found = [(key, summary_values(summary)) for _, key, summary in summarised([cell], metrics)]
+        for key, values in found or [("", (0, *[None] * (len(SUMMARY) - 1)))]:
+            yield cell.name, key, cell.errors, cell.warmups, *values, cell.emulated

@@ -1,0 +1,579 @@
+"""The cells of a run of requests: the samples that count, the metrics, JSON, CSV and comparison made of them.
+
+Warm-ups and failed samples are counted and take part in no summary. The rate of a request is told twice.
+``tokens_per_s`` is the paper's (section V-D): N_tokens / T_eval, T_eval being the engine's own time from the end of the
+prompt to the last token; where a server does not tell it, the other stands in. ``decode_tokens_per_s`` is what the
+client saw: (n - 1) / (t_last - t_first), so that sending counts.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
+
+from s2a_bench.experiments import Compared, Metric, Subject, by_name
+from s2a_bench.facts import (
+    END_N,
+    FIRST_DECODE_MS,
+    PREDICTED_MS,
+    PREDICTED_N,
+    PREDICTED_STEPS,
+    PREPROCESS_MS,
+    PROMPT_EVAL_MS,
+    PROMPT_MS,
+    PROMPT_N,
+    VISION_ENCODE_MS,
+    Fact,
+)
+from s2a_bench.inference import declared as declared_engine
+from s2a_bench.machine.resources import ENERGY_J
+from s2a_bench.provenance import UNKNOWN, Provenance
+from s2a_bench.stats import Ratio, Summary, summary_of
+from s2a_bench.store.manifest import present
+from s2a_bench.store.schema import Count, about, with_fields
+from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
+from s2a_bench.transport import declared
+from s2a_bench.writers.as_json import summaries
+from s2a_bench.writers.csv_text import CsvTable
+from s2a_bench.writers.figures import wrapped
+from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    from s2a_bench.experiments import Rows
+    from s2a_bench.store.run import Run
+
+    Floats: TypeAlias = NDArray[np.float64]
+    Of: TypeAlias = Callable[["Cell"], pd.Series[Any]]
+    Split: TypeAlias = Sequence[tuple[Run, list["Cell"]]]
+
+RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
+"""What cells are compared by: columns of the samples, less the unit."""
+
+_NS_PER_MS = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class RequestMetric(Metric):
+    """A metric of requests: ``of`` a cell it has a row a request, or a token where the index is ``request_id``.
+
+    Times are in ms. Without ``of`` it is the column of the samples that has its name.
+    """
+
+    of: Of | None = None
+    shown: tuple[str, ...] = ()
+    """The statistics of it in the table of tokens."""
+
+    @property
+    def key(self) -> str:
+        """Return its name in JSON and CSV, which says the unit where that is ms."""
+        return self.name if self.unit != "ms" else f"{self.name.removesuffix('_ms')}_ms"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a run; ``good`` holds the samples that count, in the order in which they were taken."""
+
+    name: str
+    about: dict[str, str]
+    good: pd.DataFrame
+    tokens: pd.DataFrame
+    warmups: int
+    errors: int
+    stages: Mapping[str, str]
+    """Stage -> group of the run, in the order of the path."""
+    emulated: bool
+    """Whether the engine's times come from a profile, or from latencies that were given."""
+
+    @property
+    def n(self) -> int:
+        return len(self.good)
+
+    @property
+    def pipeline(self) -> str:
+        return self.about["pipeline"]
+
+    @property
+    def path(self) -> tuple[str, str]:
+        return self.about["pipeline"], self.about["variant"]
+
+    def is_compared_with(self, base: Cell) -> bool:
+        """Whether the transport declares that its cells are divided by those of another."""
+        return base.pipeline in declared(self.pipeline).compared_with
+
+    def values(self, metric: RequestMetric | str) -> Floats:
+        """Return a metric's values, times in ms: one a request that has it, or one a token."""
+        return _numbers(self.column(metric))
+
+    def values_ms(self, column: str) -> Floats:
+        """Return the values of a stage, or of another column less ``_ns``, in ms."""
+        return numbers_ms(self._ns(column))
+
+    def group_ms(self, group: str) -> Floats:
+        """Return the sums, in ms, of the stages of a group; a sample without such stages has none."""
+        return _numbers(self.sums_ms(group))
+
+    def rows(self, metric: RequestMetric | str) -> Rows:
+        """Return a metric's values, a row a request that has any."""
+        column = self.column(metric).dropna()
+        if column.index.name != "request_id":
+            return list(_numbers(column)[:, None])
+        found = {str(request): _numbers(values) for request, values in column.groupby(level=0, sort=False)}
+        return [found[request] for request in self.good["request_id"] if request in found]
+
+    def by_launch(self, metric: str) -> dict[int, dict[int, list[float]]]:
+        """Return the values of a metric by the launch and the block in which they were taken, times in ms."""
+        values = self.column(metric).dropna()
+        return by_launch(self.good.loc[values.index], values)
+
+    def column(self, metric: RequestMetric | str) -> pd.Series[Any]:
+        """Return a metric's column, times in ms; one of the samples' is named with or without ``_ms``."""
+        found = OF_ANSWERS.get(metric) if isinstance(metric, str) else metric
+        if found and found.of:
+            return found.of(self)
+        name = found.name if found else str(metric)
+        return self.good[name] if name in self.good else self._ns(name.removesuffix("_ms")) / _NS_PER_MS
+
+    def sums_ms(self, group: str) -> pd.Series[Any]:
+        """Return the sums of the stages of a group, a row a request."""
+        names = [f"{stage}_ns" for stage, of in self.stages.items() if of == group]
+        return self.good[names].sum(axis=1, min_count=1) / _NS_PER_MS
+
+    def fact(self, name: str) -> pd.Series[Any]:
+        """Return a fact, a row a request; NaN where nobody tells it."""
+        return self._facts.get(name, self._facts["events"] * float("nan"))
+
+    def _ns(self, column: str) -> pd.Series[Any]:
+        """Return a column of ns; that of a stage which the run's transports do not have is empty."""
+        name = f"{column}_ns"
+        return self.good[name] if name in self.good else self.good["frame_index"].iloc[:0]
+
+    @property
+    def has_ingest(self) -> bool:
+        """Return whether the server is a llama-server, seen from outside."""
+        return bool(self.group_ms("ingest").size)
+
+    def flagged(self) -> int:
+        return int((self.values("residual_share") > RESIDUAL_LIMIT).sum())
+
+    @cached_property
+    def _facts(self) -> pd.DataFrame:
+        """Return the facts of each request that counts, its events (tokens as they came), and their span in s."""
+        import pandas as pd
+
+        times = self.tokens.groupby("request_id")["client_ns"].agg(["min", "max", "size"])
+        times = times.loc[self.good["request_id"]].set_axis(self.good.index)
+        facts = pd.DataFrame([json.loads(str(each)) for each in self.good["facts"]], self.good.index, dtype="float64")
+        return facts.assign(events=times["size"], span_s=(times["max"] - times["min"]) / 1e9)
+
+    @property
+    def n_tokens(self) -> pd.Series[Any]:
+        """Return the tokens of each answer: the server's own count, its invisible last left out, where it tells one."""
+        return _some(self.fact(PREDICTED_N)).fillna(self.fact("events")) - self.fact(END_N).fillna(0)
+
+    @property
+    def told(self) -> bool:
+        """Return whether the engine said how long it evaluated; else the paper's rate is the client's."""
+        return bool(_some(self.fact(PREDICTED_MS)).notna().any())
+
+    @cached_property
+    def answers(self) -> pd.DataFrame:
+        """Return the tokens of the samples that count by ``request_id``, each request's in order.
+
+        ``gap_ns`` is the time since the token before, as the client saw both; the first has none.
+        """
+        tokens = self.tokens[self.tokens["request_id"].isin(self.good["request_id"])]
+        tokens = tokens.sort_values(["request_id", "index"]).set_index("request_id")
+        return tokens.assign(gap_ns=tokens.groupby(level=0)["client_ns"].diff())
+
+
+def _some(values: pd.Series[Any]) -> pd.Series[Any]:
+    """Return values without those that are 0."""
+    return values.where(values != 0)
+
+
+def decode_rate(cell: Cell) -> pd.Series[Any]:
+    """Return (n - 1) / (t_last - t_first), as the client saw the tokens."""
+    tokens, span_s = cell.n_tokens, cell.fact("span_s")
+    return ((tokens - 1) / span_s).where((tokens > 1) & (span_s > 0))
+
+
+def _engine_rate(cell: Cell) -> pd.Series[Any]:
+    """Return N_tokens / T_eval; ``predicted_steps`` is told where the engine's time covers another number (vLLM)."""
+    steps = cell.fact(PREDICTED_STEPS).fillna(cell.n_tokens)
+    return (steps / _some(cell.fact(PREDICTED_MS)) * 1e3).fillna(decode_rate(cell))
+
+
+def _fact(name: Fact) -> Of:
+    return lambda cell: cell.fact(name)
+
+
+def _ms(name: str, title: str, about: str, of: Of | None = None, shown: tuple[str, ...] = ()) -> RequestMetric:
+    return RequestMetric(name, "ms", title=title, about=about, of=of, shown=shown)
+
+
+def _rate(name: str, unit: str, title: str, about: str, of: Of) -> RequestMetric:
+    return RequestMetric(name, unit, "higher", title, about=about, of=of)
+
+
+ANSWER_METRICS: Final = (
+    _rate(
+        *("tokens_per_s", "tokens/s", "N / T_eval"),
+        "The paper's: N_tokens / T_eval, in the engine: from the end of the prompt to the last token.",
+        _engine_rate,
+    ),
+    _rate(
+        *("decode_tokens_per_s", "tokens/s", "decode"),
+        "(n - 1) / (t_last - t_first), as the client saw the tokens.",
+        decode_rate,
+    ),
+    _ms("ttft_ms", "TTFT", "From the prompt: e2e without capture."),
+    _ms("prompt_ms", "all", "Picture and prompt in the engine, up to the first token's logits.", _fact(PROMPT_MS)),
+    _ms(
+        *("preprocess_ms", "preprocess"),
+        "The part of prompt_ms before the model: template, slicing, resizing, tokenising.",
+        _fact(PREPROCESS_MS),
+    ),
+    _ms(
+        *("vision_encode_ms", "vision encode"),
+        "The vision tower's part of prompt_ms, over all slices.",
+        _fact(VISION_ENCODE_MS),
+    ),
+    _ms(
+        *("image_ms", ""),
+        "The part of prompt_ms outside the language model: slicing, vision tower, tokenising.",
+        lambda cell: cell.fact(PROMPT_MS) - cell.fact(PROMPT_EVAL_MS),
+    ),
+    _ms("prompt_eval_ms", "prefill", "The language model's part of prompt_ms.", _fact(PROMPT_EVAL_MS)),
+    _ms(
+        *("first_decode_ms", "1st decode"),
+        "The first token to the second in the engine: the first step after the prompt.",
+        _fact(FIRST_DECODE_MS),
+    ),
+    RequestMetric(
+        *("prompt_tokens", "tokens", "neither", "tokens"),
+        about="Prompt tokens evaluated, pictures included.",
+        of=lambda cell: _some(cell.fact(PROMPT_N)),
+    ),
+    _rate(
+        *("prefill_tokens_per_s", "tokens/s", "tokens/s"),
+        "prompt_tokens / prompt_ms.",
+        lambda cell: _some(cell.fact(PROMPT_N)) / _some(cell.fact(PROMPT_MS)) * 1e3,
+    ),
+    _rate(
+        *("tokens_per_joule", "tokens/J", "tokens/J"),
+        "Tokens of the answer per joule of the whole request, where power can be read.",
+        lambda cell: cell.n_tokens / _some(cell.fact(ENERGY_J)),
+    ),
+)
+"""What follows from the tokens of a request and the facts that are told of it."""
+
+TOKEN_METRICS: Final = (
+    _ms(
+        *("itl", "gap"),
+        "Every gap between a token and the next, as the client saw them.",
+        lambda cell: cell.answers["gap_ns"] / _NS_PER_MS,
+        ("median", "p99"),
+    ),
+    _ms(
+        *("token_delay", "delay"),
+        "From a token's leaving the engine to the client's seeing it.",
+        lambda cell: (cell.answers["client_ns"] - cell.answers["engine_ns"]) / _NS_PER_MS,
+        ("median", "p90", "p99"),
+    ),
+)
+"""What the tokens of a request show, so that a row has several values."""
+
+OF_ANSWERS: Final = by_name((*ANSWER_METRICS, *TOKEN_METRICS))
+
+
+def by_launch(places: pd.DataFrame, values: Iterable[Any]) -> dict[int, dict[int, list[float]]]:
+    """Collect values by their places' columns ``launch`` and ``block``."""
+    found: dict[int, dict[int, list[float]]] = {}
+    for launch, block, value in zip(places["launch"], places["block"], values, strict=True):
+        found.setdefault(int(launch), {}).setdefault(int(block), []).append(float(value))
+    return found
+
+
+def numbers_ms(column: pd.Series[Any]) -> Floats:
+    """Return a column of ns in ms, the missing values left out."""
+    return _numbers(column) / _NS_PER_MS
+
+
+def cells_of(run: Run) -> list[Cell]:
+    """Split a run into its cells, in the order that their transports declare, then by name."""
+    return _cells(run, run.samples)
+
+
+def split(runs: Iterable[Run]) -> Split:
+    """Return runs, each with its cells."""
+    return [(run, cells_of(run)) for run in runs]
+
+
+def launches_of(run: Run) -> list[tuple[int, list[Cell]]]:
+    """Return launch and cells for every launch of a run."""
+    samples = run.samples
+    return [(int(launch), _cells(run, samples[samples["launch"] == launch])) for launch in samples["launch"].unique()]
+
+
+def _cells(run: Run, samples: pd.DataFrame) -> list[Cell]:
+    tokens, stages = run.tokens, run.stages
+    cells = [
+        _cell(str(name), samples[samples["cell"] == name], tokens[tokens["cell"] == name], stages, run.origins.of(name))
+        for name in samples["cell"].unique()
+    ]
+    return sorted(cells, key=_place)
+
+
+def ratios(cells: list[Cell], seed: int) -> Iterator[tuple[str, Cell, Cell, Ratio]]:
+    """Yield metric, cell, base and ratio: every cell over those of the transports that its own is compared with.
+
+    A pair is left out where a cell lacks the metric, as e2e without inference behind a black box.
+    """
+    for metric in RATIO_METRICS:
+        for base in cells:
+            for cell in cells:
+                if cell.is_compared_with(base) and (ratio := ratio_between(cell, base, metric, seed)):
+                    yield metric, cell, base, ratio
+
+
+def spelled(metric: str) -> str:
+    """Return the name of what cells are compared by in words: End to end without inference."""
+    return metric.replace("e2e", "End to end").replace("_", " ")
+
+
+def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | None:
+    """Divide the medians of two cells, launch by launch and block by block.
+
+    None where they cannot be compared: a llama-server's `ingest` slices and resizes the picture, which our engine
+    counts as inference, so that e2e without inference does not mean the same on both sides.
+    """
+    if metric == "e2e_without_inference" and cell.has_ingest != base.has_ingest:
+        return None
+    from s2a_bench.stats.change import ratio_of_launches
+
+    return ratio_of_launches(cell.by_launch(metric), base.by_launch(metric), seed)
+
+
+def asked(run: Run, cells: list[Cell]) -> str:
+    """Return what each request brings, in words: the pictures' sizes, how many, and the robot's state."""
+    sizes = sorted({cell.about["size"] for cell in cells})
+    return str(run.manifest["configuration"].get("observation") or ", ".join(sizes))
+
+
+def pieces_of(run: Run) -> str:
+    """Return what answers are made of: tokens or actions."""
+    engine: dict[str, Any] = run.manifest["configuration"].get("engine") or {}
+    return "actions" if engine.get("answer") == "actions" else "tokens"
+
+
+def chunks(run: Run) -> str:
+    """Return the shape of each answer, in words, where answers are chunks of actions that an engine of ours makes."""
+    return str((run.manifest.get("model") or {}).get("answer") or "")
+
+
+def engine_note(run: Run, cells: list[Cell]) -> Note:
+    """Return what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
+    engines = dict.fromkeys(cell.about["engine"] for cell in cells)
+    idle = [name for name in engines if not declared_engine(name).computes]
+    notes = [Note(f"{name} engine", f"{name} engine") for name in idle]
+    if idle:
+        origins = [run.origins.of(cell.name) for cell in cells if cell.about["engine"] in idle]
+        drawn = dict.fromkeys(origin.profile for origin in origins if origin.emulated)
+        notes += [Note(f"EMULATED: {latencies}", EMULATED) for latencies in drawn]
+    if any(declared_engine(name).plays for name in engines):
+        notes.append(_emulated(_replayed(run, cells)))
+    answered = [cell.name for cell in cells if not declared_engine(cell.about["engine"]).plays]
+    if any(run.origins.of(name).weights == "dummy" for name in answered):
+        notes.append(Note("dummy weights", DUMMY))
+    if UNKNOWN in engines:
+        notes.append(Note("engine unknown, as the server does not tell", "engine unknown"))
+    return Note(", ".join(notes), *(label for note in notes for label in note.labels))
+
+
+def stand_ins(runs: Split) -> list[str]:
+    """Return what did not really answer runs, a sentence each."""
+    return sorted({note.sentence() for run, cells in runs if (note := engine_note(run, cells))})
+
+
+def _replayed(run: Run, cells: list[Cell]) -> dict[str, Any]:
+    """Return what is known of the profile that was played: by a server of ours, or by one that told in its answers."""
+    model: dict[str, Any] = run.manifest.get("model") or {}
+    if declared_engine(model.get("engine", "")).plays:
+        return model
+    told = next((origin for cell in cells if declared_engine((origin := run.origins.of(cell.name)).engine).plays), None)
+    return {"profile": told.profile, "dummy": told.weights == "dummy"} if told else model
+
+
+def _emulated(model: dict[str, Any]) -> Note:
+    note = f"EMULATED: replayed profile {model.get('profile', '')}".rstrip()
+    said = [Note(f"{model['gaps']} gaps")] if "gaps" in model else []
+    said += [Note("the paper's rate", PAPERS)] if model.get("origin") == "paper" else []
+    said += [Note("recorded with dummy weights", DUMMY)] if model.get("dummy") else []
+    labels = (label for more in said for label in more.labels)
+    return Note(f"{note} ({', '.join(said)})" if said else note, EMULATED, *labels)
+
+
+def groups_present(cells: list[Cell]) -> list[str]:
+    """List the groups that some sample has, in the order of the path."""
+    return [group for group in GROUPS if any(cell.group_ms(group).size for cell in cells)]
+
+
+def stages_present(cells: list[Cell]) -> list[str]:
+    """List the stages that some sample has, in the order of the path."""
+    stages = cells[0].stages if cells else ()
+    return [stage for stage in stages if any(cell.values_ms(stage).size for cell in cells)]
+
+
+def _cell(
+    name: str, samples: pd.DataFrame, tokens: pd.DataFrame, stages: Mapping[str, str], origin: Provenance
+) -> Cell:
+    """Sort the samples of one cell into those that count and those that are only counted."""
+    about = {
+        key: str(samples[key].iloc[-1])  # who answers may be known from the first answer on
+        for key in ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
+    }
+    failed = samples["error"] != ""
+    good = samples[~samples["warmup"] & ~failed]
+    errors = int((failed & ~samples["warmup"]).sum())
+    return Cell(name, about, good, tokens, int(samples["warmup"].sum()), errors, stages, origin.emulated)
+
+
+def _place(cell: Cell) -> tuple[float, str, int, str]:
+    """Sort by the transport's order, its variants in theirs, then by name."""
+    transport, variant = declared(cell.pipeline), cell.about["variant"]
+    known = transport.variants.index(variant) if variant in transport.variants else len(transport.variants)
+    return transport.order, cell.pipeline, known, cell.name
+
+
+def _numbers(column: pd.Series[Any]) -> Floats:
+    return column.dropna().to_numpy(dtype="float64")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RequestsCell:
+    """What the cells of every run of requests say about themselves."""
+
+    cell: Annotated[str, about("The name that ratios use.")]
+    pipeline: str
+    variant: str
+    payload: str
+    connection: str
+    engine: str
+    mode: Literal["request", "stream"]
+    size: Annotated[str, {"pattern": "^[0-9]+x[0-9]+$"}]
+    observation: Annotated[
+        str, about("What each request brings: sizes, number of pictures, scaling, numbers of the robot's state.")
+    ]
+    answer: Annotated[Literal["tokens", "actions"], about("What answers are made of.")]
+    profile: str | None
+    emulated: Annotated[
+        bool, about("True where a profile was replayed, or latencies were given: such numbers are not measured.")
+    ]
+    dummy: Annotated[
+        bool | None, about("Whether the model's weights are dummies, random: its times are real, its words are not.")
+    ] = None
+    n: Annotated[Count, about("Samples that count: no warm-ups, no failures.")]
+    errors: Count
+    warmups: Count
+
+
+def cell_class(name: str, meaning: str, metrics: Iterable[RequestMetric], **own: Any) -> type:
+    """Return the class of a cell of ``--json``: its ``own`` fields, and a summary of each metric that it has."""
+    hints = {each.key: Annotated[Summary | None, about(each.about) if each.about else {}] for each in metrics}
+    made: type = with_fields(name, meaning, RequestsCell, {**own, **hints})
+    return made
+
+
+def cell_json(cls: type, cell: Cell, run: Run, metrics: Iterable[RequestMetric], **own: Any) -> dict[str, Any]:
+    """Return one cell's numbers; a metric that no sample has is an absent key, ``dummy`` where it is not known."""
+    origin = run.origins.of(cell.name)
+    described: dict[str, Any] = {
+        "cell": cell.name,
+        **cell.about,
+        "observation": asked(run, [cell]),
+        "answer": pieces_of(run),
+        "profile": origin.profile or None,
+        "dummy": {"real": False, "dummy": True, "none": True}.get(origin.weights),
+        **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},
+    }
+    return present(cls(**described, **own, **summaries((each.key, cell.values(each)) for each in metrics)))
+
+
+def summarised(cells: Iterable[Cell], metrics: Iterable[RequestMetric]) -> Iterator[tuple[Cell, str, Summary]]:
+    """Yield every cell and metric that has values, with their summary."""
+    every = list(metrics)
+    for cell in cells:
+        for metric in every:
+            if found := summary_of(cell.values(metric)):
+                yield cell, metric.key, found
+
+
+def ratio_table(cells: Iterable[Cell], found: Iterable[tuple[str, str, str, Ratio]]) -> CsvTable:
+    """Lay out metric, cell, base and ratio for programs."""
+    emulated = {cell.name for cell in cells if cell.emulated}
+    header = ("metric", "of", "to", "value", "ci95_low", "ci95_high", "launches", "launch_sd", "emulated")
+    return CsvTable.of(
+        header, ((metric, of, to, *astuple(ratio), bool({of, to} & emulated)) for metric, of, to, ratio in found)
+    )
+
+
+def compared_by(metrics: Iterable[RequestMetric], shown: tuple[str, ...], **more: Any) -> Compared:
+    """Return what runs of requests are compared by, a row a request, every launch by itself."""
+    named = by_name(metrics)
+
+    def subject(cell: Cell, launch: int) -> Subject:
+        return Subject(
+            cell.name, cell.about, cell.n, cell.errors, lambda name: cell.rows(named.get(name, name)), launch=launch
+        )
+
+    def subjects(run: Run) -> list[Subject]:
+        return [subject(cell, launch) for launch, cells in launches_of(run) for cell in cells]
+
+    return Compared(named, subjects, lambda run: stand_ins(split([run])), shown, **more)
+
+
+def launches_note(ratios: Iterable[Ratio]) -> tuple[str, ...]:
+    """Return for what the intervals of ratios hold, one launch or any like those measured; nothing without them."""
+    told = [ratio for ratio in ratios if ratio.low is not None]
+    if not told:
+        return ()
+    spreads = sorted(ratio.launch_sd for ratio in told if ratio.launch_sd is not None)
+    if not spreads:
+        return ("The intervals hold for this launch only, the next may differ by more: measure with --launches 5.",)
+    span = " to ".join(dict.fromkeys(f"{spread * 100:.2g}" for spread in (spreads[0], spreads[-1])))
+    launches = max(ratio.launches for ratio in told)
+    differ = f"Ratios are over {launches} launches, which differ by a standard deviation of {span} %"
+    return (f"{differ}; the intervals (Student's t) hold for launches like these.",)
+
+
+def engine_notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
+    """Return what did not really answer, as a sentence."""
+    note = engine_note(run, cells)
+    return (note.sentence(),) if note else ()
+
+
+def failure_notes(cells: Iterable[Cell], what: str) -> tuple[str, ...]:
+    """Return how many samples or requests failed."""
+    failed = sum(cell.errors for cell in cells)
+    return (f"{failed} {what} failed and are in no number here; samples.csv says why.",) if failed else ()
+
+
+def span_of(counts: Iterable[int], what: str = "") -> str:
+    """Return how many there are: 50, or 48 to 50 requests."""
+    found = sorted(counts)
+    span = " to ".join(str(count) for count in dict.fromkeys((*found[:1], *found[-1:])))
+    return f"{span} {what}{'s' * (found[-1] != 1)}" if what else span
+
+
+def title_of(run: Run, cells: list[Cell], what: str, facts: Sequence[str], more: Sequence[str] = ()) -> str:
+    """Return what a figure draws, from how many samples of what, and what did not really answer."""
+    note = engine_note(run, cells)
+    said = [f"n = {span_of(cell.n for cell in cells)} a cell", *facts, *([note] if note else []), *more]
+    return wrapped((what, ", ".join(said)))

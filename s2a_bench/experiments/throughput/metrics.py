@@ -1,0 +1,211 @@
+"""What a throughput run is measured by: the reference's rows, the metric table, and JSON, CSV and compare from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from s2a_bench.experiments.requests import (
+    ANSWER_METRICS,
+    TOKEN_METRICS,
+    Cell,
+    by_launch,
+    cell_class,
+    cell_json,
+    cells_of,
+    compared_by,
+    ratio_table,
+    summarised,
+)
+from s2a_bench.stats import Summary, summarise
+from s2a_bench.stats.change import ratio_of_launches
+from s2a_bench.store.manifest import present
+from s2a_bench.store.schema import Count, Table, about
+from s2a_bench.transport import declared
+from s2a_bench.writers.as_json import frame, ratio_entry
+from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
+
+if TYPE_CHECKING:
+    from s2a_bench.experiments.requests import Floats
+    from s2a_bench.stats import Ratio
+    from s2a_bench.store.run import Run
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceRow:
+    """One run of llama-bench beside ours: ``n_gen`` tokens decoded in ``decode_ns``, behind ``depth`` others."""
+
+    block: int
+    position: int
+    warmup: bool
+    started_ns: int
+    finished_ns: int
+    n_gen: int
+    depth: int
+    decode_ns: int
+    facts: dict[str, Any] = field(default_factory=dict)
+    launch: int = 0
+
+
+REFERENCE: Final[Table[ReferenceRow]] = Table("reference", ReferenceRow)
+"""One row a run of the reference program."""
+
+
+RATIO_METRIC: Final = "decode_tokens_per_s"
+"""What cells and the reference are compared by."""
+
+ENGINE_METRIC: Final = "tokens_per_s"
+"""What engines are compared by besides: sending is not in it."""
+
+LLAMA_BENCH: Final = "llama-bench"
+"""How the reference is called where cells are listed."""
+
+BIN: Final = 32
+"""Tokens of one bin of the rates by position."""
+
+METRICS: Final = (*ANSWER_METRICS, *TOKEN_METRICS)
+COMPARED: Final = compared_by(METRICS, (ENGINE_METRIC, RATIO_METRIC, "ttft_ms", "prefill_tokens_per_s", "itl"))
+
+
+@dataclass(frozen=True)
+class Position:
+    """The tokens of an answer from the first to the last, counted from 0."""
+
+    first: Count
+    last: Count
+    decode_tokens_per_s: Summary
+
+
+ThroughputCell: Final = cell_class(
+    "ThroughputCell",
+    "One pipeline in tokens a second; what no request has is an absent key.",
+    METRICS,
+    t_eval=Annotated[
+        Literal["engine", "client"],
+        about("Who told T_eval: the engine, or nobody, so that decode_tokens_per_s stands for tokens_per_s."),
+    ],
+    positions=Annotated[list[Position], about("Decode rate by the place in the answer.")],
+)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """llama.cpp's llama-bench on the same model file, one run a block."""
+
+    program: Literal["llama-bench"]
+    command: list[str]
+    depths: Annotated[list[Count], about("Tokens in the context before those that were timed.")]
+    decode_tokens_per_s: Summary
+
+
+def throughput_cells(run: Run) -> list[Cell]:
+    """Split a run into its cells: in-process first, then HTTP and ROS."""
+    return sorted(cells_of(run), key=lambda cell: not declared(cell.pipeline).in_process)
+
+
+def joined(cell: Cell) -> int:
+    """Count tokens that came together with another, as where a server holds back half a character."""
+    return int((cell.n_tokens - cell.fact("events")).clip(lower=0).sum())
+
+
+def rates_by_position(cell: Cell) -> dict[tuple[int, int], Floats]:
+    """Return (first, last token of a bin, from 0) -> decode rates there, one a request that got so far.
+
+    The gap before token i belongs to the bin of i; token 0 has none.
+    """
+    answers = cell.answers
+    gaps = answers.assign(bin=answers["index"] // BIN).dropna(subset="gap_ns")
+    spent = gaps.groupby(["bin", "request_id"])["gap_ns"].agg(["sum", "size"])
+    spent = spent[spent["sum"] > 0].reset_index()
+    rates = spent["size"].to_numpy(dtype="float64") / spent["sum"].to_numpy(dtype="float64") * 1e9
+    places = spent["bin"].to_numpy(dtype="int64")
+    return {(place * BIN, place * BIN + BIN - 1): rates[places == place] for place in sorted(set(places.tolist()))}
+
+
+def reference_by_launch(run: Run) -> dict[int, dict[int, list[float]]]:
+    """Return llama-bench's tokens/s by launch and block, its warm-ups left out."""
+    rows = run.table(REFERENCE)
+    counted = rows[~rows["warmup"]]
+    return by_launch(counted, counted["n_gen"] / counted["decode_ns"] * 1e9)
+
+
+def reference_values(run: Run) -> list[float]:
+    """Return llama-bench's tokens/s in the order of the blocks."""
+    launches = sorted(reference_by_launch(run).items())
+    return [value for _, blocks in launches for _, values in sorted(blocks.items()) for value in values]
+
+
+def reference_depths(run: Run) -> list[int]:
+    """Return how many tokens lay before those that llama-bench timed: one number where all prompts are alike."""
+    rows = run.table(REFERENCE)
+    return sorted({int(depth) for depth in rows[~rows["warmup"]]["depth"]})
+
+
+def ratios_of(run: Run, cells: Sequence[Cell]) -> Iterator[tuple[str, str, str, Ratio]]:
+    """Yield metric, cell, base and ratio: every cell to llama-bench where it ran, and every other cell to in-process.
+
+    Cells that another engine answered are compared by the engines' own figures too.
+    """
+    reference, seed = reference_by_launch(run), run.bootstrap_seed
+    for cell in cells:
+        base = _base(cell, cells)
+        others = {LLAMA_BENCH: reference, **({base.name: base.by_launch(RATIO_METRIC)} if base else {})}
+        for name, values in others.items():
+            if ratio := ratio_of_launches(cell.by_launch(RATIO_METRIC), values, seed):
+                yield RATIO_METRIC, cell.name, name, ratio
+    for cell in cells:
+        base = _base(cell, cells)
+        if not (base and base.told and cell.told and cell.about["engine"] != base.about["engine"]):
+            continue
+        if ratio := ratio_of_launches(cell.by_launch(ENGINE_METRIC), base.by_launch(ENGINE_METRIC), seed):
+            yield ENGINE_METRIC, cell.name, base.name, ratio
+
+
+def throughput_json(run: Run) -> dict[str, Any]:
+    """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
+    cells = throughput_cells(run)
+    found = [
+        cell_json(
+            ThroughputCell,
+            cell,
+            run,
+            METRICS,
+            t_eval="engine" if cell.told else "client",
+            positions=[Position(*place, summarise(rates)) for place, rates in rates_by_position(cell).items()],
+        )
+        for cell in cells
+    ]
+    more = {}
+    if rates := reference_values(run):
+        command = run.manifest.get("reference", {}).get("command", [])
+        more["reference"] = present(Reference(LLAMA_BENCH, command, reference_depths(run), summarise(rates)))
+    return frame(run, found, [ratio_entry(*ratio) for ratio in ratios_of(run, cells)], **more)
+
+
+def throughput_csv(run: Run) -> dict[str, CsvTable]:
+    """Return file name -> CSV table, every digit kept; what is absent has no row."""
+    cells = throughput_cells(run)
+    rows = [
+        (cell.name, key, *summary_values(summary), cell.emulated) for cell, key, summary in summarised(cells, METRICS)
+    ]
+    if reference := reference_values(run):
+        rows.append((LLAMA_BENCH, RATIO_METRIC, *summary_values(summarise(reference)), False))
+    positions = [
+        (cell.name, *place, *summary_values(summarise(rates)), cell.emulated)
+        for cell in cells
+        for place, rates in rates_by_position(cell).items()
+    ]
+    return {
+        "throughput.csv": CsvTable.of(("cell", "metric", *SUMMARY, "emulated"), rows),
+        "positions.csv": CsvTable.of(("cell", "first", "last", *SUMMARY, "emulated"), positions),
+        "ratios.csv": ratio_table(cells, ratios_of(run, cells)),
+    }
+
+
+def _base(cell: Cell, cells: Sequence[Cell]) -> Cell | None:
+    """Return the cell in this process whose engine is set alike, as its name ends, or the first; None for itself."""
+    here = [each for each in cells if declared(each.pipeline).in_process]
+    alike = [each for each in here if each is not cell and cell.name.endswith(each.name.partition("?")[2])]
+    found = max(alike, key=lambda each: len(each.name), default=here[0] if here else None)
+    return None if found is cell else found

@@ -1,0 +1,257 @@
+"""How a throughput run is shown: rates with the paper's table II beside them, the prompt, gaps, rates by position."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+from s2a_bench.experiments import Shown
+from s2a_bench.experiments.paper import paper_throughput
+from s2a_bench.experiments.requests import (
+    OF_ANSWERS,
+    engine_notes,
+    failure_notes,
+    launches_note,
+    span_of,
+    title_of,
+)
+from s2a_bench.experiments.throughput.metrics import (
+    BIN,
+    ENGINE_METRIC,
+    LLAMA_BENCH,
+    RATIO_METRIC,
+    joined,
+    rates_by_position,
+    ratios_of,
+    reference_depths,
+    reference_values,
+    throughput_cells,
+    throughput_csv,
+    throughput_json,
+)
+from s2a_bench.stats import summarise, summary_of
+from s2a_bench.writers.figures import Bar, build_bars, build_distribution, new_figure
+from s2a_bench.writers.style import cell_looks
+from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interval, mean_sd, number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from s2a_bench.experiments.requests import Cell
+    from s2a_bench.store.run import Run
+
+PAPER_LABEL: Final = "the paper's claim (table II), other machines"
+_REFERENCE_FILL: Final = "#FFFFFF"
+
+
+def show(run: Run, *, against: str = "", **_: Any) -> Shown:
+    """Return what a throughput run shows."""
+    tables = throughput_tables(run)
+    return Shown(
+        sentences=throughput_sentences(run),
+        tables=tables,
+        main=["throughput", "prompt"],
+        notes=[" ".join(tables["throughput"].notes)],
+        csvs=throughput_csv(run),
+        figures=throughput_figures(run, against_paper=against == "paper"),
+        json=lambda: throughput_json(run),
+    )
+
+
+def throughput_sentences(run: Run) -> list[str]:
+    """Return how many tokens a second each cell generates."""
+    said, cells = [], throughput_cells(run)
+    for cell in cells:
+        if found := summary_of(cell.values(ENGINE_METRIC)):
+            source = "the engine's own figure" if cell.told else "as the client saw it"
+            times = span_of([found.n], "request")
+            said.append(f"{cell.name}: {mean_sd(found)} tokens/s (mean ± sd of {times}, {source}).")
+    said += [
+        f"By their own figures the engine of {of} has {interval(ratio)} of the rate of {to}."
+        for metric, of, to, ratio in ratios_of(run, cells)
+        if metric == ENGINE_METRIC
+    ]
+    return said or ["No request was answered; samples.csv says why."]
+
+
+def throughput_tables(run: Run) -> dict[str, TextTable]:
+    """Return every table of a run by its file's name."""
+    tables = {"throughput": speed_table(run), "prompt": prompt_table(run), "gaps": gap_table(run)}
+    if positions := position_table(run):
+        tables["positions"] = positions
+    return tables
+
+
+def speed_table(run: Run) -> TextTable:
+    """Lay out the rates: the paper's, what the client saw, and the ratios."""
+    cells = throughput_cells(run)
+    reference = reference_values(run)
+    ratios = {(of, to): ratio for metric, of, to, ratio in ratios_of(run, cells) if metric == RATIO_METRIC}
+    bases = list(dict.fromkeys(to for _, to in ratios))
+    metrics = [ENGINE_METRIC, RATIO_METRIC]
+    metrics += ["tokens_per_joule"] if any(cell.values("tokens_per_joule").size for cell in cells) else []
+    rows: list[tuple[str, ...]] = [
+        (
+            *(cell.name, str(cell.n), str(cell.errors)),
+            *(entries(cell.values(metric), MEAN_SD)[0] for metric in metrics),
+            *("1" if cell.name == base else interval(ratios.get((cell.name, base))) for base in bases),
+        )
+        for cell in cells
+    ]
+    if reference:
+        rates = (ABSENT, mean_sd(summarise(reference)), ABSENT)[: len(metrics)]
+        over = ("1" if base == LLAMA_BENCH else ABSENT for base in bases)
+        rows.append((LLAMA_BENCH, str(len(reference)), "0", *rates, *over))
+    return TextTable(
+        "Tokens a second: mean ± sd" + ("; ratios of decode medians [95 % interval]" if bases else ""),
+        ("cell", "n", "errors", *(OF_ANSWERS[name].title for name in metrics), *(f"ratio to {base}" for base in bases)),
+        rows,
+        1,
+        frozenset({len(cells)}) if reference else frozenset(),
+        (*_notes(run, cells, launches_note(ratios.values())), *failure_notes(cells, "requests")),
+    )
+
+
+def prompt_table(run: Run) -> TextTable:
+    """Lay out what happens before the first token, part by part, and the step after it: medians."""
+    columns = (
+        *("prompt_tokens", "preprocess_ms", "vision_encode_ms", "prompt_eval_ms", "prompt_ms"),
+        *("prefill_tokens_per_s", "first_decode_ms", "ttft_ms"),
+    )
+    rows: list[tuple[str, ...]] = [
+        (
+            cell.name,
+            *(entries(cell.values(metric), "median")[0] for metric in columns),
+            *entries(cell.values("ttft_ms"), "p99"),
+        )
+        for cell in throughput_cells(run)
+    ]
+    header = ("cell", *(OF_ANSWERS[name].title for name in columns), "p99")
+    return TextTable("The prompt and the first step after it: medians, in ms", header, rows, 1)
+
+
+def gap_table(run: Run) -> TextTable:
+    """Lay out the gaps between tokens, each gap of each request."""
+    rows = []
+    for cell in throughput_cells(run):
+        gaps = cell.values("itl")
+        longest = number(gaps.max()) if gaps.size else ABSENT
+        rows.append((cell.name, str(gaps.size), *entries(gaps, MEAN_SD, "median", "p90", "p99"), longest))
+    header = ("cell", "gaps", "mean ± sd", "median", "p90", "p99", "max")
+    return TextTable("Between two tokens, as the client saw them, in ms", header, rows, 1)
+
+
+def position_table(run: Run) -> TextTable | None:
+    """Lay out the decode rate by the place in the answer; None where all answers end in the first bin."""
+    found = {cell.name: rates_by_position(cell) for cell in throughput_cells(run)}
+    bins = sorted({place for rates in found.values() for place in rates})
+    if len(bins) < 2:  # noqa: PLR2004 - one bin is the whole answer, which stands elsewhere
+        return None
+    rows: list[tuple[str, ...]] = [
+        (
+            f"{place[0] + 1}-{place[1] + 1}",
+            *(entries(rates[place], "median")[0] if place in rates else ABSENT for rates in found.values()),
+        )
+        for place in bins
+    ]
+    return TextTable(f"Decode tokens a second by position, bins of {BIN}: medians", ("token", *found), rows, 1)
+
+
+def _notes(run: Run, cells: list[Cell], launches: tuple[str, ...]) -> list[str]:
+    untold = [cell.name for cell in cells if not cell.told]
+    notes = ["N / T_eval is the engine's own figure, as in the paper."] if len(untold) < len(cells) else []
+    notes.append("decode is (n - 1) / (t_last - t_first) at the client.")
+    if untold:
+        notes.append(f"{', '.join(untold)}: the server does not tell T_eval, so decode stands in for N / T_eval.")
+    facts = sorted({cell.about["size"] for cell in cells})
+    if sampling := (run.manifest.get("model") or {}).get("sampling"):
+        facts.append(f"sampling of our engine: {sampling}")
+    notes += [f"{', '.join(facts)}.", *launches, *engine_notes(run, cells)]
+    if depths := reference_depths(run):
+        notes.append(
+            f"{LLAMA_BENCH} decodes behind {', '.join(map(str, depths))} tokens, as our requests do; "
+            "it samples nothing and writes no text."
+        )
+    if together := sum(map(joined, cells)):
+        notes.append(f"{together} tokens came together with another one: gaps are between arrivals.")
+    return notes
+
+
+def throughput_figures(run: Run, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
+    """Return every figure by its file's name; the paper's values only when asked for. No rates, no figures."""
+    if not any(cell.values(RATIO_METRIC).size for cell in throughput_cells(run)):
+        return {}
+    return {
+        "throughput_bars": lambda: build_throughput_bars(run, against_paper=against_paper),
+        "gaps": lambda: build_gap_distribution(run),
+        "positions": lambda: build_rate_by_position(run),
+    }
+
+
+def build_throughput_bars(run: Run, *, against_paper: bool = False) -> Figure:
+    """Draw mean ± sd of N / T_eval, a row a cell (the paper's table II), and llama-bench's decode rate where it ran.
+
+    Bars from zero; points on a logarithmic axis where the rates are too far apart for one scale.
+    """
+    cells = [cell for cell in throughput_cells(run) if cell.values(ENGINE_METRIC).size]
+    looks = cell_looks({cell.name: cell.path for cell in cells})
+    rows = [(cell.name, summarise(cell.values(ENGINE_METRIC)), looks[cell.name][0]) for cell in cells]
+    if reference := reference_values(run):
+        rows.append((f"{LLAMA_BENCH}\n(decode)", summarise(reference), _REFERENCE_FILL))
+    bars = [Bar(name, found.mean, found.sd, mean_sd(found), colour) for name, found, colour in rows]
+    if against_paper:
+        bars += [
+            Bar(f"paper:\n{claim.name}", claim.tokens_per_s, None, f"{claim.tokens_per_s:g}")
+            for claim in paper_throughput()
+        ]
+    title = _title(run, cells, "Tokens a second")
+    return build_bars(title, bars, "tokens/s", PAPER_LABEL if against_paper else "", scaled=True)
+
+
+def build_gap_distribution(run: Run) -> Figure:
+    """Draw the empirical distribution of the gaps between tokens, a line a cell."""
+    cells = [cell for cell in throughput_cells(run) if cell.values("itl").size]
+    looks = cell_looks({cell.name: cell.path for cell in cells})
+    lines = {
+        f"{cell.name}, p99 {entries(gaps, 'p99')[0]} ms": (gaps, looks[cell.name])
+        for cell in cells
+        for gaps in [cell.values("itl")]
+    }
+    title = _title(run, cells, "Gaps between tokens, as the client saw them")
+    return build_distribution(title, lines, "gaps", "gap (ms)", columns=1)
+
+
+def build_rate_by_position(run: Run) -> Figure:
+    """Draw the decode rate over the place in the answer, median and a band from the lower to the upper quartile.
+
+    Not means: tokens that arrive together after a pause have any rate at all.
+    """
+    import numpy as np
+
+    cells = [cell for cell in throughput_cells(run) if rates_by_position(cell)]
+    looks = cell_looks({cell.name: cell.path for cell in cells})
+    title = _title(run, cells, f"Decode rate by position, bins of {BIN}: medians")
+    figure = new_figure(2.2 + 0.14 * -(-len(cells) // 2), title)
+    axes = figure.subplots()
+    highest = 0.0
+    for cell in cells:
+        found = rates_by_position(cell)
+        middles = [(first + last) / 2 + 1 for first, last in found]
+        low, medians, high = np.array([np.percentile(rates, (25, 50, 75)) for rates in found.values()]).T
+        colour, line = looks[cell.name]
+        highest = max(highest, *medians)
+        axes.plot(middles, medians, color=colour, linestyle=line, marker="o", markersize=3, label=cell.name)
+        axes.fill_between(middles, low, high, color=colour, alpha=0.2, linewidth=0)
+    axes.set_xlim(left=0)
+    axes.set_ylim(0, 1.5 * highest)
+    axes.set_xlabel("token of the answer")
+    axes.set_ylabel("tokens/s")
+    axes.grid(visible=True, linewidth=0.3, color="#DDDDDD")
+    figure.legend(loc="outside lower center", ncols=2, columnspacing=1.2)
+    return figure
+
+
+def _title(run: Run, cells: list[Cell], what: str) -> str:
+    tokens = summary_of(cells[0].n_tokens.to_numpy(dtype="float64"))
+    facts = [f"{tokens.median:.0f} tokens an answer"] if tokens else []
+    return title_of(run, cells, what, [*facts, *sorted({cell.about["size"] for cell in cells})])

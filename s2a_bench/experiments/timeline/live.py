@@ -1,0 +1,99 @@
+"""Live timelines: a model writes plans, over a real transport, and every policy executes them as they arrive.
+
+Tokens, parsing and execution are real. With ``--pace`` the server holds the tokens back to a rate: then the rate is
+set, and said to be; nothing is emulated unless the engine is the replay of a profile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from functools import partial
+from pathlib import Path
+
+from s2a_bench.act import SkillKind, SkillRobot, kind
+from s2a_bench.act.events import PlanFeed, StreamBroke
+from s2a_bench.act.record import Record
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import S2AError
+from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep, quick_switching
+from s2a_bench.experiments.timeline.rows import TIMELINES
+from s2a_bench.experiments.timeline.watch import Scene
+from s2a_bench.frames.stamp import Stamped
+from s2a_bench.harness.rounds import Launch, Task, run_requests
+from s2a_bench.harness.timelines.config import TimelineConfig
+from s2a_bench.harness.timelines.link import Ask, Link, word
+from s2a_bench.harness.timelines.policies import Following, prepare
+from s2a_bench.plan import Parser
+from s2a_bench.progress import Progress, watching
+from s2a_bench.store.requests import SKILLS
+
+
+def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
+    """Ask for plans, execute them, and return the run folder; raises S2AError for what a user can mend.
+
+    Whatever happens, the timelines so far are in the folder. KeyboardInterrupt passes through, after the robots hold.
+    """
+    plan, asks = word(config, progress)
+    seed = plan.request.seed
+    plan = plan.telling(
+        configuration={**config.to_manifest(), "engine": plan.manifest["configuration"]["engine"]},
+        seeds={"sampling": seed, "source": seed, "nonce": plan.feed.nonce},
+    )
+    robot = kind(config.robot, SkillKind)
+    with ExitStack() as stack:  # first, as a model may take long to load
+        robots = [stack.enter_context(closing(robot.open_skills(config.skill_set))) for _ in config.chosen]
+        stack.enter_context(quick_switching())
+        drive, tables = partial(_drive, config, asks, robots), (TIMELINES, SKILLS)
+        task = Task("timeline", drive, tables=tables, source=lambda feed: Stamped(feed.open(), feed.nonce))
+        return run_requests(task, plan, output, progress)
+
+
+def _drive(config: TimelineConfig, asks: Sequence[Ask], robots: Sequence[SkillRobot], launch: Launch) -> None:
+    """Let every policy execute every plan that is asked for."""
+    link, records, progress = Link(config, launch, config.robot), list[Record](), launch.progress
+    progress.expect(config.warmup + len(asks) * config.plans_a_cell)
+    try:
+        prior = link.warm_up(asks[0])
+        for ask in asks:
+            following = prepare(config, ask.shape, prior)
+            for plan in range(config.plans_a_cell):
+                _execute(link, ask, plan, following, robots, records)
+                progress.advance()
+        link.require_answers()
+    finally:
+        launch.writer.update(start_jitter=jitter_facts(records))
+
+
+def _execute(
+    link: Link, ask: Ask, plan: int, following: Following, robots: Sequence[SkillRobot], records: list[Record]
+) -> None:
+    """Ask for one plan, let every policy execute it as it arrives, and add what they did to ``records``."""
+    policies, progress = following.policies(), link.launch.progress
+    span_s = ask.n_skills * (ask.tokens_per_skill / link.rate if link.rate else 0.0) + ask.n_skills * ask.t_nom_s
+    progress.stage(f"{link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
+    side_by_side = SideBySide(policies, ask.shape, ask.skills.gap, robots, link.config.timeout_s)
+    feed = PlanFeed(Parser(ask.format), side_by_side.tell)
+    title = f"live {link.cell.name}, L = {ask.tokens_per_skill}{_remarks(link)}"
+    request_id = ""
+    try:
+        with side_by_side, watching(progress, Scene(title, side_by_side.records, ask.n_skills, span_s)):
+            try:
+                request_id = link.ask(ask, plan, feed).sample.request_id
+            except S2AError as error:  # the run ends, but not in the middle of a skill
+                side_by_side.tell(StreamBroke(now_ns(), "stream-error", f"{type(error).__name__}: {error}"))
+                side_by_side.finish()
+                raise
+            side_by_side.finish()
+    finally:  # what an interruption leaves is kept too
+        executed = side_by_side.records
+        records += executed
+        link.saw(max((record.token_ns for record in executed), key=len))
+        link.launch.warnings.extend(keep(link.writer, link.setting(ask), plan, request_id, policies, executed))
+    following.learn(side_by_side.records)
+
+
+def _remarks(link: Link) -> str:
+    paced = f", paced to {link.pace:g} tokens/s" if link.pace else ""
+    dummy = ", dummy weights" if link.writer.manifest["model"].get("dummy") else ""
+    return f"{paced}{dummy}{' (EMULATED)' if link.origin.emulated else ''}"

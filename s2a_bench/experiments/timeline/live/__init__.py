@@ -1,1 +1,0 @@
-"""Timelines on the stream of a model that answers."""

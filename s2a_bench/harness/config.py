@@ -1,0 +1,316 @@
+"""What a run of requests is asked to do, checked, and the pipelines that follow from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+
+from pydantic import create_model
+
+from s2a_bench import extras
+from s2a_bench.errors import UsageError
+from s2a_bench.frames import SOURCES
+from s2a_bench.inference import STAND_IN, EngineConfig, acting, check_engine
+from s2a_bench.options import Grammar, Names, Options, Size, Square, TextOrFile, group, option
+from s2a_bench.transport import (
+    ACTIONS,
+    EXTERNAL,
+    PAYLOADS,
+    PROGRAM,
+    SERVER,
+    TRANSPORTS,
+    Choice,
+    Payload,
+    named_by,
+)
+from s2a_bench.transport.defaults import COMPARED
+from s2a_bench.transport.pipeline import Pipeline, answer_over, carries_alone, pipelines, require_payload
+
+LARGEST = 16_384
+
+DEFAULT_PROMPT = """You are a robot task planner.
+Skills: go_to(location), open(object), close(object), pick(object), place(object, location).
+Rules: Output only numbered skill calls, one per line.
+Do not output any explanation."""
+"""The paper's prompt (section IV-E)."""
+
+
+def _options() -> type[Options]:
+    """Make a group of the options of each transport; what only concerns `serve` is no flag."""
+    fields: dict[str, Any] = {
+        name: (each.options, group(each.options, only=each.options.of_sides("", SERVER, EXTERNAL, PROGRAM)))
+        for name, each in TRANSPORTS.loaded()
+    }
+    return create_model("PerTransport", __base__=Options, **fields)
+
+
+def _variants(*, first: bool) -> type[Options]:
+    """Make an option for each transport with variants: which to measure, unless told the first or its own choice."""
+    fields: dict[str, Any] = {}
+    for name, each in TRANSPORTS.loaded():
+        if each.variants:
+            about = f"{', '.join(each.variants)}; several with commas"
+            measured = each.variants[:1] if first else each.measured(Choice(each.options()))
+            default = measured if first else ()
+            fields[name] = (Names, option(default, f"{about} [default: {','.join(measured)}]"))
+    return create_model("PerTransport", __base__=Options, **fields)
+
+
+def _with_url(url: str, options: Options | Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of transports, the one that a URL's scheme names told the URL."""
+    told = {name: own if isinstance(own, Mapping) else own.given_values() for name, own in dict(options).items()}
+    name = named_by(url)
+    return {**told, name: {**told.get(name, {}), "url": url}}
+
+
+if TYPE_CHECKING:
+    TransportOptions: TypeAlias = Options
+    Variants: TypeAlias = Options
+    FirstVariants: TypeAlias = Options
+else:
+    TransportOptions = _options()
+    Variants = _variants(first=False)
+    FirstVariants = _variants(first=True)
+
+
+class RequestsConfig(Options):
+    """The settings of one run of requests."""
+
+    QUICK: ClassVar[dict[str, int]] = {"runs": 10, "warmup": 2, "max_tokens": 8}
+    """What ``quick`` sets, unless told."""
+    COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
+    """Why answers of actions are no use here; empty: they are."""
+    OF_ENGINE: ClassVar[tuple[str, ...]] = ()
+    """The engine's options that names of pipelines may hold: so cells of one run have engines set differently."""
+
+    transports: Names = option(
+        COMPARED,
+        f"{', '.join(TRANSPORTS)}; several with commas, with /VARIANT and ?OPTION=VALUE: ros/topic?payload=yuyv",
+        flag="transport",
+    )
+    source: str = option("synthetic", f"{', '.join(SOURCES)}, as video:FILE")
+    size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]")
+    cameras: int = option(1, "pictures a request, read one after the other from the source", ge=1, le=16)
+    resize: Square | None = option(
+        None, "WIDTHxHEIGHT, or 224 for 224x224: pictures are scaled to it before they travel [default: as captured]"
+    )
+    state: int = option(0, "numbers (float32) of the robot's state that go with a request", ge=0, le=4096)
+    payload: Payload = option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: http jpeg, ros raw]")
+    variants: Variants = group(Variants)
+    """The variants to measure where a pipeline's name has none; those that a transport measures by default if empty."""
+    options: TransportOptions = group(TransportOptions)
+    """The options of every transport, for names that do not say them themselves."""
+    url: str = option(
+        "",
+        "a server that runs already (a black box), of the transport that its scheme names: "
+        f"{', '.join(f'{scheme}://' for _, each in TRANSPORTS.loaded() for scheme in each.urls.schemes)}",
+    )
+    engine: EngineConfig = group(EngineConfig)
+    runs: int = option(50, "samples a pipeline [default: 50, quick: 10]", ge=1, le=10**9)
+    warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
+    launches: int = option(1, "fresh sets of servers, --runs samples each; ratios then hold beyond one", ge=1, le=1000)
+    mode: Literal["request", "stream"] = option("request", "request (a frame each), stream (a camera runs)")
+    fps: float = option(30.0, "rate of the camera in --mode stream", ge=0.1, le=1000)
+    max_tokens: int = option(32, "tokens an answer [default: 32, quick: 8]", ge=1, le=2**20)
+    prompt: TextOrFile = option(DEFAULT_PROMPT, "text, or @FILE [default: the paper's prompt]")
+    grammar: Grammar = option("", "GBNF file that every answer obeys")
+    seed: int = option(0, "seed of the order, the source and the sampling", ge=0, le=2**31 - 1)
+    nonce: str = option(
+        "",
+        "nonce of another run, to send its very pictures again [default: a new one]",
+        pattern="^[0-9A-Za-z_-]{0,64}$",
+    )
+    timeout_s: float = option(300.0, "longest silence of a server, in seconds", flag="timeout", ge=0.1, le=86_400)
+    deadline_s: float = option(
+        0.0,
+        "longest time of a whole answer, in seconds; 0: --timeout and 5 s a token",
+        flag="deadline",
+        ge=0,
+        le=86_400,
+    )
+    sample_resources_hz: float = option(
+        10.0,
+        "readings a second of CPU, memory, GPU and power beside the run; 0: none",
+        flag="sample-resources",
+        ge=0,
+        le=1000,
+    )
+    record: Path | None = option(None, "also record frames, requests and tokens, as run.mcap (rosbag2)")
+    quick: bool = option(False, "fewer samples: a first look")
+
+    def __init__(self, **given: Any) -> None:
+        """Keep what is given, few samples where a quick look is asked for; raises UsageError naming the field."""
+        given = {**self.QUICK, **given} if given.get("quick") else given
+        if given.get("url"):
+            given["options"] = _with_url(given["url"], given.get("options") or {})
+        super().__init__(**given)
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Return pipeline names: ``transport[/variant][?option=value&...]``."""
+        return self.transports
+
+    @cached_property
+    def pipelines(self) -> list[Pipeline]:
+        """Return what is compared, a cell each; raises UsageError."""
+        told = {name: given.given_values() for name, given in self.options}
+        told[""] = {"payload": self.payload}
+        return pipelines(self.names, told, dict(self.variants), self.engine.name, self.OF_ENGINE)
+
+    @cached_property
+    def answer(self) -> str:
+        """Return what the answers of all cells are made of; raises UsageError."""
+        return answer_over(self.engine.answer, self.pipelines)
+
+    @property
+    def served_engine(self) -> EngineConfig:
+        return self.engine.but(answer=self.answer)
+
+    @property
+    def tuned(self) -> bool:
+        """Whether this process and the servers keep large blocks of memory for the next picture."""
+        return all(given.tuned for _, given in self.options)
+
+    @property
+    def own_engine(self) -> bool:
+        """Whether an engine of ours answers over any transport."""
+        return not all(pipeline.black_box for pipeline in self.pipelines)
+
+    @property
+    def starts_program(self) -> bool:
+        """Whether somebody else's server is started on the model's files."""
+        return any(pipeline.options.program for pipeline in self.pipelines)
+
+    @property
+    def foreign(self) -> str:
+        """Return the first option that says that a server is not ours, or nothing."""
+        return next(filter(None, (each.options.external for each in self.pipelines)), "")
+
+    def answered(self, say: Callable[[str], None]) -> RequestsConfig:
+        """Return it with the engine that can answer where none is named, and ``say`` which if that is not llama."""
+        if "name" in self.engine.model_fields_set or not self.own_engine:
+            return self
+        if self.answer == ACTIONS and not self.engine.of_model:
+            say("the echo engine answers with actions; a model's are those of its own server, see `url`")
+            return self.but(engine=self.engine.but(name=STAND_IN))
+        if self.starts_program and not extras.installed("llama_cpp"):
+            return self._without_our_engine(say)
+        chosen = self.but(engine=self.engine.but(name=self.engine.default_name(say)))
+        if left_out := {each.name for each in self.pipelines} - {each.name for each in chosen.pipelines}:
+            say(f"{', '.join(sorted(left_out))}: left out, as it needs a model")
+        return chosen
+
+    def _without_our_engine(self, say: Callable[[str], None]) -> RequestsConfig:
+        """Return it with the cells that need no engine of ours, and ``say`` so; raises UsageError for a named other."""
+        kept = [each for each in self.pipelines if each.black_box]
+        missing = f"our own servers have no engine here; {{}}{extras.how_to_install(*self.engine.kind.needs[:1])}"
+        if named := [each.name for each in self.pipelines if each not in kept and self._is_named(each, kept)]:
+            raise UsageError(f"{', '.join(named)}: {missing.format('measure without a model with `engine` echo, or ')}")
+        only = [each.name for each in kept]
+        say(f"only {', '.join(only)}: {missing.format('')}")
+        return self.but(transports=only)
+
+    def _is_named(self, cell: Pipeline, others: Sequence[Pipeline]) -> bool:
+        """Whether the user named a cell, or its transport, of which ``others`` has none."""
+        transport = cell.transport.name
+        written = {name.partition("?")[0] for name in self.names} if "transports" in self.model_fields_set else set()
+        if cell.name.partition("?")[0] in written or transport in self.variants.model_fields_set:
+            return True
+        named = transport in written or transport in self.options.model_fields_set
+        return named and all(each.transport is not cell.transport for each in others)
+
+    @property
+    def reads_model(self) -> bool:
+        """Whether a server of this run loads a model's files."""
+        return self.own_engine or self.starts_program
+
+    def check(self) -> None:
+        if not self.transports:
+            raise UsageError(f"`transport`: name at least one of {', '.join(TRANSPORTS)}")
+        width, height = self.size
+        if not (16 <= width <= LARGEST and 16 <= height <= LARGEST) or width % 2:  # noqa: PLR2004
+            raise UsageError(f"`size`: {width}x{height} should be 16x16 to {LARGEST}x{LARGEST}, of even width")
+        check_engine(self.engine)
+        self._check_answer()
+        self._check_observation()
+        if self.record is not None and self.record.exists():
+            raise UsageError(f"`record`: {self.record} exists already and is not overwritten; name another")
+        for pipeline in self.pipelines:
+            self._check(pipeline)
+        running = [each for each in self.pipelines if each.options.external_address]
+        if self.launches > 1 and running:
+            field = running[0].options.external
+            raise UsageError(f"`launches`: a server that runs already cannot be started afresh; leave out `{field}`")
+        if self.engine.kind.plays and self.foreign:
+            raise UsageError(f"`engine` {self.engine.name} needs our own servers; leave out `{self.foreign}`")
+        if self.engine.latency and self.foreign:
+            raise UsageError(f"`latency` is about our own servers; leave out `{self.foreign}`")
+        self._check_unused()
+
+    def _check(self, pipeline: Pipeline) -> None:
+        if self.resize and pipeline.payload in {"yuyv", "jpeg-preencoded"}:
+            raise UsageError(f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png")
+        if self.state and not pipeline.capabilities.accepts_state:
+            raise UsageError(f"`state`: a request of {pipeline.name} has no place for it; leave one of them out")
+        choice = Choice(pipeline.options, pipeline.variant, mode=self.mode, engine=self.engine.name)
+        pipeline.transport.require(choice)
+        require_payload(pipeline)
+        self.served_engine.but(**dict(pipeline.engine))  # raises UsageError for a value in its name
+        if pipeline.engine and pipeline.options.external_address:
+            raise UsageError(f"`{pipeline.engine[0][0]}`: the server of {pipeline.name} runs already, as it was set")
+        if self.mode == "stream" and pipeline.payload == "jpeg-preencoded":
+            raise UsageError("`payload` jpeg-preencoded has no meaning in `mode` stream; use jpeg")
+
+    def _check_answer(self) -> None:
+        if self.answer != ACTIONS:
+            return
+        alone = carries_alone(ACTIONS, self.pipelines) or "`answer` actions"
+        if self.COUNTS_TOKENS:
+            raise UsageError(f"{self.COUNTS_TOKENS}, and {alone} brings actions; 's2a-bench latency' measures them")
+        if self.own_engine and "name" in self.engine.model_fields_set and not self.engine.kind.acts:
+            raise UsageError(
+                f"`engine` {self.engine.name} answers with tokens, and {alone} carries actions; use `engine` {acting()}"
+            )
+
+    def _check_observation(self) -> None:
+        if self.resize is not None and not all(1 <= side <= LARGEST for side in self.resize):
+            raise UsageError(f"`resize`: {self.resize[0]}x{self.resize[1]} should be 1x1 to {LARGEST}x{LARGEST}")
+        if self.mode == "stream" and (self.cameras > 1 or self.resize):
+            name = "cameras" if self.cameras > 1 else "resize"
+            raise UsageError(f"`{name}`: in `mode` stream one camera runs, whose frames travel as they are")
+
+    def _check_unused(self) -> None:
+        """Refuse a server of somebody else's that no cell asks, and a model that no server loads."""
+        used = {(each.transport.name, each.options.external) for each in self.pipelines}
+        for name, given in self.options:
+            transport, field = TRANSPORTS[name], given.external
+            if field and (name, field) not in used:
+                variants = transport.variants if name in dict(used) else ()
+                able = [each for each in variants if transport.capabilities(Choice(given, each)).options.external]
+                fit = [f"{name}/{each}" for each in able]
+                raise UsageError(f"`{field}` needs {' or '.join(fit) or name} among `transport`")
+        if (given := self.engine.of_model) and not self.reads_model:
+            raise UsageError(f"`{given}`: no server of this run loads a model; leave it out with `{self.foreign}`")
+
+    def risks(self) -> Iterator[tuple[str, str, str]]:
+        """Yield those of the options, in the names of pipelines too."""
+        yield from super().risks()
+        for pipeline in self.pipelines:
+            yield from pipeline.risks()
+
+    def to_manifest(self) -> dict[str, Any]:
+        """Return the settings as plain data, with what every pipeline came to be told."""
+        told = {
+            each.name: {**each.options.model_dump(mode="json", exclude_defaults=True), **dict(each.engine)}
+            for each in self.pipelines
+        }
+        own = self.model_dump(exclude={"quick", "nonce"})  # the nonce stands with the seeds
+        width, height = self.size
+        size = f"{width}x{height}"
+        observation = f"{self.cameras} x {size}" if self.cameras > 1 else size
+        observation += f" as {self.resize[0]}x{self.resize[1]}" if self.resize else ""
+        observation += f", state of {self.state}" if self.state else ""
+        more = {"width": width, "height": height, "size": size, "observation": observation, "tuned": self.tuned}
+        return {**own, **more, "engine": self.served_engine.to_manifest(), "pipelines": told}

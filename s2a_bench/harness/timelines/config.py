@@ -1,0 +1,321 @@
+"""What a timeline run compares: policies on boards, granularities, lengths and durations; and what it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from pydantic import Field
+
+from s2a_bench.act import SkillKind, kind
+from s2a_bench.boards.profile import load_profile
+from s2a_bench.boards.tokens import NO_JITTER, Board, board_of_profile, board_of_rate
+from s2a_bench.errors import UsageError
+from s2a_bench.inference import EngineConfig
+from s2a_bench.options import SEVERAL, Names, Options, Size, TextOrFile, group, option
+from s2a_bench.plan import SkillSet, load_skills
+from s2a_bench.policy import COMPARED, POLICIES, PlanShape, Policy, Timing, policies
+from s2a_bench.policy.conformal import GUARANTEE, Guarantee
+from s2a_bench.policy.conformal import check as check_calibration
+from s2a_bench.stats.seeds import Verbatim
+from s2a_bench.transport.defaults import BLACK_BOX, FOLLOWED
+from s2a_bench.transport.pipeline import first_variants
+
+if TYPE_CHECKING:
+    from s2a_bench.harness.config import RequestsConfig
+
+PROFILES: Final = ("rtx-4080", "jetson-agx-orin", "jetson-orin-nano")
+REAL_TIME_PROFILE: Final = "jetson-agx-orin"
+LENGTHS: Final = (6, 4, 2, 1)
+LIVE_LENGTH: Final = 6
+PLANS: Final = 1000
+"""Plans a cell where something is random; one where nothing is."""
+MOST_SKILLS: Final = 2_000_000
+"""Skills that one run computes: beyond that, studies are the tool."""
+MOST_TOKENS: Final = 20_000_000
+"""Tokens of a cell: they are held in memory at once."""
+MOST_CV: Final = 3**-0.5
+"""Uniform durations of a larger spread could be negative."""
+LEAST_T_NOM_S: Final = 1e-6
+"""Run folders keep times in whole nanoseconds: a shorter skill would lose its digits."""
+
+Counts = Annotated[tuple[Annotated[int, Field(ge=1)], ...], SEVERAL]
+Rates = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...], SEVERAL]
+Seconds = Annotated[tuple[Annotated[float, Field(ge=LEAST_T_NOM_S, allow_inf_nan=False)], ...], SEVERAL]
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What plans have in common, whatever the policy."""
+
+    board: str
+    """A profile's name; empty where only a rate was given."""
+    title: str
+    tokens_per_s: float
+    prompt_s: float | None
+    """c; None where a model took what it took."""
+    tokens_per_skill: int
+    n_skills: int
+    t_nom_s: float
+    mode: str = "virtual"
+    emulated: bool = True
+    """Whether no model answered."""
+
+    @property
+    def name(self) -> str:
+        board = self.board or f"{self.tokens_per_s:g}tps"
+        return f"{board}/L{self.tokens_per_skill}/N{self.n_skills}/T{self.t_nom_s:g}"
+
+    @property
+    def key(self) -> Verbatim:
+        """Return what its draws follow from: another field, or another name of one, is another draw."""
+        return Verbatim(repr(self))
+
+    def request_id(self, plan: int, policy: str = "") -> str:
+        """Name a request; policies that share arrivals share the request."""
+        return f"{self.name}/{policy}/{plan}" if policy else f"{self.name}/{plan}"
+
+
+class Compared(Options):
+    """Options about what is compared, wherever the tokens are from."""
+
+    policies: Names = option(
+        COMPARED,
+        f"{', '.join(POLICIES)}, with parameters as in NAME?parameter=value&other=value; several with commas",
+        flag="policy",
+        min_length=1,
+    )
+    profiles: Names = option(
+        (),
+        f"boards: names of 'profile list', or paths [default: {','.join(PROFILES)}; --real-time: {REAL_TIME_PROFILE}; "
+        "none with --rate]; with --live what --engine replay plays",
+        flag="profile",
+    )
+    tokens_per_skill: Counts = option(
+        (),
+        "L, the delimiter included; several with commas "
+        f"[default: {','.join(map(str, LENGTHS))}; --live: {LIVE_LENGTH}]",
+    )
+    n_skills: Counts = option((8,), "N, skills a plan; several with commas", min_length=1)
+    t_nom_s: Seconds = option(
+        (), "seconds a skill takes; several with commas [default: 1; --live: the skill set's own]", flag="t-nom"
+    )
+    t_min: float = option(0.8, "least duration of a skill, as a factor of T_nom", gt=0, le=1)
+    t_max: float = option(1.5, "longest duration of a skill, as a factor of T_nom", ge=1, allow_inf_nan=False)
+    plans: int | None = option(None, "plans a cell [default: 1; with jitter 1000]", ge=1)
+    seed: int = option(0, "seed of everything that is drawn", ge=0)
+    epsilon: float = option(0.01, "share of plans that may stall: lambda is calibrated or tracked for it")
+    track: bool = option(False, "let online policies follow lambda from plan to plan (needs jitter, or --live)")
+    real_time: bool = option(False, "play the boards' tokens on the clock and execute while you watch")
+    live: bool = option(False, "execute what a model really answers, as it arrives")
+
+
+class Modelled(Options):
+    """Options about tokens that no model writes."""
+
+    rates: Rates = option((), "boards of which only the tokens/s are known; several with commas", flag="rate")
+    prompt_s: float | None = option(
+        None,
+        "seconds before decoding, c [default: the profile's; with --rate 0]",
+        flag="prompt-time",
+        ge=0,
+        allow_inf_nan=False,
+    )
+    t_nom_cv: float = option(0.0, "how much T_nom differs from skill to skill: sd / mean", ge=0, le=MOST_CV)
+    jitter: str = option(
+        NO_JITTER,
+        "none (tokens come evenly, as in the paper), profile (as the profile says), or a family of gaps, as "
+        "lognormal:cv=0.2",
+    )
+    guarantee: Guarantee = option("high-confidence", GUARANTEE)
+    calibration_plans: int = option(400, "other plans that prior and lambda are learned from")
+    calibrate: Path | None = option(
+        None, "run folder of latency or throughput: learn prior and lambda from its answers instead"
+    )
+
+
+class Live(Options):
+    """Options about a model that answers."""
+
+    transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]")
+    skills: str = option("household", "--live: household, driving, or a TOML file")
+    task: TextOrFile = option("", "--live: what the robot should do, text or @FILE")
+    robot: str = option("timed", "--live: timed, ros, call?function=MODULE:NAME; timed only waits")
+    engine: EngineConfig = group(
+        EngineConfig, only=("name", "model", "mmproj", "threads", "gpu_layers", "pace"), about="--live: "
+    )
+    source: str = option("synthetic", "--live: the camera")
+    size: Size = option((640, 480), "--live: WIDTHxHEIGHT of the frames [default: 640x480]")
+    url: str = option("", "--live: an HTTP server that runs already (a black box)")
+    dialect: str = option("", "--live: what --url speaks [default: ask]")
+    nonce: str = option("", "--live: nonce of another run, to send its very pictures again [default: a new one]")
+    no_grammar: bool = option(False, "--live: let the model write what it likes")
+    warmup: int = option(1, "--live: answers before, which policies learn the rate from", ge=0)
+    timeout_s: float = option(
+        60.0, "--live: seconds without a token after which the robot holds", flag="timeout", ge=0.1, le=86_400
+    )
+
+
+class TimelineConfig(Live, Modelled, Compared):
+    """What is compared with what: computed, played in real time, or live."""
+
+    @property
+    def virtual(self) -> bool:
+        return not (self.live or self.real_time)
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        return self.tokens_per_skill or ((LIVE_LENGTH,) if self.live else LENGTHS)
+
+    @cached_property
+    def boards(self) -> list[Board]:
+        """Find the boards; raises UsageError for a profile or jitter that there is not."""
+        found = [board_of_profile(load_profile(name), self.jitter, self.prompt_s) for name in self._profiles]
+        return found + [board_of_rate(rate, self.jitter, self.prompt_s) for rate in self.rates]
+
+    @cached_property
+    def chosen(self) -> dict[str, Policy]:
+        """Build the policies, by their canonical names; raises UsageError."""
+        return policies(self.policies)
+
+    @property
+    def _profiles(self) -> tuple[str, ...]:
+        default = () if self.rates else (REAL_TIME_PROFILE,) if self.real_time else PROFILES
+        return self.profiles or default
+
+    @cached_property
+    def skill_set(self) -> SkillSet:
+        """Load the skills that a model is asked for; raises UsageError."""
+        return load_skills(self.skills)
+
+    @property
+    def random(self) -> bool:
+        """Whether one plan differs from the next."""
+        return self.t_nom_cv > 0 or not all(board.even for board in self.boards)
+
+    @property
+    def plans_a_cell(self) -> int:
+        return self.plans if self.plans is not None else PLANS if not self.live and self.random else 1
+
+    def check(self) -> None:
+        if self.track:
+            check_tracking(self)
+        if self.live:
+            if self.real_time:
+                raise UsageError("`live` and `real_time` are two things: a model answers, or a profile is played")
+            if "epsilon" in self.given(Compared) and not self.track:
+                raise UsageError("`epsilon`: nothing is calibrated with `live`; it needs `track`")
+            for name in self.given(Modelled):
+                raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")
+            check_live(self)
+            return
+        for name in self.given(Live):
+            raise UsageError(f"`{name}` is about a model that answers; it needs `live`")
+        self._check_modelled()
+
+    def _check_modelled(self) -> None:
+        _ = self.chosen
+        check_calibration(self.calibration_plans, self.epsilon)
+        if self.calibrate is not None and len(self.boards) != 1:
+            raise UsageError("`calibrate`: the recorded machine is one board; name it with one `profiles` or `rates`")
+        plans = self.plans_a_cell
+        if plans > 1 and not self.random:
+            raise UsageError("`plans`: without `jitter` or `t_nom_cv` all plans are the same; leave it out")
+        skills = sum(setting.n_skills for _, setting in settings(self)) * len(self.chosen) * plans
+        if skills > MOST_SKILLS:
+            raise UsageError(f"`plans`: {skills} skills are more than the {MOST_SKILLS} of one run; ask for fewer")
+        tokens = max(self.n_skills) * max(self.lengths)
+        if (drawn := tokens * max(plans, self.calibration_plans)) > MOST_TOKENS:
+            raise UsageError(
+                f"`n_skills`, `tokens_per_skill`: {tokens} tokens a plan, {drawn} a cell: {MOST_TOKENS} is the most"
+            )
+
+    def shape(self, setting: Setting) -> PlanShape:
+        """Return what is known of a plan before its first token."""
+        t_nom_s = setting.t_nom_s
+        timing = Timing(t_nom_s, self.t_min * t_nom_s, self.t_max * t_nom_s)
+        return PlanShape(setting.n_skills, setting.tokens_per_skill, timing, self.t_nom_cv)
+
+    def risks(self) -> Iterator[tuple[str, str, str]]:
+        """Yield those of the requests, live, and a robot that runs code."""
+        yield from requests_of(self).risks() if self.live else super().risks()
+        if self.live and (risk := kind(self.robot, SkillKind).risk):
+            yield "robot", risk, self.robot
+
+    def to_manifest(self) -> dict[str, Any]:
+        """Return the options that hold in this kind of run, with the values that follow from others."""
+        own = self.model_dump(include=set(Compared.model_fields) - {"profiles", "real_time", "live"})
+        own |= {"tokens_per_skill": self.lengths, "plans": self.plans_a_cell}
+        if self.live:
+            asked = {"skills": self.skills, "task": self.task, "robot": self.robot, "constrained": not self.no_grammar}
+            return {**requests_of(self).to_manifest(), **own, **asked, "time": "live"}
+        own |= self.model_dump(include=set(Modelled.model_fields))
+        own |= {"profiles": self._profiles, "t_nom_s": self.t_nom_s or (1.0,)}
+        return own | ({"time": "real-time"} if self.real_time else {})
+
+
+def check_tracking(config: TimelineConfig) -> None:
+    """Refuse to track what does not vary or has no lambda to follow; raises UsageError."""
+    if not any(policy.learns and policy.caution is None for policy in config.chosen.values()):
+        raise UsageError("`track`: no policy here has a lambda to follow; take stream-to-act without caution")
+    if not config.live and not config.random:
+        raise UsageError("`track`: without `jitter` or `t_nom_cv` all plans are the same; nothing can be learned")
+
+
+def settings(config: TimelineConfig) -> Iterator[tuple[Board, Setting]]:
+    """List what is compared, board by board."""
+    for n_skills, t_nom_s, board, tokens in product(
+        config.n_skills, config.t_nom_s or (1.0,), config.boards, config.lengths
+    ):
+        yield board, Setting(board.name, board.title, board.tokens_per_s, board.prompt_s, tokens, n_skills, t_nom_s)
+
+
+def requests_of(config: TimelineConfig) -> RequestsConfig:
+    """Return how the model is asked: one transport in one variant; prompt and length follow from the plan."""
+    from s2a_bench.harness.config import RequestsConfig
+
+    transport = config.transport or (BLACK_BOX if config.url else FOLLOWED)
+    return RequestsConfig(
+        transports=(transport,),
+        variants=first_variants(),
+        options={BLACK_BOX: {"url": config.url, "dialect": config.dialect}},
+        source=config.source,
+        size=config.size,
+        engine=config.engine.but(profile=",".join(config.profiles)) if config.profiles else config.engine,
+        runs=1,
+        warmup=config.warmup,
+        seed=config.seed,
+        nonce=config.nonce,
+        timeout_s=config.timeout_s,
+        sample_resources_hz=0,
+    )
+
+
+def check_live(config: TimelineConfig) -> None:
+    """Refuse what no model, robot or policy can do; raises UsageError naming the fields."""
+    requests = requests_of(config)
+    if len(requests.pipelines) != 1:
+        raise UsageError("`transport`: `live` follows one stream; name one, as ros, ros/action or http/binary")
+    _ = config.skill_set
+    for policy in config.chosen.values():
+        policy.stepper(PlanShape(1, 1, Timing(1.0, 1.0, 1.0)))
+    if not kind(config.robot, SkillKind).several and len(config.chosen) > 1:
+        raise UsageError(f"`robot`: {config.robot} follows one policy at a time; choose it with `policies`")
+    engine = config.engine
+    if engine.pace and config.url:
+        raise UsageError("`pace` needs our own server, which holds its engine back")
+    if not engine.kind.computes:
+        raise UsageError(f"`engine` {engine.name} writes no plans; `live` needs llama, or replay")
+    if engine.kind.plays:
+        if engine.pace:
+            raise UsageError(f"`pace`: `engine` {engine.name} has its profile's rate; leave one of them out")
+        skills, tokens = engine.kind.plays
+        if (config.skills, config.lengths) != (skills, (tokens,)):
+            raise UsageError(
+                f"`engine` {engine.name} writes plans of the {skills} skills in {tokens} tokens a skill; "
+                "leave out `skills` and `tokens_per_skill`"
+            )

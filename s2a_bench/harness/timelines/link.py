@@ -1,0 +1,220 @@
+"""A model to ask for plans: what is asked of it, its server, a client, warm-ups, and requests."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count, product
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from s2a_bench.act.events import PlanFeed
+from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.harness.plan import Plan, resolve
+from s2a_bench.harness.rounds import Launch
+from s2a_bench.harness.servers import on_files
+from s2a_bench.harness.session import Asked, Measured, Place
+from s2a_bench.harness.timelines.config import Setting, TimelineConfig, requests_of
+from s2a_bench.harness.timelines.policies import prior_of
+from s2a_bench.inference import need_engine
+from s2a_bench.machine.tuning import limit_threads
+from s2a_bench.plan import Durations, Format, SkillSet, choose_format, grammar, paper_format, prompt
+from s2a_bench.policy import PlanShape, Timing
+from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.progress import Progress
+from s2a_bench.provenance import Origins
+from s2a_bench.store.manifest import RunWarning
+
+ROOM: Final = 16
+"""Tokens a skill that a model of unknown tokenizer may need for the paper's format."""
+MODE = "live"
+LATE = 1.05
+"""An answer that takes so many times what the pace allows was not paced, but slow."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """One setting, ready to be asked for."""
+
+    skills: SkillSet
+    format: Format
+    tokens_per_skill: int
+    n_skills: int
+    prompt: str
+    grammar: str
+    max_tokens: int
+
+    @property
+    def t_nom_s(self) -> float:
+        return self.shape.expected.nominal_s
+
+    @property
+    def shape(self) -> PlanShape:
+        """Return what is known of the plan before its first token: every call is as likely as any other."""
+        times = [call.skill.durations for call in self.skills.calls]
+        nominal_s = np.array([time.nominal_s for time in times])
+        mean_s = float(nominal_s.mean())
+        timing = Timing(
+            mean_s, float(np.mean([time.least_s for time in times])), float(np.mean([time.most_s for time in times]))
+        )
+        return PlanShape(self.n_skills, self.tokens_per_skill, timing, float(nominal_s.std()) / mean_s)
+
+
+def asks_of(config: TimelineConfig, model: Path | None) -> list[Ask]:
+    """Word every setting for the tokenizer of ``model``; raises UsageError where there is no such format."""
+    tokenize = None
+    if not in_paper_format(config):
+        from s2a_bench.inference.tokenizer import Tokenizer
+
+        tokenize = Tokenizer(model)
+    found = []
+    for tokens, n_skills, t_nom_s in product(config.lengths, config.n_skills, config.t_nom_s or (None,)):
+        skills = skills_lasting(config, t_nom_s)
+        format_ = paper_format(skills) if tokenize is None else choose_format(skills, tokens, tokenize, n_skills)
+        # Token ids mean something to our own server only, which has the same model files.
+        pinned = None if config.url else tokenize
+        counted = tokens if tokenize is not None or config.engine.kind.plays else ROOM
+        found.append(
+            Ask(
+                skills,
+                format_,
+                tokens,
+                n_skills,
+                prompt(format_, n_skills, config.task),
+                grammar(format_, n_skills, pinned) if not config.no_grammar else "",
+                n_skills * counted,
+            )
+        )
+    return found
+
+
+def in_paper_format(config: TimelineConfig) -> bool:
+    """Return True if plans are written as in the paper, for want of a tokenizer to choose a format with."""
+    return not config.engine.kind.needs_model or bool(config.url)
+
+
+def skills_lasting(config: TimelineConfig, t_nom_s: float | None) -> SkillSet:
+    """Return the skill set, every skill of which takes ``t_nom_s`` if that is given."""
+    if t_nom_s is None:
+        return config.skill_set
+    times = Durations(config.t_min * t_nom_s, t_nom_s, config.t_max * t_nom_s)
+    skills = tuple(replace(skill, durations=times) for skill in config.skill_set.skills)
+    return replace(config.skill_set, skills=skills)
+
+
+def word(config: TimelineConfig, progress: Progress) -> tuple[Plan, list[Ask]]:
+    """Find the model's files, word what it is asked, and plan requests with the room that it needs; raises S2AError."""
+    limit_threads()
+    requests = requests_of(config)
+    if not in_paper_format(config):
+        need_engine(requests.engine)
+        requests = requests.but(engine=on_files(requests.engine, progress))
+    asks = asks_of(config, requests.engine.model)
+    plan = resolve(requests.but(max_tokens=max(ask.max_tokens for ask in asks)))
+    return replace(plan, finds_model=False), asks
+
+
+@dataclass
+class Link:
+    """The way to one model, for one run."""
+
+    config: TimelineConfig
+    launch: Launch
+    robot: str
+    """What will act, for the record."""
+    blocks: Iterator[int] = field(default_factory=count)
+    answers: int = 0
+    """Plans that came as they should."""
+
+    def __post_init__(self) -> None:
+        (self.session,) = self.launch.sessions
+        self.cell, self.writer = self.session.cell, self.launch.writer
+        self.pace = self.rate = self.launch.plan.servers.engine.pace
+        """Tokens/s: set, or as first seen."""
+        self._tell_origin()
+        self.writer.update(
+            live={
+                "transport": self.cell.name,
+                **({"paced_tokens_per_s": self.pace} if self.pace else {}),
+                "grammar": not self.config.no_grammar,
+                "skills": self.config.skill_set.name,
+                "robot": self.robot,
+            },
+        )
+
+    def _tell_origin(self) -> None:
+        """Write down where the tokens come from, and ``dummy`` where that is known of the weights."""
+        self.origin = self.session.origin
+        dummy = {"dummy": True, "real": False}.get(self.origin.weights)
+        live = {"engine": self.origin.engine, "emulated": self.origin.emulated}
+        self.writer.update(
+            provenance=Origins(self.origin).to_manifest(), live=live if dummy is None else {**live, "dummy": dummy}
+        )
+
+    def warm_up(self, ask: Ask) -> GapPrior | None:
+        """Ask as often as the configuration wants, and return what policies learn from that."""
+        warmups, progress = self.launch.plan.blocks.warmup, self.launch.progress
+        arrivals_ns = []
+        for _ in range(warmups):
+            progress.stage("warming up")
+            measured = self.ask(ask, 0, None)
+            arrivals_ns.append([token.client_ns for token in measured.tokens])
+            progress.advance()
+        prior = prior_of(arrivals_ns, self.rate)
+        if prior is not None:
+            self.rate = self.rate or 1 / prior.mean_s
+            about = {"mean_s": prior.mean_s, "plan_cv": prior.plan_cv, "token_cv": prior.token_cv}
+            self.writer.update(prior={**about, "warmups": warmups})
+        return prior
+
+    def ask(self, ask: Ask, plan: int, feed: PlanFeed | None) -> Measured:
+        """Make one request and keep its rows; raises what ends the run."""
+        run = self.session.request
+        asked = replace(run, prompt=ask.prompt, grammar=ask.grammar, max_pieces=ask.max_tokens, seed=run.seed + plan)
+        place = Place(next(self.blocks), 0, warmup=feed is None)
+        measured = self.session.measure(place, Asked(plan=feed, request=asked))
+        if self.session.origin != self.origin:
+            self._tell_origin()
+        self.answers += feed is not None and not measured.sample.error
+        try:
+            self.launch.keep(self.session, measured)
+        except UsageError as error:
+            if "grammar" not in str(error):
+                raise
+            raise UsageError(f"{error} (here: `no_grammar`)") from error
+        return measured
+
+    def setting(self, ask: Ask) -> Setting:
+        """Return the setting of what was asked, at the rate that was seen."""
+        return Setting(
+            board="",
+            title=f"live {self.cell.name}",
+            tokens_per_s=float(f"{self.rate or 0.0:.4g}"),
+            prompt_s=None,
+            tokens_per_skill=ask.tokens_per_skill,
+            n_skills=ask.n_skills,
+            t_nom_s=ask.t_nom_s,
+            mode=MODE,
+            emulated=self.origin.emulated,
+        )
+
+    def saw(self, token_ns: Sequence[int]) -> None:
+        """Learn the rate from an answer if nobody set it, and warn where the model was slower."""
+        if len(token_ns) < 2:  # noqa: PLR2004 - no gap
+            return
+        came = (len(token_ns) - 1) / (token_ns[-1] - token_ns[0]) * 1e9
+        self.rate = self.rate or came
+        if self.pace and came * LATE < self.pace:
+            what = f"{came:.3g} tokens/s came, not the {self.pace:g} of --pace: the model is slower"
+            self.launch.warnings.append(
+                RunWarning("pace-missed", what, "stop what else runs, try --threads 1, or a lower --pace")
+            )
+
+    def require_answers(self) -> None:
+        """Raise TransportError where no plan came as it should."""
+        if not self.answers:
+            raise TransportError(
+                f"no request of {self.cell.name} succeeded; {self.writer.path / 'samples.csv'} says why"
+            )

@@ -1,0 +1,181 @@
+"""What policies know: of a board's tokens before the first one comes, and from plan to plan in executed runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from s2a_bench.act.record import Record, observed
+from s2a_bench.boards.tokens import Board
+from s2a_bench.errors import UsageError
+from s2a_bench.harness.timelines.config import MOST_CV, Setting, TimelineConfig
+from s2a_bench.policy import CAUTION, ONLINE, Floats, Plans, PlanShape, Policy
+from s2a_bench.policy.arrivals import recorded_plans, with_skills
+from s2a_bench.policy.conformal import PLANS, Calibration, Guarantee, Tracker, choose, scores
+from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
+from s2a_bench.policy.evaluate import TOLERANCE_S
+from s2a_bench.policy.parameters import canonical
+from s2a_bench.policy.tracking import Tracked
+from s2a_bench.stats.seeds import generator
+
+
+@dataclass(slots=True)
+class Knowledge:
+    """What is learned of one setting before its plans."""
+
+    prior: GapPrior
+    plans: Plans | None
+    """What lambda is calibrated on; None where nothing is random."""
+    epsilon: float
+    guarantee: Guarantee
+    calibrations: dict[Policy, Calibration] = field(default_factory=dict)
+    """Of the online rules as they were chosen, each for itself."""
+    scores: dict[Policy, Floats] = field(default_factory=dict)
+
+    def prepare(self, policy: Policy) -> Policy:
+        """Tell online rules what they were not told yet, the prior and lambda."""
+        return policy.informed(self.prior, self._caution(policy) if _open(policy) else None)
+
+    def tracked(self, policy: Policy) -> Tracked | None:
+        """Return what follows the lambda of a policy from plan to plan; None where it has none, or was told it."""
+        if not _open(policy) or self.plans is None:
+            return None
+        self._caution(policy)
+        return Tracked(policy.informed(self.prior), Tracker(self.scores[policy], self.epsilon))
+
+    def _caution(self, policy: Policy) -> float:
+        if self.plans is None:
+            return CAUTION
+        if policy not in self.calibrations:
+            self.scores[policy] = scores(policy.informed(self.prior), self.plans)
+            self.calibrations[policy] = choose(self.scores[policy], self.epsilon, self.guarantee)
+        return self.calibrations[policy].caution
+
+    def facts(self, setting: Setting) -> dict[str, Any]:
+        """Return the calibrations as plain data, stream-to-act's by the setting's name, others by their cell's."""
+        named = {canonical(policy.name, policy): found for policy, found in self.calibrations.items()}
+        return {
+            setting.name if name == ONLINE else f"{setting.name}/{name}": asdict(found)
+            | {"caution": finite(found.caution)}
+            for name, found in named.items()
+        }
+
+
+def _open(policy: Policy) -> bool:
+    """Whether a policy has a lambda that nobody has set."""
+    return policy.learns and policy.caution is None
+
+
+def finite(caution: float | None) -> float | None:
+    """Return lambda, or None where it is infinite: JSON has no infinity."""
+    return None if caution is None or caution == float("inf") else caution
+
+
+def learn(config: TimelineConfig, board: Board, setting: Setting, answers: Sequence[Floats] = ()) -> Knowledge:
+    """Learn a prior, and what to calibrate on, from other plans of the same kind: drawn ones, or recorded ``answers``.
+
+    Where nothing is random the prior is as certain as the arrivals, and the online rule starts at S0.
+    """
+    plans = None
+    if answers:
+        plans = plans_of(config, setting, answers)
+        prior = GapPrior.fit(plans.token_s)  # type: ignore[arg-type]  # recorded plans have tokens
+    elif config.random and any(policy.learns for policy in config.chosen.values()):
+        count = max(setting.n_skills * setting.tokens_per_skill, 3)  # a spread needs two gaps
+        rng = generator(config.seed, "timeline", "prior", setting.key)
+        prior = GapPrior.fit(board.tokens(count, rng, config.calibration_plans))
+        _, plans = draw(config, board, setting, config.calibration_plans, "calibration")
+    else:
+        prior = GapPrior(1 / board.tokens_per_s, LEAST_CV, LEAST_CV)
+    return Knowledge(prior, plans, config.epsilon, config.guarantee)
+
+
+def plans_of(config: TimelineConfig, setting: Setting, answers: Sequence[Floats]) -> Plans:
+    """Make plans of recorded answers; raises UsageError where too few are long enough."""
+    rng = generator(config.seed, "timeline", "calibration", setting.key)
+    plans = recorded_plans(answers, config.shape(setting), rng)
+    count, tokens = plans.arrival_s.shape[1], setting.n_skills * setting.tokens_per_skill
+    if (count + 1) * config.epsilon < 1:
+        raise UsageError(
+            f"`calibrate`: {count} of {len(answers)} answers have the {tokens} tokens of {setting.name}; "
+            f"`epsilon` {config.epsilon:g} needs {math.ceil(1 / config.epsilon) - 1}"
+        )
+    return plans
+
+
+def draw(config: TimelineConfig, board: Board, setting: Setting, plans: int, purpose: str) -> tuple[Floats, Plans]:
+    """Draw plans and the tokens that they come in; each purpose has random numbers of its own."""
+    rng = generator(config.seed, "timeline", purpose, setting.key)
+    shape = config.shape(setting)
+    token_s = board.tokens(setting.n_skills * setting.tokens_per_skill, rng, plans)
+    return token_s, with_skills(token_s, shape, rng)
+
+
+@dataclass(slots=True)
+class Following:
+    """The policies of one setting, and the trackers of those that follow their lambda, by their names."""
+
+    shape: PlanShape
+    made: Mapping[str, Policy]
+    tracked: dict[str, Tracked] = field(default_factory=dict)
+
+    def policies(self) -> dict[str, Policy]:
+        return {name: self.tracked[name].policy if name in self.tracked else each for name, each in self.made.items()}
+
+    def learn(self, records: Sequence[Record]) -> None:
+        """Learn from a plan that was executed; what did not come whole teaches nothing."""
+        for record in records:
+            plan = observed(record, self.shape)
+            if plan is not None and record.policy in self.tracked:
+                stalled = any(stall_ns > TOLERANCE_S * 1e9 for stall_ns in record.stalls_ns)
+                self.tracked[record.policy].learn(plan, stalled=stalled)
+
+
+def prepare(config: TimelineConfig, shape: PlanShape, prior: GapPrior | None) -> Following:
+    """Tell online policies the prior, and lambda where it was not given: nothing is calibrated here, but tracked."""
+    made, tracked = dict(config.chosen), {}
+    for name, policy in config.chosen.items():
+        made[name] = policy.informed(prior)
+        if _open(policy) and config.track:
+            plans = drawn(made[name].prior, shape, generator(config.seed, "tracking", shape.key), PLANS)
+            tracked[name] = Tracked.begin(made[name], plans, config.epsilon)
+        elif _open(policy):
+            made[name] = policy.informed(prior, CAUTION)
+    return Following(shape, made, tracked)
+
+
+def drawn(prior: GapPrior, shape: PlanShape, rng: np.random.Generator, plans: int) -> Plans:
+    """Draw plans as a prior expects them: lognormal rates and gaps, uniform durations."""
+
+    def lognormal(cv: float, *size: int) -> Any:
+        variance = np.log1p(cv**2)
+        return rng.lognormal(-variance / 2, np.sqrt(variance), size)
+
+    gaps_s = (
+        prior.mean_s
+        * lognormal(prior.plan_cv, plans)
+        * lognormal(prior.token_cv, shape.n_skills * int(shape.tokens_per_skill), plans)
+    )
+    even = replace(shape, expected_cv=min(shape.expected_cv, MOST_CV))
+    return replace(with_skills(np.cumsum(gaps_s, axis=0), even, rng), shape=shape)
+
+
+def prior_of(arrivals_ns: Sequence[Sequence[int]], rate: float | None) -> GapPrior | None:
+    """Learn the gaps from warm-ups; with a set rate but no warm-up only their mean; None where nothing is known."""
+    gaps_s = np.array([float(gap) for times in arrivals_ns for gap in np.diff(times)]) / 1e9
+    if gaps_s.size > 1 and gaps_s.mean() > 0:
+        mean_s = float(gaps_s.mean())
+        return GapPrior(mean_s, PLAN_CV, max(_spread_s(gaps_s) / mean_s, LEAST_CV))
+    return None if rate is None else GapPrior(1 / rate, PLAN_CV, 2 * PLAN_CV)
+
+
+def _spread_s(gaps_s: Floats) -> float:
+    """Return sigma of a gap: of single gaps or, where gaps come in bursts and that says more, from sums over blocks."""
+    size = max(1, round(gaps_s.size**0.5))
+    blocks = gaps_s[: gaps_s.size // size * size].reshape(-1, size).sum(axis=1)
+    of_blocks = float(blocks.std(ddof=1)) / size**0.5 if blocks.size > 1 else 0.0
+    return max(float(gaps_s.std(ddof=1)), of_blocks)

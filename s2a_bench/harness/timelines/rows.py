@@ -1,0 +1,65 @@
+"""Plans as rows: the tokens and skills of those that are kept, in the integers of a run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import numpy as np
+
+from s2a_bench.policy import Floats, Plans, Schedule
+from s2a_bench.policy.metrics import stalls
+from s2a_bench.policy.schedule import align
+from s2a_bench.store.requests import SkillRow, TokenRow
+
+KEPT_PLANS: Final = 10
+"""As many plans of a cell keep their tokens, skills and motion; the others only their metrics."""
+
+
+def skill_rows(
+    cell: str,
+    plans: Plans,
+    schedule: Schedule,
+    request_ids: Sequence[str],
+    *,
+    first_plan: int = 0,
+    texts: Sequence[Sequence[str]] | None = None,
+    due_s: Floats | None = None,
+) -> list[SkillRow]:
+    """List every skill of the plans that are kept; ``texts`` are the calls, a sequence a plan.
+
+    ``due_s``, shape (N, M), says when there was reason to start each skill that was really executed.
+    """
+    arrival_s, nominal_s, least_s, most_s, start_s, duration_s = align(
+        plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s, schedule.start_s, schedule.duration_s
+    )
+    stall_s = np.vstack([np.zeros(start_s.shape[1]), stalls(schedule)])
+    times_s = {
+        "arrival_ns": arrival_s,
+        "start_ns": start_s,
+        "end_ns": start_s + duration_s,
+        "stall_ns": stall_s,
+        "nominal_ns": nominal_s,
+        "least_ns": least_s,
+        "most_ns": most_s,
+        **({} if due_s is None else {"due_ns": due_s}),
+    }
+    rows = []
+    for place, request_id in enumerate(request_ids[: max(KEPT_PLANS - first_plan, 0)]):
+        for index in range(len(start_s)):
+            text = texts[place][index] if texts else ""
+            times_ns = {name: to_ns(each[index, place]) for name, each in times_s.items()}
+            rows.append(SkillRow(cell, request_id, first_plan + place, index, text, **times_ns))
+    return rows
+
+
+def token_rows(cell: str, token_s: Floats, request_ids: Sequence[str]) -> Iterable[TokenRow]:
+    """List every token of the plans that are kept, shape (tokens, M); nobody wrote them, so they have no text."""
+    for place, request_id in enumerate(request_ids[:KEPT_PLANS]):
+        for index, at_s in enumerate(token_s[:, place]):
+            yield TokenRow(request_id, cell, index, -1, "", None, to_ns(at_s))
+
+
+def to_ns(seconds: float) -> int:
+    """Round to nanoseconds."""
+    return round(float(seconds) * 1e9)

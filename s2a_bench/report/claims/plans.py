@@ -1,0 +1,302 @@
+"""What timeline, boundary and CCRB runs are judged by: stalls, ends and S0 of plans, and what becomes of cars."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from math import inf
+from typing import Any, Final
+
+import numpy as np
+
+from s2a_bench.experiments.boundary.rows import BOUNDARY
+from s2a_bench.experiments.boundary.view import grid_of, is_random
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS
+from s2a_bench.experiments.ccrb.view.outcomes import (
+    Share,
+    configuration,
+    has,
+    rollouts_of,
+    scenes_of,
+    share_of,
+    tokens_line,
+)
+from s2a_bench.experiments.paper import PaperThroughput, paper_throughput
+from s2a_bench.experiments.timeline.view.cells import Timelines, timelines_of
+from s2a_bench.plan.skillset import GAPS
+from s2a_bench.policy import Floats, Plans
+from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
+from s2a_bench.provenance import UNKNOWN
+from s2a_bench.report.claims import Check, Met, Need, Part, Trial
+from s2a_bench.report.claims.requests import LIKE, PAPERS_MODEL, change, emulated, exact, facts_of, on_board, one_of
+from s2a_bench.scenario.ccrb.options import CcrbOptions
+from s2a_bench.scenario.ccrb.words import PAPER, SAID, law
+from s2a_bench.stats import Ratio
+from s2a_bench.stats.change import Change
+from s2a_bench.store.run import Run
+
+NAIVE, WAIT, OURS = "naive", "wait-then-act", "stream-to-act"
+RTX, ORIN, NANO = paper_throughput()
+_LENGTHS: Final = ("6", "4", "2", "1")
+_PROMISED: Final = 0.01
+VISIBLE_S: Final = 0.02
+
+
+def listed(name: str, *values: str) -> Need:
+    """Need a fact to list all of these."""
+    return Need(name, ", ".join(dict.fromkeys(values)), lambda found: set(values) <= set(found.split(", ")))
+
+
+def more(name: str, limit: float) -> Need:
+    """Need a fact to be a larger number."""
+    return Need(name, f"more than {limit:g}", lambda found: found > limit)
+
+
+@dataclass(frozen=True)
+class _Or(Need):
+    """A need for one fact, or for all of several others."""
+
+    others: tuple[Need, ...]
+
+    def of(self, facts: Mapping[str, Any]) -> Met:
+        """Look at the facts of a part; where something is missing only that is told."""
+        rows = [Met(f"{self.name}: {facts[self.name]}", met=True)] if self.test(facts[self.name]) else []
+        rows = rows or [need.of(facts) for need in self.others]
+        missing = [row.text for row in rows if not row.met]
+        return Met(", ".join(missing or [row.text for row in rows]), not missing)
+
+
+def timelines(run: Run) -> Iterator[Part]:
+    """Yield the timelines of one source of tokens, N and T_nom: L -> policy -> cell, from long to short skills."""
+
+    def setting(cell: Timelines) -> tuple[str, int, float]:
+        title, _, n_skills, t_nom_s = cell.setting
+        return title, n_skills, t_nom_s
+
+    asked = run.manifest.get("configuration", {})
+    spread, jitter = asked.get("t_nom_cv") or 0.0, asked.get("jitter", "none")
+    for (title, n_skills, t_nom_s), found in groupby(sorted(timelines_of(run), key=setting), key=setting):
+        every = sorted(found, key=lambda cell: -cell.setting[1])
+        cells: dict[int, dict[str, Timelines]] = {}
+        for cell in every:
+            cells.setdefault(cell.setting[1], {})[cell.policy] = cell
+        origins = [run.origins.of(str(cell.about("cell"))) for cell in every]
+        shown = _shown(cells)
+        facts = facts_of(run, origins) | {
+            "tokens/s": float(every[0].about("tokens_per_s")),
+            "N": n_skills,
+            "T_nom": f"{t_nom_s:g} s" + (f", cv {spread:g}" if spread else ""),
+            "L": ", ".join(map(str, cells)),
+            "policies": ", ".join(name for name in cells[max(cells)] if all(name in each for each in cells.values())),
+            "stall of naive in s": max([0.0, *(_stall_s(each[NAIVE]) for each in cells.values() if NAIVE in each)]),
+            "S0 after the first arrival in s": max(
+                [0.0, *(float(safe_start(arrival, nominal)[0] - arrival[0, 0]) for arrival, nominal, *_ in shown)]
+            ),
+            "T_max / T_nom": max((float((most / nominal).max()) for _, nominal, _, most in shown), default=1.0),
+            "promised": min(float(asked.get("epsilon") or _PROMISED), _PROMISED),
+            "exact": asked.get("jitter") == "none"
+            and not spread
+            and all(cell.about("mode") == "virtual" for cell in every),
+        }
+        lines = "; ".join(dict.fromkeys(origin.line for origin in origins))
+        gaps = "" if jitter == "none" else f", jitter {jitter}, {every[0].n} plans a cell"
+        assumed = "an assumption: the paper gives neither N nor T_nom"
+        yield Part(run, facts, cells, f"{title}, N = {n_skills}, T_nom = {t_nom_s:g} s ({assumed}){gaps}; {lines}.")
+
+
+def _shown(cells: Mapping[int, Mapping[str, Timelines]]) -> list[tuple[Floats, ...]]:
+    """Return arrivals, nominal, least and most durations of the shown plan of each L, as columns in s."""
+    columns = ("arrival_ns", "nominal_ns", "least_ns", "most_ns")
+    every = [next(iter(of_length.values())).skills for of_length in cells.values()]
+    return [
+        tuple(skills[name].to_numpy(dtype="float64")[:, None] / 1e9 for name in columns)
+        for skills in every
+        if len(skills) > 1
+    ]
+
+
+def _stall_s(cell: Timelines) -> float:
+    return cell.mean("stall_s") or 0.0
+
+
+SEVERAL: Final = Need("L", "two or more", lambda found: ", " in found), more("stall of naive in s", VISIBLE_S)
+WAITS: Final = more("S0 after the first arrival in s", VISIBLE_S)
+ROOM: Final = more("T_max / T_nom", 1)
+
+
+def figure_5(board: PaperThroughput, *policies: str) -> Trial:
+    """Return the trial of a board: tokens at table II's rate, or of the paper's model on it, and all four L."""
+    profile, rate = board.name.lower().replace(" ", "-"), board.tokens_per_s
+    like = Need("tokens/s", f"within {LIKE:.0%} of {rate:g}", lambda found: abs(found / rate - 1) <= LIKE)
+    measured = on_board(board.name), *PAPERS_MODEL, like
+    either = f"{emulated(profile, rate)}; or {', '.join(f'{need.name} {need.wanted}' for need in measured)}"
+    source = _Or("source", either, emulated(profile, rate).__eq__, measured)
+    reading = Need("N", "2 or more", lambda found: found > 1), one_of("T_nom", "1 s")
+    needs = source, listed("L", *_LENGTHS), listed("policies", *policies), *reading
+    return Trial(f"s2a-bench timeline --profile {profile}", timelines, needs)
+
+
+def no_stalls(*policies: str) -> Check:
+    """Check that no more plans stall at any L than is promised: epsilon, but no promise of more than 1 % counts."""
+
+    def measure(part: Part) -> tuple[list[Ratio], str]:
+        promised, even = part.facts["promised"], part.facts["exact"]
+        cells = [of_length[policy] for of_length in part.cells.values() for policy in policies]
+        found, stalled = [], []
+        for cell in cells:
+            share = Share(round(cell.p_any_stall * cell.n), cell.n)
+            low, high = (share.value, share.value) if even else share.interval
+            found.append(Ratio(share.value / promised, low / promised, high / promised))
+            if share.k or high > promised:
+                spread = "" if even else f" [{low:.1%}, {high:.1%}]"
+                many = f"{share.k} of {share.n} plans stall{spread}, {_stall_s(cell):.2f} s in the mean"
+                stalled.append(f"{cell.policy} at L = {cell.setting[1]}: {many}")
+        said = "; ".join(stalled) or f"{', '.join(policies)}: no plan stalls"
+        regrets = [cell.mean("signed_start_regret") for cell in cells if cell.policy == OURS]
+        starts = [late for late in regrets if late is not None]
+        late = f" Stream-to-act starts at S0 {_signed(min(starts))} to {_signed(max(starts))}." if starts else ""
+        return found, f"{said}; promised: at most {promised:.1%}.{late}"
+
+    return Check("{}", measure, 0, 1)
+
+
+def after(policy: str, than: str, metric: str, least: float = -inf, most: float = inf) -> Check:
+    """Check how much later a policy's mean start or end is than that of another at every L, as a ratio."""
+
+    def measure(part: Part) -> tuple[list[Ratio], str]:
+        found = [_compared(part, cells[policy], cells[than], metric) for cells in part.cells.values()]
+        shares = ["" if each.ratio.value is None else f" ({_signed(each.ratio.value - 1)})" for each in found]
+        shifts = [round(each.difference.value or 0.0, 2) + 0.0 for each in found]
+        texts = [f"{shift:+.2f} s{share}" for shift, share in zip(shifts, shares, strict=True)]
+        return [each.ratio for each in found], _at(part, texts)
+
+    return Check(f"{policy}'s {metric.removesuffix('_s')} after {than}'s: {{}}.", measure, least, most)
+
+
+def stalled_gaps(part: Part) -> tuple[list[Ratio], str]:
+    """Measure the share of the gaps between skills that are stalls under naive, at every L."""
+    cells = [of_length[NAIVE] for of_length in part.cells.values()]
+    shares = [(cell.mean("stalls") or 0.0) / (cell.setting[2] - 1) for cell in cells]
+    return list(map(exact, shares)), _at(part, [f"{share:.0%}" for share in shares])
+
+
+def growth(part: Part) -> tuple[list[Ratio], str]:
+    """Measure by how much longer naive stalls at each larger L, from the first that stalls on."""
+    cells = [of_length[NAIVE] for _, of_length in sorted(part.cells.items())]
+    steps = [pair for pair in pairwise(cells) if max(map(_stall_s, pair)) > VISIBLE_S]
+    said = f"{', '.join(f'{_stall_s(cell):.2f}' for cell in cells)} s at L = {', '.join(map(str, sorted(part.cells)))}"
+    return [_compared(part, more, less, "stall_s").difference for less, more in steps], said
+
+
+def early_stalls(part: Part) -> tuple[list[Ratio], str]:
+    """Start at five times before S0, T_nom being kept: how far stalls are from what is missing to S0 (theorem T1)."""
+    off_s = []
+    for arrival, nominal, *_ in _shown(part.cells):
+        safe_s, first_s = float(safe_start(arrival, nominal)[0]), float(arrival[0, 0])
+        starts = first_s + (safe_s - first_s) * np.array([0, 0.25, 0.5, 0.75, 0.95])
+        begun = work_conserving(np.repeat(arrival, len(starts), axis=1), nominal, starts)
+        off_s += [*np.abs(begun[-1] - begun[0] - nominal[:-1].sum() - (safe_s - starts))]
+    return [exact(float(max(off_s)))], f"{len(off_s)} earlier starts tried, off by {max(off_s):.1e} s"
+
+
+def stretched(part: Part) -> tuple[list[Ratio], str]:
+    """Measure how much before S0 a plan may start without a stall, with the extension that the paper allows."""
+    found = []
+    for arrival, nominal, least, most in _shown(part.cells):
+        start_s = float(elastic(Plans(arrival, nominal, np.minimum(least, nominal), most)).start_s[0, 0])
+        safe_s = float(safe_start(arrival, nominal)[0])
+        found.append((safe_s - start_s, f"{start_s:.2f} s instead of S0 = {safe_s:.2f} s"))
+    early_s, said = max(found)
+    return [exact(early_s)], said
+
+
+def _at(part: Part, texts: Sequence[str]) -> str:
+    return ", ".join(f"{text} at L = {length}" for text, length in zip(texts, part.cells, strict=True))
+
+
+def _signed(share: float) -> str:
+    """Write a share with its sign; nothing is +0.0%."""
+    return f"{round(share, 3) + 0.0:+.1%}"
+
+
+def _compared(part: Part, above: Timelines, below: Timelines, metric: str) -> Change:
+    """Compare a metric's mean; plan by plan where both ran the same plans."""
+    one, other = above.values(metric), below.values(metric)
+    same = above.setting == below.setting and len(one) == len(other)
+    return change(one, other, part.run.bootstrap_seed, paired=same, exact=part.facts["exact"])
+
+
+def plane(run: Run) -> Iterator[Part]:
+    """Yield a run of points of rate and tokens a skill."""
+    if not run.table(BOUNDARY).empty:
+        least = float(run.manifest.get("configuration", {}).get("t_min", 1.0))
+        yield Part(run, {"tokens": "with jitter" if is_random(run) else "evenly", "T_min / T_nom": least})
+
+
+EVENLY: Final = Need("tokens", "evenly: with jitter no line separates the regions", lambda found: found == "evenly")
+SHORTER: Final = Need("T_min / T_nom", "less than 1, else both have the same line", lambda found: found < 1)
+
+
+def stalls_at(side: str, part: Part) -> tuple[list[Ratio], str]:
+    """Measure at which share of the points above or below R = L / T_min skills that run for T_nom stall, as naive's."""
+    least_s = float(grid_of(part.run, "t_min")["duration_s"].iloc[0])
+    points = grid_of(part.run, "t_nom")
+    points = points[(points["tokens_per_s"] >= points["tokens_per_skill"] / least_s) == (side == "above")]
+    stalls = int((points["p_stall"] > 0).sum())
+    found = [] if points.empty else [exact(stalls / len(points))]
+    return found, f"{stalls} of {len(points)} points {side} R = L/T_min ({least_s:g} s)"
+
+
+CHOSEN: Final[dict[str, Any]] = {
+    "profile": "jetson-agx-orin",
+    "rate": None,
+    "prompt_s": None,
+    "tokens_per_skill": 6,
+    "simulator": "longitudinal",
+    "phase_rates": [2.0, 12.0],
+    "phase_gaps_m": [6.0, 30.0],
+}
+"""The defaults of `s2a-bench ccrb` besides the scenario's: a test holds them together."""
+_SPANS: Final = ("phase_rates", "phase_gaps_m")
+_VARIED: Final = ("rear_gap_m", "gap")
+"""What the diagram varies itself; its c is the board's."""
+
+
+def drives(run: Run) -> Iterator[Part]:
+    """Yield a run of drives, with the settings that are not those of the chosen point or diagram."""
+    asked, scenario, rows = run.manifest.get("configuration", {}), CcrbOptions(), run.table(ROLLOUTS)
+    wanted = {**scenario.to_manifest(), "t_nom_s": scenario.durations.nominal_s, **CHOSEN}
+    other = {name: found for name in wanted if (found := asked.get(name, UNKNOWN)) != wanted[name]}
+    facts = {name: ", ".join(dict.fromkeys(rows[name])) for name in ("study", "policy")}
+    for name, free in (("point", _SPANS), ("diagram", _VARIED)):
+        facts[name] = ", ".join(f"{key} {found}" for key, found in other.items() if key not in free) or "as chosen"
+    yield Part(run, facts_of(run, run.origins.every) | facts)
+
+
+BOARD: Final = one_of("source", emulated("jetson-agx-orin", ORIN.tokens_per_s))
+
+
+def outcome(policy: str, part: Part) -> tuple[list[Ratio], str]:
+    """Say what becomes of the cars under one policy at the chosen point, and how far that carries."""
+    rows, asked = rollouts_of(part.run, "point"), configuration(part.run)
+    row = rows[rows["policy"] == policy].iloc[0]
+    speed = "" if row["outcome"] == "none" else f" at {row['impact_speed_mps']:.1f} m/s"
+    share = "its share of the diagram: run with --phase"
+    if has(part.run, "phase"):
+        found = share_of(scenes_of(part.run, "phase", asked["gap"]), "paper").value
+        share = f"the paper's outcomes of all three policies hold at {found:.1%} of the diagram"
+    point = f"R = {row['tokens_per_s']:g}, front gap {asked['front_gap_m']:g} m, rear gap {asked['rear_gap_m']:g} m"
+    said = f"{SAID[str(row['outcome'])]}{speed}; {share}. {tokens_line(part.run)} {point}, gap behaviour {asked['gap']}"
+    return [exact(float(row["outcome"] == PAPER[policy]))], f"{said}; {law(asked)}"
+
+
+def worse(policy: str, part: Part) -> tuple[list[Ratio], str]:
+    """Measure at how much more of the phase diagram a policy is worse than stream-to-act than it is better."""
+    found, said = [], []
+    for gap in GAPS:
+        scenes = scenes_of(part.run, "phase", gap)
+        bad, good = (share_of(scenes, f"{policy.partition('-')[0]}_{side}").value for side in ("worse", "better"))
+        found.append(exact(bad - good) if bad != good else Ratio(0.0, -1.0, 1.0))  # as many: neither more nor fewer
+        said.append(f"{gap} {bad:.0%} worse and {good:.0%} better")
+    return found, ", ".join(said)

@@ -1,0 +1,242 @@
+"""What latency and throughput runs are judged by: facts of machine and model, stages of requests, tokens a second."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from typing import Any, Final
+
+import numpy as np
+
+from s2a_bench.experiments.paper import PaperThroughput
+from s2a_bench.experiments.requests import Cell, cells_of
+from s2a_bench.experiments.throughput.metrics import throughput_cells
+from s2a_bench.policy import Floats
+from s2a_bench.provenance import NONE, UNKNOWN, Provenance
+from s2a_bench.report.claims import Need, Part
+from s2a_bench.stats import Ratio, summarise, summary_of
+from s2a_bench.stats.change import Blocks, Change, change_between, ratio_of_launches
+from s2a_bench.store.run import Run
+from s2a_bench.transport import EXTERNAL, PROGRAM, declared
+from s2a_bench.writers.tables import interval, mean_sd
+
+_MODEL: Final = "MiniCPM-V 2.6"
+_MODEL_NAMES: Final = re.compile("minicpmv?26")
+"""As files and headers have it, letters and digits only; the paper writes MiniCPM-2.6."""
+_LAYERS: Final = 28
+"""Of that model: with as many or more asked for, all are on the GPU."""
+LIKE: Final = 0.10
+"""Means within this share of the paper's are called the same: it gives no spread from machine to machine."""
+_METRIC: Final = "e2e_without_inference"
+_HTTP, _BINARY, _LLAMA_SERVER, _ROS = "http/as-deployed", "http/binary", "http/llama-server", "ros"
+_NAMES: Final = ("engine", "model", "quantisation")
+"""What llama-server is called, and our engine on the same file."""
+_LAUNCHES: Final = 3
+_SMALL: Final = 50_000
+
+
+def one_of(name: str, *values: str) -> Need:
+    """Need a fact to be one of these texts."""
+    return Need(name, " or ".join(values), lambda found: found in values)
+
+
+def on_board(board: str) -> Need:
+    """Need a run to be measured on the board of that name; another word behind it would make it another one."""
+    name = re.escape(board.removeprefix("Jetson "))
+    known = re.compile(rf"(?<!\S){name}(?![^\s,])(?! (?:super|laptop)\b)", re.IGNORECASE)
+    return Need("board", board, lambda found: bool(known.search(found)))
+
+
+PAPERS_MODEL: Final = (
+    one_of("model", _MODEL),
+    one_of("weights", "real"),
+    one_of("processor", "all layers on the GPU"),
+    one_of("tokens", "measured"),
+)
+"""What a claim about a model needs; an unknown provenance meets none of it."""
+
+
+def facts_of(run: Run, origins: Sequence[Provenance]) -> dict[str, Any]:
+    """Return machine, model and where its numbers come from; what nobody told is unknown."""
+    facts, model = run.manifest.get("environment", {}), run.manifest.get("model") or {}
+    gpus = " + ".join(str(gpu.get("name")) for gpu in facts.get("gpus", []))
+    told = {
+        name: ", ".join(filter(None, dict.fromkeys(getattr(origin, name) for origin in origins))) or UNKNOWN
+        for name in ("model", "weights", "tokens", "quantisation", "link")
+    }
+    names = re.sub(r"[^a-z0-9]", "", f"{told['model']} {model.get('model')}".lower())
+    return told | {
+        "board": ", ".join(filter(None, (facts.get("board"), facts.get("cpu"), gpus))) or "a machine that is not known",
+        "model": _MODEL if _MODEL_NAMES.search(names) else told["model"],
+        "processor": _processor(model, {origin.model_sha256 for origin in origins}),
+        "source": _source(run, origins),
+    }
+
+
+def _processor(model: Mapping[str, Any], answered: set[str]) -> str:
+    """Return where the layers of the model are; unknown where it is not the one that answered."""
+    layers, offload = model.get("gpu_layers"), model.get("gpu_offload_supported")
+    if not isinstance(layers, int) or offload is None or answered - {model.get("model_sha256")}:
+        return UNKNOWN
+    return f"{'all' if layers < 0 or layers >= _LAYERS else layers} layers on the GPU" if offload and layers else "CPU"
+
+
+def _source(run: Run, origins: Sequence[Provenance]) -> str:
+    """Return which of the paper's boards is emulated, with its rate; else where tokens come from."""
+    profiles = {origin.profile if origin.emulated else "" for origin in origins}
+    for board in run.manifest.get("boards", []):
+        if board.get("origin") == "paper" and {board["name"]} == profiles:
+            return emulated(board["name"], board["tokens_per_s"])
+    return "; ".join(dict.fromkeys(origin.line for origin in origins)) or UNKNOWN
+
+
+def emulated(profile: str, rate: float) -> str:
+    """Return whose tokens are emulated at the paper's rate."""
+    return f"EMULATED after {profile}, {rate:g} tokens/s of table II"
+
+
+def exact(value: float) -> Ratio:
+    """Return a value that was computed, not sampled."""
+    return Ratio(value, value, value)
+
+
+def change(over: Floats, base: Floats, seed: int, *, paired: bool = False, exact: bool = False) -> Change:
+    """Compare the means of two sides in order of time; ``paired`` where row i of both belongs together."""
+    return change_between([[*base[:, None]]], [[*over[:, None]]], "mean", seed=seed, paired=paired, exact=exact)
+
+
+def pairs(run: Run) -> Iterator[Part]:
+    """Yield HTTP as usually deployed, or llama-server, with ROS: every cell of one with every cell of the other."""
+    cells = cells_of(run)
+    https = [cell for cell in cells if "/".join(cell.path) in {_HTTP, _LLAMA_SERVER}]
+    for pair in product(https, [cell for cell in cells if cell.pipeline == _ROS]):
+        facts = {
+            "both sides": _unlike(run, pair) or "alike",
+            "servers": _others(run, pair) or "started by the run",
+            "launches": sum(map(bool, _blocks(pair)[0].values())),
+            "stages": "".join(f"hidden by {cell.name}" for cell in pair if cell.has_ingest) or "seen",
+        }
+        found = [(cell.name, summary_of(cell.values_ms(_metric(pair)))) for cell in pair]
+        times = ", ".join(f"{name} {mean_sd(each)} ms" for name, each in found if each)
+        yield _pair(run, pair, facts, f"{times} (mean ± sd, n = {pair[0].n}).")
+
+
+def bodies(run: Run) -> Iterator[Part]:
+    """Yield HTTP with Base64 and without, of the same payload and size."""
+    cells = [cell for cell in cells_of(run) if cell.good["payload_bytes"].notna().any()]
+    coded, plain = ([cell for cell in cells if "/".join(cell.path) == path] for path in (_HTTP, _BINARY))
+    for pair in product(coded, plain):
+        if all(pair[0].about[name] == pair[1].about[name] for name in ("payload", "size")):
+            texts = ", ".join(f"{cell.name} {_bytes(cell):,.0f} bytes" for cell in pair)
+            yield _pair(run, pair, {"bytes a picture": round(_bytes(pair[1]))}, f"{texts}.")
+
+
+def _pair(run: Run, pair: tuple[Cell, Cell], facts: dict[str, Any], about: str) -> Part:
+    told = {name: " and ".join(dict.fromkeys(cell.about[name] for cell in pair)) for name in ("mode", "payload")}
+    return Part(run, facts_of(run, [run.origins.of(cell.name) for cell in pair]) | told | facts, pair, about)
+
+
+def _unlike(run: Run, pair: tuple[Cell, Cell]) -> str:
+    """Return in what frames and engines differ; llama-server on the file of our engine counts as that engine."""
+    http, ros = (run.origins.of(cell.name).to_dict() | {"size": cell.about["size"]} for cell in pair)
+    engines = http["engine"], ros["engine"]
+    same_file = engines == ("llama-server", "llama") and http["model_sha256"] == ros["model_sha256"] != ""
+    both = {name: dict.fromkeys((http[name] or NONE, value or NONE)) for name, value in ros.items()}
+    return ", ".join(
+        f"{name} {' and '.join(found)}"
+        for name, found in both.items()
+        if (len(found) > 1 or UNKNOWN in found) and not (same_file and name in _NAMES)
+    )
+
+
+def _others(run: Run, pair: tuple[Cell, Cell]) -> str:
+    """Return which servers the run did not start, and what names them."""
+    pipelines = run.manifest.get("configuration", {}).get("pipelines", {})
+    found = [f"{cell.name} {UNKNOWN}" for cell in pair if cell.name not in pipelines]
+    for cell in pair:
+        external = declared(cell.pipeline).options.of_sides(EXTERNAL, PROGRAM)
+        named = {name for name in external if pipelines.get(cell.name, {}).get(name)}
+        found += [f"{cell.name} by {name}" for name in sorted(named - {"llama_server"})]
+    return ", ".join(found)
+
+
+REQUESTS: Final = one_of("mode", "request")
+COMPARED: Final = (
+    REQUESTS,
+    one_of("payload", "jpeg-preencoded and raw", "jpeg-preencoded and yuyv"),
+    one_of("link", "real"),
+    Need("both sides", "alike: engine, model, size; llama-server and llama are, on the same file", "alike".__eq__),
+    one_of("servers", "started by the run"),
+    Need("launches", f"{_LAUNCHES} or more", lambda found: found >= _LAUNCHES),
+)
+"""What a pair of HTTP/JSON and ROS has to be."""
+LARGE: Final = Need("bytes a picture", f"{_SMALL} or more, by a larger --size", lambda found: found >= _SMALL)
+
+
+def times_as_long(part: Part) -> tuple[list[Ratio], str]:
+    """Measure how much longer HTTP takes in the mean, launch by launch and block by block."""
+    ratio = ratio_of_launches(*_blocks(part.cells), part.run.bootstrap_seed, "mean") or Ratio(None, None, None)
+    return [ratio], interval(ratio)
+
+
+def times_as_large(part: Part) -> tuple[list[Ratio], str]:
+    """Measure how much larger bodies are with Base64, in the mean."""
+    ratio = _bytes(part.cells[0]) / _bytes(part.cells[1])
+    return [exact(ratio)], f"{ratio:.4f}"
+
+
+def shares(side: int, groups: Mapping[str, Sequence[str]], part: Part) -> tuple[list[Ratio], str]:
+    """Measure what share of the time of one side, inference left out, groups of stages take."""
+    cell: Cell = part.cells[side]
+    whole, seed = cell.values_ms(_METRIC), part.run.bootstrap_seed
+    spent = {stage: _spent(cell, [stage]).sum() for stage, of in cell.stages.items() if of != "inference"}
+    parts = [_spent(cell, stages) for stages in groups.values()]
+    found = [change(each, whole, seed, paired=True).ratio if each.any() else exact(0.0) for each in parts]
+    spread = ["" if each.low is None else f" [{each.low:.0%}, {each.high:.0%}]" for each in found]
+    texts = [f"{each.value or 0:.0%}{more}{said}" for each, more, said in zip(found, spread, groups, strict=True)]
+    return found, f"{', '.join(texts)} of {cell.name}; the longest stage is {max(spent, key=spent.__getitem__)}"
+
+
+def _spent(cell: Cell, stages: Sequence[str]) -> Floats:
+    """Return what stages took together, one value a sample that has the metric, in ms."""
+    good = cell.good[cell.good[f"{_METRIC}_ns"].notna()]
+    names = [f"{stage}_ns" for stage in stages if f"{stage}_ns" in good]
+    spent: Floats = good[names].fillna(0).sum(axis=1).to_numpy(dtype="float64") / 1e6
+    return spent
+
+
+def _bytes(cell: Cell) -> float:
+    return float(cell.good["payload_bytes"].dropna().mean())
+
+
+def _metric(pair: Sequence[Cell]) -> str:
+    """Return what is compared: the `ingest` of a llama-server has work in it that our engine counts as inference."""
+    return "e2e_without_model" if any(cell.has_ingest for cell in pair) else _METRIC
+
+
+def _blocks(pair: Sequence[Cell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
+    """Return the values of both sides by launch and block, without the blocks that one side lacks."""
+    sides = [cell.by_launch(_metric(pair)) for cell in pair]
+    both = {launch: sides[0][launch].keys() & sides[1][launch].keys() for launch in sides[0].keys() & sides[1].keys()}
+    http, ros = ({launch: {block: side[launch][block] for block in both[launch]} for launch in both} for side in sides)
+    return http, ros
+
+
+def speeds(run: Run) -> Iterator[Part]:
+    """Yield every cell that has a rate."""
+    for speed in throughput_cells(run):
+        if speed.values("tokens_per_s").size:
+            told = {"T_eval": "the engine's" if speed.told else "the client's"}
+            yield Part(run, facts_of(run, [run.origins.of(speed.name)]) | told, speed)
+
+
+KNOWN: Final = Need("quantisation", "known (the paper does not say which it used)", lambda found: found != UNKNOWN)
+
+
+def speed_over(board: PaperThroughput, part: Part) -> tuple[list[Ratio], str]:
+    """Measure tokens a second over those of the paper's board."""
+    values = part.cells.values("tokens_per_s")
+    found = change(values, np.full(len(values), board.tokens_per_s), part.run.bootstrap_seed)
+    rate = summarise(values)
+    return [found.ratio], f"{part.cells.name}: {mean_sd(rate)} tokens/s (n = {rate.n})"

@@ -1,0 +1,302 @@
+"""Topics and services over Zenoh as rmw_zenoh has them.
+
+Topics are CDR with an attachment; latched ones are cached by their publisher. A service is a complete queryable, which
+answers queries under the asker's name.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+from weakref import ref
+
+import zenoh
+from zenoh import ext
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import TransportError
+from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, QoS
+from s2a_bench.ros import zenoh_names as names
+from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
+from s2a_bench.ros.zenoh_node import Bell, Inbox, Node, direct, give_way, refusals
+
+CACHED_AT_MOST: Final = 1000
+"""What a latched topic that keeps all keeps."""
+SMALL_BYTES: Final = 16 * REQUEST_BYTES
+"""So much of a service's requests may wait, where they hold no pictures."""
+ANSWER_S: Final = 86_400.0
+"""A query may wait so long for its reply, as that for a goal's result does; whoever calls waits less."""
+
+_log = logging.getLogger(__name__)
+
+
+class ZenohPublisher:
+    """Sends messages of one type to one topic; callable from any thread."""
+
+    def __init__(self, node: Node, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION) -> None:
+        """Declare the publisher of ``/topic``, then announce it."""
+        self._node, self._topic, self._type_name, self._version = node, topic, type_name, version
+        key = node.key(topic, type_name, version)
+        how: dict[str, Any] = {
+            "congestion_control": getattr(zenoh.CongestionControl, "BLOCK" if qos.reliable else "DROP"),
+            "reliability": getattr(zenoh.Reliability, "RELIABLE" if qos.reliable else "BEST_EFFORT"),
+            "express": True,
+        }
+        with refusals(topic):
+            if qos.latched:
+                cache = ext.CacheConfig(qos.depth or CACHED_AT_MOST)
+                self._publisher: Any = ext.declare_advanced_publisher(
+                    node.session, key, cache=cache, publisher_detection=True, **how
+                )
+            else:
+                self._publisher = node.session.declare_publisher(key, **how)
+        self._latched = qos.latched
+        self._seen = node.announce(names.PUBLISHER, topic, type_name, version, qos)
+
+    def pack(self, message: Any) -> bytearray:
+        return serialise(message, self._type_name, self._version, padded=False)
+
+    def send(self, packed: bytearray) -> None:
+        """Put, without holding the GIL while a link is busy."""
+        with refusals(self._topic):
+            self._publisher.put(packed, attachment=self._seen.attachment())
+        give_way()
+
+    def matched(self) -> int:
+        """Count the subscriptions that are announced, once the router has told that there are any."""
+        with refusals(self._topic):
+            if not (self._latched or self._publisher.matching_status.matching):
+                return 0
+        return self._node.matching(names.SUBSCRIPTION, self._seen.entity)
+
+
+class ZenohSubscription:
+    """Receives messages of one type from one topic, on the consuming thread."""
+
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        type_name: str,
+        qos: QoS,
+        version: str = DEFAULT_VERSION,
+        bell: Bell | None = None,
+    ) -> None:
+        """Declare the subscriber of ``/topic``, then announce it; ``bell`` is rung by what arrives."""
+        self._node, self.topic, self._type_name, self._version = node, topic, type_name, version
+        self._oldest_ns = round(qos.lifespan_s * 1e9)
+        self._said = False
+        self._bell = bell or Bell()
+        self._inbox: Inbox[Any] = Inbox(topic, self._bell, qos.depth)
+        self.interrupt = self._bell.interrupt
+        self._subscriber = self._declared(node.key(topic, type_name, version), qos)
+        self._seen = node.announce(names.SUBSCRIPTION, topic, type_name, version, qos)
+
+    def _declared(self, key: str, qos: QoS) -> Any:
+        """Declare what fills the inbox; of a latched topic also with what its publishers keep."""
+        held = ref(self._inbox)  # Zenoh keeps the callback for as long as the session lives
+
+        def put(sample: Any) -> None:
+            if sample.kind == zenoh.SampleKind.PUT and (kept := held()) is not None:
+                kept.put(sample, len(sample.payload))
+
+        with refusals(self.topic):
+            if not qos.latched:
+                return self._node.session.declare_subscriber(key, direct(put))
+            history = ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth or CACHED_AT_MOST)
+            return ext.declare_advanced_subscriber(
+                self._node.session, key, direct(put), history=history, subscriber_detection=True
+            )
+
+    def take(self, timeout_s: float) -> memoryview | None:
+        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        while not self._bell.interrupted:
+            sample = self._inbox.take()
+            if sample is None:
+                if not self._bell.wait_until(deadline_ns):
+                    return None
+            elif self._wanted(sample):
+                return memoryview(sample.payload.to_bytes())
+        return None
+
+    def _wanted(self, sample: Any) -> bool:
+        """Whether a sample is a message of ROS's, and young enough; what is none is told once."""
+        try:
+            _, source_ns, _ = names.attached(sample.attachment.to_bytes() if sample.attachment else b"")
+        except TransportError as error:
+            if not self._said:
+                self._said = True
+                _log.warning("%s: dropped a message: %s", self.topic, error)
+            return False
+        return not self._oldest_ns or time.time_ns() - source_ns <= self._oldest_ns
+
+    def arrived(self) -> Any:
+        return (memoryview(sample.payload.to_bytes()) for sample in self._inbox.arrived() if self._wanted(sample))
+
+    def unpack(self, packed: memoryview) -> Any:
+        return deserialise(packed, self._type_name, self._version)
+
+    def announced(self) -> bool:
+        """Return whether the type has a publisher, even one of another version, which does not reach us."""
+        return any(True for _ in self._node.peers(names.PUBLISHER, self._seen.entity))
+
+    def publishers(self) -> int:
+        """Count the publishers that are announced under the topic's name, those of other types too."""
+        return self._node.named(names.PUBLISHER, self._seen.entity)
+
+    def matched(self) -> int:
+        return self._node.matching(names.PUBLISHER, self._seen.entity)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Who asked: a query, and what of its attachment goes back with the reply."""
+
+    query: zenoh.Query
+    sequence: int
+    gid: bytes
+
+
+class ServiceServer:
+    """The server's side of one service."""
+
+    body_at = CDR_HEADER
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        type_name: str,
+        version: str,
+        bell: Bell,
+        qos: QoS = SERVICE_QOS,
+        most_bytes: int = SMALL_BYTES,
+    ) -> None:
+        """Declare the queryable of ``/name``, then announce it; ``bell`` is rung by what arrives.
+
+        Requests of ``most_bytes`` together may wait, with 0 as many as an inbox holds.
+        """
+        self.type_name = type_name
+        self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
+        self._name, self._version = name, version
+        self._key = node.key(name, type_name, version)
+        self._inbox: Inbox[zenoh.Query] = Inbox(name, bell, most_bytes=most_bytes)
+        self._said = False
+        held = ref(self._inbox)
+
+        def put(query: zenoh.Query) -> None:
+            inbox = held()
+            if inbox is None or not inbox.put(query, len(query.payload or b"")):
+                query.drop()
+
+        with refusals(name):
+            self._queryable = node.session.declare_queryable(self._key, direct(put), complete=True)
+        self.seen = node.announce(names.SERVICE, name, type_name, version, qos)
+
+    def arrived(self) -> Iterator[tuple[memoryview, Asked]]:
+        """Take what has arrived, a bounded number; a query that rmw_zenoh would not make is dropped, and told once."""
+        for query in self._inbox.arrived():
+            payload, attachment = query.payload, query.attachment
+            try:
+                sequence, _, gid = names.attached(attachment.to_bytes() if attachment else b"")
+            except TransportError as error:
+                query.drop()
+                if not self._said:
+                    self._said = True
+                    _log.warning("%s: dropped a request: %s", self._name, error)
+            else:
+                yield memoryview(payload.to_bytes() if payload else b""), Asked(query, sequence, gid)
+
+    def drop(self, caller: Asked) -> None:
+        caller.query.drop()
+
+    def pack(self, body: Any) -> bytearray:
+        return serialise(body, self.reply_type, self._version, padded=False)
+
+    def unpack(self, packed: memoryview) -> Any:
+        return deserialise(packed, self.request_type, self._version)
+
+    def reaches(self, caller: Asked) -> bool:  # noqa: ARG002 - a query knows its way back
+        """Return True: who has left is not waited for."""
+        return True
+
+    def respond(self, packed: bytearray, caller: Asked) -> None:
+        """Reply, and end the query."""
+        attachment = names.attachment(caller.sequence, caller.gid)
+        with refusals(self._name):
+            try:
+                caller.query.reply(self._key, packed, attachment=attachment, express=True)
+            finally:
+                caller.query.drop()
+        give_way()
+
+
+class ServiceClient:
+    """The client's side of one service."""
+
+    body_at = CDR_HEADER
+
+    def __init__(self, node: Node, name: str, type_name: str, version: str, bell: Bell) -> None:
+        """Declare the querier of ``/name``, then announce it; ``bell`` is rung by what arrives."""
+        self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
+        self.hashed_type = type_name
+        self._node, self._name, self._version = node, name, version
+        self._inbox: Inbox[tuple[bytes, Any]] = Inbox(name, bell)
+        with refusals(name):
+            self._querier = node.session.declare_querier(
+                node.key(name, type_name, version),
+                target=zenoh.QueryTarget.ALL_COMPLETE,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=ANSWER_S,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                express=True,
+            )
+        self._seen = node.announce(names.CLIENT, name, type_name, version, SERVICE_QOS)
+
+    def pack(self, body: Any) -> bytearray:
+        return serialise(body, self.request_type, self._version, padded=False)
+
+    def unpack(self, packed: memoryview) -> Any:
+        return deserialise(packed, self.reply_type, self._version)
+
+    def call(self, packed: bytearray, goal_id: bytes) -> None:
+        """Send a request that concerns ``goal_id``; the first reply to it counts."""
+        held = ref(self._inbox)
+        answered: list[bool] = []
+
+        def put(reply: zenoh.Reply) -> None:
+            inbox = held()
+            if inbox is not None and reply.ok is not None and not answered:
+                answered.append(True)
+                inbox.put((goal_id, reply.ok.payload), len(reply.ok.payload))
+
+        def end() -> None:
+            inbox = held()
+            if inbox is not None and not answered:
+                inbox.put((goal_id, None), 0)
+
+        with refusals(self._name):
+            handler = zenoh.handlers.Callback(put, end, indirect=False)
+            self._querier.get(handler, payload=packed, attachment=self._seen.attachment())
+        give_way()
+
+    def replies(self) -> Iterator[tuple[bytes, memoryview | None]]:
+        for key, payload in self._inbox.arrived():
+            yield key, None if payload is None else memoryview(payload.to_bytes())
+
+    def matched(self) -> bool:
+        """Return whether a server is there: one of our version that is reached, or only others."""
+        hashes = [*self._node.peers(names.SERVICE, self._seen.entity)]
+        if self._seen.entity.type_hash in hashes:
+            with refusals(self._name):
+                return bool(self._querier.matching_status.matching)
+        return bool(hashes)
+
+    def peer_type_hash(self) -> str:
+        """Return the type hash that a server announces, ours rather than another; empty without one."""
+        hashes = {*self._node.peers(names.SERVICE, self._seen.entity)} - {names.NO_HASH}
+        own = self._seen.entity.type_hash
+        return own if own in hashes else next(iter(hashes), "")

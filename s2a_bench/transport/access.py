@@ -1,0 +1,69 @@
+"""Access to the servers that a browser can reach, HTTP and WebSocket: decided by the headers, before a body is read.
+
+A page in a browser on this machine reaches servers on loopback, too. Its requests carry `Origin`, or, where its own
+name has been made to mean this machine (DNS rebinding), that name as `Host`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from http import HTTPStatus
+from ipaddress import ip_address
+from typing import Final
+
+from s2a_bench.options import option
+from s2a_bench.transport import SERVING
+from s2a_bench.transport.listening import ListeningOptions, has_key
+
+LOCAL: Final = "localhost"
+HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]*\]|[^:\[\]]*)(?::[0-9]*)?")
+
+
+class WebOptions(ListeningOptions):
+    """How a server that browsers can reach is reached, or somebody else's is asked."""
+
+    allow_host: str = option(
+        "", "on loopback, more names that clients may send as Host, comma separated: a proxy's", side=SERVING
+    )
+
+
+class Access:
+    """The rules of one server."""
+
+    def __init__(self, options: WebOptions, bound_host: str, key: str, scheme: str) -> None:
+        """Listen at the IP address ``bound_host``; clients send the ``key``, if there is one, with ``scheme``."""
+        self._key, self._scheme = key.encode(), scheme
+        self._names = {LOCAL, *(name.strip().lower() for name in options.allow_host.split(","))}  # "" among them
+        self._on_loopback = ip_address(bound_host).is_loopback
+
+    def refusal(self, path_is_open: bool, headers: Iterable[tuple[str, str]]) -> tuple[int, str] | None:
+        """Return status and one line for a request that is refused; names of ``headers`` are in lower case.
+
+        A path that ``path_is_open`` needs no key.
+        """
+        keys = []
+        for name, value in headers:
+            if name == "origin":
+                return HTTPStatus.FORBIDDEN, "this server does not answer pages in browsers, which send an Origin"
+            if name == "host" and self._on_loopback and not self._is_known(value):
+                return HTTPStatus.FORBIDDEN, f"this server is not {value[:80]!r}; see `serve --allow-host`"
+            if name == "authorization":
+                keys.append(value)
+        if self._key and not path_is_open and not (len(keys) == 1 and self._has_key(keys[0])):
+            return HTTPStatus.UNAUTHORIZED, f"this server wants its key: Authorization: {self._scheme} KEY"
+        return None
+
+    def _is_known(self, host: str) -> bool:
+        """Whether a Host header, with or without a port, names this machine or is allowed."""
+        found = HOST.fullmatch(host)
+        if found is None:
+            return False
+        name = found[1].strip("[]")
+        try:
+            return name.lower() in self._names or ip_address(name).is_loopback
+        except ValueError:
+            return False
+
+    def _has_key(self, value: str) -> bool:
+        return has_key(value.encode(errors="replace"), self._scheme, self._key)

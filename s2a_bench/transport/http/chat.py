@@ -1,0 +1,196 @@
+"""One chat completion, as both of our HTTP servers have it: a body becomes a request, pieces become an answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+from s2a_bench.errors import RequestFailed, S2AError
+from s2a_bench.facts import PROMPT_N
+from s2a_bench.trace import Trace
+from s2a_bench.transport.chunks import state_of
+from s2a_bench.transport.http import blocks, own
+from s2a_bench.transport.limits import SEEDS, Limits, check_values, text, whole_number
+from s2a_bench.transport.pictures import decoded
+from s2a_bench.transport.serving import Disconnected, Exchange
+from s2a_bench.types import Action, Frame, Piece, Request
+
+EVENTS = "text/event-stream; charset=utf-8"
+Headers = Iterable[tuple[str, str]]
+"""Names in lower case."""
+Buffer = bytes | memoryview
+Reads = Callable[[Headers, Buffer, Trace, Limits], tuple[Request, bool]]
+
+
+def of_json(_headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> tuple[Request, bool]:
+    """Read a JSON body that nobody has validated; return the request, and whether its answer is streamed."""
+    return of_fields(_parsed(bytes(body), "the body", trace), trace, limits, own.FAST)
+
+
+def of_picture(headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> tuple[Request, bool]:
+    """Read a body that is the picture itself."""
+    said = dict(headers)
+    fields = _parsed(said.get(own.PARAMETERS_HEADER, "").encode(), f"header {own.PARAMETERS_HEADER}", trace)
+    if not (isinstance(fields, dict) and isinstance(prompt := fields.get("prompt", ""), str)):
+        raise RequestFailed(f"header {own.PARAMETERS_HEADER} should be an object whose prompt is text")
+    pictures = _cut(fields.get("pictures"), said.get("content-type", ""), body)
+    images = tuple(decoded(kind, data, trace, limits) for kind, data in pictures)
+    return _request(fields, prompt, images, limits)
+
+
+def _parsed(document: bytes, what: str, trace: Trace) -> Any:
+    check_values(document)
+    try:
+        fields = own.FAST.loads(document)
+    except ValueError as error:
+        raise RequestFailed(f"{what} is no JSON: {error}") from error
+    trace.mark("json_parse")
+    return fields
+
+
+def _cut(pictures: Any, media_type: str, body: Buffer) -> list[tuple[str, Buffer]]:
+    """Return the pictures of a body with their media types; raises RequestFailed where they are not the whole."""
+    if pictures is None:
+        return [(media_type, body)] if body else []
+    view, at = memoryview(body), 0
+    found: list[tuple[str, Buffer]] = []
+    try:
+        for kind, size in pictures:
+            if not (isinstance(kind, str) and type(size) is int and 0 < size <= len(view) - at):
+                raise ValueError(f"{size!r} bytes of {kind!r} where {len(view) - at} are left")
+            found.append((kind, view[at : at + size]))
+            at += size
+        if at != len(view):
+            raise ValueError(f"{len(view) - at} bytes are nobody's")
+    except (TypeError, ValueError) as error:
+        raise RequestFailed(f"pictures should be pairs of media type and bytes: {error}") from error
+    return found
+
+
+def of_fields(fields: Any, trace: Trace, limits: Limits, codec: own.Codec) -> tuple[Request, bool]:
+    """Read OpenAI's fields and decode the pictures of the messages."""
+    images: list[Frame] = []
+    texts: list[str] = []
+    try:
+        for message in fields["messages"]:
+            content = message["content"]
+            parts: list[dict[str, Any]] = [{"type": "text", "text": content}] if isinstance(content, str) else content
+            for part in parts:
+                if part["type"] != "image_url":
+                    texts.append(part["text"])
+                    continue
+                media_type, encoded = own.split_data_uri(part["image_url"]["url"])
+                data = codec.from_base64(encoded)
+                trace.mark("base64_decode")
+                images.append(decoded(media_type, data, trace, limits))
+        prompt = "\n".join(texts)
+    except (ValueError, KeyError, TypeError) as error:  # binascii.Error is a ValueError
+        raise RequestFailed(f"messages: {error!r}") from error
+    return _request(fields, prompt, tuple(images), limits)
+
+
+def _request(fields: dict[str, Any], prompt: str, images: tuple[Frame, ...], limits: Limits) -> tuple[Request, bool]:
+    """Read the parameters."""
+    request = Request(
+        id=text("request_id", fields.get("request_id")) or "chatcmpl-0",
+        prompt=text("the prompt", prompt),
+        images=images,
+        max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, limits.answer_tokens, 32),
+        grammar=text("grammar", fields.get("grammar")),
+        seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
+        state=state_of(fields.get("state") or ()),
+    )
+    return request, bool(fields.get("stream"))
+
+
+class ChatExchange(Exchange):
+    """One chat completion; a server's framing adds `read`, `write` and `whole`."""
+
+    takes_blocks = False
+    """Whether the client reads `blocks` where the answer is one of actions."""
+
+    def __init__(self, codec: own.Codec, trace: Trace | None = None) -> None:
+        """Write JSON with ``codec``."""
+        super().__init__(trace)
+        self._codec = codec
+        self._asked = Request("", "")
+        self._streamed = False
+        self._pieces: list[Piece] = []  # of an answer that is not streamed
+        self._count = 0
+        self._kind = ""  # of the answer that has begun
+
+    def read(self) -> tuple[Request, bool]:
+        """Parse and decode the request; return it, and whether its answer is streamed."""
+        raise NotImplementedError
+
+    def write(self, data: bytes, kind: str, *, last: bool) -> None:
+        """Send a part of a streamed answer; the first one names the media type, which is ``kind``."""
+        raise NotImplementedError
+
+    def whole(self, status: int, value: Any, headers: dict[str, str]) -> None:
+        """Send an answer that is one JSON value."""
+        raise NotImplementedError
+
+    def request(self) -> Request:
+        self._asked, self._streamed = self.read()
+        return self._asked
+
+    def send(self, piece: Piece) -> bool:
+        self._count += 1
+        if not self._streamed:
+            self._pieces.append(piece)
+        elif not isinstance(piece, Action):
+            event = own.chunk(self._asked.id, {"content": piece.text})
+            event["choices"][0]["token"] = piece.id
+            self._write(self._framed(event))
+        elif self.takes_blocks:
+            self._write(blocks.of_action(piece), blocks.MEDIA_TYPE)
+        else:
+            event = own.chunk(self._asked.id, {})
+            event["choices"][0] |= {"tick": piece.index, "action": piece.values.tolist()}
+            self._write(self._framed(event))
+        if self.gone():
+            raise Disconnected
+        return True
+
+    def end(self) -> None:
+        if not self._streamed:
+            self.sent_whole()
+        request_id, marks = self._asked.id, self.trace.to_remote().to_json()
+        finish = "length" if self._count >= self._asked.max_tokens else "stop"
+        prompt = int(self.trace.facts.get(PROMPT_N, 0))
+        usage = {"prompt_tokens": prompt, "completion_tokens": self._count, "total_tokens": prompt + self._count}
+        if not self._streamed:
+            message = {"role": "assistant", "content": content(self._pieces)}
+            answer = {"id": request_id, "object": "chat.completion", "model": "s2a"}
+            choice = {"index": 0, "message": message, "finish_reason": finish}
+            self.whole(200, {**answer, "choices": [choice], "usage": usage, "s2a": marks}, {})
+        elif self._kind == blocks.MEDIA_TYPE:
+            self._write(self._framed(own.chunk(request_id, {}, finish, s2a=marks)), last=True)
+        else:
+            end = own.chunk(request_id, {}, finish), own.chunk(request_id, {}, usage=usage, s2a=marks)
+            self._write(b"".join(map(self._framed, end)) + b"data: [DONE]\n\n", last=True)
+
+    def fail(self, error: S2AError) -> None:
+        if self._kind:
+            said = {"error": {"message": str(error), "type": type(error).__name__}}
+            self._write(self._framed(said), last=True)
+        else:
+            status = own.status_of(error)
+            self.whole(status, own.error_json(status, str(error)), own.headers_of(error))
+
+    def _write(self, data: bytes, kind: str = EVENTS, *, last: bool = False) -> None:
+        first, self._kind = not self._kind, self._kind or kind
+        self.write(data, self._kind if first else "", last=last)
+
+    def _framed(self, value: Any) -> bytes:
+        """Return a message as the answer under way has them."""
+        return (
+            blocks.of_json(value) if self._kind == blocks.MEDIA_TYPE else b"data: " + self._codec.dumps(value) + b"\n\n"
+        )
+
+
+def content(pieces: Sequence[Piece]) -> str:
+    """Return an answer as one text; actions as a JSON list of theirs."""
+    acts = any(isinstance(piece, Action) for piece in pieces)
+    return f"[{', '.join(piece.text for piece in pieces)}]" if acts else "".join(piece.text for piece in pieces)

@@ -1,0 +1,257 @@
+"""The server of *best effort* and *binary*: a thread a connection on blocking sockets, and no framework.
+
+httptools reads the head of a request; its body, whose length the head has to say, is read straight into its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from http import HTTPStatus
+from socket import IPPROTO_TCP, MSG_DONTWAIT, TCP_NODELAY
+from typing import Any, Final
+
+import httptools
+import numpy as np
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import S2AError
+from s2a_bench.transport import Handler, Wiring
+from s2a_bench.transport.access import Access
+from s2a_bench.transport.connections import LINGER_S, Connections, Wire
+from s2a_bench.transport.http import own
+from s2a_bench.transport.http.chat import ChatExchange, Reads, of_json, of_picture
+from s2a_bench.transport.http.options import HttpOptions
+from s2a_bench.transport.http.own import Refused
+from s2a_bench.transport.limits import Limits
+from s2a_bench.transport.listening import bound_socket
+from s2a_bench.transport.serving import Core
+from s2a_bench.types import Request
+
+PIECE: Final = 1 << 16
+EARLY: Final = 1 << 20
+"""The most that may come behind a request before its answer."""
+END: Final = b"\r\n\r\n"
+CONTINUE: Final = b"HTTP/1.1 100 Continue\r\n\r\n"
+READS: Final[Mapping[str, Reads]] = {
+    own.PATHS[own.AS_DEPLOYED]: of_json,  # where clients of OpenAI's dialect look
+    own.PATHS[own.BEST_EFFORT]: of_json,
+    own.PATHS[own.BINARY]: of_picture,
+}
+
+
+class Head:
+    """The head of a request, parsed."""
+
+    def __init__(self, data: bytes) -> None:
+        """Parse what comes before a body, the empty line included; raises Refused."""
+        if data.count(b"\n") > own.LINES:
+            raise Refused(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, f"more than {own.LINES} lines of headers")
+        self.headers: list[tuple[str, str]] = []
+        self._url, self._complete = b"", False
+        parser = httptools.HttpRequestParser(self)
+        try:
+            parser.feed_data(data)
+        except httptools.HttpParserUpgrade:
+            pass  # which a server may ignore (RFC 9110, 7.8)
+        except httptools.HttpParserError as error:
+            raise Refused(HTTPStatus.BAD_REQUEST, f"no HTTP request: {error}") from error
+        if not self._complete:
+            raise Refused(HTTPStatus.BAD_REQUEST, "no HTTP request")
+        self.method, self.path = parser.get_method(), self._url.partition(b"?")[0].decode("latin-1")
+        self.chunks = parser.get_http_version() == "1.1"
+        self.keep = self.chunks and "close" not in self.said("connection").lower()
+
+    def on_url(self, url: bytes) -> None:
+        self._url += url
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        self.headers.append((name.decode("latin-1").lower(), value.decode("latin-1")))
+
+    def on_headers_complete(self) -> None:
+        self._complete = True
+
+    def said(self, name: str) -> str:
+        """Return the value of a header; of several they are a list (RFC 9110, 5.3)."""
+        return ", ".join(value for known, value in self.headers if known == name)
+
+    def body_bytes(self, most: int) -> int:
+        """Return how long the body is; raises Refused where that is not said, or more than is taken."""
+        if self.said("transfer-encoding"):
+            raise Refused(HTTPStatus.LENGTH_REQUIRED, "a body has to say how long it is: Content-Length")
+        length = int(self.said("content-length") or 0)  # one number below 2^64, or the parser would have refused it
+        if length > most:
+            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"the body is larger than {most} bytes")
+        return length
+
+
+class FastServer:
+    """Answers one request of a connection after the other."""
+
+    def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
+        """Bind ``host:port`` of ``wiring.address`` or what `address` was, without it 127.0.0.1 and any port.
+
+        Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
+        """
+        listener, key = bound_socket(wiring.address, "http", wiring.options)
+        host, port = listener.getsockname()
+        self.address = f"http://{host}:{port}"
+        self._core = Core(handler, wiring.limits)
+        self._access = Access(wiring.options, host, key, own.SCHEME)
+        most = wiring.limits.connections
+        full = Refused(HTTPStatus.SERVICE_UNAVAILABLE, f"{most} connections are open already", {"retry-after": "1"})
+        self._connections = Connections(listener, self._answer_all, most, full.answer)
+
+    def describe(self) -> dict[str, str | int]:
+        return {"server": "a thread a connection", "http": "httptools", "version": httptools.__version__}
+
+    def serve(self) -> None:
+        self._connections.serve()
+
+    def stop(self) -> None:
+        """Finish the requests under way, for a second at most."""
+        self._connections.stop()
+
+    def _answer_all(self, wire: Wire) -> None:
+        """Answer the requests of a connection until one is refused, or the client wants no more."""
+        wire.socket.setsockopt(IPPROTO_TCP, TCP_NODELAY, 1)
+        early: bytes | None = b""
+        try:
+            while early is not None:
+                with ExitStack() as held:
+                    early = self._answer(wire, early, held)
+        except Refused as error:
+            refused = error
+        except S2AError as error:  # too many bytes
+            refused = Refused.because(error)
+        else:
+            return
+        wire.sendall(refused.answer)
+        wire.linger()
+
+    def _answer(self, wire: Wire, early: bytes, held: ExitStack) -> bytes | None:
+        """Answer one request, of which ``early`` came already; return what came of the next, None for no more."""
+        came = held.enter_context(self._core.in_flight.counted())
+        data, rest = self._head(wire, early)
+        if not data:
+            return None
+        head, limits = Head(data), self._core.limits
+        own.admit(self._access, head.path, head.headers)
+        size = head.body_bytes(limits.body_bytes)
+        if (page := self._page(head)) is not None and not size:
+            wire.sendall(page)
+            wire.flush(LINGER_S)
+            return rest if head.keep else None
+        reads = READS.get(head.path) if head.method == b"POST" else None
+        if reads is None:
+            raise Refused(HTTPStatus.NOT_FOUND, f"POST to one of {', '.join(READS)}")
+        came(len(data))
+        wire.read_until(now_ns() + round(limits.body_s * 1e9))
+        if len(rest) < size and head.said("expect").lower() == "100-continue":
+            wire.sendall(CONTINUE)
+        try:
+            body = _body(wire, rest, size, came)
+        except TimeoutError:
+            message = f"the body took more than {limits.body_s:g} s"
+            raise Refused(HTTPStatus.REQUEST_TIMEOUT, message) from None
+        exchange = FastExchange(wire, head, reads, body, rest[size:], limits)
+        exchange.trace.mark("network")
+        del body  # which the exchange gives back once it is read
+        exchange.held = held
+        wire.read_until(0)
+        self._core.answer(exchange)
+        return bytes(exchange.early) if exchange.keep else None
+
+    def _head(self, wire: Wire, early: bytes) -> tuple[bytes, bytes]:
+        """Return a head and what came behind it; nothing where the client has closed, or sends none for an hour."""
+        data, limits, seen, ends_ns = bytearray(early), self._core.limits, 0, 0
+        while (end := data.find(END, seen)) < 0:
+            seen = max(0, len(data) - len(END))
+            if len(data) > limits.header_bytes:
+                break
+            if data and not ends_ns:
+                ends_ns = now_ns() + round(limits.head_s * 1e9)
+            wire.read_until(ends_ns or now_ns() + own.KEEP_ALIVE_S * 10**9)
+            try:
+                piece = wire.recv(PIECE)
+            except TimeoutError:
+                if not data:
+                    return b"", b""
+                message = f"the headers took more than {limits.head_s:g} s"
+                raise Refused(HTTPStatus.REQUEST_TIMEOUT, message) from None
+            if not piece:
+                return b"", b""
+            data += piece
+        size = end + len(END)
+        if end < 0 or size > limits.header_bytes:
+            message = f"more than {limits.header_bytes} bytes of headers"
+            raise Refused(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, message)
+        return bytes(data[:size]), bytes(data[size:])
+
+    def _page(self, head: Head) -> bytes | None:
+        """Return what is answered without a request, None for another path."""
+        if head.method != b"GET":
+            return None
+        if head.path == own.HEALTH:
+            return own.answer(*own.health(self._core), keep=head.keep)
+        return own.answer(200, own.models(self._core.queued), keep=head.keep) if head.path == own.MODELS else None
+
+
+def _body(wire: Wire, begun: bytes, size: int, came: Callable[[int], None]) -> memoryview:
+    """Read a body into its place: no more of its memory is touched than has come. Raises EOFError, TimeoutError."""
+    body, have = np.empty(size, np.uint8).data, min(len(begun), size)
+    body[:have] = begun[:have]
+    came(have)
+    while have < size:
+        more = wire.recv_into(body[have:])
+        if not more:
+            raise EOFError
+        came(more)
+        have += more
+    return body
+
+
+class FastExchange(ChatExchange):
+    """One request whose body is there."""
+
+    def __init__(self, wire: Wire, head: Head, reads: Reads, body: memoryview, early: bytes, limits: Limits) -> None:
+        """Answer on ``wire``; a stream is chunked, or ends with the connection where that is too old for it."""
+        super().__init__(own.FAST)
+        self.takes_blocks = reads is of_picture
+        self.keep = False
+        """Whether the connection may be kept: once the answer is on its way."""
+        self.early = bytearray(early)
+        """What came of the next request."""
+        self._wire, self._head, self._reads, self._body, self._limits = wire, head, reads, body, limits
+
+    def gone(self) -> bool:
+        """Whether the client has hung up, or floods us; what it left is read, for its end comes behind."""
+        try:
+            self.early += self._wire.socket.recv(PIECE, MSG_DONTWAIT)
+        except BlockingIOError:
+            pass
+        except OSError:
+            return True
+        return self._wire.gone() or len(self.early) > EARLY
+
+    def read(self) -> tuple[Request, bool]:
+        body, self._body = self._body, memoryview(b"")
+        return self._reads(self._head.headers, body, self.trace, self._limits)
+
+    def write(self, data: bytes, kind: str, *, last: bool) -> None:
+        if self._head.chunks:
+            data = b"%x\r\n%b\r\n%b" % (len(data), data, b"0\r\n\r\n" * last)
+        if kind:
+            headers = {"content-type": kind, **({"transfer-encoding": "chunked"} if self._head.chunks else {})}
+            data = own.head_of(200, headers, keep=self._head.keep) + data
+        self._wire.sendall(data)
+        if last:
+            self._over()
+
+    def whole(self, status: int, value: Any, headers: dict[str, str]) -> None:
+        self._wire.sendall(own.answer(status, value, headers, keep=self._head.keep))
+        self._over()
+
+    def _over(self) -> None:
+        self._wire.flush(max(self.left_s(), LINGER_S))
+        self.keep = self._head.keep

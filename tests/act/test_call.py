@@ -1,0 +1,90 @@
+"""Actions and skills to a Python function that is named."""
+
+from __future__ import annotations
+
+import sys
+from threading import Event, current_thread, main_thread
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from s2a_bench.act import SkillKind, kind, open_robot
+from s2a_bench.act.call import CallableRobot, Motion
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import RobotError, UsageError
+from s2a_bench.plan import load_skills
+
+
+@pytest.fixture
+def arm(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = ModuleType("somebodys_arm")
+    monkeypatch.setitem(sys.modules, "somebodys_arm", module)
+    return module
+
+
+def test_the_function_gets_each_action_and_no_stall(arm: ModuleType) -> None:
+    seen: list[list[float]] = []
+    arm.move = lambda action: seen.append(action.tolist())  # type: ignore[attr-defined]
+    robot = open_robot("call?function=somebodys_arm:move", 2, 1)
+    for action in (np.array([1, 2], np.float32), None, np.array([3, 4], np.float32)):
+        robot.send(action, 0)
+    assert seen == [[1, 2], [3, 4]]
+    assert robot.state() == ()
+    assert robot.describe() == {"robot": "call", "function": "somebodys_arm:move"}
+    robot.close()
+
+
+def test_what_it_raises_ends_the_run_with_one_line_that_names_it(arm: ModuleType) -> None:
+    def move(_: object) -> None:
+        raise ValueError("joint 3\nis at its limit")
+
+    arm.move = move  # type: ignore[attr-defined]
+    robot = open_robot("call?function=somebodys_arm:move", 1, 1)
+    with pytest.raises(RobotError) as error:
+        robot.send(np.zeros(1, np.float32), 0)
+    assert str(error.value) == r"`robot`: call: somebodys_arm:move: ValueError: joint 3\nis at its limit"
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ("call", "`robot`: call: function = '' should look like module:name"),
+        ("call?function=move", "`robot`: call: function = 'move' should look like module:name"),
+        ("call?function=somebodys_arm:wave", "`robot`: call: somebodys_arm:wave does not load: AttributeError"),
+        ("call?function=no_such_arm:move", "`robot`: call: no_such_arm:move does not load: ModuleNotFoundError"),
+        (
+            "call?function=somebodys_arm:joints",
+            "`robot`: call: somebodys_arm:joints cannot be called: it is of type int",
+        ),
+    ],
+)
+def test_what_is_no_function_is_refused(arm: ModuleType, written: str, message: str) -> None:
+    arm.joints = 7  # type: ignore[attr-defined]
+    with pytest.raises(UsageError) as error:
+        open_robot(written, 1, 1)
+    assert message in str(error.value)
+    with pytest.raises(UsageError) as again:
+        kind(written, SkillKind).open_skills(load_skills("household"))
+    assert str(again.value) == str(error.value)
+
+
+def test_the_function_gets_each_skill_on_a_thread_of_its_own(arm: ModuleType) -> None:
+    seen: list[tuple[str, bool]] = []
+    over = Event()
+
+    def act(motion: Motion) -> None:
+        seen.append((str(motion.call), current_thread() is main_thread()))
+
+    arm.act = act  # type: ignore[attr-defined]
+    household = load_skills("household")
+    robot = kind("call?function=somebodys_arm:act", SkillKind).open_skills(household)
+    assert isinstance(robot, CallableRobot)
+    for call in household.calls[:2]:
+        over.clear()
+        running = robot.start(call, now_ns() + 10**9, lambda error: over.set() if not error else None)
+        assert over.wait(10)
+        assert running.ended()
+    assert seen == [(str(call), False) for call in household.calls[:2]]
+    robot.hold("coast")
+    robot.close()

@@ -1,0 +1,183 @@
+"""The control loop against virtual time: the same ticks, whatever the latencies, and numbers for what was late."""
+
+import sys
+from itertools import pairwise
+from threading import Event
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from s2a_bench.act.control import SWITCH_S, Acted, ControlLoop
+from s2a_bench.clock import SystemClock, VirtualClock, now_ns
+from s2a_bench.policy.chunks import Setting, mode
+from s2a_bench.policy.chunks.cycles import NEVER, follow
+
+PERIOD_NS, HORIZON = 1_000_000, 6
+MODES = [
+    "sync",
+    "queue?trigger=2",
+    "queue?trigger=5&execute=5",
+    "replace?execute=3",
+    "replace?execute=2&under_way=many",
+    "replace?execute=4&assumed=2",
+    "aggregate?trigger=3",
+    "streamed?trigger=2&gap_s=0.0004",
+    "streamed?trigger=1&gap_s=0.0017&start=naive",
+]
+
+
+class Late(VirtualClock):
+    """A clock whose sleepers wake up late."""
+
+    def __init__(self, late_ns: list[int]) -> None:
+        """Be late by those times in turn."""
+        super().__init__()
+        self._late_ns = late_ns
+        self._slept = 0
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Jump behind the deadline."""
+        super().sleep_until_ns(deadline_ns + self._late_ns[self._slept % len(self._late_ns)])
+        self._slept += 1
+
+
+def act(written: str, setting: Setting, latency_ns: list[int], clock: VirtualClock, ticks: int = 400) -> Acted:
+    """Run a loop whose answers are told at once, for the time at which they come."""
+    chosen = mode(written)
+    actions = [np.full(1, place, np.float32) for place in range(setting.horizon)]
+    start_ns: list[int] = []
+
+    def ask(request: int, tick: int) -> None:
+        if not start_ns:
+            start_ns.append(loop.acted().start_ns)
+        if request < len(latency_ns):
+            began_ns = start_ns[0] + tick * setting.period_ns + latency_ns[request]
+            if chosen.streams:
+                for place in range(setting.horizon):
+                    loop.arrived(request, actions[: place + 1], began_ns + place * chosen.gap_ns)
+            else:
+                loop.arrived(request, actions, began_ns)
+
+    loop = ControlLoop(chosen, setting, lambda *_: None, ask, ticks, clock)
+    loop.run()
+    return loop.acted()
+
+
+@pytest.mark.parametrize("written", MODES)
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+@settings(max_examples=25)
+@given(
+    latency_ns=st.lists(st.integers(0, 8).map(lambda half: half * PERIOD_NS // 2), min_size=2, max_size=20),
+    late_ns=st.lists(st.integers(0, 5 * PERIOD_NS), min_size=1, max_size=5),
+)
+def test_loop_does_what_virtual_time_says(
+    written: str, rounding: str, latency_ns: list[int], late_ns: list[int]
+) -> None:
+    setting = Setting(PERIOD_NS, HORIZON, rounding)  # type: ignore[arg-type]
+    acted = act(written, setting, latency_ns, Late(late_ns))
+    arrival_ns = np.where(acted.arrival_ns < 0, NEVER, acted.arrival_ns)
+    _, said = follow(mode(written), arrival_ns, setting, acted.chunk.size)
+    assert acted.whole == len(latency_ns)
+    np.testing.assert_array_equal(acted.chunk, said.chunk)
+    np.testing.assert_array_equal(acted.index, said.index)
+
+
+def test_lateness_is_told_and_made_up_for() -> None:
+    acted = act("queue", Setting(PERIOD_NS, HORIZON, "ceil"), [0] * 40, Late([0, 3 * PERIOD_NS]), ticks=100)
+    assert acted.chunk.size == 100
+    assert acted.late_ns[1] == 3 * PERIOD_NS
+    assert acted.late_ns[2] == 2 * PERIOD_NS  # the clock had gone that far
+    assert (acted.chunk >= 0).all()
+
+
+def test_a_chunk_that_never_comes_ends_what_is_decided() -> None:
+    acted = act("queue?trigger=1", Setting(PERIOD_NS, HORIZON), [0, 0], VirtualClock(), ticks=50)
+    assert acted.whole == 2
+    assert acted.chunk.size == 50
+    assert (acted.chunk[int(acted.asked_tick[2]) + 1 :] < 0).all()  # one action was left
+
+
+def test_robot_is_sent_each_action_and_each_stall() -> None:
+    setting, sent = Setting(2_000_000, 3), []
+    chunk = [np.full(2, place, np.float32) for place in range(3)]
+    loop = ControlLoop(
+        mode("sync"),
+        setting,
+        lambda action, due_ns: sent.append((None if action is None else float(action[0]), due_ns)),
+        lambda request, _: loop.arrived(request, chunk, now_ns() + 3_000_000),
+        ticks=10,
+    )
+    loop.start()
+    assert loop.join(10)
+    acted = loop.acted()
+    assert len(sent) == 10
+    assert [value for value, _ in sent] == [None if place < 0 else float(place) for place in acted.index]
+    assert {late - early for (_, early), (_, late) in pairwise(sent)} == {2_000_000}
+
+
+def test_overlapping_actions_are_blended_as_virtual_time_says() -> None:
+    setting, sent = Setting(PERIOD_NS, HORIZON), []
+    chosen = mode("aggregate?trigger=3")
+    rng = np.random.default_rng(0)
+    chunks = rng.normal(size=(12, HORIZON, 2)).astype(np.float32)
+    latency_ns = rng.integers(0, 4 * PERIOD_NS, 12)
+
+    def ask(request: int, tick: int) -> None:
+        if request < len(chunks):
+            began_ns = tick * PERIOD_NS
+            loop.arrived(request, list(chunks[request]), began_ns + int(latency_ns[request]))
+
+    loop = ControlLoop(chosen, setting, lambda action, _: sent.append(action), ask, 80, VirtualClock())
+    loop.run()
+    cycles, ticks = follow(chosen, np.repeat(latency_ns[:, np.newaxis], HORIZON, axis=1), setting)
+    said = np.full((cycles.ticks, 2), np.nan)
+    for tick, chunk, index, share in chosen.blend(cycles, ticks):
+        said[tick] = np.nan_to_num(said[tick]) + share[:, np.newaxis] * chunks[chunk, index]
+    done = np.array([[np.nan] * 2 if action is None else action for action in sent[: cycles.ticks]])
+    np.testing.assert_allclose(done, said, rtol=1e-5)
+
+
+def test_failure_of_a_robot_reaches_who_waits_and_the_interpreter_is_as_before() -> None:
+    before_s = sys.getswitchinterval()
+    seen: list[float] = []
+
+    def broken(*_: object) -> None:
+        seen.append(sys.getswitchinterval())
+        raise ValueError("the arm fell off")
+
+    setting = Setting(1_000_000, 3)
+    loop = ControlLoop(mode("sync"), setting, broken, lambda *_: None, 10)
+    loop.start()
+    with pytest.raises(ValueError, match="fell off"):
+        loop.join(10)
+    assert seen == pytest.approx([SWITCH_S])
+    assert sys.getswitchinterval() == before_s
+
+
+def test_stop_ends_it_before_its_time() -> None:
+    asked = Event()
+    setting = Setting(1_000_000, 3)
+    loop = ControlLoop(mode("sync"), setting, lambda *_: None, lambda *_: asked.set(), 10**9, SystemClock())
+    loop.start()
+    assert asked.wait(10)
+    assert not loop.join(0.001)
+    loop.stop()
+    assert loop.join(10)
+
+
+def test_what_was_told_before_is_passed_over_and_old_chunks_are_forgotten() -> None:
+    setting, sent = Setting(PERIOD_NS, 3), []
+    one, other = [[np.full(1, value, np.float32)] * 3 for value in (1, 2)]
+
+    def ask(request: int, tick: int) -> None:
+        for chunk in (one, other):
+            loop.arrived(request, chunk, tick * PERIOD_NS)
+
+    loop = ControlLoop(
+        mode("replace?execute=2"), setting, lambda action, _: sent.append(action), ask, 300, VirtualClock()
+    )
+    loop.run()
+    assert {float(action[0]) for action in sent} == {1.0}
+    assert len(loop._actions) < 3

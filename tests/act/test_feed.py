@@ -1,0 +1,76 @@
+"""From text to executors: any chunking gives the same plan, and what is no plan is an outcome."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from s2a_bench.act.events import Event, PlanFeed, ScriptedInbox
+from s2a_bench.act.executor import Executor
+from s2a_bench.act.record import Record
+from s2a_bench.clock import VirtualClock
+from s2a_bench.plan import Parser, load_skills, paper_format
+from s2a_bench.policy import policy
+from tests.act.drive import Obedient, ns, shape, starts
+
+HOUSEHOLD = load_skills("household")
+PLAN = "1. go_to(kitchen)\n2. pick(cup)\n3. place(cup, table)\n"
+
+
+def execute(chunks: list[str], n_skills: int, gap_s: float = 0.5, name: str = "naive", broke: str = "") -> Record:
+    events: list[Event] = []
+    feed = PlanFeed(Parser(paper_format(HOUSEHOLD)), events.append)
+    feed.requested(ns(0))
+    for place, chunk in enumerate(chunks, start=1):
+        feed.token(chunk, ns(place * gap_s))
+    if broke:
+        feed.broke(broke, ns((len(chunks) + 1) * gap_s))
+    else:
+        feed.ended(ns((len(chunks) + 1) * gap_s))
+    clock = VirtualClock(ns(0))
+    robot = Obedient(clock)
+    record = Executor(policy(name), shape(n_skills), robot, ScriptedInbox(clock, events), clock).run()
+    assert {word.split()[1] for _, word in robot.told if word.startswith("start")} <= {"go_to", "pick", "place"}
+    return record
+
+
+@given(cuts=st.lists(st.integers(0, len(PLAN)), max_size=12))
+def test_any_chunking_is_carried_out_alike(cuts: list[int]) -> None:
+    places = sorted({0, len(PLAN), *cuts})
+    chunks = [PLAN[start:end] for start, end in pairwise(places)]
+    record = execute(chunks, 3, gap_s=1e-6)
+    assert [str(skill.call) for skill in record.ran] == ["go_to(kitchen)", "pick(cup)", "place(cup, table)"]
+    assert record.outcome == "completed"
+
+
+def test_a_skill_arrives_with_the_token_that_completes_it() -> None:
+    record = execute(["1. go_to(", "kitchen", ")\n2. pick(cup)\n", "3. place(cup, table)"], 3)
+    assert [(at_ns - ns(0)) / 1e9 for at_ns, _ in record.arrivals] == [1.5, 1.5, 2.5]
+    assert starts(record) == [1.5, 5.5, 7.5]
+
+
+def test_skills_before_a_malformed_line_are_begun_and_those_after_it_are_not() -> None:
+    record = execute(["1. go_to(kitchen)\n", "2. fly(roof)\n", "3. pick(cup)\n"], 3)
+    assert record.outcome == "invalid-line"
+    assert record.why == "line 2 (unknown-skill): 'fly' is none of the skills"
+    assert [str(skill.call) for skill in record.skills] == ["go_to(kitchen)"]
+
+
+@given(text=st.text(max_size=60), n_skills=st.integers(1, 4))
+def test_prose_moves_nothing(text: str, n_skills: int) -> None:
+    record = execute(list("~" + text), n_skills)
+    assert record.outcome in {"invalid-line", "short"}
+    assert record.skills == []
+
+
+@given(length=st.integers(0, len(PLAN)), name=st.sampled_from(["naive", "wait-then-act", "stream-to-act"]))
+def test_an_answer_cut_off_anywhere_starts_nothing_that_was_not_written(length: int, name: str) -> None:
+    record = execute(list(PLAN[:length]), 3, gap_s=0.05, name=name, broke="the server died")
+    written = PLAN[:length].count("\n")
+    assert record.outcome == ("completed" if written == 3 else "stream-error")
+    assert [str(skill.call) for skill in record.skills] == [
+        str(call) for _, call in record.arrivals[: len(record.skills)]
+    ]
+    assert len(record.arrivals) == written

@@ -1,0 +1,55 @@
+"""A metric of requests is one row of a table: JSON, its schema, CSV, comparison and the table of tokens follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.experiments.latency.metrics import METRICS, compared, latency_cell, latency_csv, latency_json
+from s2a_bench.experiments.latency.view import latency_tables
+from s2a_bench.experiments.requests import RequestMetric
+from s2a_bench.store.requests import SampleRow, TokenRow
+from s2a_bench.store.run import Run, RunWriter, read_run
+from tests.made_runs import STAGES, known
+
+LATE = RequestMetric(
+    "token_late",
+    "ms",
+    title="late",
+    about="From a token's leaving the engine to the client's seeing it, twice.",
+    of=lambda cell: 2 * (cell.answers["client_ns"] - cell.answers["engine_ns"]) / 1e6,
+    shown=("median",),
+)
+
+
+@pytest.fixture
+def run(tmp_path: Path, make_row: Callable[..., SampleRow]) -> Run:
+    with RunWriter.create(tmp_path, "latency", known({"stages": STAGES})) as writer:
+        for block in range(2):
+            row = make_row("ros/topic", {"capture": 1, "inference": 100, "return": 0.5}, block)
+            writer.sample(row)
+            writer.tokens(
+                TokenRow(row.request_id, row.cell, i, i, "x", 10**9 + i, 10**9 + i + (block + 1) * 10**6)
+                for i in range(3)
+            )
+    return read_run(writer.path)
+
+
+def test_a_metric_is_added_in_one_place_and_is_nowhere_without_it(run: Run) -> None:
+    assert "token_late" not in compared().metrics
+    assert "token_late_ms" not in latency_json(run)["cells"][0]
+    assert "late median" not in latency_tables(run)["tokens"].header
+    metrics = (*METRICS, LATE)
+    (subject,) = compared(metrics).subjects(run)
+    assert [row.tolist() for row in subject.rows("token_late")] == [[2.0] * 3, [4.0] * 3]
+    assert compared(metrics).metrics["token_late"] is LATE
+    (cell,) = latency_json(run, metrics)["cells"]
+    assert (cell["token_late_ms"]["n"], cell["token_late_ms"]["median"]) == (6, 3.0)
+    assert "token_late_ms" in {field.name for field in fields(latency_cell(metrics))}
+    rows = {str(row[1]): row for row in latency_csv(run, metrics)["summary.csv"].rows}
+    assert rows["token_late_ms"][4:6] == (6, 3.0)
+    table = latency_tables(run, metrics)["tokens"]
+    assert (table.header[-1], table.rows[0][-1]) == ("late median", "3.00")

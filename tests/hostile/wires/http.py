@@ -1,0 +1,234 @@
+"""Hostile peers of our HTTP server and client."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
+from functools import cache, partial
+from typing import Any
+
+from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
+from s2a_bench.testing.hostile.tcp import CLIENTS as ANY_CLIENT
+from s2a_bench.testing.hostile.tcp import NOISE, answers, crowd, sends, sends_made, servers
+from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS
+
+CHAT = PATHS["as-deployed"]
+MIB = 1 << 20
+JSON = "Content-Type: application/json"
+
+
+def head(*headers: str, path: str = CHAT, length: int | None = None) -> bytes:
+    """Return the head of a request whose connection is closed after its answer."""
+    said = [] if length is None else [f"Content-Length: {length}"]
+    lines = [f"POST {path} HTTP/1.1", "Host: localhost", "Connection: close", *headers, *said]
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+def post(body: bytes, *headers: str, path: str = CHAT) -> bytes:
+    """Return a whole request."""
+    return head(*(headers or (JSON,)), path=path, length=len(body)) + body
+
+
+def chat(prompt: str = '"go on"', fields: str = "", path: str = CHAT) -> bytes:
+    """Return a request whose prompt and further fields are JSON text."""
+    return post(
+        f'{{"messages": [{{"role": "user", "content": {prompt}}}]{fields and ", " + fields}}}'.encode(), path=path
+    )
+
+
+def binary(body: bytes, fields: str = "{}", kind: str = "image/png") -> bytes:
+    """Return a request of the variant whose body is the picture."""
+    return post(body, f"Content-Type: {kind}", f"{PARAMETERS_HEADER}: {fields}", path=PATHS["binary"])
+
+
+@cache
+def png_of_zeros(width: int, height: int) -> bytes:
+    """Return a PNG of one bit a pixel, made without its pixels: 30000x30000 are 110 kB, and 2.7 GB once decoded."""
+    pack = zlib.compressobj(9)
+    rows = b"".join(pack.compress(bytes(1 + (width + 7) // 8)) for _ in range(height)) + pack.flush()
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    ihdr = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", ihdr) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def bomb() -> bytes:
+    """Return a small picture of 900 million pixels."""
+    return png_of_zeros(30_000, 30_000)
+
+
+def bomb_uri(path: str) -> Sequence[bytes]:
+    """Return a request with the bomb in a data URI."""
+    uri = "data:image/png;base64," + base64.b64encode(bomb()).decode()
+    return [chat(json.dumps([{"type": "image_url", "image_url": {"url": uri}}]), path=path)]
+
+
+def parentheses(number: int) -> str:
+    """Return a grammar as deep as that."""
+    return json.dumps("root ::= " + "(" * number + '"a"' + ")" * number)
+
+
+REFUSED = "^HTTP/1.1 400 .*"
+GOES_ON = '"stream": true, "max_tokens": 5000'
+CHUNKS = "Transfer-Encoding: chunked"
+
+
+def _clients(path: str) -> Iterator[Case[Attack]]:
+    """Yield what both of our servers outlive, at a path that takes JSON."""
+    yield Case("half the headers, then gone", sends(head(path=path)[:40], then="goes"))
+    yield Case("half the body, then gone", sends(head(JSON, path=path, length=1000) + b"{", then="goes"))
+    slow = head(path=path)[:-2] + b"x: " + b"a" * 300
+    yield Case("headers a byte at a time", sends(*(bytes([byte]) for byte in slow), every_s=0.05), "^HTTP/1.1 408 |^$")
+    yield Case(
+        "body a byte at a time", sends(head(JSON, path=path, length=1000), *[b" "] * 20, every_s=0.1, then="goes")
+    )
+    yield Case("1 GiB said", sends(head(JSON, path=path, length=1 << 30), bytes(MIB)), "^HTTP/1.1 413 ")
+    yield Case("64 MiB of spaces", sends_made(lambda: [post(b" " * 64 * MIB, path=path)]), REFUSED)
+    lines = [b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)]
+    yield Case("1 MiB of headers", sends(head(path=path)[:-2], *lines))
+    yield Case("one header of 1 MiB", sends(head(path=path)[:-2] + b"x: " + b"a" * MIB + b"\r\n\r\n"))
+    yield Case("16,000 empty headers", sends(head(path=path)[:-2] + b"a:\r\n" * 16_000 + b"\r\n"), "^HTTP/1.1 431 ")
+    yield Case("length that is none", sends(head("Content-Length: -5", path=path)), REFUSED)
+    yield Case("length of 20 digits", sends(head("Content-Length: 99999999999999999999", path=path)), REFUSED)
+    yield Case("length of 5,000 digits", sends(head(f"Content-Length: {'9' * 5000}", path=path)), REFUSED)
+    yield Case("two lengths", sends(head("Content-Length: 3", "Content-Length: 5", path=path) + b"{}{}{}"), REFUSED)
+    both = head("Content-Length: 3", CHUNKS, path=path)
+    yield Case("length and chunks", sends(both + b"0\r\n\r\nGET / HTTP/1.1\r\n\r\n"))
+    yield Case("HTTP/9.9", sends(b"POST / HTTP/9.9\r\n\r\n"), REFUSED)
+    yield Case("TLS", sends(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + NOISE[:500]))
+    yield Case("upgrade to a WebSocket", sends(head("Upgrade: websocket", "Connection: upgrade", path="/", length=0)))
+    many = chat(path=path).replace(b"Connection: close\r\n", b"") * 200
+    yield Case("200 requests in one piece", sends(many, chat(path=path)))
+    yield Case("no JSON", sends(post(b"{]", path=path)), REFUSED)
+    yield Case("no UTF-8", sends(post(b'{"messages": [{"role": "user", "content": "\xff\xfe"}]}', path=path)), REFUSED)
+    yield Case("deep JSON", sends(post(b"[" * MIB, path=path)), REFUSED)
+    for size in (4, 57):
+        lists = sends_made(partial(_lists, size, path), seconds=10)
+        yield Case(f"{size} MiB of lists", lists, REFUSED + "20000 values", mib=512)
+    for text in ("5", "[5]", "[[]]", '[{"role": 5}]', '{"a": 1}', "null", '[{"role": "user", "content": [[]]}]'):
+        yield Case(f"messages {text[:20]}", sends(post(f'{{"messages": {text}}}'.encode(), path=path)), REFUSED)
+    yield Case("max_tokens NaN", sends(chat(fields='"max_tokens": NaN', path=path)), REFUSED)
+    yield Case("picture of 900 million pixels", sends_made(lambda: bomb_uri(path)), REFUSED + "30000x30000")
+    yield Case("bad grammar", sends(chat(fields=f'"grammar": {parentheses(20_000)}', path=path)))
+    goes_on = chat(fields=GOES_ON, path=path)
+    yield Case("gone in the middle of an answer", sends(goes_on, then="goes"))
+    yield Case("reset in the middle of an answer", sends(goes_on, then="resets"))
+    yield Case("gone without waiting for the whole", sends(chat(fields='"max_tokens": 5000', path=path), then="resets"))
+    yield Case("200 KB behind the request, then gone", sends(goes_on + bytes(200_000), then="goes"))
+    streamed = chat(fields='"stream": true', path=path)
+    yield Case("100 clients at once", crowd(100, sends(streamed, seconds=20)), "HTTP/1.1 (200|503) ")
+    yield Case("100 clients that go", crowd(100, sends(goes_on, then="goes")))
+    yield Case("a page in a browser", sends(head("Origin: http://localhost", path=path, length=0)), "^HTTP/1.1 403 ")
+    yield Case("a name that means us", sends(head("Host: example.com", path=path, length=0)), "^HTTP/1.1 403 ")
+
+
+def _lists(size: int, path: str) -> Sequence[bytes]:
+    """Return a request of so many MiB whose messages are empty lists."""
+    return [post(b'{"messages": [' + b"[]," * (size * MIB // 3) + b"[]]}", path=path)]
+
+
+FAST_CHAT = PATHS["best-effort"]
+CLIENTS: tuple[Case[Attack], ...] = (
+    *ANY_CLIENT,
+    *_clients(CHAT),
+    Case("1 GiB unsaid", sends(head(JSON, CHUNKS), *[b"100000\r\n" + bytes(MIB) + b"\r\n"] * 1024)),
+    Case("chunk of a size that is none", sends(head(JSON, CHUNKS) + b"-1\r\nzz\r\n")),
+    Case("chunk of 2^64 bytes", sends(head(JSON, CHUNKS) + b"FFFFFFFFFFFFFFFF\r\nzz\r\n")),
+)
+FAST: tuple[Case[Attack], ...] = (
+    *ANY_CLIENT,
+    *_clients(FAST_CHAT),
+    Case(
+        "chunks of 2 bytes",
+        sends(head(JSON, CHUNKS, path=FAST_CHAT) + b"2\r\n  \r\n" * MIB),
+        "^HTTP/1.1 411 ",
+    ),
+    Case("64 MiB of zeros as pixels", sends_made(lambda: [binary(bytes(64 * MIB))]), REFUSED),
+    Case("no parameters", sends(binary(b"", "[]")), REFUSED),
+    Case("deep parameters", sends(binary(b"", "[" * 50_000)), REFUSED),
+    Case("picture of 900 million pixels as the body", sends_made(lambda: [binary(bomb())]), REFUSED + "30000x30000"),
+    Case("noise as a picture", sends(binary(NOISE)), REFUSED),
+    Case(
+        "raw pixels of another size",
+        sends(binary(b"abc", kind="application/x-raw;width=9;height=9;encoding=bgr8")),
+        REFUSED,
+    ),
+)
+
+
+def said(*lines: str, status: str = "200 OK") -> bytes:
+    """Return the head of an answer."""
+    return "\r\n".join([f"HTTP/1.1 {status}", *lines, "", ""]).encode()
+
+
+STREAM = said("Content-Type: text/event-stream", "Connection: close")
+
+
+def event(value: Any) -> bytes:
+    """Return one server-sent event."""
+    return b"data: " + (value if isinstance(value, bytes) else json.dumps(value).encode()) + b"\n\n"
+
+
+def token(text: str = "go") -> dict[str, Any]:
+    """Return one token as our server sends it."""
+    return {"choices": [{"index": 0, "delta": {"content": text}, "finish_reason": None, "token": 1}]}
+
+
+def _answers(*pieces: bytes, **more: Any) -> Trap:
+    return answers(*pieces, scheme="http://", **more)
+
+
+def _streams(*values: Any, **more: Any) -> Trap:
+    return _answers(STREAM, *(event(value) for value in values), then="goes", **more)
+
+
+CONTROL = "\x1b[2J\r\nOK: all is well\x07\x00"
+
+SERVERS: tuple[Case[Trap], ...] = (
+    *servers("http://"),
+    Case("headers, then silence", _answers(STREAM), "^RequestFailed: .*silent"),
+    Case("headers, then gone", _answers(STREAM, then="goes"), "before the answer was complete"),
+    Case("one token, then silence", _answers(STREAM, event(token())), "^RequestFailed: .*silent"),
+    Case("one token, then gone", _streams(token()), "before the answer was complete"),
+    Case("one token, then reset", _answers(STREAM, event(token()), then="resets"), FAILED),
+    Case("an event that ends in the middle", _answers(STREAM, b'data: {"choi', then="goes"), FAILED),
+    Case("events that are no JSON", _streams(b"{]"), FAILED),
+    Case("events that are no objects", _streams([], 5, "a", None), FAILED),
+    Case("choices that are none", _streams({"choices": "go"}, {"choices": [5]}, {"choices": [{"delta": 5}]}), FAILED),
+    Case("deep events", _streams(b"[" * 100_000), FAILED),
+    Case(
+        "another media type",
+        _answers(said("Content-Type: text/html", "Connection: close"), b"<html>", then="goes"),
+        FAILED,
+    ),
+    Case("a refusal of 4 GiB", _answers(said(status="500 No"), again=[b"no " * (1 << 15)]), "^RequestFailed: .*500"),
+    Case("a redirect", _answers(said("Location: http://127.0.0.1:1/", status="302 Found"), then="goes"), FAILED),
+    Case(
+        "a chunk of 2^60 bytes",
+        _answers(STREAM[:-2] + b"Transfer-Encoding: chunked\r\n\r\n1000000000000000\r\ngo"),
+        FAILED,
+    ),
+    Case("endless headers", _answers(b"HTTP/1.1 200 OK\r\n", again=[b"x: y\r\n" * 1000]), FAILED),
+    Case("an endless line", _answers(STREAM, b"data: ", again=[b"a" * (1 << 16)]), FAILED),
+    Case("no gzip", _answers(STREAM[:-2] + b"Content-Encoding: gzip\r\n\r\n" + NOISE, then="goes"), FAILED),
+    Case(
+        "a gzip of 1 GiB",
+        _answers(STREAM[:-2] + b"Content-Encoding: gzip\r\n\r\n", gzip.compress(bytes(1 << 20)) * 1024),
+        FAILED,
+    ),
+    Case("endless tokens", _answers(STREAM, again=[event(token()) * 1000]), FAILED),
+    Case("endless events of nothing", _answers(STREAM, again=[event({}) * 1000]), FAILED),
+    Case("endless interim answers", _answers(again=[said(status="103 Early Hints") * 1000]), FAILED),
+    Case("an error that forges lines", _streams({"error": {"message": CONTROL}}), "^RequestFailed: .*all is well"),
+    Case(
+        "a refusal that forges lines",
+        _answers(said(status="400 No"), CONTROL.encode(), then="goes"),
+        "^RequestFailed: .*all is well",
+    ),
+)

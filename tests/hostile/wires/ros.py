@@ -1,0 +1,204 @@
+"""Hostile peers of our ROS server: participants of the same domain."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, suppress
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from s2a_bench.clock import now_ns
+from s2a_bench.ros import QoS, Rejected, Result
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
+from s2a_bench.testing.hostile import Attack, Case
+from s2a_bench.testing.hostile.tcp import NOISE
+from s2a_bench.transport import Wiring
+from s2a_bench.transport.ros.action import ACTION
+from s2a_bench.transport.ros.camera import CAMERA, POLL_S
+from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
+from s2a_bench.transport.ros.wire import READER_QOS, request_message
+from s2a_bench.types import Frame, Request
+from tests.hostile.wires.http import bomb
+
+Messages: TypeAlias = "Callable[[], Iterable[bytes | bytearray]]"
+CDR = b"\x00\x01\x00\x00"
+MATCHES_S = 10.0
+RELIABLE = QoS(depth=0)
+
+
+def publishes(
+    make: Messages, topic: str = "/request", kind: str = ros.REQUEST, *, qos: QoS = RELIABLE, answers: int = 1
+) -> Attack:
+    """Return a client that publishes messages, and returns the errors of so many ``answers`` on /token."""
+
+    def attack(told: Wiring[Any]) -> str:
+        errors: list[str] = []
+        with closing(join(told, "hostile")) as middleware:
+            tokens = middleware.subscription(namespace_of(told) + "/token", ros.TOKEN, READER_QOS)
+            publisher = middleware.publisher(namespace_of(told) + topic, kind, qos)
+            wait_until(lambda: bool(publisher.matched() and tokens.matched()), lambda: True, "no server to attack")
+            for packed in make():
+                publisher.send(bytearray(packed))
+            deadline = now_ns() + round(MATCHES_S * 1e9)
+            while len(errors) < answers and now_ns() < deadline:
+                taken = tokens.take(POLL_S)
+                if taken is not None and (token := tokens.unpack(taken)).last and token.id != "honest":
+                    errors.append(token.error)
+        return "\n".join(errors)
+
+    return attack
+
+
+def sends_goals(acts: Callable[[Any], Iterable[Any]]) -> Attack:
+    """Return an action client that does something, and returns the events that came of it."""
+
+    def attack(told: Wiring[Any]) -> str:
+        with closing(join(told, "hostile")) as middleware:
+            client = middleware.action_client(namespace_of(told) + ACTION, GENERATE_RESPONSE)
+            wait_until(client.server_present, lambda: True, "no server to attack")
+            return "\n".join(str(said) for said in acts(client))
+
+    return attack
+
+
+def _request(images: Iterable[Any] = (), compressed: Iterable[Any] = (), **fields: Any) -> Any:
+    request = Request(**{"id": "hostile", "prompt": "go on", "max_tokens": 3, **fields})
+    return request_message(request, list(images), list(compressed))
+
+
+def _asks(images: Iterable[Any] = (), compressed: Iterable[Any] = (), **fields: Any) -> Messages:
+    return lambda: [ros.serialise(_request(images, compressed, **fields), ros.REQUEST)]
+
+
+def image(width: int, height: int, data: int, encoding: str = "rgb8", step: int | None = None) -> Any:
+    """Return a picture that says that it has this size, and so many bytes."""
+    small = ros.image_message(Frame(0, 0, 1, 1, "rgb8", np.zeros((1, 1, 3), np.uint8)), 1, "camera")
+    small.width, small.height, small.encoding = width, height, encoding
+    small.step, small.data = width * 3 if step is None else step, np.zeros(data, np.uint8)
+    return small
+
+
+def compressed(data: bytes) -> Any:
+    """Return a compressed picture."""
+    return ros.compressed_image_message(np.frombuffer(data, np.uint8), 1, "camera", "png")
+
+
+def _bomb() -> Iterable[bytearray]:
+    return [ros.serialise(_request(compressed=[compressed(bomb())]), ros.REQUEST)]
+
+
+def _altered(at: bytes, by: bytes) -> Messages:
+    """Return a request in whose bytes ``at`` is replaced."""
+    return lambda: [bytes(ros.serialise(_request(prompt="marker"), ros.REQUEST)).replace(at, by, 1)]
+
+
+def _event(client: Any, *kinds: type, seconds: float = MATCHES_S) -> Any:
+    """Return the next event of a kind."""
+    deadline = now_ns() + round(seconds * 1e9)
+    while now_ns() < deadline:
+        if isinstance(event := client.next_event(POLL_S), kinds):
+            return event
+    return None
+
+
+def _goal(prompt: str = "go on", **more: Any) -> Any:
+    return generate_goal(prompt, **more)
+
+
+def _garbage_goal(client: Any) -> Iterator[Any]:
+    packed = bytearray(client.pack(_goal("marker")))
+    at = packed.index(b"marker")
+    packed[at - 4 : at] = struct.pack("<I", 1 << 30)
+    client.send(packed)
+    yield type(_event(client, Rejected, Result)).__name__
+
+
+def _cancelled(client: Any) -> Iterator[Any]:
+    goals = [client.send(client.pack(_goal("go on " * 100))) for _ in range(8)]
+    for goal in goals:
+        client.cancel(goal)
+    yield from (_event(client, Rejected, Result) is not None for _ in goals)
+
+
+def _same_id(client: Any) -> Iterator[Any]:
+    goal = client.send(client.pack(_goal()))
+    for _ in range(9):
+        client.send(client.pack(_goal()), goal)
+    yield from (type(_event(client, Rejected, Result)).__name__ for _ in range(10))
+
+
+def _unknown(client: Any) -> Iterator[Any]:
+    for index in range(1, 21):  # 0 means all goals
+        client.cancel(index.to_bytes(16, "big"))
+        client.get_result(index.to_bytes(16, "little"))
+    yield _event(client, Result)
+
+
+def _gone(client: Any) -> Iterator[Any]:
+    client.send(client.pack(_goal()))
+    yield "gone"
+
+
+def _with(image_of_goal: Any) -> Callable[[Any], Iterator[Any]]:
+    def act(client: Any) -> Iterator[Any]:
+        client.send(client.pack(_goal(images=[image_of_goal])))
+        result = _event(client, Rejected, Result)
+        yield client.unpack_result(result.packed).response.text if isinstance(result, Result) else result
+
+    return act
+
+
+def datagrams(told: Wiring[Any]) -> str:
+    """Send noise to the UDP ports of the domain's first participants (DDSI-RTPS, 9.6.1)."""
+    base = 7400 + 250 * domain_of(told)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for port in (base, base + 1, *(base + offset + 2 * index for index in range(4) for offset in (10, 11))):
+            for size in (0, 1, 20, 1400, 60_000):
+                with suppress(OSError):
+                    sender.sendto(NOISE[:size], ("127.0.0.1", port))
+                    sender.sendto(b"RTPS\x02\x01" + NOISE[:size], ("127.0.0.1", port))
+    return ""
+
+
+CLIENTS: tuple[Case[Attack], ...] = (
+    Case("noise as datagrams", datagrams),
+    Case("noise as requests", publishes(lambda: [CDR + NOISE[: 4 * n] for n in range(1, 200)], answers=0)),
+    Case("nothing as a request", publishes(lambda: [CDR] * 9, answers=0)),
+    Case("a text of 1 GiB announced", publishes(lambda: [CDR + struct.pack("<I", 1 << 30) + NOISE[:400]], answers=0)),
+    Case("2^32-1 pictures announced", publishes(lambda: [CDR + b"\x01\0\0\0\0\0\0\0" * 4 + b"\xff" * 400], answers=0)),
+    Case("no UTF-8", publishes(_altered(b"marker", b"\xff\xfe\xc0\xed\xa0\x80"), answers=0)),
+    Case("a NUL in a text", publishes(_altered(b"marker", b"m\0rker"))),
+    Case("max_tokens 0", publishes(_asks(max_tokens=0)), "max_tokens should be"),
+    Case("max_tokens 2^32-1", publishes(_asks(max_tokens=(1 << 32) - 1)), "max_tokens should be"),
+    Case("a prompt of 16 MiB", publishes(_asks(prompt="go" + " " * (16 << 20)))),
+    Case(
+        "8 requests of 16 MiB",
+        publishes(lambda: [*_asks(id="flood", prompt="go" + " " * (16 << 20))()] * 8, answers=8),
+    ),
+    Case("fewer pixels than said", publishes(_asks([image(640, 480, 10)])), "."),
+    Case("more pixels than said", publishes(_asks([image(2, 2, 5000)]))),
+    Case("2^31 x 2^31 pixels", publishes(_asks([image((1 << 31) - 1, (1 << 31) - 1, 12, step=12)])), "at most"),
+    Case("a step of 0", publishes(_asks([image(2, 2, 12, step=0)])), "."),
+    Case("an unknown encoding", publishes(_asks([image(2, 2, 12, "bayer_rggb16")])), "bayer_rggb16"),
+    Case("an empty picture", publishes(_asks([image(0, 0, 0)])), "empty"),
+    Case("100 pictures", publishes(_asks([image(64, 48, 64 * 48 * 3)] * 100))),
+    Case("a picture of 900 million pixels", publishes(_bomb), "30000x30000"),
+    Case("noise as a picture", publishes(_asks(compressed=[compressed(NOISE)])), "neither"),
+    Case("300 requests at once", publishes(lambda: [*_asks(id="flood", max_tokens=50)()] * 300, answers=300)),
+    Case("gone in the middle of an answer", publishes(_asks(max_tokens=5000), answers=0)),
+    Case("noise as a camera", publishes(lambda: [CDR + NOISE] * 50, CAMERA, ros.IMAGE, qos=QoS(1), answers=0)),
+    Case("noise as a goal", sends_goals(_garbage_goal), "Rejected"),
+    Case("8 goals that are cancelled", sends_goals(_cancelled), "^(True\n?)+$"),
+    Case("one id for ten goals", sends_goals(_same_id), "Rejected"),
+    Case("unknown goals are cancelled and asked about", sends_goals(_unknown)),
+    Case("gone in the middle of a goal", sends_goals(_gone)),
+    Case("a goal with fewer pixels than said", sends_goals(_with(image(640, 480, 10))), "."),
+    Case(
+        "a goal of 2^31 x 2^31 pixels", sends_goals(_with(image((1 << 31) - 1, (1 << 31) - 1, 12, step=12))), "at most"
+    ),
+)
+"""What our server outlives; both variants' clients are served by one."""

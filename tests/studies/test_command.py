@@ -1,0 +1,70 @@
+"""`python -m studies` as a user runs it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from s2a_bench.store.run import read_run
+from studies.rows import STUDY_CELLS
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "studies", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=200,
+        cwd=ROOT,
+    )
+
+
+def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
+    done = run("misfit", "--plans", "100", "--calibration-plans", "100", "--output", str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "Wrong beliefs" in done.stdout
+    assert (
+        "warning [few-calibration-plans]: 100 calibration plans are few: one lambda may stall up to 6.7%" in done.stderr
+    )
+    (folder,) = tmp_path.iterdir()
+    assert f"run folder: {folder}" in done.stderr
+    kept = read_run(folder)
+    assert kept.manifest["state"] == "finished"
+    assert kept.manifest["seeds"] == {"study": 0}
+    assert (folder / "studies.parquet").exists()
+    rows = kept.table(STUDY_CELLS)
+    assert len(rows) == 3 * 17
+    assert (rows["plans"] == 100).all()
+    for name in ("| N -2 |", "| L x 1.25 |", "| gap x 2 |"):
+        assert name in done.stdout
+    for name in ("figures/misfit.png", "figures/misfit.pdf", "tables/wrong-beliefs.md", "tables/misfit.csv"):
+        assert (folder / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fly"], "argument NAME: invalid choice: 'fly'"),
+        (["targets", "--plans", "0"], "--plans: '0' should be greater than or equal to 1"),
+    ],
+)
+def test_wrong_use_is_one_line_and_leaves_nothing_behind(arguments: list[str], message: str, tmp_path: Path) -> None:
+    done = run(*arguments, "--output", str(tmp_path))
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_studies_that_ask_no_model_need_no_extra() -> None:
+    hidden = "import sys; sys.modules.update(llama_cpp=None, gguf=None)"
+    hidden += "; from studies.__main__ import parser; parser().print_help()"
+    done = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert "frontier" in done.stdout

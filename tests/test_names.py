@@ -1,0 +1,116 @@
+"""Consumers trust declarations: no experiment uses another one, and nobody names one policy, mode, engine or transport.
+
+Research stands outside: `studies` imports what docs/library.md lists, and the package never imports `studies`.
+
+What is named is read off the syntax tree: modules that are imported, wherever, and texts that are a registered name.
+`tests/data/names.txt` is what may, as a default or a claim has to name one, and what is still to be moved: it shrinks.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import s2a_bench
+from s2a_bench.act import ROBOTS
+from s2a_bench.inference import ENGINES
+from s2a_bench.policy import POLICIES
+from s2a_bench.policy.chunks import MODES
+from s2a_bench.transport import TRANSPORTS
+
+ROOT = Path(__file__).parent.parent
+ALLOWED = Path(__file__).parent / "data" / "names.txt"
+EXPERIMENTS = {path.parent.name for path in (ROOT / "s2a_bench" / "experiments").glob("*/__init__.py")}
+COMMON = {"queue", "replace"}
+"""Modes whose names are words of other things too (a stage, an error handler): seen where they are imported only."""
+ROBOTS_AT = "s2a_bench/act/"
+"""Where a robot's name is a robot, whatever else is called so."""
+KINDS = {
+    "policy": (POLICIES, "s2a_bench/policy/"),
+    "mode": (MODES, "s2a_bench/policy/"),
+    "engine": (ENGINES, "s2a_bench/inference/"),
+    "transport": (TRANSPORTS, "s2a_bench/transport/{}/"),
+}
+
+
+def imported(nodes: list[ast.AST]) -> set[str]:
+    """Return what is imported, as module.name."""
+    found = {
+        f"{node.module}.{alias.name}" for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    return found | {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+
+
+def within(name: str, module: str) -> bool:
+    """Whether a name is a module or in it."""
+    return name == module or name.startswith(f"{module}.")
+
+
+def imports_of(path: Path) -> set[str]:
+    return imported(list(ast.walk(ast.parse(path.read_text(encoding="utf-8")))))
+
+
+def named(path: Path) -> Iterator[str]:
+    """Yield what a module names that it should not have to."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    nodes = list(ast.walk(tree))
+    prose = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    modules = imported(nodes)
+    texts = {
+        node.value
+        for node in nodes
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose
+    }
+    where = path.relative_to(ROOT).as_posix()
+    for kind, (registry, home) in KINDS.items():
+        declared = "s2a_bench/transport/__init__.py" if kind == "transport" else home
+        for name in registry.built_in():
+            if where.startswith((home.format(name), declared)):
+                continue
+            module = registry.where(name)
+            robot = where.startswith(ROBOTS_AT) and name in ROBOTS.built_in()
+            if any(within(each, module) for each in modules) or (name in texts and name not in COMMON and not robot):
+                yield f"{kind} {name}"
+    parts = path.relative_to(ROOT).parts
+    if parts[1] == "experiments" and parts[2] in EXPERIMENTS:
+        for each in modules:
+            other = each.removeprefix("s2a_bench.experiments.").partition(".")[0]
+            if each.startswith("s2a_bench.experiments.") and other in EXPERIMENTS - {parts[2]}:
+                yield f"experiment {other}"
+
+
+def test_nobody_names_one_of_a_kind_but_where_it_is_allowed() -> None:
+    found = {
+        f"{path.relative_to(ROOT).as_posix()}: {', '.join(sorted(names))}"
+        for path in (ROOT / "s2a_bench").rglob("*.py")
+        if (names := set(named(path)))
+    }
+    allowed = {line for line in ALLOWED.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")}
+    assert not found - allowed, "a declaration lacks an attribute, or a module belongs elsewhere"
+    assert not allowed - found, "no longer so: take the lines out"
+
+
+def test_studies_import_the_documented_modules_alone() -> None:
+    page = (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
+    public = re.findall(r"^\| `(s2a_bench\.\w+)` \|", page, re.MULTILINE)
+    face = {"s2a_bench", *(f"s2a_bench.{name}" for name in s2a_bench.__all__)}
+    found = {
+        f"{path.name}: {name}"
+        for path in (ROOT / "studies").rglob("*.py")
+        for name in imports_of(path)
+        if within(name, "s2a_bench") and name not in face and not any(within(name, module) for module in public)
+    }
+    assert {"s2a_bench.policy", "s2a_bench.store"} <= set(public)
+    assert not found, "docs/library.md does not list these modules"
+
+
+def test_the_package_never_imports_the_studies() -> None:
+    found = {
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in (ROOT / "s2a_bench").rglob("*.py")
+        for name in imports_of(path)
+        if within(name, "studies")
+    }
+    assert not found

@@ -1,0 +1,40 @@
+"""How lines are counted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tools.size import room_of, size_of
+
+TEXT = '''"""A docstring
+of two lines."""
+
+# a comment
+TEXT = """two
+lines"""
+
+
+def double(x: int) -> int:
+    """Return twice x."""
+    return (  # a reason
+        2 * x
+    )
+'''
+
+
+def test_lines_of_code_are_neither_docstrings_nor_comments_nor_blank() -> None:
+    size = size_of(TEXT)
+    assert (size.lines, size.code, size.files) == (13, 6, 1)
+
+
+def test_rooms_are_folders_and_each_transport_experiment_and_report_is_one() -> None:
+    rooms = {
+        "s2a_bench/clock.py": "(top)",
+        "s2a_bench/ros/dds.py": "ros",
+        "s2a_bench/machine/doctor/gpu.py": "machine",
+        "s2a_bench/transport/serving.py": "transport",
+        "s2a_bench/transport/http/dialects/tgi.py": "transport/http",
+        "s2a_bench/experiments/ccrb/view/tables.py": "experiments/ccrb",
+        "tools/size.py": "tools",
+    }
+    assert {path: room_of(Path(path)) for path in rooms} == rooms

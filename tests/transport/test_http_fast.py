@@ -1,0 +1,261 @@
+"""What HTTP allows on a connection of the server of best effort and binary, and what that refuses; limits of both."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import time
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from itertools import count
+from threading import Event
+
+import pytest
+
+from s2a_bench.testing.transport import Recorder, served, wiring
+from s2a_bench.trace import Trace
+from s2a_bench.transport import Handler
+from s2a_bench.transport.http.own import PATHS
+from s2a_bench.transport.limits import LIMITS, MIB, Limits
+from s2a_bench.types import Request, Token
+
+PATH = PATHS["best-effort"]
+
+
+@contextmanager
+def connected(
+    handler: Handler | None = None, limits: Limits = LIMITS, variant: str = "best-effort"
+) -> Iterator[socket.socket]:
+    """Serve, and connect, for as long as the context lasts."""
+    with ExitStack() as stack:
+        told = replace(wiring(f"http/{variant}"), limits=limits)
+        server, _ = stack.enter_context(served(told, handler or Recorder(["go", "_to"])))
+        host, port = server.address.removeprefix("http://").split(":")
+        yield stack.enter_context(socket.create_connection((host, int(port)), timeout=20))
+
+
+def body(prompt: str = "plan", **more: object) -> bytes:
+    return json.dumps({"messages": [{"role": "user", "content": prompt}], **more}).encode()
+
+
+def request(data: bytes, *headers: str, version: str = "1.1", path: str = PATH) -> bytes:
+    lines = [
+        f"POST {path} HTTP/{version}",
+        "Host: localhost",
+        "Content-Type: application/json",
+        *(headers or (f"Content-Length: {len(data)}",)),
+    ]
+    return "\r\n".join([*lines, "", ""]).encode() + data
+
+
+def read(connection: socket.socket) -> tuple[int, bytes]:
+    """Read one answer with a length; return its status and body."""
+    head = b""
+    while not head.endswith(b"\r\n\r\n"):
+        piece = connection.recv(1)
+        assert piece, head
+        head += piece
+    size = next(int(line.split(b":")[1]) for line in head.split(b"\r\n") if line.startswith(b"content-length"))
+    return int(head.split()[1]), connection.recv(size, socket.MSG_WAITALL)
+
+
+def rest_of(connection: socket.socket) -> bytes:
+    """Read until the server closes."""
+    data = b""
+    with contextlib.suppress(ConnectionError):
+        while piece := connection.recv(65536):
+            data += piece
+    return data
+
+
+def said(answer: tuple[int, bytes]) -> str:
+    status, data = answer
+    assert status == 200
+    text: str = json.loads(data)["choices"][0]["message"]["content"]
+    return text
+
+
+@pytest.mark.parametrize("size", [1, 100_000, 3_000_000])
+def test_a_kept_connection_is_answered_again_and_again(size: int) -> None:
+    with connected() as connection:
+        for _ in range(3):
+            connection.sendall(request(body("a" * size)))
+            assert said(read(connection)) == "go_to"
+
+
+@pytest.mark.parametrize("cut", [1, 30, 130, 200])
+def test_a_request_may_come_in_pieces(cut: int) -> None:
+    data = request(body("a" * 200))
+    with connected() as connection:
+        for at in range(0, len(data), cut):
+            connection.sendall(data[at : at + cut])
+            time.sleep(0.001)
+        assert said(read(connection)) == "go_to"
+
+
+def test_who_expects_it_is_told_to_go_on() -> None:
+    data = body()
+    with connected() as connection:
+        connection.sendall(request(b"", f"Content-Length: {len(data)}", "Expect: 100-continue"))
+        assert connection.recv(1000) == b"HTTP/1.1 100 Continue\r\n\r\n"
+        connection.sendall(data)
+        assert said(read(connection)) == "go_to"
+
+
+@pytest.mark.parametrize("stream", [True, False])
+def test_http_1_0_has_no_chunks_and_ends_with_the_connection(stream: bool) -> None:
+    with connected() as connection:
+        connection.sendall(request(body(stream=stream), version="1.0"))
+        head, _, answer = rest_of(connection).partition(b"\r\n\r\n")
+        assert b"chunked" not in head
+        assert answer.endswith(b"data: [DONE]\n\n") if stream else json.loads(answer)
+
+
+def test_a_connection_is_for_all_paths() -> None:
+    with connected() as connection:
+        for path in (*PATHS.values(), *PATHS.values()):
+            header = 'S2A-Request: {"prompt": "a"}'
+            data = b"" if path == PATHS["binary"] else body()
+            connection.sendall(request(data, header, f"Content-Length: {len(data)}", path=path))
+            assert said(read(connection)) == "go_to"
+
+
+@pytest.mark.parametrize(
+    ("data", "status", "says"),
+    [
+        (request(b"", "Transfer-Encoding: chunked") + b"0\r\n\r\n", 411, "Content-Length"),
+        (request(b"", f"Content-Length: {'9' * 5000}"), 400, "Content-Length"),
+        (request(b"", "Content-Length: -5"), 400, "Content-Length"),
+        (request(b"", "Content-Length: 3", "Content-Length: 5"), 400, "Content-Length"),
+        (b"CONNECT a:80 HTTP/1.1\r\nHost: localhost\r\n\r\n", 404, "POST to one of"),
+        (request(b"", "Upgrade: websocket", "Connection: upgrade", path="/"), 404, "POST to one of"),
+        (b"\x16\x03\x01\r\n\r\n", 400, "no HTTP request"),
+        (b"\r\n\r\n", 400, "no HTTP request"),
+        (b"POST / HTTP/9.9\r\n\r\n", 400, "no HTTP request"),
+        (request(b"", *["a:"] * 130), 431, "lines of headers"),
+        (request(b"", "a: " + "b" * 70_000), 431, "bytes of headers"),
+        (request(b"", "Origin: null"), 403, "Origin"),
+        (request(b"", "Host: example.com"), 403, "example.com"),
+    ],
+)
+def test_what_is_not_taken_is_told_in_one_line_and_hung_up_on(
+    data: bytes, status: int, says: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with connected() as connection:
+        connection.sendall(data)
+        got, answer = read(connection)
+        assert got == status
+        assert says in json.loads(answer)["error"]["message"]
+        assert rest_of(connection) == b""
+    assert caplog.text == ""
+
+
+def test_an_upgrade_is_ignored() -> None:
+    data = body()
+    with connected() as connection:
+        connection.sendall(request(data, f"Content-Length: {len(data)}", "Upgrade: h2c", "Connection: Upgrade"))
+        assert said(read(connection)) == "go_to"
+
+
+class Slow:
+    """Answers when told."""
+
+    def __init__(self) -> None:
+        self.began, self.go = Event(), Event()
+
+    def __call__(self, _request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        self.began.set()
+        self.go.wait(20)
+        yield Token(0, "go")
+
+
+def test_a_request_that_comes_before_the_answer_is_kept() -> None:
+    slow = Slow()
+    with connected(slow) as connection:
+        connection.sendall(request(body("first")))
+        assert slow.began.wait(20)
+        connection.sendall(request(body("a" * 300_000)))
+        slow.go.set()
+        assert said(read(connection)) == "go"
+        assert said(read(connection)) == "go"
+
+
+def test_requests_that_come_together_are_answered_in_order() -> None:
+    with connected() as connection:
+        connection.sendall(request(body("a" * 100_000)) * 3 + request(body())[:-1])
+        for _ in range(3):
+            assert said(read(connection)) == "go_to"
+        connection.sendall(request(body())[-1:])
+        assert said(read(connection)) == "go_to"
+
+
+@pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
+@pytest.mark.parametrize("stream", [True, False])
+def test_who_leaves_bytes_behind_and_goes_does_not_hold_the_engine(stream: bool, variant: str) -> None:
+    began, ended = Event(), Event()
+
+    def endless(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        try:
+            began.set()
+            for index in count():
+                time.sleep(0.01)
+                yield Token(index, "go")
+        finally:
+            ended.set()
+
+    with connected(endless, variant=variant) as connection:
+        connection.sendall(request(body(stream=stream), path=PATHS[variant]))
+        assert began.wait(20)
+        connection.sendall(bytes(200_000))
+        connection.close()
+        assert ended.wait(20)
+
+
+@pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
+class TestLimits:
+    def test_a_body_that_says_that_it_is_too_large_is_refused_unread(self, variant: str) -> None:
+        with connected(limits=Limits(body_mib=1000 / MIB), variant=variant) as connection:
+            connection.sendall(request(b"", "Content-Length: 1001", path=PATHS[variant]))
+            status, answer = read(connection)
+            assert status == json.loads(answer)["error"]["code"] == 413
+
+    def test_headers_a_byte_at_a_time_end(self, variant: str) -> None:
+        with connected(limits=Limits(head_s=0.3), variant=variant) as connection:
+            with contextlib.suppress(ConnectionError):
+                for byte in request(b"", path=PATHS[variant])[:30]:
+                    connection.sendall(bytes([byte]))
+                    time.sleep(0.02)
+            assert b" 408 " in rest_of(connection)[:20]
+
+    def test_an_idle_connection_is_kept(self, variant: str) -> None:
+        with connected(limits=Limits(head_s=0.1, body_s=0.1), variant=variant) as connection:
+            for _ in range(2):
+                time.sleep(0.3)
+                connection.sendall(request(body(), path=PATHS[variant]))
+                assert said(read(connection)) == "go_to"
+
+    @pytest.mark.parametrize("sent", [b"", b"{", b" " * 500_000])
+    def test_a_slow_body_ends(self, variant: str, sent: bytes) -> None:
+        with connected(limits=Limits(body_s=0.3), variant=variant) as connection:
+            connection.sendall(request(sent, "Content-Length: 1000000", path=PATHS[variant]))
+            assert read(connection)[0] == 408
+
+    def test_bytes_under_way_are_counted_over_all_connections_and_given_back(self, variant: str) -> None:
+        data = body("a" * 600_000)
+        whole = request(data, path=PATHS[variant])
+        with connected(limits=Limits(in_flight_mib=1), variant=variant) as first:
+            first.sendall(whole[:-1])
+            time.sleep(0.2)
+            with socket.create_connection(first.getpeername(), timeout=20) as second:
+                second.sendall(whole[:-1])
+                answer = rest_of(second)
+                assert b" 503 " in answer[:20]
+                assert b"retry-after: 1\r\n" in answer
+            time.sleep(0.2)
+            first.sendall(data[-1:])
+            assert said(read(first)) == "go_to"
+            for _ in range(3):
+                first.sendall(whole)
+                assert said(read(first)) == "go_to"

@@ -1,0 +1,207 @@
+"""Requests without a picture, by what the camera's topic brings: frames, publishers without frames, or nothing."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import pytest
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import RequestFailed
+from s2a_bench.ros import Middleware, Publisher, QoS, Result, Subscription
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.action import Status
+from s2a_bench.ros.diagnostics import ARRAY, Level
+from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
+from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
+from s2a_bench.transport import Client, Wiring, open_client
+from s2a_bench.transport.ros import camera as camera_module
+from s2a_bench.transport.ros.camera import CAMERA, CAMERA_QOS
+from s2a_bench.transport.ros.joining import join
+from s2a_bench.types import Frame, Request
+from tests.waiting import until
+
+TOPIC = "/robot/camera/image_raw"
+BLIND = f"no picture: 1 publisher on {TOPIC}, no frame comes: look at the buffers (qos reliable"
+WAIT_S = 20.0
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as whole:
+        yield whole
+
+
+@pytest.fixture(params=["cyclonedds", "zenoh"])
+def told(request: pytest.FixtureRequest, dds_domain: int) -> Wiring[Any]:
+    """What a server is told, over each middleware that comes from PyPI."""
+    pytest.importorskip(request.param, reason=f"{request.param} is not installed")
+    options = {"middleware": request.param, "domain_id": dds_domain, "node_api": True, "max_frame_age": 0.3}
+    return wiring("ros/topic", "/robot", **options)
+
+
+class Robot:
+    """A server, and a peer in its domain."""
+
+    def __init__(self, stack: ExitStack, told: Wiring[Any]) -> None:
+        self.handler = Recorder(["x"])
+        self.server: Any = stack.enter_context(served(told, self.handler))[0]
+        self._stack, self._told = stack, replace(told, address=self.server.address)
+        self.peer = self.join()
+
+    def join(self) -> Middleware:
+        middleware = join(self._told, "peer")
+        self._stack.callback(middleware.close)
+        return middleware
+
+    def client(self, variant: str = "topic") -> Client:
+        client = open_client(replace(self._told, variant=variant))
+        self._stack.callback(client.close)
+        return client
+
+    def camera(self, qos: str = "reliable", middleware: Middleware | None = None) -> Publisher:
+        """A publisher on the camera's topic that the server knows."""
+        publisher = (middleware or self.peer).publisher("/robot" + CAMERA, ros.IMAGE, CAMERA_QOS[qos])
+        until(lambda: self.server._cache._cameras[0].publishers() == 1)
+        return publisher
+
+    def diagnosed(self, diagnostics: Subscription, wanted: str) -> Any:
+        """The first status of the camera whose message matches."""
+        deadline = now_ns() + int(WAIT_S * 1e9)
+        while now_ns() < deadline:
+            if (packed := diagnostics.take(0.2)) is not None:
+                _, status = diagnostics.unpack(packed).status
+                if re.search(wanted, status.message):
+                    return status
+        raise AssertionError("it did not come")
+
+
+@pytest.fixture
+def robot(stack: ExitStack, told: Wiring[Any]) -> Robot:
+    return Robot(stack, told)
+
+
+def refusal(client: Client) -> str:
+    """Why a request without a picture fails."""
+    with pytest.raises(RequestFailed) as raised:
+        ask(client, Request("a", "plan"))
+    return str(raised.value)
+
+
+def logged(caplog: pytest.LogCaptureFixture, part: str) -> list[str]:
+    return [message for message in caplog.messages if part in message]
+
+
+def test_goals_without_a_picture_are_aborted_where_no_frame_of_the_camera_comes(
+    robot: Robot, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept = robot.camera()
+    goals = robot.peer.action_client("/robot/generate_response", GENERATE_RESPONSE)
+    assert goals.wait_for_server(WAIT_S)
+    results = []
+    for _ in range(6):
+        goals.send(goals.pack(generate_goal("plan")))
+        while not isinstance(event := goals.next_event(WAIT_S), Result):
+            assert event is not None
+        results.append((event.status, goals.unpack_result(event.packed).response.text[: len(BLIND)]))
+    assert results == [(Status.ABORTED, BLIND)] * 6
+    assert robot.handler.requests == []
+    assert len(logged(caplog, BLIND)) == 1
+    goals.send(goals.pack(generate_goal("plan", [ros.image_message(yuyv_frame(), 1, "camera")])))
+    while not isinstance(event := goals.next_event(WAIT_S), Result):
+        assert event is not None
+    assert event.status == Status.SUCCEEDED
+    assert [len(request.images) for request in robot.handler.requests] == [1]
+    del kept
+
+
+def test_a_request_on_the_topic_fails_too_and_is_answered_again_once_the_publisher_has_left(robot: Robot) -> None:
+    client, other = robot.client(), robot.join()
+    kept = robot.camera(middleware=other)
+    assert BLIND in refusal(client)
+    other.close()
+    until(lambda: robot.server._cache._cameras[0].publishers() == 0)
+    assert ask(client, Request("b", "plan"))[0]
+    assert [request.images for request in robot.handler.requests] == [()]
+    del kept
+
+
+def test_diagnostics_warn_of_a_camera_whose_frames_do_not_come(robot: Robot) -> None:
+    diagnostics = robot.peer.subscription("/diagnostics", ARRAY, QoS())
+    status = robot.diagnosed(diagnostics, "^no camera: no publisher on its topics$")
+    assert status.level == Level.OK
+    publisher = robot.camera()
+    status = robot.diagnosed(diagnostics, f"^1 publisher on {TOPIC}, no frame comes: look at the buffers")
+    assert status.level == Level.WARN
+    publisher.send(publisher.pack(ros.image_message(yuyv_frame(), 1, "camera")))
+    status = robot.diagnosed(diagnostics, f"^the newest frame is .* s old: 1 publisher on {TOPIC}, no frame comes")
+    assert status.level == Level.WARN
+
+
+@pytest.mark.parametrize("variant", ["topic", "action"])
+def test_without_a_publisher_text_is_answered_and_the_log_says_once_that_there_is_no_camera(
+    robot: Robot, caplog: pytest.LogCaptureFixture, variant: str
+) -> None:
+    client = robot.client(variant)
+    for _ in range(3):
+        assert ask(client, Request("a", "plan"))[0]
+    assert [request.images for request in robot.handler.requests] == [()] * 3
+    (line,) = [record for record in caplog.records if "camera" in record.getMessage()]
+    assert line.getMessage().startswith(f"no camera: no publisher on {TOPIC} or {TOPIC}/compressed; ")
+    assert line.levelno == logging.WARNING
+
+
+def test_a_request_waits_for_the_first_frame_of_a_publisher_that_has_just_appeared(
+    stack: ExitStack, told: Wiring[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(camera_module, "FIRST_FRAME_S", WAIT_S)
+    robot = Robot(stack, replace(told, options=told.options.but(max_frame_age=60.0)))
+    client, publisher = robot.client(), robot.camera()
+    asking = Thread(target=ask, args=(client, Request("a", "plan")))
+    asking.start()
+    until(lambda: robot.server._shared.activity.requests == 1)
+    publisher.send(publisher.pack(ros.image_message(yuyv_frame(), 7, "camera")))
+    asking.join(WAIT_S)
+    assert [[image.stamp_ns for image in request.images] for request in robot.handler.requests] == [[7]]
+
+
+def test_frames_that_cannot_be_used_are_named_as_the_reason(robot: Robot) -> None:
+    client, publisher = robot.client(), robot.camera()
+    depth = replace(ros.image_message(Frame(0, 0, 2, 2, "mono8", np.zeros((2, 2), np.uint8)), 1, "c"), encoding="16UC1")
+    publisher.send(publisher.pack(depth))
+    until(lambda: bool(robot.server._cache._unused))
+    reason = rf"no picture: 1 publisher on {TOPIC}, none of its frames can be used: .*16UC1"
+    assert re.search(reason, refusal(client))
+
+
+@pytest.mark.parametrize("told", ["cyclonedds"], indirect=True)
+def test_a_best_effort_camera_that_a_reliable_server_does_not_match_is_no_missing_camera(robot: Robot) -> None:
+    publisher = robot.camera("sensor_data")
+    assert publisher.matched() == 0
+    why = refusal(robot.client())
+    assert BLIND in why
+    assert why.endswith("; a best-effort publisher is received with qos sensor_data")
+
+
+def test_an_old_frame_is_told_of_with_buffers_while_there_is_a_publisher(
+    robot: Robot, caplog: pytest.LogCaptureFixture
+) -> None:
+    client, other = robot.client(), robot.join()
+    publisher = robot.camera(middleware=other)
+    publisher.send(publisher.pack(ros.image_message(yuyv_frame(), 1, "camera")))
+    cache = robot.server._cache
+    until(lambda: cache._newest is not None and now_ns() - cache._newest.received_ns > 300_000_000)
+    for _ in range(2):
+        why = refusal(client)
+        assert re.search(rf"more than `max_frame_age` 0\.3 s: 1 publisher on {TOPIC}, no frame comes: look at", why)
+    assert len(logged(caplog, "newest frame came")) == 1
+    other.close()
+    until(lambda: robot.server._cache._cameras[0].publishers() == 0)
+    assert refusal(client).endswith("s: see whether the camera still publishes")
