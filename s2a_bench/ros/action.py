@@ -476,11 +476,14 @@ class ServedAction(Generic[Caller]):
         self._send_status(status_array(self._goals.listed()))
 
     def _answer(self, service: Service[Caller], answer: Callable[[Any, Caller], None]) -> None:
-        """Answer the requests that have arrived; what cannot be read is dropped."""
+        """Answer the requests that have arrived; what cannot be read is dropped.
+
+        A cancel counts though its client has left since; who has left waits for no result.
+        """
         for packed, caller in service.arrived():
             try:
                 request = service.unpack(packed)
-                if service.reaches(caller):
+                if service.reaches(caller) or service is self._cancel:
                     with self._lock:
                         answer(request, caller)
             except Exception as error:  # noqa: BLE001 - one thread answers all: the next request may fare better

@@ -39,6 +39,14 @@ class TestCycloneActions(ActionSuite):
     """In a domain of Cyclone DDS."""
 
 
+def test_a_cancel_counts_though_its_client_has_left_since(action: Action, monkeypatch: pytest.MonkeyPatch) -> None:
+    server: Any = action.server
+    goal = start(action)
+    monkeypatch.setattr(server._cancel, "reaches", lambda _: False)
+    action.client.cancel(goal.id)
+    until(lambda: goal.cancel_requested)
+
+
 def announced(domain: int, wanted: set[tuple[str, str]]) -> dict[tuple[str, str], Any]:
     """What a third participant discovers of these (kind, topic)."""
     from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
