@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -31,6 +32,8 @@ from s2a_bench.transport import Program
 READY_TIMEOUT_S = 600.0
 """A model of several GB may have to come from a slow disk."""
 STOP_TIMEOUT_S = 3.0
+LOOK_S = 1.0
+"""How long the end of a process is waited for in one go."""
 
 
 class ServerProcess(AbstractContextManager["ServerProcess"]):
@@ -65,13 +68,27 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
     def alive(self) -> bool:
         return self._process.poll() is None
 
-    def ends_within(self, timeout_s: float | None) -> bool:
-        """Give a process a moment to end, or to be seen as ended where its connections broke; without end for None."""
+    def ends_within(self, timeout_s: float) -> bool:
+        """Give a process a moment to end, or to be seen as ended where its connections broke."""
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             return False
         return True
+
+    def wait_end(self) -> None:
+        """Wait until the process has ended, or a signal's handler raises.
+
+        Popen's own wait would keep its lock where a signal comes as it takes it, and so could never be called again.
+        No wait is without end, as a signal that comes just before one does not break it off.
+        """
+        ended = os.pidfd_open(self.pid)
+        try:
+            while not select.select([ended], [], [], LOOK_S)[0]:
+                pass
+        finally:
+            os.close(ended)
+        self._process.wait()
 
     def death(self) -> ServerDied:
         """Describe how the process ended, with the last line it wrote."""
@@ -167,7 +184,7 @@ def _serve(job: ServerJob, ready: Callable[[ServerProcess], None]) -> tuple[str,
     with OwnServer(job.wiring.transport, job) as server:
         server.wait_ready()
         ready(server)
-        server.ends_within(None)
+        server.wait_end()
         return server.address, server.death()
 
 

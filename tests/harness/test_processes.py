@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from s2a_bench.errors import ServerDied
-from s2a_bench.harness.processes import LlamaServer, OwnServer, ServerProcess
+from s2a_bench.harness.processes import LlamaServer, OwnServer, ServerProcess, keep_serving
+from s2a_bench.harness.serving import ServerJob
+from s2a_bench.inference import EngineConfig
 from s2a_bench.sweep.perform import _outside
+from s2a_bench.testing.transport import wiring
 
 
 class Dies(ServerProcess):
@@ -34,6 +41,40 @@ def test_a_server_that_met_an_illegal_instruction_says_to_set_up_again(tmp_path:
 def test_another_signal_is_only_told(tmp_path: Path) -> None:
     with Dies(tmp_path / "log", "SIGTERM") as server, pytest.raises(ServerDied, match="by signal 15; its log is"):
         server.wait_ready()
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Give back the handlers of this process's signals."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("handlers")
+def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same() -> None:
+    """As one that comes just before the wait; here another thread of this process receives it."""
+    late: list[int] = []
+
+    def ready(server: ServerProcess) -> None:
+        def kill() -> None:
+            late.append(server.pid)
+            os.kill(server.pid, signal.SIGKILL)
+
+        def interrupt() -> None:
+            signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+
+        guard.append(threading.Timer(30, kill))
+        for timer in (threading.Timer(0.3, interrupt), *guard):
+            timer.start()
+
+    guard: list[threading.Timer] = []
+    died: list[str] = []
+    keep_serving(ServerJob(wiring("http/binary"), EngineConfig(name="echo")), ready, died.append)
+    guard[0].cancel()
+    assert not late
+    assert not died
 
 
 def test_only_our_own_server_is_mended_by_our_set_up() -> None:
