@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from socket import SHUT_RDWR, create_server
+from socket import SHUT_RDWR, create_connection, create_server
 from threading import Event, Thread
 from typing import Any
 
@@ -271,6 +271,20 @@ def test_what_half_a_message_held_is_given_back() -> None:
         with robot(server.address) as (socket, _):
             socket.send(packb({"image": np.zeros((400, 500, 3), np.uint8)}))
             assert unpackb(socket.recv(timeout=20))["actions"].shape == (4, 3)
+
+
+def test_what_a_refused_message_held_is_given_back_though_its_client_stays() -> None:
+    handshake = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: "
+    handshake = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n" + handshake + b"AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+    with serving(Recorder(list(CHUNK)), limits=Limits(in_flight_mib=1.0)) as server:
+        host, _, port = server.address.removeprefix("ws://").partition(":")
+        with create_connection((host, int(port)), 20) as stays:
+            stays.sendall(handshake + b"\x82\xff" + (1_200_000).to_bytes(8, "big") + bytes(1_100_000))
+            heard = b"".join(iter(lambda: stays.recv(4096), b""))
+            assert b"come again later" in heard
+            with robot(server.address) as (socket, _):
+                socket.send(packb({"image": np.zeros((400, 500, 3), np.uint8)}))
+                assert unpackb(socket.recv(timeout=20))["actions"].shape == (4, 3)
 
 
 def test_a_message_that_does_not_end_is_given_up() -> None:
