@@ -18,7 +18,7 @@ from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.pictures import bgr_of, encoded
 from s2a_bench.transport.shm import ShmOptions
 from s2a_bench.transport.shm.door import connect
-from s2a_bench.transport.shm.memory import ANSWER_BYTES, PLACE, STEP_BYTES, Memory, accept, offer
+from s2a_bench.transport.shm.memory import ANSWER_BYTES, PLACE, STEP_BYTES, Memory, accept, in_steps, offer
 from s2a_bench.transport.shm.pieces import Said, unpacked
 from s2a_bench.types import Action, Frame, Piece, Request, Token
 
@@ -88,7 +88,7 @@ class ShmClient:
         trace.mark("header_pack")
         link = self._link
         if link is None or link.requests.size < needed:
-            link = self._connect(-(-needed // STEP_BYTES) * STEP_BYTES)
+            link = self._connect(in_steps(needed))
             trace.mark("connect")
         at = 0
         for about, frame in pictures:

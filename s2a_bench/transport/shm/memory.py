@@ -56,6 +56,11 @@ class Memory:
         self.size = size
 
 
+def in_steps(size: int) -> int:
+    """Return how much memory is offered for so many bytes."""
+    return -(-size // STEP_BYTES) * STEP_BYTES
+
+
 def offer(link: socket.socket, size: int) -> Memory:
     """Make memory of so many bytes and hand it over; raises TransportError where there is none, OSError."""
     try:

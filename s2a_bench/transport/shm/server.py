@@ -12,7 +12,7 @@ from threading import Event
 from typing import Final
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, S2AError, TransportError
+from s2a_bench.errors import RequestFailed, S2AError, TooLarge, TransportError
 from s2a_bench.trace import Remote
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.connections import Connections, Wire, wait_at_most
@@ -25,6 +25,7 @@ from s2a_bench.transport.shm.memory import (
     STEP_BYTES,
     Memory,
     accept,
+    in_steps,
     offer,
     refusal,
 )
@@ -69,7 +70,7 @@ class ShmServer:
             wait_at_most(link, limits.head_s)
             if not may_ask(link):
                 raise TransportError("this server answers its own user only")
-            requests = accept(link, -(-limits.body_bytes // STEP_BYTES) * STEP_BYTES)
+            requests = accept(link, in_steps(limits.body_bytes))
             writer = Writer(wire, offer(link, ANSWER_BYTES))
             wait_at_most(link, 0)
         except TransportError as error:
@@ -158,7 +159,7 @@ class ShmExchange(Exchange):
     def request(self) -> Request:
         size, limits = size_of(self._requests, *self._place), self._core.limits
         if size > limits.body_bytes:
-            raise RequestFailed(f"the request is larger than {limits.body_bytes} bytes")
+            raise TooLarge(f"the request is larger than {limits.body_bytes} bytes")
         self.held.enter_context(self._core.in_flight.counted())(size)
         return request_at(self._requests, *self._place, limits, self.trace)
 
