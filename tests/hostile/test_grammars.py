@@ -56,9 +56,9 @@ def test_our_own_grammars_are_within_them() -> None:
 
 @pytest.mark.parametrize("text", ['\\"' * 2**19, "[" * 2**20, "{" * 2**20, '"' * 2**20, "\\" * 2**20])
 def test_reading_costs_no_time(text: str) -> None:
-    began = time.monotonic()
+    began = time.process_time()
     beyond_limits(text)
-    assert time.monotonic() - began < 2
+    assert time.process_time() - began < 2
 
 
 LLAMA = """
