@@ -7,7 +7,7 @@ import os
 import signal
 import socket
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import pytest
@@ -23,6 +23,20 @@ pytest.register_assert_rewrite("tests.ros.action_suite", "tests.ros.middleware_s
 # S2A_RANDOM=1 draws anew, and so does `make fuzz`.
 settings.register_profile("s2a", deadline=None, derandomize="S2A_RANDOM" not in os.environ)
 settings.load_profile("s2a")
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    """What a test leaves at its end."""
+    with ExitStack() as whole:
+        yield whole
+
+
+@pytest.fixture(params=["cyclonedds", "zenoh"])
+def from_pypi(request: pytest.FixtureRequest) -> str:
+    """Each middleware that comes from PyPI."""
+    pytest.importorskip(request.param, reason=f"{request.param} is not installed")
+    return str(request.param)
 
 
 @pytest.hookimpl(optionalhook=True)

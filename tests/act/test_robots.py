@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from contextlib import ExitStack
 from threading import Event as Flag
 from threading import Thread
@@ -149,11 +148,6 @@ class TestFunctions:
 
 class TestRosActions:
     pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
-
-    @pytest.fixture
-    def stack(self) -> Iterator[ExitStack]:
-        with ExitStack() as stack:
-            yield stack
 
     @pytest.fixture
     def serving(self, dds_domain: int, stack: ExitStack) -> Middleware:

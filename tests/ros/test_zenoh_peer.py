@@ -7,7 +7,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,12 +28,6 @@ pytestmark = pytest.mark.skipif(
 )
 SCRIPT = Path(__file__).with_name("zenoh_peer.py")
 NAME = "/robot/node/get_parameter_types"
-
-
-@pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    with ExitStack() as whole:
-        yield whole
 
 
 @pytest.fixture

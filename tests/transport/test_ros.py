@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from contextlib import ExitStack
 from dataclasses import replace
 from threading import Event, Thread
@@ -23,12 +23,6 @@ from s2a_bench.transport.ros.camera import CAMERA
 from s2a_bench.transport.serving import Queued
 from s2a_bench.types import Frame, Request, Token
 from tests.waiting import until
-
-
-@pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    with ExitStack() as whole:
-        yield whole
 
 
 def serve(stack: ExitStack, told: Wiring[Any], handler: Handler) -> Any:

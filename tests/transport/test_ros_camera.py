@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from threading import Thread
@@ -34,16 +33,9 @@ WAIT_S = 20.0
 
 
 @pytest.fixture
-def stack() -> Iterator[ExitStack]:
-    with ExitStack() as whole:
-        yield whole
-
-
-@pytest.fixture(params=["cyclonedds", "zenoh"])
-def told(request: pytest.FixtureRequest, dds_domain: int) -> Wiring[Any]:
-    """What a server is told, over each middleware that comes from PyPI."""
-    pytest.importorskip(request.param, reason=f"{request.param} is not installed")
-    options = {"middleware": request.param, "domain_id": dds_domain, "node_api": True, "max_frame_age": 0.3}
+def told(from_pypi: str, dds_domain: int) -> Wiring[Any]:
+    """What a server is told."""
+    options = {"middleware": from_pypi, "domain_id": dds_domain, "node_api": True, "max_frame_age": 0.3}
     return wiring("ros/topic", "/robot", **options)
 
 
@@ -181,7 +173,7 @@ def test_frames_that_cannot_be_used_are_named_as_the_reason(robot: Robot) -> Non
     assert re.search(reason, refusal(client))
 
 
-@pytest.mark.parametrize("told", ["cyclonedds"], indirect=True)
+@pytest.mark.parametrize("from_pypi", ["cyclonedds"], indirect=True)
 def test_a_best_effort_camera_that_a_reliable_server_does_not_match_is_no_missing_camera(robot: Robot) -> None:
     publisher = robot.camera("sensor_data")
     assert publisher.matched() == 0
