@@ -24,7 +24,7 @@ def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--transport", default="http/binary?payload=raw")
-    parser.add_argument("--runs", type=int, default=300)
+    parser.add_argument("--requests", type=int, default=300)
     asked = parser.parse_args()
     cell = one_pipeline(asked.transport)
     plan = resolve(RequestsConfig(transports=asked.transport, max_tokens=4))
@@ -32,7 +32,7 @@ def main() -> None:
     with ExitStack() as stack:
         sessions = {pixels: _session(cell, plan, stack, pixels=pixels) for pixels in e2e_ms}
         random = Random(0)  # noqa: S311 - an order, not a secret
-        for block in range(asked.runs):
+        for block in range(asked.requests):
             for pixels in random.sample([True, False], 2):
                 sample = sessions[pixels].measure(Place(block, 0, warmup=False)).sample
                 if sample.error:

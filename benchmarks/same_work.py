@@ -1,9 +1,9 @@
 """Null experiment: e2e without model of the same requests, by our marks and as of a llama-server.
 
-``python -m benchmarks.same_work [--runs N]``. Our engine answers behind our HTTP as deployed. From inside, e2e without
-model is what the marks leave beside the model; from outside, as where a server tells its times only, it is e2e less
-the time that the engine reports for its prompt. What differs is what a black box hides: changing threads, choosing the
-first token.
+``python -m benchmarks.same_work [--requests N]``. Our engine answers behind our HTTP as deployed. From inside, e2e
+without model is what the marks leave beside the model; from outside, as where a server tells its times only, it is e2e
+less the time that the engine reports for its prompt. What differs is what a black box hides: changing threads, choosing
+the first token.
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ from s2a_bench.facts import PREPROCESS_MS, PROMPT_MS
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-RUNS = 50
+REQUESTS = 50
 
 
-def both(output: Path, runs: int = RUNS, **options: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def both(output: Path, requests: int = REQUESTS, **options: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return e2e without model in ms of every request, from inside and from outside."""
-    run = s2a.latency(transports=["http/as-deployed"], engine="llama", runs=runs, output=output, tune=True, **options)
+    run = s2a.latency(
+        transports=["http/as-deployed"], engine="llama", requests=requests, output=output, tune=True, **options
+    )
     good = run.samples[~run.samples["warmup"] & (run.samples["error"] == "")]
     facts = [json.loads(str(told)) for told in good["facts"]]
     model_ms = np.array([told[PROMPT_MS] - told[PREPROCESS_MS] for told in facts])
@@ -38,9 +40,9 @@ def both(output: Path, runs: int = RUNS, **options: Any) -> tuple[NDArray[np.flo
 def main() -> None:
     """Print medians and differences in ms."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=RUNS, help="requests")
+    parser.add_argument("--requests", type=int, default=REQUESTS, help="requests")
     with tempfile.TemporaryDirectory() as folder:
-        inside, outside = both(Path(folder), parser.parse_args().runs)
+        inside, outside = both(Path(folder), parser.parse_args().requests)
     least, hidden = np.percentile(outside - inside, [10, 50])
     print(f"e2e without model, n = {inside.size}, medians in ms")
     print(f"{np.median(inside):9.3f}  by our marks")

@@ -1,6 +1,6 @@
 """Every error a user can meet, as one tree; the message names the field, path or key and the way out. And exit codes.
 
-A field of a configuration stands in backquotes, as `runs`: the command line shows it as its flag, --runs.
+A field of a configuration stands in backquotes, as `requests`: the command line shows it as its flag, --requests.
 
 S2AError
 ├── UsageError, MissingExtra, SourceError, SimulatorError, RobotError, StoreError, UnlikeRuns

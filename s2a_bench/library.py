@@ -2,7 +2,7 @@
 
     import s2a_bench as s2a
 
-    run = s2a.latency(transports=["http", "ros"], engine="echo", runs=50, output="results")
+    run = s2a.latency(transports=["http", "ros"], engine="echo", requests=50, output="results")
     run.samples                      # a DataFrame, a row a request, warm-ups marked
     run.table("stages")              # a table of the run as a DataFrame
     run.figures()["stage_breakdown"] # matplotlib

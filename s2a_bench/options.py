@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
@@ -25,6 +25,9 @@ class Options(BaseModel):
     """Base of configurations; an option is a field made with `option`, a group of options a field of such a class."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    OLD: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    """Names that options had -> the field that is given instead, and what goes before each of its values."""
 
     def __init__(self, **given: Any) -> None:
         """Keep what is given, the defaults for the rest; raises UsageError naming the field."""
@@ -124,7 +127,7 @@ def places(options: type[Options]) -> dict[str, list[Place]]:
 
     The options of a group are there by their own names; groups beside each other share those that they all have.
     """
-    found: dict[str, list[Place]] = {}
+    found: dict[str, list[Place]] = {name: [(name,)] for name in options.OLD}
     for name, field in options.model_fields.items():
         if inner := group_of(field):
             for each, paths in places(inner).items():
@@ -162,6 +165,10 @@ def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
 
 def _line(error: ErrorDetails, options: type[Options]) -> str:
     field = str(error["loc"][0]) if error["loc"] else ""
+    if field in options.OLD:
+        instead, prefix = options.OLD[field]
+        values = ",".join(f"{prefix}{value}" for value in listed(error["input"]))
+        return f"`{field}` has another name: write `{instead}` {values}"
     if error["type"] == "extra_forbidden":
         return f"`{field}` is none of the options {', '.join(options.model_fields)}"
     if error["type"] == "missing":

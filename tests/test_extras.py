@@ -95,7 +95,7 @@ def test_a_server_without_a_library_says_so_in_one_line(transport: str, tmp_path
 def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Measure once without any extra."""
     folder = tmp_path_factory.mktemp("bare")
-    few = ("--runs", "3", "--warmup", "1", "--max-tokens", "4", "--size", "64x48")
+    few = ("--requests", "3", "--warmup", "1", "--max-tokens", "4", "--size", "64x48")
     done = without(OPTIONAL, folder, "latency", "--transport", "loopback,http", *few)
     assert done.returncode == 0, done.stderr
     assert "Echo engine" in done.stdout
@@ -107,7 +107,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("latency", "--engine", "echo", "--transport", "loopback,http", "--runs", "3", "--data-only"),
+        ("latency", "--engine", "echo", "--transport", "loopback,http", "--requests", "3", "--data-only"),
         ("timeline", "--profile", "rtx-4080", "--tokens-per-skill", "6"),
         ("boundary", "--data-only"),
         ("ccrb", "--data-only"),

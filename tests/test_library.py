@@ -17,10 +17,10 @@ import os, sys
 import cv2
 before = dict(os.environ), cv2.getNumThreads()
 import s2a_bench as s2a
-run = s2a.latency(transports=["loopback"], engine="echo", size="64x48", runs=2, warmup=0, output=sys.argv[1])
+run = s2a.latency(transports=["loopback"], engine="echo", size="64x48", requests=2, warmup=0, output=sys.argv[1])
 assert (dict(os.environ), cv2.getNumThreads()) == before, "the caller's process was changed"
 assert run.manifest["tuning"]["process"] is False
-run = s2a.latency(transports=["loopback"], engine="echo", size="64x48", runs=2, warmup=0, output=sys.argv[1], tune=True)
+run = s2a.latency(transports=["loopback"], engine="echo", size="64x48", requests=2, output=sys.argv[1], tune=True)
 assert run.manifest["tuning"]["process"] is True
 print(cv2.getNumThreads())
 """
@@ -58,7 +58,7 @@ def test_a_run_shows_its_rows_tables_and_figures(tmp_path: Path) -> None:
 
 
 def test_samples_have_their_warm_ups_marked_and_runs_are_compared(tmp_path: Path) -> None:
-    few = {"transports": ["loopback"], "engine": "echo", "size": "64x48", "runs": 12, "output": tmp_path}
+    few = {"transports": ["loopback"], "engine": "echo", "size": "64x48", "requests": 12, "output": tmp_path}
     one, other = s2a.latency(**few, warmup=2), s2a.latency(**few, warmup=2)
     assert one.samples["warmup"].tolist() == [True] * 2 + [False] * 12
     assert set(one.table("stages")["cell"]) == {"loopback"}
@@ -70,6 +70,8 @@ def test_samples_have_their_warm_ups_marked_and_runs_are_compared(tmp_path: Path
 def test_a_field_is_named_in_what_is_wrong(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"^`points`: 1 should be greater than or equal to 2$"):
         s2a.boundary(points=1, output=tmp_path)
+    with pytest.raises(UsageError, match=r"^`runs` has another name: write `requests` 50$"):
+        s2a.latency(runs=50)
     with pytest.raises(UsageError, match=r"^`speed` is none of the options profiles"):
         s2a.boundary(speed=1, output=tmp_path)
 

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "tests" / "plugin_example"
 Command = Callable[..., subprocess.CompletedProcess[str]]
-SMALL = ("--size", "64x48", "--runs", "6", "--warmup", "1", "--engine", "echo", "--max-tokens", "3")
+SMALL = ("--size", "64x48", "--requests", "6", "--warmup", "1", "--engine", "echo", "--max-tokens", "3")
 
 
 @pytest.fixture(scope="session")
@@ -228,7 +228,7 @@ def test_its_dialect_is_asked(command: Command, tmp_path: Path) -> None:
     asked = Recorder(["one", " two", " three"])
     spoken = ["--dialect", "toy-chat", "--served-model", "toy", "--transport", "http"]
     with serving(answering(Speaker(), asked)) as url:
-        done = command("latency", "--url", url, *spoken, "--size", "64x48", "--runs", "3", "--warmup", "1")
+        done = command("latency", "--url", url, *spoken, "--size", "64x48", "--requests", "3", "--warmup", "1")
     samples = pd.read_csv(folder_of(done, tmp_path) / "samples.csv")
     assert len(asked.requests) == len(samples) == 4 * samples["cell"].nunique()
     assert samples["error"].isna().all()

@@ -103,7 +103,7 @@ def test_no_figure_is_written_without_it(tmp_path: Path) -> None:
 
 
 RUNS: dict[str, dict[str, Any]] = {
-    "latency": {"transports": ["loopback"], "engine": "echo", "runs": 3, "warmup": 1},
+    "latency": {"transports": ["loopback"], "engine": "echo", "requests": 3, "warmup": 1},
     "timeline": {"profiles": ["rtx-4080"], "tokens_per_skill": [6]},
     "boundary": {"profiles": ["rtx-4080"], "tokens_per_skill": [6], "rates": (1.0, 10.0)},
     "ccrb": {},

@@ -79,12 +79,14 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
         if group is not None:
             only, about = extra.get("only"), extra.get("about", "")
             for flag in flags_of(group):
-                if not only or flag.path[0] in only:
+                if not only or {flag.path[0], *group.OLD.get(flag.path[0], ())} & {*only}:
                     yield replace(flag, path=(name, *flag.path), whose=f"{about}{flag.whose}")
         else:
             flag_name = str(extra.get("flag") or name.replace("_", "-"))
             kind, argument, hidden = _kind(field.annotation), bool(extra.get("argument")), bool(extra.get("hidden"))
             yield Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument, hidden)
+    for name in options.OLD:
+        yield Flag(name.replace("_", "-"), (name,), str, "", hidden=True)
 
 
 def command(function: Callable[..., None], *options: type[Options], about: str = "") -> Callable[..., None]:

@@ -157,7 +157,8 @@ def command_of(name: str, key: str = "command", *, trusted: bool = False) -> Com
             flags[parameter.name] = "argument"
         else:
             long = next(flag for flag in parameter.opts if flag.startswith("--"))
-            kind = "value" if not parameter.is_flag else "toggle" if parameter.secondary_opts else "switch"
+            value = "hidden" if parameter.hidden else "value"
+            kind = value if not parameter.is_flag else "toggle" if parameter.secondary_opts else "switch"
             flags[long.removeprefix("--")] = kind
     return Command(name, flags, lambda argv: _check(name, argv, trusted=trusted))
 

@@ -78,10 +78,11 @@ else:
 class RequestsConfig(Options):
     """The settings of one run of requests."""
 
-    QUICK: ClassVar[dict[str, int]] = {"runs": 10, "warmup": 2, "max_tokens": 8}
+    QUICK: ClassVar[dict[str, int]] = {"requests": 10, "warmup": 2, "max_tokens": 8}
     """What ``quick`` sets, unless told."""
     COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
     """Why answers of actions are no use here; empty: they are."""
+    OLD: ClassVar[Mapping[str, tuple[str, str]]] = {"runs": ("requests", "")}
     OF_ENGINE: ClassVar[tuple[str, ...]] = ()
     """The engine's options that names of pipelines may hold: so cells of one run have engines set differently."""
 
@@ -108,9 +109,9 @@ class RequestsConfig(Options):
         f"{', '.join(f'{scheme}://' for _, each in TRANSPORTS.loaded() for scheme in each.urls.schemes)}",
     )
     engine: EngineConfig = group(EngineConfig)
-    runs: int = option(50, "samples a pipeline [default: 50, quick: 10]", ge=1, le=10**9)
+    requests: int = option(50, "requests a pipeline [default: 50, quick: 10]", ge=1, le=10**9)
     warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
-    launches: int = option(1, "fresh sets of servers, --runs samples each; ratios then hold beyond one", ge=1, le=1000)
+    launches: int = option(1, "fresh sets of servers, --requests each; ratios then hold beyond one", ge=1, le=1000)
     mode: Literal["request", "stream"] = option("request", "request (a frame each), stream (a camera runs)")
     fps: float = option(30.0, "rate of the camera in --mode stream", ge=0.1, le=1000)
     max_tokens: int = option(32, "tokens an answer [default: 32, quick: 8]", ge=1, le=2**20)

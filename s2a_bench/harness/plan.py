@@ -27,7 +27,7 @@ LARGE_PICTURE = 640 * 480
 class BlocksPlan:
     """How often every cell has its turn, and the order."""
 
-    runs: int
+    requests: int
     warmup: int
     launches: int
     seed: int
@@ -133,7 +133,7 @@ def resolve(config: RequestsConfig) -> Plan:
     nonce, size = config.nonce or new_nonce(), "{}x{}".format(*config.size)
     return Plan(
         cells=cells,
-        blocks=BlocksPlan(config.runs, config.warmup, config.launches, config.seed),
+        blocks=BlocksPlan(config.requests, config.warmup, config.launches, config.seed),
         feed=FeedPlan(
             config.source, config.size, config.fps, config.seed, nonce, stream, config.cameras, config.resize
         ),

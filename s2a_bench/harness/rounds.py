@@ -262,7 +262,7 @@ def run_blocks(
     So that what is compared with the requests can learn from the first of them how long their prompts are.
     """
     everyone = [*slots, *others]
-    blocks = plan.warmup + plan.runs
+    blocks = plan.warmup + plan.requests
     progress.expect(len(everyone) * blocks * plan.launches)
     random = Random(plan.seed + launch)  # noqa: S311 - an order, not a secret
     which = f", launch {launch + 1} of {plan.launches}" if plan.launches > 1 else ""

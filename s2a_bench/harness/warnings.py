@@ -226,5 +226,5 @@ class SampleGuard:
             if memory.dependent
         )
         what = f"neighbouring samples are alike: intervals of this launch may be too narrow ({where})"
-        advice = "measure several launches, --launches 5, or more samples, --runs"
+        advice = "measure several launches, --launches 5, or more --requests"
         return [RunWarning("autocorrelation", what, advice)] if where else []

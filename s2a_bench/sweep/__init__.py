@@ -20,8 +20,9 @@ from s2a_bench.options import Names, Options, option
 from s2a_bench.store.run import read_run
 from s2a_bench.sweep.file import find_sweep
 
-Flag: TypeAlias = Literal["value", "switch", "toggle", "argument"]
-"""A switch is given or not; a toggle has its opposite too, as --animation and --no-animation."""
+Flag: TypeAlias = Literal["value", "hidden", "switch", "toggle", "argument"]
+"""A switch is given or not; a toggle has its opposite too, as --animation and --no-animation; no hint names what is
+hidden."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,7 +72,8 @@ def _check_keys(file: SweepFile, command: Command, setting: Setting) -> None:
                 raise UsageError(f"{file.path}: board: {value!r} should be the name of a machine")
             continue
         if key not in command.flags:
-            known = sorted({*command.flags, BOARD}.difference(OWN))
+            shown = {name for name, kind in command.flags.items() if kind != "hidden"}
+            known = sorted({*shown, BOARD}.difference(OWN))
             hint = like(key, known) or f"; it has {', '.join(known)}"
             raise UsageError(f"{file.path}: '{key}' is no flag of s2a-bench {command.name}{hint}")
         if command.flags[key] in {"switch", "toggle"}:
@@ -93,7 +94,7 @@ def _argv(file: SweepFile, command: Command, setting: Setting, seed: int) -> lis
         text = _text(value)
         if command.flags[key] == "argument":
             arguments.append(text)
-        elif command.flags[key] == "value":
+        elif command.flags[key] in {"value", "hidden"}:
             flags.append(f"--{key}={text}")
         elif value:
             flags.append(f"--{key}")

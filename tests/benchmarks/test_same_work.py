@@ -11,7 +11,7 @@ from benchmarks import same_work
 
 @pytest.mark.slow
 def test_a_black_box_hides_little_of_the_same_requests(tmp_path: Path) -> None:
-    inside, outside = same_work.both(tmp_path, runs=6, warmup=1, size="64x48", max_tokens=2)
+    inside, outside = same_work.both(tmp_path, requests=6, warmup=1, size="64x48", max_tokens=2)
     assert inside.size == outside.size == 6
     hidden = outside - inside
     assert hidden.min() > -1e-3  # what the engine reports lies within our mark, to the nanosecond's rounding

@@ -24,7 +24,7 @@ from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, answering
 
 ROOT = Path(__file__).parent.parent.parent
-SMALL = ["--size", "64x48", "--runs", "4", "--warmup", "1", "--max-tokens", "3", "--data-only", "--json"]
+SMALL = ["--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3", "--data-only", "--json"]
 ENCODER_S = 0.1
 """What the server below needs for a picture that it has not seen."""
 

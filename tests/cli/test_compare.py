@@ -90,7 +90,7 @@ def test_drawn_timelines_of_two_seeds_do_not_differ(timelines: dict[str, str]) -
 @pytest.mark.slow
 def test_throughput_is_compared_with_higher_as_better(tmp_path: Path) -> None:
     replay = ("--engine", "replay", "--profile", "rtx-4080", "--transport", "in-process")
-    few = ("--runs", "6", "--warmup", "1", "--max-tokens", "8", "--sample-resources", "0")
+    few = ("--requests", "6", "--warmup", "1", "--max-tokens", "8", "--sample-resources", "0")
     program("throughput", *replay, *few, "--output", tmp_path)
     folder = str(next(tmp_path.iterdir()))
     whole: dict[str, Any] = json.loads(run(folder, folder, "--json").stdout)

@@ -21,7 +21,7 @@ from tests.cli.program import program, refused
 
 ROOT = Path(__file__).parent.parent.parent
 SCHEMA = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
-SMALL = ["--size", "64x48", "--runs", "4", "--warmup", "1", "--data-only"]
+SMALL = ["--size", "64x48", "--requests", "4", "--warmup", "1", "--data-only"]
 ECHO = ["latency", "--engine", "echo", "--transport", "http,loopback", *SMALL]
 
 

@@ -25,7 +25,7 @@ from s2a_bench.trace import budget
 from tests.cli.program import program, refused
 
 ROOT = Path(__file__).parent.parent.parent
-DRAWN = ["--engine", "echo", "--size", "64x48", "--runs", "4", "--warmup", "1", "--max-tokens", "3"]
+DRAWN = ["--engine", "echo", "--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3"]
 SMALL = [*DRAWN, "--data-only"]
 
 
@@ -49,7 +49,7 @@ def only_run(output: Path) -> Run:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, str]:
     """Measure all pipelines; return the run and what was printed."""
     output = tmp_path_factory.mktemp("whole")
-    done = run(*DRAWN, "--transport", "http,ros,loopback", "--runs", "8", "--verbose", output=output)
+    done = run(*DRAWN, "--transport", "http,ros,loopback", "--requests", "8", "--verbose", output=output)
     return only_run(output), done.stdout
 
 
@@ -218,7 +218,7 @@ def test_the_manifest_tells_the_machine(whole: tuple[Run, str]) -> None:
 def start_long(output: Path, *arguments: str) -> tuple[subprocess.Popen[str], Path]:
     """Start a run that would take very long and wait until it has some samples."""
     process = subprocess.Popen(
-        command(*SMALL, "--runs", "1000000", *arguments, output=output),
+        command(*SMALL, "--requests", "1000000", *arguments, output=output),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -391,7 +391,7 @@ def test_a_single_picture_is_another_one_in_every_sample_and_the_same_in_every_c
 def test_a_real_model_answers_over_both_pipelines(tmp_path: Path) -> None:
     grammar = tmp_path / "yes.gbnf"
     grammar.write_text('root ::= "yes" | "no"\n')
-    few = ["--runs", "2", "--warmup", "1", "--max-tokens", "5", "--threads", "1"]
+    few = ["--requests", "2", "--warmup", "1", "--max-tokens", "5", "--threads", "1"]
     run(*few, "--grammar", str(grammar), "--transport", "http,ros", "--http", "as-deployed", output=tmp_path / "r")
     kept = only_run(tmp_path / "r")
     assert kept.manifest["model"]["dummy"] is True

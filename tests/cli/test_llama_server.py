@@ -23,7 +23,7 @@ SMALL = ("--size", "64x48", "--max-tokens", "4", "--warmup", "1", "--data-only")
 
 
 def latency(output: Path, *arguments: str, code: int = 0) -> subprocess.CompletedProcess[str]:
-    return program("latency", *SMALL, "--runs", "3", "--output", output, *arguments, code=code)
+    return program("latency", *SMALL, "--requests", "3", "--output", output, *arguments, code=code)
 
 
 def test_it_is_measured_beside_our_own_cells(tmp_path: Path) -> None:
@@ -45,7 +45,7 @@ def test_it_is_measured_beside_our_own_cells(tmp_path: Path) -> None:
 
 
 def test_throughput_lets_it_answer_in_turn_with_our_engine(tmp_path: Path) -> None:
-    few = (*SMALL, "--threads", "1", "--runs", "2", "--json", "--output", tmp_path)
+    few = (*SMALL, "--threads", "1", "--requests", "2", "--json", "--output", tmp_path)
     done = program("throughput", "--engine", "llama-server", *few)
     whole = json.loads(done.stdout)
     theirs, ours = sorted(whole["cells"], key=lambda cell: str(cell["engine"]), reverse=True)
@@ -81,7 +81,7 @@ def test_connections_that_are_closed_after_each_answer(tmp_path: Path, connectio
 
 
 def test_killed_in_the_middle_is_one_line_and_keeps_the_samples(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, "--runs", "100000", "--output", str(tmp_path)]
+    command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, "--requests", "100000", "--output", str(tmp_path)]
     process = subprocess.Popen(
         [*command, "--transport", "http/llama-server"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )

@@ -124,7 +124,7 @@ def test_a_server_that_replays_says_so() -> None:
 def test_a_replayed_run_is_labelled_emulated_wherever_it_shows(home: Path) -> None:
     done = program(
         *("latency", "--engine", "replay", "--profile", "fast", "--transport", "loopback", "--size", "64x48"),
-        *("--runs", "4", "--warmup", "1", "--max-tokens", "20", "--json"),
+        *("--requests", "4", "--warmup", "1", "--max-tokens", "20", "--json"),
     )
     whole = json.loads(done.stdout)
     (cell,) = whole["cells"]

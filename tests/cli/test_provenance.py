@@ -19,7 +19,7 @@ from tests.cli.program import called, program, refused
 from tests.servers.sockets import serving as serving_socket
 from tests.servers.speakers import Cloud, answering
 
-SMALL = ("--size", "64x48", "--runs", "5", "--warmup", "1", "--max-tokens", "3")
+SMALL = ("--size", "64x48", "--requests", "5", "--warmup", "1", "--max-tokens", "3")
 
 
 @contextmanager

@@ -204,7 +204,7 @@ def test_a_wrong_file_is_one_line(tmp_path: Path, text: str, message: str) -> No
 def test_latency_drives_a_node_that_runs_already(start: Start, tmp_path: Path) -> None:
     start("ros", "--engine", "echo", "--namespace", "/llama", "--max-tokens", "50", *ONE_BY_ONE)
     arguments = ["latency", "--transport", "ros", "--action", "/llama/generate_response", "--size", "64x48"]
-    arguments += ["--engine", "echo", "--runs", "3", "--warmup", "1", "--max-tokens", "4"]
+    arguments += ["--engine", "echo", "--requests", "3", "--warmup", "1", "--max-tokens", "4"]
     arguments += ["--data-only", "--output", str(tmp_path)]
     subprocess.run([sys.executable, "-m", "s2a_bench", *arguments], check=True, timeout=120, capture_output=True)
     (folder,) = tmp_path.iterdir()
@@ -225,7 +225,7 @@ def test_two_servers_and_a_black_box_meet_at_one_zenoh_router(start: Start, dds_
     _, line = start("ros", *over, "--namespace", "/second")
     assert f"in domain {dds_domain} of the Zenoh router {router}; engine" in line
     arguments = ["latency", "--transport", f"ros?middleware=zenoh&router={router}&action=/second/generate_response"]
-    arguments += ["--engine", "echo", "--runs", "3", "--warmup", "1", "--max-tokens", "4", "--size", "64x48"]
+    arguments += ["--engine", "echo", "--requests", "3", "--warmup", "1", "--max-tokens", "4", "--size", "64x48"]
     arguments += ["--data-only", "--output", str(tmp_path)]
     subprocess.run([sys.executable, "-m", "s2a_bench", *arguments], check=True, timeout=120, capture_output=True)
     (folder,) = tmp_path.iterdir()
@@ -271,7 +271,7 @@ def test_a_server_whose_latencies_are_known_says_so_and_is_recognised_from_afar(
     assert "engine echo, latencies bursty:mean_ms=5,cv=0,burst_tokens=2,within=.2 (EMULATED); " in line
     url = line.split()[2].partition("/v1")[0]
     command = [sys.executable, "-m", "s2a_bench", "latency", "--transport", "http/as-deployed", "--url", url]
-    small = ["--size", "64x48", "--runs", "3", "--warmup", "1", "--max-tokens", "3", "--data-only"]
+    small = ["--size", "64x48", "--requests", "3", "--warmup", "1", "--max-tokens", "3", "--data-only"]
     subprocess.run([*command, *small, "--output", str(tmp_path)], check=True, capture_output=True)
     (folder,) = tmp_path.iterdir()
     found = read_run(folder)

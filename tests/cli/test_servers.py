@@ -21,7 +21,7 @@ from tests.cli.program import program, refused
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, LlamaServer, Ollama, answering
 
-SMALL = ["--transport", "http", "--size", "64x48", "--runs", "2", "--warmup", "1", "--max-tokens", "3"]
+SMALL = ["--transport", "http", "--size", "64x48", "--requests", "2", "--warmup", "1", "--max-tokens", "3"]
 KEY = "sekret-0123456789"
 
 
@@ -75,7 +75,9 @@ def test_an_unknown_server_is_asked_what_it_is(tmp_path: Path) -> None:
 def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path: Path) -> None:
     reply = [head("429 Too Many Requests", "application/json", "Retry-After: 0.01"), Cloud().refusal(429, "slow down")]
     with serving(lambda _: reply) as url:
-        done = run("--url", url, "--dialect", "openai", "--http", "best-effort", "--runs", "9", output=tmp_path, code=1)
+        done = run(
+            "--url", url, "--dialect", "openai", "--http", "best-effort", "--requests", "9", output=tmp_path, code=1
+        )
     assert "waiting 0.01 s, as the server of http/best-effort asks" in done.stderr
     last = done.stderr.strip().splitlines()[-2:]
     assert any("failed 5 times in a row" in line and "answered 429: slow down" in line for line in last)

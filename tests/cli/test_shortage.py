@@ -47,7 +47,7 @@ def test_too_little_address_space_is_told_before_anything_begins(tmp_path: Path)
 
 
 def test_a_file_that_may_not_grow_ends_the_run_with_its_samples(tmp_path: Path) -> None:
-    said = run(resource.RLIMIT_FSIZE, 600_000, tmp_path, "--runs", "1000000")
+    said = run(resource.RLIMIT_FSIZE, 600_000, tmp_path, "--requests", "1000000")
     assert "csv: File too large; samples so far are kept" in said[-1]
     (folder,) = tmp_path.iterdir()
     kept = read_run(folder)

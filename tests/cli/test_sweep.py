@@ -219,7 +219,7 @@ def test_a_failed_cell_keeps_its_error_and_is_retried_when_told(tmp_path: Path) 
 def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp_path: Path) -> None:
     file = tmp_path / "m.toml"
     file.write_text(
-        'command = "latency"\n[settings]\nengine = "echo"\ntransport = "loopback"\nruns = 3\nwarmup = 0\n'
+        'command = "latency"\n[settings]\nengine = "echo"\ntransport = "loopback"\nrequests = 3\nwarmup = 0\n'
         '[grid]\nsource = ["synthetic", "video:/no/such/file.mp4"]\n'
     )
     done = sweep(file, "--output", tmp_path / "results", "--json", code=1)
@@ -240,6 +240,12 @@ def test_a_setting_that_makes_no_sense_is_told_before_anything_runs(tmp_path: Pa
     line = refused("sweep", file, "--output", tmp_path / "results")
     assert "plans=5: --plans: without --jitter or --t-nom-cv all plans are the same" in line
     assert not (tmp_path / "results").exists()
+
+
+def test_an_old_name_of_a_setting_is_told_its_new_one(tmp_path: Path) -> None:
+    file = tmp_path / "f.toml"
+    file.write_text('command = "latency"\n[settings]\nruns = 5\n')
+    assert "f.toml: runs=5: --runs has another name: write --requests 5" in refused("sweep", file, "--dry-run")
 
 
 def test_latencies_are_an_axis_as_numbers_and_as_families(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from tests.cli.program import program
 from tests.llama_bench_stand_in import install
 
 ROOT = Path(__file__).parent.parent.parent
-SMALL = ["--size", "64x48", "--runs", "2", "--warmup", "1", "--max-tokens", "40", "--threads", "1"]
+SMALL = ["--size", "64x48", "--requests", "2", "--warmup", "1", "--max-tokens", "40", "--threads", "1"]
 REAL = "S2A_BENCH_LLAMA_BENCH"
 """Names the real llama-bench, for the test that needs it."""
 

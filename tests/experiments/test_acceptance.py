@@ -41,7 +41,7 @@ def measured(payload: str, output: Path) -> tuple[dict[str, float], list[str]]:
     arguments = ["latency", "--engine", "echo", "--transport", transports]
     arguments += ["--max-tokens", "1"] * (payload == "alone")
     done = subprocess.run(
-        [sys.executable, "-m", "s2a_bench", *arguments, "--runs", "100", "--json", "--output", str(output)],
+        [sys.executable, "-m", "s2a_bench", *arguments, "--requests", "100", "--json", "--output", str(output)],
         capture_output=True,
         text=True,
         check=True,

@@ -153,7 +153,7 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
     engine = EngineConfig(threads=1, pace=60.0)
     asked = config.but(
-        engine=engine, profiles=(), transport="http", timeout_s=120.0, t_nom_s=(0.05,), task="Tidy up.", plans=2
+        engine=engine, profiles=(), transport="http", timeout_s=120.0, t_nom_s=(0.05,), task="Tidy up.", requests=2
     )
     view = Watched()
     run = read_run(run_live(asked, tmp_path / "runs", view))
@@ -380,7 +380,7 @@ def taught(monkeypatch: pytest.MonkeyPatch) -> list[Tracked]:
 
 
 def test_lambda_is_followed_live_by_each_policy(config: TimelineConfig, taught: list[Tracked], tmp_path: Path) -> None:
-    live(config.but(policies=("stream-to-act", "stream-to-act?detect=True", "naive"), track=True, plans=2), tmp_path)
+    live(config.but(policies=("stream-to-act", "stream-to-act?detect=True", "naive"), track=True, requests=2), tmp_path)
     assert [each.made.detect for each in taught] == [False, True] * 2
     assert taught[:2] == taught[2:]
     for each in taught[:2]:

@@ -31,7 +31,7 @@ REQUESTS = ThroughputConfig(max_tokens=16)
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"runs": 0}, "`runs`: 0"),
+        ({"requests": 0}, "`requests`: 0"),
         (
             {"engine": EngineConfig(sampling="greedy"), "transports": ("http/best-effort?url=http://x",)},
             "`sampling` greedy is our own engine's",
@@ -67,7 +67,7 @@ def test_the_engine_llama_server_is_llama_cpps_own_beside_ours() -> None:
     config = ThroughputConfig(engine={"name": "llama-server", "threads": 1}, options={"http": {"llama_server": "/x"}})
     assert [pipeline.name for pipeline in config.pipelines] == ["loopback", "http/llama-server"]
     assert (config.engine.name, config.engine.threads, config.greedy) == ("llama", 1, False)
-    assert config.but(runs=3).pipelines == config.pipelines
+    assert config.but(requests=3).pipelines == config.pipelines
     with pytest.raises(UsageError, match="`engine` llama-server is `transport` in-process,http/llama-server; leave"):
         ThroughputConfig(engine={"name": "llama-server"}, transports="ros")
     with pytest.raises(UsageError, match="`sampling` greedy is our own engine's; leave it out with `llama_server`"):

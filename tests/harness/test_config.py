@@ -213,7 +213,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"options": {"ros": {"middleware": "x"}}}, "`middleware`: 'x' is none of cyclonedds, rclpy"),
         ({"options": {"ros": {"result_timeout": -1}}}, "`result_timeout`: -1 should be greater than or equal to 0"),
         ({"options": {"http": {"port": "many"}}}, "`port`: 'many' should be a valid integer"),
-        ({"runs": 0}, "`runs`: 0 should be greater than or equal to 1"),
+        ({"requests": 0}, "`requests`: 0 should be greater than or equal to 1"),
         ({"warmup": -1}, "`warmup`: -1"),
         ({"max_tokens": 0}, "`max_tokens`: 0"),
         ({"fps": 0.0}, "`fps`: 0.0"),

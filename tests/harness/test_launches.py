@@ -22,7 +22,7 @@ ECHO = LatencyConfig(
 
 
 def test_every_launch_has_fresh_servers_in_one_run_folder(tmp_path: Path) -> None:
-    config = ECHO.but(launches=3, runs=4, warmup=1)
+    config = ECHO.but(launches=3, requests=4, warmup=1)
     run = read_run(run_latency(config, tmp_path, NullProgress()))
     samples = run.samples
     assert run.manifest["state"] == "finished"

@@ -23,7 +23,7 @@ def test_every_part_says_what_the_configuration_did() -> None:
         options={"ros": {"namespace": "/arm"}},
         engine=EngineConfig(name="llama", model=Path("m.gguf")),
         size=(64, 48),
-        runs=3,
+        requests=3,
         warmup=1,
         launches=2,
         seed=7,

@@ -168,7 +168,7 @@ def test_a_run_holds_no_secret(tmp_path: Path) -> None:
     ]
     body = json.dumps({"provider": {"api_key": KEY}})
     with serving(lambda _: answers[0] if len(list(tmp_path.rglob("tokens.csv"))) < 2 else answers[1]) as url:
-        small = ["--transport", "http/as-deployed", "--size", "64x48", "--runs", "2", "--warmup", "0"]
+        small = ["--transport", "http/as-deployed", "--size", "64x48", "--requests", "2", "--warmup", "0"]
         asked = [*small, "--max-tokens", "64", "--url", url, "--dialect", "openai", "--extra-body", body, "--output"]
         runs = [
             subprocess.run(

@@ -54,7 +54,7 @@ def test_without_ros_one_line_says_so(name: str, tmp_path: Path) -> None:
 def test_the_ratios_are_printed(tmp_path: Path) -> None:
     pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
     script = str(RECIPES / "rclpy_speed")
-    flags = ["--runs", "5", "--launches", "2", "--over", "qos=sensor_data", "--output", str(tmp_path)]
+    flags = ["--requests", "5", "--launches", "2", "--over", "qos=sensor_data", "--output", str(tmp_path)]
     done = subprocess.run([sys.executable, script, *flags], capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
     ratio = r"ratio to cyclonedds [\d.]+ \[[\d.]+, [\d.]+\]"

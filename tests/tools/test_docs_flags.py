@@ -35,7 +35,7 @@ def test_a_table_can_be_of_one_group_or_of_the_others() -> None:
 
 def test_a_table_can_be_of_what_another_command_has_otherwise() -> None:
     lines = docs_flags.table("throughput", "-", "latency").splitlines()
-    assert "| `--runs` | 10, quick: 3 | requests a cell |" in lines
+    assert "| `--requests` | 10, quick: 3 | requests a cell |" in lines
     assert not [line for line in lines if "`--prompt`" in line]
 
 

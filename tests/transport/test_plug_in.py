@@ -86,7 +86,7 @@ class TestToy(TransportSuite):
 @pytest.fixture
 def run(toy: None, tmp_path: Path) -> Run:  # noqa: ARG001 - what is measured
     names = ("loopback", "toy", "toy?greeting=servus", "toy?number=2")
-    few: dict[str, Any] = {"runs": 3, "warmup": 1, "max_tokens": 3, "sample_resources_hz": 0}
+    few: dict[str, Any] = {"requests": 3, "warmup": 1, "max_tokens": 3, "sample_resources_hz": 0}
     config = RequestsConfig(transports=names, engine=EngineConfig(name="echo"), size=(64, 48), **few)
     return read_run(run_latency(config, tmp_path, NullProgress()))
 
@@ -122,7 +122,7 @@ def test_a_stage_that_nobody_declares_makes_the_sample_an_error(
 ) -> None:
     monkeypatch.setattr(Toy, "stages", {})
     engine = EngineConfig(name="echo")
-    config = RequestsConfig(transports=("toy", "loopback"), engine=engine, size=(64, 48), runs=2, warmup=0)
+    config = RequestsConfig(transports=("toy", "loopback"), engine=engine, size=(64, 48), requests=2, warmup=0)
     with pytest.raises(Exception, match="toy does not declare the stage greet"):
         run_latency(config, tmp_path, NullProgress())
 

@@ -573,7 +573,7 @@ class TestLayoutOfAServer:
     def test_a_run_records_it_and_no_sample_waits_for_it(self, peer: Any, tmp_path: Path) -> None:
         answers = Policy(configs("__ModalityConfig__"))
         with policy(answers, **mapped(peer)) as url:
-            config = LatencyConfig(transports=(f"zmq?url={url}",), runs=2, warmup=0, size=(64, 48))
+            config = LatencyConfig(transports=(f"zmq?url={url}",), requests=2, warmup=0, size=(64, 48))
             run = read_run(run_latency(config, tmp_path, NullProgress()))
         assert run.manifest["asked"] == {
             f"zmq/gr00t?url={url}": {"url": url, "template": "gr00t-n1.6", "layout": "n1.7"}

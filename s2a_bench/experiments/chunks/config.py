@@ -132,7 +132,7 @@ class ChunksConfig(Options):
         told: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
         if self.known:
             told |= {"latency": self.known} | ({"name": STAND_IN} if not self.requests.engine.model_fields_set else {})
-        return self.requests.but(engine=self.requests.engine.but(**told), seed=self.seed, runs=1)
+        return self.requests.but(engine=self.requests.engine.but(**told), seed=self.seed, requests=1)
 
     @property
     def known(self) -> str:

@@ -48,7 +48,7 @@ class ThroughputEngine(EngineConfig):
 class ThroughputConfig(RequestsConfig):
     """The settings of a throughput run."""
 
-    QUICK: ClassVar[dict[str, int]] = {"runs": 3, "warmup": 1, "max_tokens": 32}
+    QUICK: ClassVar[dict[str, int]] = {"requests": 3, "warmup": 1, "max_tokens": 32}
     OF_ENGINE: ClassVar[tuple[str, ...]] = ("flash_attention",)
 
     transports: Names = option(
@@ -58,7 +58,7 @@ class ThroughputConfig(RequestsConfig):
     engine: ThroughputEngine = group(
         ThroughputEngine, only=set(EngineConfig.model_fields) - {"pace", "latency", *ANSWERS}
     )
-    runs: int = option(10, "requests a cell [default: 10, quick: 3]", ge=1, le=10**9)
+    requests: int = option(10, "requests a cell [default: 10, quick: 3]", ge=1, le=10**9)
     warmup: int = option(2, "warm-ups a cell, kept and marked [default: 2, quick: 1]", ge=0, le=10**9)
     max_tokens: int = option(128, "tokens an answer [default: 128, quick: 32]", ge=1, le=2**20)
     reference: Path | None = option(

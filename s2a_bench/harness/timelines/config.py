@@ -106,7 +106,6 @@ class Compared(Options):
     )
     t_min: float = option(0.8, "least duration of a skill, as a factor of T_nom", gt=0, le=1)
     t_max: float = option(1.5, "longest duration of a skill, as a factor of T_nom", ge=1, allow_inf_nan=False)
-    plans: int | None = option(None, "plans a cell [default: 1; with jitter 1000]", ge=1)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
     epsilon: float = option(0.01, "share of plans that may stall: lambda is calibrated or tracked for it")
     track: bool = option(False, "let online policies follow lambda from plan to plan (needs jitter, or --live)")
@@ -126,6 +125,7 @@ class Modelled(Options):
         allow_inf_nan=False,
     )
     t_nom_cv: float = option(0.0, "how much T_nom differs from skill to skill: sd / mean", ge=0, le=MOST_CV)
+    plans: int | None = option(None, "plans a cell [default: 1; with jitter 1000]", ge=1)
     jitter: str = option(
         NO_JITTER,
         "none (tokens come evenly, as in the paper), profile (as the profile says), or a family of gaps, as "
@@ -143,6 +143,7 @@ class Live(Options):
 
     transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]")
     skills: str = option("household", "--live: household, driving, or a TOML file")
+    requests: int = option(1, "--live: plans that the model is asked for, a cell", ge=1)
     task: TextOrFile = option("", "--live: what the robot should do, text or @FILE")
     robot: str = option("timed", "--live: timed, ros, call?function=MODULE:NAME; timed only waits")
     engine: EngineConfig = group(
@@ -199,7 +200,9 @@ class TimelineConfig(Live, Modelled, Compared):
 
     @property
     def plans_a_cell(self) -> int:
-        return self.plans if self.plans is not None else PLANS if not self.live and self.random else 1
+        if self.live:
+            return self.requests
+        return self.plans if self.plans is not None else PLANS if self.random else 1
 
     def check(self) -> None:
         if self.track:
@@ -209,6 +212,8 @@ class TimelineConfig(Live, Modelled, Compared):
                 raise UsageError("`live` and `real_time` are two things: a model answers, or a profile is played")
             if "epsilon" in self.given(Compared) and not self.track:
                 raise UsageError("`epsilon`: nothing is calibrated with `live`; it needs `track`")
+            if self.plans is not None:
+                raise UsageError(f"`plans` are computed; with `live` write `requests` {self.plans}")
             for name in self.given(Modelled):
                 raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")
             check_live(self)
@@ -286,7 +291,7 @@ def requests_of(config: TimelineConfig) -> RequestsConfig:
         source=config.source,
         size=config.size,
         engine=config.engine.but(profile=",".join(config.profiles)) if config.profiles else config.engine,
-        runs=1,
+        requests=config.requests,
         warmup=config.warmup,
         seed=config.seed,
         nonce=config.nonce,

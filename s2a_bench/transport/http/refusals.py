@@ -55,7 +55,7 @@ def advice_for(status: int, said: str, options: HttpOptions, *, moved: str = "")
         403: key if options.api_key_env else no_key,
         404: f"see `url`, `dialect` and `served_model` (now '{options.served_model}')",
         413: "choose a smaller `size`, or `payload` jpeg",
-        429: "it wants fewer requests: see its quota, or `runs`",
+        429: "it wants fewer requests: see its quota, or `requests`",
     }.get(status, "")
 
 
