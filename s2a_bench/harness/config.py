@@ -46,18 +46,6 @@ def _options() -> type[Options]:
     return create_model("PerTransport", __base__=Options, **fields)
 
 
-def _variants(*, first: bool) -> type[Options]:
-    """Make an option for each transport with variants: which to measure, unless told the first or its own choice."""
-    fields: dict[str, Any] = {}
-    for name, each in TRANSPORTS.loaded():
-        if each.variants:
-            about = f"{', '.join(each.variants)}; several with commas"
-            measured = each.variants[:1] if first else each.measured(Choice(each.options()))
-            default = measured if first else ()
-            fields[name] = (Names, option(default, f"{about} [default: {','.join(measured)}]"))
-    return create_model("PerTransport", __base__=Options, **fields)
-
-
 def _with_url(url: str, options: Options | Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of transports, the one that a URL's scheme names told the URL."""
     told = {name: own if isinstance(own, Mapping) else own.given_values() for name, own in dict(options).items()}
@@ -67,12 +55,8 @@ def _with_url(url: str, options: Options | Mapping[str, Any]) -> dict[str, Any]:
 
 if TYPE_CHECKING:
     TransportOptions: TypeAlias = Options
-    Variants: TypeAlias = Options
-    FirstVariants: TypeAlias = Options
 else:
     TransportOptions = _options()
-    Variants = _variants(first=False)
-    FirstVariants = _variants(first=True)
 
 
 class RequestsConfig(Options):
@@ -82,7 +66,12 @@ class RequestsConfig(Options):
     """What ``quick`` sets, unless told."""
     COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
     """Why answers of actions are no use here; empty: they are."""
-    OLD: ClassVar[Mapping[str, tuple[str, str]]] = {"runs": ("requests", "")}
+    OLD: ClassVar[Mapping[str, tuple[str, str]]] = {
+        "runs": ("requests", ""),
+        **{name: ("transports", f"{name}/") for name, each in TRANSPORTS.loaded() if each.variants},
+    }
+    EVERY_VARIANT: ClassVar[bool] = True
+    """Whether a transport whose name has no variant stands for all that it measures by default; else for the first."""
     OF_ENGINE: ClassVar[tuple[str, ...]] = ()
     """The engine's options that names of pipelines may hold: so cells of one run have engines set differently."""
 
@@ -99,8 +88,6 @@ class RequestsConfig(Options):
     )
     state: int = option(0, "numbers (float32) of the robot's state that go with a request", ge=0, le=4096)
     payload: Payload = option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: http jpeg, ros raw]")
-    variants: Variants = group(Variants)
-    """The variants to measure where a pipeline's name has none; those that a transport measures by default if empty."""
     options: TransportOptions = group(TransportOptions)
     """The options of every transport, for names that do not say them themselves."""
     url: str = option(
@@ -158,7 +145,7 @@ class RequestsConfig(Options):
         """Return what is compared, a cell each; raises UsageError."""
         told = {name: given.given_values() for name, given in self.options}
         told[""] = {"payload": self.payload}
-        return pipelines(self.names, told, dict(self.variants), self.engine.name, self.OF_ENGINE)
+        return pipelines(self.names, told, self.engine.name, self.OF_ENGINE, every=self.EVERY_VARIANT)
 
     @cached_property
     def answer(self) -> str:
@@ -217,7 +204,7 @@ class RequestsConfig(Options):
         """Whether the user named a cell, or its transport, of which ``others`` has none."""
         transport = cell.transport.name
         written = {name.partition("?")[0] for name in self.names} if "transports" in self.model_fields_set else set()
-        if cell.name.partition("?")[0] in written or transport in self.variants.model_fields_set:
+        if cell.name.partition("?")[0] in written:
             return True
         named = transport in written or transport in self.options.model_fields_set
         return named and all(each.transport is not cell.transport for each in others)
@@ -315,3 +302,9 @@ class RequestsConfig(Options):
         observation += f", state of {self.state}" if self.state else ""
         more = {"width": width, "height": height, "size": size, "observation": observation, "tuned": self.tuned}
         return {**own, **more, "engine": self.served_engine.to_manifest(), "pipelines": told}
+
+
+class FirstVariants(RequestsConfig):
+    """The settings of a run in which a transport whose name has no variant stands for its first."""
+
+    EVERY_VARIANT: ClassVar[bool] = False

@@ -262,8 +262,6 @@ class Choice(Generic[O]):
 
     options: O
     variant: str = ""
-    variants: Sequence[str] = ()
-    """Those that a flag chooses."""
     mode: str = ""
     engine: str = ""
 
@@ -339,9 +337,9 @@ class Transport(Generic[O]):
         """Bind a server, ready to `serve`; raises PortInUse or TransportError."""
         raise NotImplementedError
 
-    def measured(self, choice: Choice[O]) -> Sequence[str]:
+    def measured(self, choice: Choice[O]) -> Sequence[str]:  # noqa: ARG002 - for those whose variants depend on it
         """Return the variants to measure where the pipeline names none."""
-        return choice.variants or self.variants[:1] or ("",)
+        return self.variants[:1] or ("",)
 
     def capabilities(self, choice: Choice[O]) -> Capabilities[O]:
         """Return what a variant can carry with its options."""

@@ -1,8 +1,9 @@
 """Pipeline names, the same in flags, sweeps, tables and code: ``transport[/variant][?option=value&...]``.
 
-``http`` stands for the variants that flags choose, ``http/binary`` for one, ``ros/topic?payload=yuyv`` for one with an
-option of its own. A cell's *canonical* name has the variant, leaves out options that are what they would be without
-being named, and sorts the others. Values are percent-encoded where they need to be (RFC 3986): a comma is ``%2C``.
+``http`` stands for the variants that are measured by default, ``http/binary`` for one, ``ros/topic?payload=yuyv`` for
+one with an option of its own. A cell's *canonical* name has the variant, leaves out options that are what they would be
+without being named, and sorts the others. Values are percent-encoded where they need to be (RFC 3986): a comma is
+``%2C``.
 Where a command says so a name may hold options of the engine too, which come last: ``loopback?flash_attention=on``.
 """
 
@@ -102,21 +103,22 @@ def _parse(text: str) -> _Named:
 def pipelines(
     names: Iterable[str],
     options: Mapping[str, Mapping[str, Any]] | None = None,
-    variants: Mapping[str, Sequence[str]] | None = None,
     engine: str = "",
     of_engine: Collection[str] = (),
+    *,
+    every: bool = True,
 ) -> list[Pipeline]:
     """Return the pipelines that names stand for, each once; raises UsageError.
 
-    ``options`` (transport -> option -> value) and ``variants`` (transport -> variants) hold what flags give, for names
-    that do not say it themselves. A ``payload`` under the transport "" is for all that can carry it. ``engine`` is what
-    answers, where variants that are measured by default depend on that; ``of_engine`` are options of it that names may
-    hold as well.
+    ``options`` (transport -> option -> value) hold what flags give, for names that do not say it themselves. A
+    ``payload`` under the transport "" is for all that can carry it. A name without a variant stands for ``every`` one
+    that is measured by default, or for the first of them; ``engine`` is what answers, as that may decide which they
+    are. ``of_engine`` are options of it that names may hold as well.
     """
     given = {name: dict(values) for name, values in (options or {}).items()}
     found: dict[str, Pipeline] = {}
     for text in names:
-        for pipeline in _standing_for(_parse(text), given, variants or {}, engine, of_engine):
+        for pipeline in _standing_for(_parse(text), given, engine, of_engine, every=every):
             found.setdefault(pipeline.name, pipeline)
     return list(found.values())
 
@@ -139,25 +141,19 @@ def carries_alone(kind: str, compared: Sequence[Pipeline]) -> str:
     return next((each.name for each in compared if each.capabilities.answer_kinds == (kind,)), "")
 
 
-def first_variants() -> dict[str, tuple[str, ...]]:
-    """Return transport -> its first variant, where it has some: what one stream takes where its name has none."""
-    return {name: transport.variants[:1] for name, transport in TRANSPORTS.loaded() if transport.variants}
-
-
 def one_pipeline(text: str, **options: Any) -> Pipeline:
     """Return the one pipeline of a name, its first variant where it names none; ``options`` are as if by flags."""
     named = _parse(text)
-    transport = TRANSPORTS[named.transport]
-    variants = {transport.name: transport.variants[:1]}
-    return next(_standing_for(named, {transport.name: options}, variants))
+    return next(_standing_for(named, {named.transport: options}, every=False))
 
 
 def _standing_for(
     named: _Named,
     given: Mapping[str, Mapping[str, Any]],
-    chosen: Mapping[str, Sequence[str]],
     engine: str = "",
     of_engine: Collection[str] = (),
+    *,
+    every: bool,
 ) -> Iterator[Pipeline]:
     transport = TRANSPORTS[named.transport]
     flags = {**given.get("", {}), **given.get(transport.name, {})}
@@ -165,13 +161,11 @@ def _standing_for(
     own = tuple(sorted(named.options.items() - told.items()))
     plain = _checked(transport.options, flags, transport.name)
     asked = _checked(transport.options, {**flags, **told}, transport.name)
-    choice = Choice(asked, variants=chosen.get(transport.name, ()), engine=engine)
-    variants = [named.variant] if named.variant else transport.measured(choice)
-    for variant in variants:
+    measured = transport.measured(Choice(asked, engine=engine))
+    for variant in [named.variant] if named.variant else measured if every else measured[:1]:
         if variant not in (transport.variants or ("",)):
             known = ", ".join(transport.variants) or "none: it has no variants"
-            field = "transport" if named.variant else transport.name
-            raise UsageError(f"`{field}`: '{variant}' is none of {transport.name}'s {known}")
+            raise UsageError(f"`transport`: '{variant}' is none of {transport.name}'s {known}")
         can = transport.capabilities(Choice(asked, variant))
         default, filled, holding = (_filled(options, can.payloads) for options in (plain, asked, can.options))
         yield Pipeline(_canonical(transport, variant, filled, default, own), transport, variant, holding, own)

@@ -134,7 +134,7 @@ def test_a_server_that_is_not_ours_is_asked_for_its_first_model_and_nothing_of_o
     tmp_path: Path,
 ) -> None:
     with caching(Caching()) as url:
-        result = run(url, "--http", "as-deployed", output=tmp_path)
+        result = run(url, "--transport", "http/as-deployed", output=tmp_path)
     asked = json.loads((Path(result["run"]) / "manifest.json").read_text())["asked"]["http/as-deployed"]
     assert asked["model"] == "first"
     assert not [word for word in ("dummy", "starting", "model's headers") if word in result["said"]]
@@ -153,7 +153,7 @@ def test_identical_runs_against_one_llama_server_never_hit(tmp_path: Path) -> No
         try:
             assert server.stdout is not None
             url = server.stdout.readline().strip()
-            told = ["--http", "as-deployed", "--size", "320x240", "--extra-body", '{"ignore_eos": true}']
+            told = ["--transport", "http/as-deployed", "--size", "320x240", "--extra-body", '{"ignore_eos": true}']
             first, second = (run(url, *told, output=tmp_path) for _ in range(2))
             hit = run(url, *told, "--dialect", "openai", "--nonce", "n", output=tmp_path)
             hit = run(url, *told, "--dialect", "openai", "--nonce", "n", output=tmp_path)

@@ -354,7 +354,7 @@ def test_a_run_is_recorded_and_its_frames_are_a_source(tmp_path: Path, mode: str
     from rosbags.highlevel import AnyReader
 
     bag = tmp_path / "run.mcap"
-    few = ["--transport", "http,ros", "--http", "binary", "--mode", mode, "--record", str(bag)]
+    few = ["--transport", "http/binary,ros", "--mode", mode, "--record", str(bag)]
     run(*SMALL, *few, output=tmp_path / "results")
     kept = only_run(tmp_path / "results")
     with AnyReader([bag]) as reader:
@@ -392,7 +392,7 @@ def test_a_real_model_answers_over_both_pipelines(tmp_path: Path) -> None:
     grammar = tmp_path / "yes.gbnf"
     grammar.write_text('root ::= "yes" | "no"\n')
     few = ["--requests", "2", "--warmup", "1", "--max-tokens", "5", "--threads", "1"]
-    run(*few, "--grammar", str(grammar), "--transport", "http,ros", "--http", "as-deployed", output=tmp_path / "r")
+    run(*few, "--grammar", str(grammar), "--transport", "http/as-deployed,ros", output=tmp_path / "r")
     kept = only_run(tmp_path / "r")
     assert kept.manifest["model"]["dummy"] is True
     answers = kept.tokens.groupby("request_id")["text"].apply("".join)

@@ -67,7 +67,7 @@ def test_an_unknown_server_is_asked_what_it_is(tmp_path: Path) -> None:
         return chat(received)
 
     with serving(reply) as url:  # type: ignore[arg-type]
-        done = run("--url", url, "--http", "as-deployed", "--json", output=tmp_path)
+        done = run("--url", url, "--transport", "http/as-deployed", "--json", output=tmp_path)
     (cell,) = json.loads(done.stdout)["cells"]
     assert {"ingest", "inference"} <= set(cell["stages_ms"])
 
@@ -76,7 +76,16 @@ def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path:
     reply = [head("429 Too Many Requests", "application/json", "Retry-After: 0.01"), Cloud().refusal(429, "slow down")]
     with serving(lambda _: reply) as url:
         done = run(
-            "--url", url, "--dialect", "openai", "--http", "best-effort", "--requests", "9", output=tmp_path, code=1
+            "--url",
+            url,
+            "--dialect",
+            "openai",
+            "--transport",
+            "http/best-effort",
+            "--requests",
+            "9",
+            output=tmp_path,
+            code=1,
         )
     assert "waiting 0.01 s, as the server of http/best-effort asks" in done.stderr
     last = done.stderr.strip().splitlines()[-2:]
@@ -99,7 +108,17 @@ def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: P
             over.wait(60)
         yield speaker.closing([Token(0, "go")])
 
-    command = [sys.executable, "-m", "s2a_bench", "latency", *SMALL, "--http", "as-deployed", "--output", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "s2a_bench",
+        "latency",
+        *SMALL,
+        "--transport",
+        "http/as-deployed",
+        "--output",
+        str(tmp_path),
+    ]
     with serving(reply) as url:
         process = subprocess.Popen([*command, "--url", url], stderr=subprocess.PIPE, text=True)
         assert under_way.wait(60)
@@ -119,7 +138,7 @@ def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: P
 def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path) -> None:
     reply = answering(Cloud(), Recorder(["go", "_to", "x"]))
     with serving(reply) as url:
-        done = program("throughput", *SMALL, "--http", "as-deployed", "--url", url, "--output", tmp_path)
+        done = program("throughput", *SMALL, "--url", url, "--output", tmp_path)
     said = " ".join(done.stdout.split())
     assert "http/as-deployed: the server does not tell T_eval, so decode stands in for N / T_eval." in said
     assert "the engine's own figure" not in said

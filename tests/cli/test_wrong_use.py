@@ -39,6 +39,7 @@ WRONG = {
         ("--rules guess", "--rules: 'guess' is none of calibrated"),
         ("--eps 0.001 --calibration-cycles 100", "--eps: 100 calibration plans promise"),
         ("--rounding up", "--rounding"),
+        ("--live --zmq gr00t", "--zmq has another name: write --transport zmq/gr00t"),
     ],
     "throughput": [
         ("--transport pigeon", "--transport: 'pigeon' is none of http, ros, loopback"),
@@ -101,7 +102,8 @@ WRONG = {
         ("--port 70000", "--port: 70000 should be less than"),
         ("--payload gif", "--payload: 'gif' is none of raw, yuyv, jpeg, jpeg-preencoded, png"),
         ("--transport http,pigeon", "--transport: 'pigeon'"),
-        ("--http fast", "--http: 'fast'"),
+        ("--transport http/fast", "--transport: 'fast'"),
+        ("--http binary", "--http has another name: write --transport http/binary"),
         ("--size big", "--size: 'big' should look like 640x480"),
         ("--engine gpt", "--engine: 'gpt'"),
         ("--against rivals", "--against: 'rivals' should be paper"),

@@ -43,7 +43,7 @@ def llama_server_alone(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"payload": "raw"}, False),
         ({"engine": EngineConfig(name="echo")}, False),
         ({"options": {"http": {"url": "http://x"}}}, False),
-        ({"variants": {"http": ("binary",)}}, False),
+        ({"transports": "http/binary"}, False),
     ],
 )
 def test_llama_cpps_own_server_is_a_cell_where_it_has_the_same_to_do(
@@ -92,10 +92,10 @@ def test_without_our_own_engine_its_cell_and_servers_that_run_already_are_measur
 @pytest.mark.parametrize(
     "asked",
     [
-        {"variants": {"ros": ("topic", "action")}},
+        {"transports": ("http", "ros/topic", "ros/action")},
         {"transports": ("http", "ros")},
         {"transports": ("http/llama-server", "http/as-deployed")},
-        {"variants": {"http": ("llama-server", "binary")}},
+        {"transports": ("http/llama-server", "http/binary", "ros")},
         {"options": {"ros": {"middleware": "cyclonedds"}}},
     ],
 )
@@ -138,7 +138,6 @@ def test_a_model_is_never_answered_for_by_another_engine(
     ("asked", "wanted"),
     [
         ({"transports": "http/best-effort"}, "http/llama-server"),
-        ({"variants": {"http": ("binary",)}}, "http/llama-server"),
         ({"transports": "ros"}, "http"),
     ],
 )
@@ -153,9 +152,7 @@ def test_all_http_variants_and_ros_are_shown_unless_told() -> None:
 
 def test_cells_follow_the_flags() -> None:
     options = {"http": {"connection": "per-request"}}
-    config = RequestsConfig(
-        transports=("loopback", "http"), variants={"http": ("binary",)}, options=options, payload="raw"
-    )
+    config = RequestsConfig(transports=("loopback", "http/binary"), options=options, payload="raw")
     loopback, http = config.pipelines
     assert (loopback.name, loopback.payload) == ("loopback", "")
     assert (http.name, http.payload) == ("http/binary", "raw")
@@ -172,14 +169,29 @@ def test_a_payload_that_is_not_given_is_each_transports_own() -> None:
 
 def test_a_foreign_action_is_the_only_ros_cell() -> None:
     options = {"ros": {"action": "/llama/generate_response"}}
-    config = RequestsConfig(transports="ros", variants={"ros": ("topic", "action")}, options=options)
+    config = RequestsConfig(transports="ros", options=options)
     (cell,) = config.pipelines
     assert (cell.name, cell.black_box) == ("ros/action", True)
     assert cell.options.external_address == "/llama/generate_response"
 
 
 def test_both_ros_variants_are_measured_in_one_run() -> None:
-    assert names(RequestsConfig(transports="ros", variants={"ros": "topic,action"})) == ["ros/topic", "ros/action"]
+    assert names(RequestsConfig(transports="ros/topic,ros/action")) == ["ros/topic", "ros/action"]
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ({"http": "binary"}, "`http` has another name: write `transports` http/binary"),
+        ({"ros": ("topic", "action")}, "`ros` has another name: write `transports` ros/topic,ros/action"),
+        ({"websocket": "openpi"}, "`websocket` has another name: write `transports` websocket/openpi"),
+        ({"zmq": "gr00t"}, "`zmq` has another name: write `transports` zmq/gr00t"),
+    ],
+)
+def test_an_old_list_of_variants_is_told_as_transports(given: dict[str, Any], line: str) -> None:
+    with pytest.raises(UsageError) as error:
+        RequestsConfig(**given)
+    assert str(error.value) == line
 
 
 def test_a_black_box_is_asked_without_the_binary_variant() -> None:
@@ -203,7 +215,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"transports": ()}, "`transport`: name at least one of http, ros, loopback"),
         ({"transports": ("http/fast",)}, "`transport`: 'fast' is none of http's as-deployed, best-effort, binary"),
         ({"transports": ("loopback/fast",)}, "`transport`: 'fast' is none of loopback's none: it has no variants"),
-        ({"variants": {"ros": ("service",)}}, "`ros`: 'service' is none of ros's topic, action"),
+        ({"transports": "ros/service"}, "`transport`: 'service' is none of ros's topic, action"),
         ({"payload": "yuyv"}, "`payload`: over http/as-deployed a picture travels as jpeg, jpeg-preencoded, png, raw"),
         ({"payload": "yuyv"}, "http/as-deployed?payload=jpeg"),
         ({"options": {"http": {"connection": "x"}}}, "`connection`: 'x' should be 'keep-alive'"),
@@ -233,7 +245,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"options": {"ros": {"action": "/x"}}, "transports": ("ros/topic",)}, "`action` is spoken by ros/action"),
         ({"options": {"ros": {"action": "/x"}}, "mode": "stream"}, "`action`: `mode` stream needs our own server"),
         (
-            {"variants": {"ros": ("action",)}, "payload": "jpeg"},
+            {"transports": "ros/action", "payload": "jpeg"},
             "`payload`: a goal carries sensor_msgs/Image, not jpeg",
         ),
         ({"options": {"http": {"url": "http://x", "llama_server": Path("y")}}}, "`url` and `llama_server`"),
@@ -246,7 +258,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"options": {"http": {"url": "http://x", "api_key_env": "sk-1"}}}, "`api_key_env` takes the name of an env"),
         ({"options": {"http": {"url": "http://x", "api_key_env": "NO_KEY"}}}, "`api_key_env`: the environment has no"),
         ({"options": {"http": {"url": "http://u:p@x"}}}, "`url`: leave the password out"),
-        ({"options": URL, "variants": {"http": ("binary",)}}, "`http`: binary needs our own server"),
+        ({"options": URL, "transports": "http/binary"}, "`transport` http/binary needs our own server"),
         (
             {"options": {"http": {"llama_server": "x"}}, "engine": EngineConfig(name="echo")},
             "`llama_server` runs a model",

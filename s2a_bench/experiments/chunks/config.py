@@ -15,7 +15,7 @@ from s2a_bench import extras
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.latencies import split
-from s2a_bench.harness.config import FirstVariants, RequestsConfig
+from s2a_bench.harness.config import FirstVariants
 from s2a_bench.inference import STAND_IN, EngineConfig
 from s2a_bench.options import Names, Options, group, one_of, option
 from s2a_bench.policy.chunks import COMPARED, MODES, Rounding
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from s2a_bench.policy.chunks import Mode, Setting
 
 SHOWN: Final = (
-    *("transports", "variants", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
+    *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
     *("prompt", "warmup", "timeout_s", "deadline_s", "sample_resources_hz", "nonce"),
 )
 """The options that are flags of `chunks`."""
 
 
-class LiveRequests(RequestsConfig):
+class LiveRequests(FirstVariants):
     """The requests of a control loop."""
 
     COUNTS_TOKENS: ClassVar[str] = ""
@@ -45,7 +45,6 @@ class LiveRequests(RequestsConfig):
         f"[default: {ACTING[0]}, {ACTING[1]} where its packages are not installed]",
         flag="transport",
     )
-    variants: FirstVariants = group(FirstVariants)
     engine: EngineConfig = group(EngineConfig, only=("name", "profile", "gaps", "action_dim"))
     warmup: int = option(5, "requests before a cell's loop starts, kept and marked", ge=1, le=10**6)
     sample_resources_hz: float = option(

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Final
 from pydantic import AfterValidator, field_validator
 
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import FirstVariants, RequestsConfig
+from s2a_bench.harness.config import FirstVariants
 from s2a_bench.inference import ANSWERS, ENGINES, FLASH_ATTENTION, MODEL, EngineConfig
 from s2a_bench.options import Names, group, listed, one_of, option
 from s2a_bench.transport.defaults import LLAMA_SERVER, LOOPBACK
@@ -45,7 +45,7 @@ class ThroughputEngine(EngineConfig):
     )
 
 
-class ThroughputConfig(RequestsConfig):
+class ThroughputConfig(FirstVariants):
     """The settings of a throughput run."""
 
     QUICK: ClassVar[dict[str, int]] = {"requests": 3, "warmup": 1, "max_tokens": 32}
@@ -54,7 +54,6 @@ class ThroughputConfig(RequestsConfig):
     transports: Names = option(
         (IN_PROCESS,), "in-process, http, ros, as in latency; several with commas", flag="transport"
     )
-    variants: FirstVariants = group(FirstVariants)
     engine: ThroughputEngine = group(
         ThroughputEngine, only=set(EngineConfig.model_fields) - {"pace", "latency", *ANSWERS}
     )

@@ -23,7 +23,6 @@ from s2a_bench.policy.conformal import GUARANTEE, Guarantee
 from s2a_bench.policy.conformal import check as check_calibration
 from s2a_bench.stats.seeds import Verbatim
 from s2a_bench.transport.defaults import BLACK_BOX, FOLLOWED
-from s2a_bench.transport.pipeline import first_variants
 
 if TYPE_CHECKING:
     from s2a_bench.harness.config import RequestsConfig
@@ -281,13 +280,13 @@ def settings(config: TimelineConfig) -> Iterator[tuple[Board, Setting]]:
 
 def requests_of(config: TimelineConfig) -> RequestsConfig:
     """Return how the model is asked: one transport in one variant; prompt and length follow from the plan."""
-    from s2a_bench.harness.config import RequestsConfig
+    from s2a_bench.harness.config import FirstVariants
 
     transport = config.transport or (BLACK_BOX if config.url else FOLLOWED)
-    return RequestsConfig(
+    options: Any = {BLACK_BOX: {"url": config.url, "dialect": config.dialect}}
+    return FirstVariants(
         transports=(transport,),
-        variants=first_variants(),
-        options={BLACK_BOX: {"url": config.url, "dialect": config.dialect}},
+        options=options,
         source=config.source,
         size=config.size,
         engine=config.engine.but(profile=",".join(config.profiles)) if config.profiles else config.engine,

@@ -72,7 +72,9 @@ CLAIMS: Final[tuple[Claim, ...]] = (
         "III-A",
         "Base64 makes a picture 1.3333 times as large",
         "Mean body of http/as-deployed over http/binary, same payload and size, within 1% of 4/3.",
-        Trial("s2a-bench latency --http as-deployed,binary", timed.bodies, (timed.REQUESTS, timed.LARGE)),
+        Trial(
+            "s2a-bench latency --transport http/as-deployed,http/binary", timed.bodies, (timed.REQUESTS, timed.LARGE)
+        ),
         (Check("{} times, the prompt and JSON's own characters included.", timed.times_as_large, 1.32, 4.04 / 3),),
     ),
     *(

@@ -94,8 +94,6 @@ class Http(Transport[HttpOptions]):
     def measured(self, choice: Choice[HttpOptions]) -> Sequence[str]:
         """Return all that the server speaks; llama.cpp's own too where it is there and has the same to do."""
         options = choice.options
-        if choice.variants:
-            return choice.variants
         if options.url:
             return VARIANTS[:2]
         wanted = choice.engine == "llama" and options.payload in {"", "jpeg"} and found_llama_server()
@@ -131,7 +129,7 @@ class Http(Transport[HttpOptions]):
         """Refuse what only our own server knows, a key that is not there, and a model's server without a model."""
         variant, options = choice.variant, choice.options
         if options.url and variant in {BINARY, LLAMA_SERVER}:
-            raise UsageError(f"`http`: {variant} needs our own server; leave it out with `url`")
+            raise UsageError(f"`transport` {self.name}/{variant} needs our own server; leave it out with `url`")
         if variant == LLAMA_SERVER:
             if options.llama_server is None:
                 raise UsageError(
