@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING
 import typer
 
 from s2a_bench.cli.adapter import command
-from s2a_bench.cli.output import Json, print_json, print_line, shown
-from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import Json, print_json, print_line, print_table, shown
 from s2a_bench.errors import TRIPPED, UNDECIDED
 from s2a_bench.report.compare import CompareConfig
 from s2a_bench.report.page import ReportConfig
-from s2a_bench.writers.tables import lay_out
 
 if TYPE_CHECKING:
     from s2a_bench.report.compare.gates import Judgement
@@ -23,14 +21,15 @@ if TYPE_CHECKING:
 def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     from s2a_bench.report.compare.comparison import compare as compare_runs
     from s2a_bench.report.compare.comparison import metrics_of, open_comparison, read_side, shown_metrics, warnings_of
-    from s2a_bench.report.compare.gates import judge, read_gate
+    from s2a_bench.report.compare.gates import concerned, judge, read_gate
     from s2a_bench.report.compare.shown import compare_json, compare_table, write_comparison
 
     gates = [read_gate(text) for text in config.fail_if]
     sides = read_side(config.baseline, "A"), read_side(config.other, "B")
     compared = open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
     names = config.metrics
-    compared = compare_runs(compared, metrics_of(compared, names) if names else shown_metrics(compared))
+    wanted = metrics_of(compared, names) if names else shown_metrics(compared)
+    compared = compare_runs(compared, [*wanted, *concerned(compared, gates)])
     judgements = judge(compared, gates, strict=config.strict)
     found = warnings_of(compared)
     whole = compare_json(compared, judgements, found)
@@ -41,7 +40,7 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
         print_json(whole)
     else:
         table = compare_table(compared)
-        open_console().print(lay_out(table))
+        print_table(table)
         for line in (*table.notes, *(f"written: {path}" for path in written)):
             print_line(line)
     raise typer.Exit(_gate_code(judgements))
@@ -54,10 +53,10 @@ def _gate_code(judgements: Sequence[Judgement]) -> int:
 
     for one in judgements:
         line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {change_text(one.comparison)}"
-        p = "" if one.p_holm is None else f", p = {one.p_holm:.2g}"
-        seen = f", sees {seen_text(one.detectable)}"
-        few = "; measure more launches (--launches), or --strict" if one.outcome == compare_gates.UNDECIDED else ""
-        _say(line + p + ("; too few values for a test" if one.detectable is None else seen) + few)
+        p = "" if one.comparison.p_holm is None else f", p = {one.comparison.p_holm:.2g}"
+        seen = "; too few values for a test" if one.detectable is None else f", sees {seen_text(one.detectable)}"
+        few = "; measure more launches (--launches), compare less (--metric), or --strict"
+        _say(line + p + seen + few * (one.outcome == compare_gates.UNDECIDED))
     outcomes = {one.outcome for one in judgements}
     return TRIPPED if compare_gates.TRIPPED in outcomes else UNDECIDED if compare_gates.UNDECIDED in outcomes else 0
 

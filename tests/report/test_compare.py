@@ -29,7 +29,7 @@ from s2a_bench.report.compare.comparison import (
     shown_metrics,
     warnings_of,
 )
-from s2a_bench.report.compare.gates import judge, read_gate
+from s2a_bench.report.compare.gates import Judgement, concerned, judge, read_gate
 from s2a_bench.report.compare.shown import (
     build_forest,
     compare_csv,
@@ -303,7 +303,25 @@ def test_what_is_no_gate_is_refused_with_an_example(text: str) -> None:
 
 
 def outcomes(found: ComparedRuns, *gates: str, strict: bool = False) -> set[str]:
-    return {one.outcome for one in judge(found, [read_gate(gate) for gate in gates], strict=strict)}
+    return {one.outcome for one in judged(found, *gates, strict=strict)}
+
+
+def judged(found: ComparedRuns, *texts: str, strict: bool = False) -> list[Judgement]:
+    gates = [read_gate(text) for text in texts]
+    return judge(compare(found, concerned(found, gates)), gates, strict=strict)
+
+
+def test_table_and_gate_come_from_one_correction(launch: Launch) -> None:
+    found = opened(launch(1, n=40), launch(2, n=40, factor=1.08))
+    gates = [read_gate("http/binary:e2e.median>5%")]
+    both = compare(found, [*metrics_of(found, ["all"]), *concerned(found, gates)])
+    (one,) = judge(both, gates, strict=False)
+    assert one.comparison in both.comparisons
+    assert len(both.comparisons) == len({(each.pair.name, each.name) for each in both.comparisons})
+    alone = judged(found, "http/binary:e2e.median>5%")[0].comparison.p_holm
+    assert one.comparison.p_holm is not None
+    assert alone is not None
+    assert one.comparison.p_holm > alone
 
 
 def test_a_gate_trips_beyond_its_limit_only(launch: Launch) -> None:
@@ -314,7 +332,7 @@ def test_a_gate_trips_beyond_its_limit_only(launch: Launch) -> None:
     back = opened(launch(2, n=300, factor=1.1), launch(1, n=300))
     assert outcomes(back, "e2e<-5%") == {"tripped"}
     assert outcomes(back, "e2e>0%") == {"passed"}  # as the change the other way is one
-    assert {one.comparison.pair.name for one in judge(found, [read_gate("http/*:e2e>5%")], strict=False)} == {
+    assert {one.comparison.pair.name for one in judged(found, "http/*:e2e>5%")} == {
         "http/as-deployed",
         "http/binary",
     }
@@ -322,9 +340,9 @@ def test_a_gate_trips_beyond_its_limit_only(launch: Launch) -> None:
 
 def test_a_gate_does_not_trip_on_noise_unless_it_is_strict(launch: Launch) -> None:
     found = opened(launch(1, n=10, cells=("loopback",)), launch(2, n=10, cells=("loopback",), factor=1.02))
-    (one,) = judge(found, [read_gate("e2e>0%")], strict=False)
-    assert one.p_holm is not None
-    assert one.p_holm > 0.05
+    (one,) = judged(found, "e2e>0%")
+    assert one.comparison.p_holm is not None
+    assert one.comparison.p_holm > 0.05
     rises = (one.comparison.change.relative or 0) > 0
     assert one.outcome == "undecided"
     assert one.detectable is not None

@@ -203,7 +203,7 @@ def compare(compared: ComparedRuns, wanted: Sequence[tuple[Metric, str]]) -> Com
     What could be seen is told for the first step of Holm's correction, whose level is the strictest.
     """
     with fits(*compared.baseline, *compared.other):
-        found = [found for metric, statistic in wanted for found in changes(compared, metric, statistic)]
+        found = [found for metric, statistic in dict.fromkeys(wanted) for found in changes(compared, metric, statistic)]
     corrected = holm([comparison.change.p for comparison in found])
     judged = [
         replace(

@@ -13,15 +13,14 @@ from fnmatch import fnmatchcase
 from typing import Final
 
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments import Metric
 from s2a_bench.report.compare.comparison import (
     LEVEL,
     ComparedRuns,
     Comparison,
-    changes,
     detectable,
     metric_of,
 )
-from s2a_bench.stats.change import Change, holm
 
 _FLAG: Final = "`fail_if`"
 _FORM: Final = re.compile(r"(?:(?P<cells>.+):)?(?P<metric>[\w.]+)\s*(?P<sign>>|<\s*-)\s*(?P<limit>\d+(?:\.\d+)?)\s*%")
@@ -52,7 +51,6 @@ class Judgement:
 
     gate: Gate
     comparison: Comparison
-    p_holm: float | None
     outcome: str
     detectable: float | None
     """The smallest change towards the limit that the test would have found, as a share."""
@@ -68,35 +66,34 @@ def read_gate(text: str) -> Gate:
     return Gate(text, found["cells"] or "", found["metric"], rises, limit if rises else -limit)
 
 
-def judge(compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool) -> list[Judgement]:
-    """Judge every gate in every cell it is about.
+def concerned(compared: ComparedRuns, gates: Sequence[Gate]) -> list[tuple[Metric, str]]:
+    """Return metric and statistic of each gate; raises UsageError for a metric that there is not."""
+    return [metric_of(compared, gate.metric, _FLAG) for gate in gates]
 
-    A gate trips where the change is past the limit *and* is one: its p-value, corrected by Holm for all cells of all
-    gates, is below `LEVEL`. It passes where a change of the limit's size would have been seen, or one the other way
-    was; else it is undecided. With ``strict`` the change itself decides. Raises UsageError for a metric or a cell that
-    there is not.
+
+def judge(compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool) -> list[Judgement]:
+    """Judge every gate in every cell it is about, by the comparisons of what is `concerned`.
+
+    A gate trips where the change is past the limit *and* is one: its p-value, corrected with all comparisons, is below
+    `LEVEL`. It passes where a change of the limit's size would have been seen, or one the other way was; else it is
+    undecided. With ``strict`` the change itself decides. Raises UsageError for a cell that there is not.
     """
-    asked = [(gate, one) for gate in gates for one in _concerned(compared, gate)]
-    corrected = holm([one.change.p for _, one in asked])
     judged = []
-    for (gate, one), p in zip(asked, corrected, strict=True):
-        seen = detectable(one.change, len(asked), falls=not gate.rises)
-        judged.append(Judgement(gate, one, p, _outcome(gate, one.change, p, seen, strict=strict), seen))
+    for gate, wanted in zip(gates, concerned(compared, gates), strict=True):
+        every = [one for one in compared.comparisons if (one.metric, one.statistic) == wanted]
+        found = [one for one in every if not gate.cells or fnmatchcase(one.pair.name, gate.cells)]
+        if not found:
+            names = ", ".join(one.pair.name for one in every)
+            raise UsageError(f"{_FLAG}: no cell with {wanted[0].name} is called '{gate.cells}'; there are {names}")
+        for one in found:
+            seen = detectable(one.change, len(compared.comparisons), falls=not gate.rises)
+            judged.append(Judgement(gate, one, _outcome(gate, one, seen, strict=strict), seen))
     return judged
 
 
-def _concerned(compared: ComparedRuns, gate: Gate) -> list[Comparison]:
-    metric, statistic = metric_of(compared, gate.metric, _FLAG)
-    every = list(changes(compared, metric, statistic))
-    found = [one for one in every if not gate.cells or fnmatchcase(one.pair.name, gate.cells)]
-    if not found:
-        names = ", ".join(one.pair.name for one in every)
-        raise UsageError(f"{_FLAG}: no cell with {metric.name} is called '{gate.cells}'; there are {names}")
-    return found
-
-
-def _outcome(gate: Gate, change: Change, p_holm: float | None, seen: float | None, *, strict: bool) -> str:
+def _outcome(gate: Gate, one: Comparison, seen: float | None, *, strict: bool) -> str:
     """Say in a word what a gate finds; ``seen`` is the smallest change that there was a fair chance to find."""
+    change, p_holm = one.change, one.p_holm
     rises = change.other > change.baseline
     past = gate.beyond(change.relative, rises)
     if strict:

@@ -208,7 +208,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Gated:
-    """What a gate said of one cell; ``p_holm`` is corrected for all cells of all gates."""
+    """What a gate said of one cell; ``p_holm`` is that of its comparison."""
 
     gate: str
     cell: str
@@ -220,10 +220,10 @@ class Gated:
 
     @classmethod
     def of(cls, one: Judgement) -> Gated:
-        change = one.comparison.change
+        found, change = one.comparison, one.comparison.change
         outcome: Any = one.outcome
-        name = one.comparison.pair.name
-        return cls(one.gate.text, name, change.relative, change.bounds, one.p_holm, one.detectable, outcome)
+        values = change.relative, change.bounds, found.p_holm, one.detectable
+        return cls(one.gate.text, found.pair.name, *values, outcome)
 
 
 @dataclass(frozen=True, slots=True)
