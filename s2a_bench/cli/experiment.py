@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+import json
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from pkgutil import resolve_name
@@ -17,10 +18,9 @@ from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import shown as shown_line
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, write_shown
-from s2a_bench.writers.tables import lay_out
+from s2a_bench.writers.tables import fits, lay_out
 
 if TYPE_CHECKING:
-    from s2a_bench.cli.progress import RunProgress
     from s2a_bench.options import Options
     from s2a_bench.store.run import Run
 
@@ -102,40 +102,67 @@ def command_of(experiment: Experiment) -> Callable[..., None]:
         data_only: Annotated[
             bool, typer.Option("--data-only", help="write no tables and figures into the run folder")
         ] = False,
+        verbose: Annotated[
+            bool, typer.Option("--verbose", help="also print the other tables, what measuring costs, the environment")
+        ] = False,
         json_: Json = False,
     ) -> None:
         from s2a_bench.cli.progress import RunProgress
         from s2a_bench.store.run import read_run
 
-        with RunProgress(experiment.unit) as progress:
-            try:
+        progress = RunProgress(experiment.unit)
+        try:
+            with progress:
                 kept = read_run(experiment.run_with(config, output, progress))
                 shown = experiment.show(kept, **(view[0].model_dump() if view else {}))
                 if not data_only:
                     progress.stage("drawing")
                     write_shown(kept, shown)
-                present(kept, shown, progress, as_json=json_)
-            except (S2AError, KeyboardInterrupt):
-                if progress.folder is not None:
-                    progress.say(f"{experiment.unit} so far: {progress.folder}")
-                raise
+            for warning in kept.manifest["warnings"]:
+                progress.say(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}")
+            if json_:
+                print_json(shown.json())
+            else:
+                present(kept, shown, verbose=verbose)
+        except (S2AError, KeyboardInterrupt):
+            if progress.folder is not None and progress.folder.exists():
+                progress.say(f"{experiment.unit} so far: {progress.folder}")
+            raise
 
     return command(run, *options_of(experiment), about=experiment.about)
 
 
-def present(run: Run, shown: Shown, progress: RunProgress, *, as_json: bool) -> None:
-    """Print warnings, and then the tables or the one JSON object."""
-    for warning in run.manifest["warnings"]:
-        progress.say(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}")
-    if as_json:
-        print_json(shown.json())
-        return
+def present(run: Run, shown: Shown, *, verbose: bool = False) -> None:
+    """Print the main table, what a run says, and where the rest is; every table where ``verbose``."""
     console = open_console()
-    for name in shown.tables if shown.printed is None else shown.printed:
-        console.print(lay_out(shown.narrow.get(name) or shown.tables[name]))
-    for note in (*shown.notes, run.origins.line):
-        console.print(shown_line(note), markup=False, highlight=False)
+    first = [*(shown.main[:1] or shown.tables)]
+    names = [*dict.fromkeys((*first, *shown.tables))] if verbose else first
+    rest = [name for name in shown.tables if name not in names]
+    notes: dict[str, None] = {}
+    for name in names:
+        table = shown.tables[name]
+        if not verbose and table.brief and not fits(table, console.width):
+            rest.append(f"{name} in full")
+            table = table.brief
+        console.print(lay_out(table, console.width))
+        notes |= dict.fromkeys(table.notes)
+    details = _details(run.manifest) if verbose else ()
+    for line in filter(None, (*shown.sentences, " ".join(notes), *details, run.origins.line)):
+        console.print(shown_line(line), markup=False, highlight=False)
+    if rest:
+        written = f"{run.path / 'tables'}; " if (run.path / "tables").exists() else ""
+        print_line(f"more tables ({', '.join(rest)}): {written}--verbose prints them")
     for name in shown.files:
         if (run.path / name).exists():
             print_line(f"{name}: {run.path / name}")
     print_line(f"run folder: {run.path}")
+
+
+def _details(manifest: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what measuring costs, and the environment."""
+    if "mark_cost_ns" in manifest:
+        yield f"a mark costs {manifest['mark_cost_ns']} ns"
+    if sampled := manifest.get("resources"):
+        share, edge_us = sampled["core_share"] or 0, sampled["edge_us"]
+        yield f"sampling takes {share:.2%} of a core, and {edge_us} us before and after each request"
+    yield from json.dumps(manifest["environment"], indent=2, ensure_ascii=False).splitlines()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,17 +12,15 @@ import typer
 from s2a_bench import extras
 from s2a_bench.cli.adapter import command, with_flags
 from s2a_bench.cli.experiment import PLAIN, Commands
-from s2a_bench.cli.output import Json, print_json
-from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import Json, print_json, print_table
 from s2a_bench.errors import ModelError
 from s2a_bench.inference import DummyConfig, EngineConfig, FetchConfig, InfoConfig
 from s2a_bench.inference.gguf_file import GgufInfo, Vocabulary, describe, read_header
 from s2a_bench.store.manifest import present
+from s2a_bench.writers.tables import TextTable
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
     from rich.progress import Progress, TaskID
-    from rich.table import Table
 
     from s2a_bench.inference.fetch import Fetched
 
@@ -89,10 +87,9 @@ def _info(config: InfoConfig, *, json_: Json = False) -> None:
     if json_:
         print_json({"schema": SCHEMA, "command": "model info", "files": [present(info) for info in found]})
         return
-    console = open_console()
     for info in found:
-        for part in renderables(info):
-            console.print(part, soft_wrap=isinstance(part, str), highlight=False, markup=False)
+        for part in parts_of(info):
+            typer.echo(part) if isinstance(part, str) else print_table(part)
 
 
 def _bytes_bar(*, disable: bool = False) -> Progress:
@@ -132,12 +129,14 @@ _TEMPLATE_CHARACTERS = 300
 _CONTROL_TOKENS = 24
 
 
-def renderables(info: GgufInfo) -> list[RenderableType]:
+def parts_of(info: GgufInfo) -> list[str | TextTable]:
     """Return what to print, in order."""
-    parts: list[RenderableType] = [
+    types = "type", "tensors", "parameters", "MB", "bits/weight"
+    groups = "tensor", "shape", "type", "tensors", "MB"
+    parts: list[str | TextTable] = [
         "\n".join(_head(info)),
-        _table("weights by type", ["type"], ["tensors", "parameters", "MB", "bits/weight"], _types(info)),
-        _table("weights by tensor (N: the layer)", ["tensor", "shape", "type"], ["tensors", "MB"], _groups(info)),
+        TextTable("weights by type", types, [*_types(info)], 1),
+        TextTable("weights by tensor (N: the layer)", groups, [*_groups(info)], 3),
     ]
     parts.append("settings: " + _clean(", ".join(f"{key} {value}" for key, value in info.settings.items())))
     if info.vocabulary is not None:
@@ -166,27 +165,16 @@ def _head(info: GgufInfo) -> list[str]:
     return lines
 
 
-def _types(info: GgufInfo) -> Iterator[tuple[object, ...]]:
+def _types(info: GgufInfo) -> Iterator[tuple[str, ...]]:
     for each in info.types:
         bits = f"{each.bytes * 8 / each.parameters:.2f}" if each.parameters else ""
-        yield each.kind, each.tensors, f"{each.parameters:,}", f"{each.bytes / 1e6:,.1f}", bits
+        yield each.kind, str(each.tensors), f"{each.parameters:,}", f"{each.bytes / 1e6:,.1f}", bits
 
 
-def _groups(info: GgufInfo) -> Iterator[tuple[object, ...]]:
+def _groups(info: GgufInfo) -> Iterator[tuple[str, ...]]:
     for each in info.groups:
         shape = " x ".join(map(str, each.shape))
-        yield _clean(each.name), shape, ", ".join(each.kinds), each.tensors, f"{each.bytes / 1e6:,.1f}"
-
-
-def _table(title: str, texts: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[object]]) -> Table:
-    from rich.table import Table
-
-    table = Table(*texts, title=title, title_justify="left")
-    for name in numbers:
-        table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(*map(str, row))
-    return table
+        yield _clean(each.name), shape, ", ".join(each.kinds), str(each.tensors), f"{each.bytes / 1e6:,.1f}"
 
 
 def _vocabulary(vocabulary: Vocabulary, tokenizer: dict[str, Any]) -> list[str]:

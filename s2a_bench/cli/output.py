@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,12 +11,13 @@ import typer
 
 from s2a_bench.secrets import struck
 from s2a_bench.text import one_line, visible
+from s2a_bench.writers.tables import TextTable, lay_out
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 WIDTH = 100
-"""Columns of the tables where the output is no terminal."""
+"""Columns of the tables where the output is no terminal and COLUMNS does not say."""
 
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output")]
 
@@ -32,11 +34,17 @@ def print_json(whole: dict[str, Any]) -> None:
 
 
 def console() -> Console:
-    """Return the console for tables: the terminal's, or one of `WIDTH` columns."""
+    """Return the console for tables: the terminal's, or one of COLUMNS, else `WIDTH`."""
     from rich.console import Console
 
     terminal = Console()
-    return terminal if terminal.is_terminal else Console(width=WIDTH)
+    return terminal if terminal.is_terminal or os.environ.get("COLUMNS", "").isdigit() else Console(width=WIDTH)
+
+
+def print_table(table: TextTable) -> None:
+    """Print a table at the width of the console."""
+    to = console()
+    to.print(lay_out(table, to.width))
 
 
 def print_line(line: str, to: Console | None = None) -> None:

@@ -11,12 +11,12 @@ from s2a_bench.boards.gaps import to_table
 from s2a_bench.boards.profile import Profile, find_profile, profile_files, read_profile
 from s2a_bench.cli.adapter import command, with_flags
 from s2a_bench.cli.experiment import PLAIN, Commands
-from s2a_bench.cli.output import Json, print_json
-from s2a_bench.cli.output import console as open_console
+from s2a_bench.cli.output import Json, print_json, print_table
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.profile_capture import CaptureConfig, profile_json, ttft_s
 from s2a_bench.machine.environment import board_facts, differences, matches
 from s2a_bench.store.manifest import plain
+from s2a_bench.writers.tables import TextTable
 
 app = typer.Typer(
     cls=Commands,
@@ -31,23 +31,17 @@ SCHEMA = "s2a-bench-profile/1"
 @app.command("list")
 def list_(json_: Json = False) -> None:
     """List the profiles that can be given by name; a wrong file is named on standard error."""
-    from rich.table import Table
-    from rich.text import Text
-
     found = _readable()
     if json_:
         _print_profiles("list", [profile_json(profile, path) for profile, path in found])
         return
-    table = Table(box=None, pad_edge=False)
-    for header in ("name", "board", "origin", "tokens/s", "TTFT s", "gaps"):
-        number = header in {"tokens/s", "TTFT s"}
-        table.add_column(header, justify="right" if number else "left", no_wrap=header not in {"board", "gaps"})
+    rows: list[tuple[str, ...]] = []
     for profile, _ in found:
         ttft = f"{ttft_s(profile):.3g}" + (" (assumed)" if "prompt_s" in profile.assumed else "")
         origin = profile.origin + (", dummy" if profile.dummy else "")
-        row = (profile.name, profile.title, origin, f"{profile.tokens_per_s:.3g}", ttft, _gaps(profile, full=False))
-        table.add_row(*map(Text, row))
-    open_console().print(table)
+        numbers = f"{profile.tokens_per_s:.3g}", ttft
+        rows.append((profile.name, profile.title, origin, _gaps(profile, full=False), *numbers))
+    print_table(TextTable("Profiles", ("name", "board", "origin", "gaps", "tokens/s", "TTFT s"), rows, 4))
 
 
 @app.command("show")

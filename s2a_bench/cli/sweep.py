@@ -13,11 +13,12 @@ from urllib.parse import urlsplit
 
 from s2a_bench.cli.adapter import command, flags_named
 from s2a_bench.cli.experiment import ParseError, click_command, config_of, options_of
-from s2a_bench.cli.output import Json, print_json, print_line, shown
+from s2a_bench.cli.output import Json, print_json, print_line, print_table
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import S2AError, UsageError
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.machine.environment import collect
+from s2a_bench.secrets import struck
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.sweep import CELLS, Sweep, read_sweep
 from s2a_bench.sweep import WORKERS, Cell, Command, SweepConfig, Workers
@@ -26,6 +27,7 @@ from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.sweep.plan import Plan, plan_sweep
 from s2a_bench.sweep.run import Expected, SweepRun, check_resume, earlier, expect, only_one, pending, start_sweep
 from s2a_bench.text import visible
+from s2a_bench.writers.tables import TextTable
 
 
 def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
@@ -112,20 +114,14 @@ def print_plan(plan: Plan, cells: Sequence[Cell], expected: Expected) -> None:
 
 def print_sweep(sweep: Sweep) -> None:
     """Print the failed cells, and a line for all."""
-    from rich.table import Table
-    from rich.text import Text
-
     cells = sweep.cells
     failed = cells[cells["state"] == "failed"]
     if len(failed):
-        table = Table(title="Cells that failed", title_justify="left")
-        for name in ("cell", "setting", "error"):
-            table.add_column(name, overflow="fold")
+        rows = []
         for row in failed.to_dict("records"):
             setting = " ".join(f"{key}={value}" for key, value in json.loads(row["settings"]).items())
-            texts = (f"{row['cell']}-r{row['repeat']}", setting, row["error"])
-            table.add_row(*(Text(shown(text)) for text in texts))
-        open_console().print(table)
+            rows.append(tuple(map(struck, (f"{row['cell']}-r{row['repeat']}", setting, row["error"]))))
+        print_table(TextTable("Cells that failed", ("cell", "setting", "error"), rows, 3))
     print_line(f"{len(cells) - len(failed)} of {len(cells)} cells finished on {', '.join(sorted(set(cells['host'])))}")
     print_line(f"sweep folder: {sweep.path}")
 

@@ -113,18 +113,14 @@ class Subject:
 class Shown:
     """What a run shows, each part by its file's name.
 
-    ``main`` are the tables that stand open on the page, ``printed`` those on the terminal (None: all), ``narrow`` what
-    is printed in place of tables that are too wide for it, ``notes`` what is said below them. ``csvs`` are tables for
-    programs, ``figures`` are drawn when called, ``files`` write themselves into the run folder. ``json`` gives the
-    ``--json`` object. ``lanes`` are timelines to look into.
+    ``main`` are the tables that stand open on the page; a terminal shows the first of them, and without any all tables.
+    ``csvs`` are tables for programs, ``figures`` are drawn when called, ``files`` write themselves into the run folder.
+    ``json`` gives the ``--json`` object. ``lanes`` are timelines to look into.
     """
 
     sentences: Sequence[str] = ()
     tables: Mapping[str, TextTable] = field(default_factory=dict)
     main: Sequence[str] = ()
-    printed: Sequence[str] | None = None
-    narrow: Mapping[str, TextTable] = field(default_factory=dict)
-    notes: Sequence[str] = ()
     csvs: Mapping[str, CsvTable] = field(default_factory=dict)
     figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     files: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
@@ -197,12 +193,9 @@ class Experiment:
         """Return what one of its runs shows; every table and figure says where its numbers come from."""
         shown: Shown = resolve_name(self.view)(run, **asked)
         line = run.origins.line
-        tables, narrow = (
-            {name: replace(table, provenance=table.provenance or line) for name, table in part.items()}
-            for part in (shown.tables, shown.narrow)
-        )
+        tables = {name: replace(table, provenance=table.provenance or line) for name, table in shown.tables.items()}
         figures = {name: partial(_marked, build, line) for name, build in shown.figures.items()}
-        return replace(shown, tables=tables, narrow=narrow, figures=figures)
+        return replace(shown, tables=tables, figures=figures)
 
     def cell_class(self) -> type | None:
         """Return the class of a cell of its ``--json``; None where it is not declared."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from s2a_bench.stats import summary_of
 from s2a_bench.text import one_line, visible
@@ -50,7 +50,8 @@ class TextTable:
     """One table: ``left`` columns of names, then columns of numbers; ``rules`` are the rows that a line precedes.
 
     ``notes`` are strings, or `Note` where they bear labels. ``provenance`` says in one line where the numbers come
-    from (`Origins.line`); without it a table is not written to a file.
+    from (`Origins.line`); without it a table is not written to a file. ``brief`` is what a terminal shows where it has
+    no room for the table.
     """
 
     title: str
@@ -60,6 +61,7 @@ class TextTable:
     rules: frozenset[int] = frozenset()
     notes: tuple[str, ...] = ()
     provenance: str = ""
+    brief: TextTable | None = None
 
     @classmethod
     def grouped(
@@ -145,37 +147,93 @@ def _decimals(value: float) -> int:
     return 3
 
 
-_WIDTH = 100
-"""Columns of the terminal that is planned for."""
+def fits(table: TextTable, width: int) -> bool:
+    """Whether a terminal of ``width`` columns has room for a table in one block."""
+    wide = _widths(table)
+    return sum(wide) + len(wide) - 1 <= width
 
 
-def lay_out(table: TextTable) -> RenderableType:
-    """Turn a table into one for the terminal: long headers broken, the gaps narrowed where that makes it fit."""
+def lay_out(table: TextTable, width: int) -> RenderableType:
+    """Turn a table into one for a terminal of ``width`` columns; no letter of a cell is lost.
+
+    Where it has no room, gaps are narrowed and headers broken, then long names are folded, and columns of numbers
+    that are still too many follow in further blocks, each with the names again.
+    """
+    from rich.console import Group
+    from rich.text import Text
+
+    parts = [part for each in _blocks(table, width) for part in (_block(table, *each), Text())]
+    return Group(Text(one_line(table.title), "bold"), *parts)
+
+
+def _widths(table: TextTable, *, folded: bool = False) -> list[int]:
+    """Return how wide each column is; with ``folded`` headers of numbers are broken between words too."""
+    from rich.cells import cell_len
+
+    def parts(place: int, name: str) -> list[str]:
+        return re.split(r"\s", name) if folded and place >= table.left else name.split("\n")
+
+    cells = [[one_line(row[place]) for row in table.rows] for place in range(len(table.header))]
+    return [
+        max(map(cell_len, (*parts(place, name), *column)))
+        for place, (name, column) in enumerate(zip(_headings(table), cells, strict=True))
+    ]
+
+
+def _blocks(table: TextTable, width: int) -> Iterator[tuple[list[int], list[int], int]]:
+    """Yield the columns of each block, the widths of all columns, and the gap between them."""
+    left, wide, gap = table.left, _widths(table), 2
+    if sum(wide) + gap * (len(wide) - 1) > width:
+        gap = 1
+    if sum(wide) + gap * (len(wide) - 1) > width:
+        wide = _widths(table, folded=True)
+    if sum(wide) + gap * (len(wide) - 1) > width:
+        gap = 2
+        _fold_names(table, wide, max(width // 2, width - sum(wide[left:]) - gap * len(wide[left:])) - gap * (left - 1))
+    start = sum(wide[:left]) + gap * (left - 1)
+    numbers: list[int] = []
+    used = start
+    for place in range(left, len(wide)):
+        wide[place] = min(wide[place], max(width - start - gap, 1))
+        if numbers and used + gap + wide[place] > width:
+            yield [*range(left), *numbers], wide, gap
+            numbers, used = [], start
+        numbers.append(place)
+        used += gap + wide[place]
+    yield [*range(left), *numbers], wide, gap
+
+
+def _fold_names(table: TextTable, wide: list[int], most: int) -> None:
+    """Narrow the columns of names to ``most`` together: between words first, within them where that is not enough."""
+    words = [
+        max((len(word) for row in table.rows for word in row[place].split(" ")), default=0)
+        for place in range(table.left)
+    ]
+    while sum(wide[: table.left]) > max(most, table.left):
+        loose = [place for place, least in enumerate(words) if wide[place] > least]
+        wide[max(loose or range(table.left), key=lambda place: wide[place])] -= 1
+
+
+def _block(table: TextTable, columns: Sequence[int], wide: Sequence[int], gap: int) -> RenderableType:
     from rich import box
-    from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text
 
-    header = [*table.header[: table.left], *(_broken(name) for name in table.header[table.left :])]
-    lines = [[*name.split("\n"), *column] for name, column in zip(header, zip(*table.rows, strict=True), strict=False)]
-    natural = sum(max(map(len, column)) for column in lines)
-    gap = 1 if natural + 2 * (len(lines) - 1) <= _WIDTH else 0
-    shown = Table(
-        title=Text(one_line(table.title)),
-        title_justify="left",
-        title_style="bold",
-        box=box.SIMPLE_HEAD,
-        show_edge=False,
-        padding=(0, gap, 0, 0),
-        pad_edge=False,
-    )
-    for place, name in enumerate(header):
-        shown.add_column(Text(visible(name)), justify="left" if place < table.left else "right", no_wrap=True)
-    for place, row in enumerate(table.rows):
-        if place in table.rules:
+    shown = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, gap - 1, 0, 0), pad_edge=False)
+    names = _headings(table)
+    for place in columns:
+        justify: Literal["left", "right"] = "left" if place < table.left else "right"
+        shown.add_column(Text(visible(names[place])), justify=justify, width=wide[place], overflow="fold")
+    for index, row in enumerate(table.rows):
+        if index in table.rules:
             shown.add_section()
-        shown.add_row(*(Text(one_line(text)) for text in row))
-    return Padding(shown, (0, 0, 1, 0))
+        shown.add_row(*(Text(one_line(row[place])) for place in columns))
+    return shown
+
+
+def _headings(table: TextTable) -> list[str]:
+    """Return the headings, those of numbers broken where long names have a joint."""
+    return [*table.header[: table.left], *map(_broken, table.header[table.left :])]
 
 
 def _broken(name: str) -> str:

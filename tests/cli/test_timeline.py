@@ -85,7 +85,7 @@ def test_the_run_folder_holds_skills_tokens_tables_figure_and_trace(whole: dict[
 
 def test_one_setting_shows_every_skill_and_says_what_is_emulated_and_assumed(tmp_path: Path) -> None:
     done = called(
-        *("timeline", "--profile", "jetson-agx-orin", "--tokens-per-skill", "6", "--policy", "naive"),
+        *("timeline", "--profile", "jetson-agx-orin", "--tokens-per-skill", "6", "--policy", "naive", "--verbose"),
         *("--output", tmp_path),
     )
     assert "stall before" in done.stdout

@@ -69,7 +69,7 @@ class TestLetters:
             progress.say(FORGED)
             progress.stage(f"[red]{FORGED}")
         out = io.StringIO()
-        Console(file=out, width=300).print(lay_out(TextTable(FORGED, ("a", FORGED), [(FORGED, "1")], 1)))
+        Console(file=out, width=300).print(lay_out(TextTable(FORGED, ("a", FORGED), [(FORGED, "1")], 1), 300))
         for text in (capsys.readouterr().err, out.getvalue()):
             assert "forged" in text
             assert not {"\x1b", "\r", "\x07", "\x9b", "\u202e", "\u2028"} & set(text)

@@ -37,12 +37,10 @@ _TRIALS: Final[dict[str, dict[str, Any]]] = {
 
 def show(run: Run, **_: Any) -> Shown:
     """Return what a boundary run shows."""
-    tables = {"boundary": line_table(run), "boards": board_table(run)}
     return Shown(
         sentences=boundary_sentences(run),
-        tables=tables,
+        tables={"boundary": line_table(run), "boards": board_table(run)},
         main=["boards"],
-        notes=tables["boards"].notes,
         csvs=boundary_csv(run),
         figures={"boundary": partial(build_boundary, run)},
         json=lambda: frame(run, list(_cells(run)), []),

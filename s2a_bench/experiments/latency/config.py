@@ -1,13 +1,12 @@
-"""What a latency run is asked, and what is shown of it."""
+"""What a latency run is asked."""
 
 from __future__ import annotations
 
 from typing import ClassVar
 
-from s2a_bench.experiments.paper import AgainstPaper
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.inference import EngineConfig
-from s2a_bench.options import group, option
+from s2a_bench.options import group
 
 
 class LatencyConfig(RequestsConfig):
@@ -22,9 +21,3 @@ class LatencyConfig(RequestsConfig):
             *("flash_attention", "answer", "horizon", "action_dim"),
         ),
     )
-
-
-class LatencyView(AgainstPaper):
-    """What is drawn and printed besides."""
-
-    verbose: bool = option(False, "also what measuring costs, and the environment")

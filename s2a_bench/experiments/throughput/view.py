@@ -46,12 +46,10 @@ _REFERENCE_FILL: Final = "#FFFFFF"
 
 def show(run: Run, *, against: str = "", **_: Any) -> Shown:
     """Return what a throughput run shows."""
-    tables = throughput_tables(run)
     return Shown(
         sentences=throughput_sentences(run),
-        tables=tables,
+        tables=throughput_tables(run),
         main=["throughput", "prompt"],
-        notes=[" ".join(tables["throughput"].notes)],
         csvs=throughput_csv(run),
         figures=throughput_figures(run, against_paper=against == "paper"),
         json=lambda: throughput_json(run),

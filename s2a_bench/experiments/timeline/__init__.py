@@ -9,7 +9,6 @@ EXPERIMENT = Experiment(
     run="s2a_bench.experiments.timeline.run:run_timeline",
     view="s2a_bench.experiments.timeline.view.tables:show",
     cell="s2a_bench.experiments.timeline.view.cells:TimelineCell",
-    view_options="s2a_bench.experiments.timeline.view.tables:Asked",
     compared="s2a_bench.experiments.timeline.view.cells:COMPARED",
     unit="timelines",
 )

@@ -234,7 +234,7 @@ def test_the_tables_fit_a_terminal(make: Make) -> None:
     tables = throughput_tables(run)
     assert list(tables) == ["throughput", "prompt", "gaps", "positions"]
     for table in tables.values():
-        console.print(lay_out(table))
+        console.print(lay_out(table, 100))
     text = console.export_text()
     assert "…" not in text
     assert "1000 ± 0" in text

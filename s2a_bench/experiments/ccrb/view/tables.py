@@ -60,7 +60,6 @@ def show(run: Run, *, animation: bool = False, **_: Any) -> Shown:
         sentences=ccrb_sentences(run),
         tables=tables,
         main=[name for name in ("outcomes", "phase", "random", "followers", "follower-shares") if name in tables],
-        notes=[*dict.fromkeys(note for table in tables.values() for note in table.notes), *ccrb_notes(run)],
         csvs=ccrb_csv(run),
         figures=ccrb_figures(run),
         files=animation_files(run) if animation else {},
@@ -69,25 +68,20 @@ def show(run: Run, *, animation: bool = False, **_: Any) -> Shown:
 
 
 def ccrb_sentences(run: Run) -> list[str]:
-    """Return what became of the cars, and where that ordering of the policies holds."""
+    """Return what became of the cars, where that ordering of the policies holds, and the studies' speed."""
     rows = rollouts_of(run, "point")
     survives = survives_of(rows)
     told = [
         f"{row['policy']}: {said(row['outcome'], survives)}, {row['stalls']} stalls of {row['stall_ns'] / 1e9:.2f} s."
         for row in rows.to_dict("records")
     ]
-    return told + [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
-
-
-def ccrb_notes(run: Run) -> list[str]:
-    """Return what the terminal says below the tables: findings, and the studies' speed."""
-    said = findings(run)
+    told += [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
     if len(run.table(SENSITIVITY)):
-        said.append(_sensitivity(run))
+        told.append(_sensitivity(run))
     if studies := run.manifest.get("studies"):
         speed = studies["rollouts_per_cpu_s"]
-        said.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time")
-    return said
+        told.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time.")
+    return told
 
 
 def findings(run: Run) -> list[str]:

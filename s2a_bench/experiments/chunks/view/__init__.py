@@ -24,12 +24,10 @@ if TYPE_CHECKING:
 def show(run: Run, **_: Any) -> Shown:
     """Return what a run of chunks shows."""
     tables = chunk_tables(run)
-    main = [name for name in ("chunks", "loop") if name in tables]
     return Shown(
         sentences=chunk_sentences(run),
         tables=tables,
-        main=main,
-        notes=list(dict.fromkeys(note for name in main for note in tables[name].notes)),
+        main=[name for name in ("chunks", "loop") if name in tables],
         csvs=chunk_csv(run),
         figures=chunk_figures(run),
         json=lambda: chunk_json(run),

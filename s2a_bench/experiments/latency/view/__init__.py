@@ -1,9 +1,9 @@
-"""How a latency run is shown: sentences and tables, and what of them a terminal has room for."""
+"""How a latency run is shown: sentences and tables."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,6 @@ from s2a_bench.experiments.requests import (
     spelled,
     stages_present,
 )
-from s2a_bench.inference import declared as engine
 from s2a_bench.stats import summary_of
 from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.transport import declared
@@ -38,63 +37,23 @@ if TYPE_CHECKING:
     from s2a_bench.stats import Ratio
     from s2a_bench.store.run import Run
 
-_FULL_CELLS = 2
-"""As many cells leave room for mean ± sd beside the medians."""
-_SUMMARY_COLUMNS = 9
-"""With more columns than these, ratios to more than two cells, the spread is told in short."""
 _STAGE_CELLS = 5
-"""With more cells than these the cells become rows."""
+"""With more cells than these the cells become rows, where there is no room for the whole table."""
 _MOST = 6
 """Sentences of one kind; the tables have the rest."""
 
 
-def show(run: Run, *, against: str = "", verbose: bool = False, **_: Any) -> Shown:
+def show(run: Run, *, against: str = "", **_: Any) -> Shown:
     """Return what a latency run shows."""
-    n = len(cells_of(run))
     tables = latency_tables(run)
-    stages = group_table(run) if n > _STAGE_CELLS else stage_table(run, full=n <= _FULL_CELLS)
-    printed = _printed(run)
-    compared = tables["summary" if "summary" in printed else "summary-e2e"]
-    narrow = {"stages": stages}
-    for name, metric in (("summary", "e2e_without_inference"), ("summary-e2e", "e2e")):
-        if len(tables[name].header) > _SUMMARY_COLUMNS:
-            narrow[name] = summary_table(run, metric, brief=True)
     return Shown(
         sentences=latency_sentences(run),
         tables=tables,
-        main=[name for name in ("summary", "summary-model", "stages") if name in tables],
-        printed=[name for name in tables if name in printed],
-        narrow=narrow,
-        notes=[" ".join(dict.fromkeys((*stages.notes, *compared.notes))), *(_verbose(run) if verbose else ())],
+        main=[name for name in ("stages", "summary", "summary-model") if name in tables],
         csvs=latency_csv(run),
         figures=latency_figures(run, against_paper=against == "paper"),
         json=lambda: latency_json(run),
     )
-
-
-def _printed(run: Run) -> set[str]:
-    """Return the tables for the terminal: the stages, and what is compared; end to end too where a model answers.
-
-    Without model is printed where a llama-server stands beside our own, which it alone can be compared with.
-    """
-    cells = cells_of(run)
-    known = [bool(cell.values_ms("e2e_without_inference").size) for cell in cells]
-    names = {"stages", "tokens", "frames"}
-    if any(known):
-        names.add("summary")
-    if not all(known) or any(engine(cell.about["engine"]).computes for cell in cells):
-        names.add("summary-e2e")
-    if any(cell.has_ingest for cell in cells):
-        names.add("summary-model")
-    return names
-
-
-def _verbose(run: Run) -> Iterator[str]:
-    yield f"a mark costs {run.manifest['mark_cost_ns']} ns"
-    if sampled := run.manifest.get("resources"):
-        share, edge_us = sampled["core_share"] or 0, sampled["edge_us"]
-        yield f"sampling takes {share:.2%} of a core, and {edge_us} us before and after each request"
-    yield from json.dumps(run.manifest["environment"], indent=2, ensure_ascii=False).splitlines()
 
 
 def latency_sentences(run: Run) -> list[str]:
@@ -166,14 +125,11 @@ def stage_table(run: Run, *, full: bool = True) -> TextTable:
     for metric in _foot(cells):
         add("", metric.replace("_", " "), [cell.values_ms(metric) for cell in cells])
     title = "Stages in ms: median (mean ± sd)" if full else "Stages in ms: medians"
-    return TextTable(
-        title,
-        ("group", "stage", *(cell.name for cell in cells)),
-        rows,
-        2,
-        frozenset({below + 1}),
-        _notes(run, cells),
-    )
+    header = ("group", "stage", *(cell.name for cell in cells))
+    brief = None
+    if full:
+        brief = group_table(run) if len(cells) > _STAGE_CELLS else stage_table(run, full=False)
+    return TextTable(title, header, rows, 2, frozenset({below + 1}), _notes(run, cells), brief=brief)
 
 
 def group_table(run: Run) -> TextTable:
@@ -190,25 +146,21 @@ def group_table(run: Run) -> TextTable:
     return TextTable("Groups of stages in ms: medians", header, rows, 1, notes=_notes(run, cells))
 
 
-def summary_table(run: Run, metric: str = "e2e_without_inference", *, brief: bool = False) -> TextTable:
-    """Lay out what a publication quotes: n, spread, percentiles, and the ratios to what is compared with.
-
-    A ``brief`` one leaves room for more ratios than two: of the spread it has p99.
-    """
+def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
+    """Lay out what a publication quotes: n, spread, percentiles, and the ratios to what is compared with."""
     cells = cells_of(run)
     bases = [
         base for base in cells if base.values_ms(metric).size and any(cell.is_compared_with(base) for cell in cells)
     ]
-    figures = ("median", "p99") if brief else (MEAN_SD, "median", "p90", "p99")
+    figures = (MEAN_SD, "median", "p90", "p99")
     rows = []
     found: list[Ratio] = []
     for cell in cells:
         over = {base.name: _ratio(cell, base, metric, run.bootstrap_seed) for base in bases}
         found += [ratio for ratio in over.values() if ratio]
         ratios = ("1" if cell.name == base else interval(ratio) for base, ratio in over.items())
-        counts = () if brief else (str(cell.n), str(cell.errors))
-        rows.append((cell.name, *counts, *entries(cell.values_ms(metric), *figures), *ratios))
-    header = ("cell", *(() if brief else ("n", "errors")), *figures, *(f"ratio to {base.name}" for base in bases))
+        rows.append((cell.name, str(cell.n), str(cell.errors), *entries(cell.values_ms(metric), *figures), *ratios))
+    header = ("cell", "n", "errors", *figures, *(f"ratio to {base.name}" for base in bases))
     title = f"{spelled(metric)} in ms; ratios of medians [95 % interval]"
     return TextTable(title, header, rows, 1, notes=(*_notes(run, cells), *launches_note(found)))
 

@@ -18,7 +18,6 @@ from s2a_bench.experiments.timeline.view.cells import (
 )
 from s2a_bench.experiments.timeline.view.chrome_trace import TRACE, write_trace
 from s2a_bench.experiments.timeline.view.figures import timeline_figures
-from s2a_bench.options import Options, option
 from s2a_bench.policy import ONLINE
 from s2a_bench.stats import summary_of
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable
@@ -28,28 +27,17 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
 
-class Asked(Options):
-    """What is printed."""
-
-    per_skill: bool = option(False, "also print every skill of the shown plans")
-
-
-def show(run: Run, *, per_skill: bool = False, **_: Any) -> Shown:
-    """Return what a run of timelines shows; ``per_skill`` also prints the skills of several settings."""
-    cells = timelines_of(run)
-    tables = timeline_tables(run)
-    one_setting = len({cell.setting for cell in cells}) == 1
+def show(run: Run, **_: Any) -> Shown:
+    """Return what a run of timelines shows."""
     return Shown(
         sentences=timeline_sentences(run),
-        tables=tables,
+        tables=timeline_tables(run),
         main=["timelines"],
-        printed=[name for name in tables if name != "skills" or per_skill or one_setting],
-        notes=tables["timelines"].notes,
         csvs=timeline_csv(run),
         figures=timeline_figures(run),
         files={TRACE: partial(write_trace, run)},
         json=lambda: timelines_json(run),
-        lanes=[cell for cell in cells if len(cell.skills)],
+        lanes=[cell for cell in timelines_of(run) if len(cell.skills)],
     )
 
 
@@ -140,7 +128,7 @@ def skill_table(cells: Sequence[Timelines]) -> TextTable:
 
 
 def timeline_tables(run: Run) -> dict[str, TextTable]:
-    """Return every table of a run by its file's name; what is compared comes last."""
+    """Return every table of a run by its file's name."""
     cells = timelines_of(run)
     shape = _common(cells)
     return {
