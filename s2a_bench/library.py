@@ -1,14 +1,6 @@
 """The library: every experiment as a function, run folders as objects that show themselves, comparisons.
 
-    import s2a_bench as s2a
-
-    run = s2a.latency(transports=["http", "ros"], engine="echo", requests=50, output="results")
-    run.samples                      # a DataFrame, a row a request, warm-ups marked
-    run.table("stages")              # a table of the run as a DataFrame
-    run.figures()["stage_breakdown"] # matplotlib
-    s2a.compare(run, s2a.load("results/old"))
-
-Nothing here prints, and nothing changes the caller's process unless ``tune=True`` asks for it.
+docs/library.md has examples. Nothing here prints; a run leaves the caller's process as it found it.
 """
 
 from __future__ import annotations
@@ -134,12 +126,12 @@ class Comparison:
 
 
 def run(
-    name: str, *, output: str | Path = "results", progress: Progress | None = None, tune: bool = False, **options: Any
+    name: str, *, output: str | Path = "results", progress: Progress | None = None, tune: bool = True, **options: Any
 ) -> Run:
     """Run an experiment by its name; ``options`` are its fields, those of its groups by their own names.
 
-    ``tune`` lets it keep freed memory and limit threads in this process, as the command line does; the manifest says
-    so, and runs with and without are not compared. Raises S2AError for what the caller can mend.
+    While it measures, this process keeps freed memory and limits threads, as the command line does, unless ``tune``
+    is False; runs with and without are not compared. Raises S2AError for what the caller can mend.
     """
     experiment: Experiment = EXPERIMENTS[name]
     config_class: type[Options] = resolve_name(experiment.config)
@@ -176,7 +168,7 @@ def command(name: str) -> Callable[..., Run]:
     """Return the function of an experiment; its signature is that of `run` without the name."""
 
     def call(
-        *, output: str | Path = "results", progress: Progress | None = None, tune: bool = False, **options: Any
+        *, output: str | Path = "results", progress: Progress | None = None, tune: bool = True, **options: Any
     ) -> Run:
         return run(name, output=output, progress=progress, tune=tune, **options)
 

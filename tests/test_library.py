@@ -11,18 +11,17 @@ import pytest
 
 import s2a_bench as s2a
 from s2a_bench.errors import UnlikeRuns, UsageError
+from s2a_bench.machine.tuning import SINGLE_THREADED
 
 QUIET = """
 import os, sys
 import cv2
 before = dict(os.environ), cv2.getNumThreads()
 import s2a_bench as s2a
-run = s2a.latency(transports=["loopback"], engine="echo", size="64x48", requests=2, warmup=0, output=sys.argv[1])
-assert (dict(os.environ), cv2.getNumThreads()) == before, "the caller's process was changed"
-assert run.manifest["tuning"]["process"] is False
-run = s2a.latency(transports=["loopback"], engine="echo", size="64x48", requests=2, output=sys.argv[1], tune=True)
-assert run.manifest["tuning"]["process"] is True
-print(cv2.getNumThreads())
+for tune in (True, False):
+    run = s2a.latency(transports=["loopback"], engine="echo", size="64x48", requests=6, output=sys.argv[1], tune=tune)
+    assert (dict(os.environ), cv2.getNumThreads()) == before, "the caller's process was changed"
+    assert run.manifest["tuning"]["process"] is tune
 """
 
 
@@ -76,17 +75,16 @@ def test_a_field_is_named_in_what_is_wrong(tmp_path: Path) -> None:
         s2a.boundary(speed=1, output=tmp_path)
 
 
-def test_the_callers_process_stays_as_it_is_unless_asked(tmp_path: Path) -> None:
-    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", QUIET, str(tmp_path)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=environment,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "1"
-    untuned, tuned = sorted(tmp_path.iterdir())
-    with pytest.raises(UnlikeRuns, match="tuning process: not tuned against tuned"):
-        s2a.compare(untuned, tuned)
+def test_a_run_leaves_the_callers_process_as_it_was_and_is_like_one_of_the_command(tmp_path: Path) -> None:
+    environment = {name: value for name, value in os.environ.items() if name not in SINGLE_THREADED}
+
+    def run(*command: str | Path) -> None:
+        subprocess.run([sys.executable, *command], check=True, capture_output=True, env=environment)
+
+    options = ("--transport", "loopback", "--engine", "echo", "--size", "64x48", "--runs", "6")
+    run("-m", "s2a_bench", "latency", *options, "--output", tmp_path)
+    run("-W", "error", "-c", QUIET, tmp_path)
+    command, library, untuned = sorted(tmp_path.iterdir())
+    assert set(s2a.compare(command, library).table()["cell"]) == {"loopback"}
+    with pytest.raises(UnlikeRuns, match=r"tuning process: tuned against not tuned \(the library's tune=False\)"):
+        s2a.compare(command, untuned)

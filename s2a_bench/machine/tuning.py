@@ -1,7 +1,7 @@
 """Processes of the harness: settings by which they measure more evenly, and children that never outlive their parent.
 
-Settings are recorded in the manifest. They are for processes of our own: the command line and the servers allow them, a
-program that uses the library has to ask for them. Where they are not allowed nothing is changed.
+Settings are recorded in the manifest. The command line, the servers and the library allow them, each as long as it
+measures; then they are what they were before. Where they are not allowed nothing is changed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import signal
 import subprocess
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from threading import Thread, current_thread, main_thread
 from typing import Any, Final
 
@@ -33,23 +33,31 @@ KEEP_FREE_BYTES = 1 << 30
 SINGLE_THREADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-_allowed = False
+_undo: ExitStack | None = None
+"""Where this process may be tuned: what puts its settings back."""
 
 
 @contextmanager
 def allowed(yes: bool = True) -> Iterator[None]:
-    """Allow this process to be tuned inside the block; what was tuned stays so."""
-    global _allowed  # noqa: PLW0603 - settings of a process are global
-    before, _allowed = _allowed, yes or _allowed
-    try:
+    """Allow this process to be tuned inside the block; after it the settings are those from before.
+
+    What glibc cannot take back: the threads of this process may share one arena from then on.
+    """
+    global _undo  # noqa: PLW0603 - settings of a process are global
+    if _undo is not None or not yes:
         yield
-    finally:
-        _allowed = before
+        return
+    with ExitStack() as undo:
+        _undo = undo
+        try:
+            yield
+        finally:
+            _undo = None
 
 
 def is_allowed() -> bool:
     """Whether this process may be tuned."""
-    return _allowed
+    return _undo is not None
 
 
 def keep_large_blocks() -> bool:
@@ -57,9 +65,12 @@ def keep_large_blocks() -> bool:
 
     All threads share them: an arena each would keep the most that each thread ever held.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if _allowed else None
-    if mallopt is None:
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if _undo is None or mallopt is None:
         return False
+    _undo.callback(give_back_memory)
+    _undo.callback(mallopt, M_TRIM_THRESHOLD, 2 * KEEP_BYTES)  # what glibc comes to by itself with blocks of that size
+    _undo.callback(mallopt, M_ARENA_MAX, 0)
     mallopt(M_ARENA_MAX, 1)
     return all(mallopt(*told) for told in ((M_TRIM_THRESHOLD, KEEP_FREE_BYTES), (M_MMAP_THRESHOLD, KEEP_BYTES)))
 
@@ -78,12 +89,14 @@ def limit_threads() -> None:
     One conversion of a picture takes a fraction of a millisecond: OpenCV's worker threads save little of it and compete
     with the model and the middleware for cores, which would disturb what is measured.
     """
-    if not _allowed:
+    if _undo is None:
         return
-    for name in SINGLE_THREADED:
-        os.environ.setdefault(name, "1")
+    for name in set(SINGLE_THREADED) - set(os.environ):
+        os.environ[name] = "1"
+        _undo.callback(os.environ.pop, name, None)
     import cv2
 
+    _undo.callback(cv2.setNumThreads, cv2.getNumThreads())
     cv2.setNumThreads(1)
 
 

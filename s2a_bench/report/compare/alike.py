@@ -79,9 +79,9 @@ def _of(prefix: str, first: Mapping[str, Any], second: Mapping[str, Any], *, fat
 
 
 def _tuning(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return whether the measuring process was tuned; a library's caller may not want that."""
+    """Return whether the measuring process was tuned; the library's caller may not want that."""
     tuned = (manifest.get("tuning") or {}).get("process")
-    return {} if tuned is None else {"process": "tuned" if tuned else "not tuned"}
+    return {} if tuned is None else {"process": "tuned" if tuned else "not tuned (the library's tune=False)"}
 
 
 def _origin(manifest: Mapping[str, Any]) -> dict[str, Any]:
