@@ -49,7 +49,13 @@ class Run:
 
     @property
     def samples(self) -> pd.DataFrame:
-        """One row a request, warm-ups and failures included and marked; times in integer ns."""
+        """One row a request that counts, failures marked and warm-ups left out; times in integer ns."""
+        every = self.all_samples
+        return every[~every["warmup"]].reset_index(drop=True)
+
+    @property
+    def all_samples(self) -> pd.DataFrame:
+        """One row a request, warm-ups and failures marked; times in integer ns."""
         return self._run.samples
 
     @property

@@ -56,10 +56,12 @@ def test_a_run_shows_its_rows_tables_and_figures(tmp_path: Path) -> None:
         run.table("stages")
 
 
-def test_samples_have_their_warm_ups_marked_and_runs_are_compared(tmp_path: Path) -> None:
+def test_samples_leave_warm_ups_out_and_runs_are_compared(tmp_path: Path) -> None:
     few = {"transports": ["loopback"], "engine": "echo", "size": "64x48", "requests": 12, "output": tmp_path}
     one, other = s2a.latency(**few, warmup=2), s2a.latency(**few, warmup=2)
-    assert one.samples["warmup"].tolist() == [True] * 2 + [False] * 12
+    assert one.all_samples["warmup"].tolist() == [True] * 2 + [False] * 12
+    assert one.samples["request_id"].tolist() == one.all_samples["request_id"].tolist()[2:]
+    assert s2a.load(one.path).samples.equals(one.samples)
     assert set(one.table("stages")["cell"]) == {"loopback"}
     compared = s2a.compare(one, other.path)
     assert set(compared.table()["cell"]) == {"loopback"}
