@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from html import escape
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, experiment_of, write_shown
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from s2a_bench.report.compare.comparison import ComparedRuns
 
 Folder: TypeAlias = "str | Path | Run"
+Known = TypeVar("Known")
+SHOWN_DPI: Final = 150
+"""At which notebooks show figures, drawn twice as fine: 7 point text is legible and sharp."""
 
 
 class Run:
@@ -75,15 +78,19 @@ class Run:
         shown = self._shown
         if f"{name}.csv" in shown.csvs:
             return pd.read_csv(io.StringIO(shown.csvs[f"{name}.csv"].text(self._run.origins)))
-        if name not in shown.tables:
-            raise UsageError(f"a {self.manifest['command']} run has no table '{name}', only {', '.join(self.tables)}")
-        table = shown.tables[name]
+        table = self._one(shown.tables, "table", name)
         return pd.DataFrame(table.rows, columns=list(table.header))
+
+    def plot(self, name: str) -> Figure:
+        """Draw one of the run's figures, which a notebook shows as any other picture."""
+        with paper_column():
+            figure = self._one(self._shown.figures, "figure", name)()
+        setattr(figure, "_repr_png_", partial(_png, figure))  # noqa: B010 - IPython asks for it
+        return figure
 
     def figures(self) -> dict[str, Figure]:
         """Draw every figure of the run."""
-        with paper_column():
-            return {name: draw() for name, draw in self._shown.figures.items()}
+        return {name: self.plot(name) for name in self._shown.figures}
 
     def json(self) -> dict[str, Any]:
         """Return the object that the command's ``--json`` prints."""
@@ -93,6 +100,12 @@ class Run:
         """Write tables and figures into the run folder, as the command does, and return it."""
         write_shown(self._run, self._shown)
         return self.path
+
+    def _one(self, known: Mapping[str, Known], kind: str, name: str) -> Known:
+        if name not in known:
+            names = ", ".join(known) or "none"
+            raise UsageError(f"a {self.manifest['command']} run has no {kind} '{name}', only {names}")
+        return known[name]
 
     @cached_property
     def _shown(self) -> Shown:
@@ -188,6 +201,15 @@ def command(name: str) -> Callable[..., Run]:
 def _opened(side: Folder | Sequence[Folder]) -> list[store.Run]:
     folders = [side] if isinstance(side, (str, Path, Run)) else side
     return [store.read_run(folder.path if isinstance(folder, Run) else Path(folder)) for folder in folders]
+
+
+def _png(figure: Figure) -> tuple[bytes, dict[str, int]]:
+    """Return a figure as PNG, and the size at which a notebook shows it."""
+    drawn = io.BytesIO()
+    with paper_column():
+        figure.savefig(drawn, dpi=2 * SHOWN_DPI)
+    width, height = figure.get_size_inches() * SHOWN_DPI
+    return drawn.getvalue(), {"width": round(width), "height": round(height)}
 
 
 def _html(table: TextTable) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import subprocess
 import sys
@@ -48,6 +49,8 @@ def test_a_run_shows_its_rows_tables_and_figures(tmp_path: Path) -> None:
     assert "boards" in run.tables
     assert run.table("boards").columns[0] == "board"
     assert list(run.figures()) == ["boundary"]
+    with pytest.raises(UsageError, match="a boundary run has no figure 'stages', only boundary"):
+        run.plot("stages")
     assert run.json()["command"] == "boundary"
     assert "Boards: is naive stall-free?" in run._repr_html_()
     assert (run.save() / "figures" / "boundary.png").exists()
@@ -90,3 +93,32 @@ def test_a_run_leaves_the_callers_process_as_it_was_and_is_like_one_of_the_comma
     assert set(s2a.compare(command, library).table()["cell"]) == {"loopback"}
     with pytest.raises(UnlikeRuns, match=r"tuning process: tuned against not tuned \(the library's tune=False\)"):
         s2a.compare(command, untuned)
+
+
+NOTEBOOK = """
+import s2a_bench as s2a
+run = s2a.boundary(points=5, most_tokens=3)
+run.plot("boundary")
+---
+from matplotlib.figure import Figure
+figure = run.plot("boundary")
+assert isinstance(figure, Figure)
+display(figure)
+---
+run
+"""
+
+
+def test_a_notebook_shows_figures_without_magics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
+    nbformat = pytest.importorskip("nbformat").v4
+    pytest.importorskip("ipykernel", reason="ipykernel is not installed")
+    for name in ("IPYTHONDIR", "JUPYTER_RUNTIME_DIR"):
+        monkeypatch.setenv(name, str(tmp_path))
+    notebook = nbformat.new_notebook(cells=[nbformat.new_code_cell(cell) for cell in NOTEBOOK.split("---")])
+    nbclient.NotebookClient(notebook, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    *drawn, shown = (cell.outputs for cell in notebook.cells)
+    for (output,) in drawn:
+        assert base64.b64decode(output.data["image/png"]).startswith(b"\x89PNG")
+        assert output.metadata["image/png"]["width"] == 525
+    assert "Boards: is naive stall-free?" in shown[0].data["text/html"]

@@ -93,7 +93,7 @@ def test_its_transport_is_measured_with_stages_of_its_own(measured: Path) -> Non
     assert set(stages[stages["stage"] == "toy_frame"]["group"]) == {"pack"}
     ratios = pd.read_csv(measured / "tables" / "ratios.csv")
     assert {("toy", "loopback")} == set(zip(ratios["of"], ratios["to"], strict=True))
-    assert (measured / "figures" / "stage_breakdown.png").exists()
+    assert (measured / "figures" / "stages.png").exists()
 
 
 def test_a_fact_of_its_transport_is_in_manifest_samples_and_table(measured: Path) -> None:

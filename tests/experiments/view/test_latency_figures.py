@@ -159,7 +159,7 @@ def test_png_and_pdf_are_written_below_the_run_and_leave_no_global_state(make_ru
     write_shown(run, EXPERIMENT.show(run, against="paper"))
     assert dict(mpl.rcParams) == before
     paths = sorted((run.path / "figures").iterdir())
-    names = ["distribution", "latency_bars", "stage_breakdown"]
+    names = ["distribution", "latency_bars", "stages"]
     assert [path.name for path in paths] == [f"{name}.{suffix}" for name in names for suffix in ("pdf", "png")]
     for path in paths:
         head = path.read_bytes()

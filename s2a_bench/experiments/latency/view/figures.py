@@ -98,7 +98,7 @@ def latency_figures(run: Run, *, against_paper: bool = False) -> dict[str, Calla
         return {}
     return {
         "latency_bars": lambda: build_latency_bars(run, against_paper=against_paper),
-        "stage_breakdown": lambda: build_stage_breakdown(run),
+        "stages": lambda: build_stage_breakdown(run),
         "distribution": lambda: build_latency_distribution(run),
     }
 
