@@ -97,11 +97,16 @@ def check(plans: int, epsilon: float = EPSILON) -> None:
     """Refuse to calibrate on so few plans that nothing can be promised; raises UsageError."""
     if not 0 < epsilon < 1:
         raise UsageError(f"`epsilon`: {epsilon:g} should be between 0 and 1")
-    if (plans + 1) * epsilon < 1 - ROUNDING:
+    if plans < fewest(epsilon):
         raise UsageError(
-            f"`epsilon`: {plans} calibration plans promise {1 / (plans + 1):.2g} at best, not {epsilon:g}: "
-            f"take {math.ceil(1 / epsilon - ROUNDING) - 1} or more ({PLANS} are better), or raise `epsilon`"
+            f"`epsilon`: calibrating on {plans} promises {1 / (plans + 1):.2g} at best, not {epsilon:g}: "
+            f"take {fewest(epsilon)} or more ({PLANS} are better), or raise `epsilon`"
         )
+
+
+def fewest(epsilon: float) -> int:
+    """Return how many plans, or latencies, a promise of ``epsilon`` takes at least."""
+    return math.ceil(1 / epsilon - ROUNDING) - 1
 
 
 def coarse(plans: int, epsilon: float = EPSILON) -> bool:

@@ -115,10 +115,10 @@ def test_among_exchangeable_plans_no_more_stall_than_promised(gaps: Markov | Non
 def test_too_few_plans_are_refused_with_what_would_do() -> None:
     assert choose(np.zeros(99)).caution == 0
     with pytest.raises(
-        UsageError, match=r"98 calibration plans promise 0\.01 at best.*take 99 or more \(400 are better\)"
+        UsageError, match=r"calibrating on 98 promises 0\.01 at best.*take 99 or more \(400 are better\)"
     ):
         choose(np.zeros(98))
-    with pytest.raises(UsageError, match=r"3 calibration plans promise 0\.25 at best, not 0\.1: take 9 or more"):
+    with pytest.raises(UsageError, match=r"calibrating on 3 promises 0\.25 at best, not 0\.1: take 9 or more"):
         choose(np.zeros(3), 0.1)
     assert choose(np.zeros(98), 0.02).caution == 0
     for epsilon in (0.0, 1.0, math.nan):

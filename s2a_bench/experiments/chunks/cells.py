@@ -62,14 +62,13 @@ class Cell:
 
 def draw(config: ChunksConfig, source: Source) -> Drawn:
     """Draw the latencies of a source; a recording is played in its order, its first half for the rules if any."""
+    count = config.learnt(source)
     if source.recorded_ns is not None:
-        count = min(config.calibration_cycles, source.recorded_ns.size // 2) if config.with_rules else 0
         judged = source.recorded_ns[count:]
         return Drawn(source, judged[: config.cycles], source.recorded_ns[:count])
     from s2a_bench.experiments.chunks.config import CYCLES
 
     judged = source.draw(generator(config.seed, "chunks", source.name), config.cycles or CYCLES)
-    count = config.calibration_cycles if config.with_rules else 0
     return Drawn(source, judged, source.draw(generator(config.seed, "chunks rules", source.name), count))
 
 

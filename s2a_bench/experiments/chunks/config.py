@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import chain
@@ -59,6 +58,8 @@ class LiveRequests(FirstVariants):
 
 RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
 """What may choose the trigger of queue."""
+PROMISING: Final = ("calibrated", "tracked")
+"""Those that keep to `epsilon`, where there is enough to learn from."""
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
 VIRTUAL: Final = ("cycles", "calibration_cycles", "tokens_per_action")
@@ -186,10 +187,36 @@ class ChunksConfig(Options):
             raise UsageError(f"`robot`: {name}: virtual time has no actions to send; name a plant, or nothing")
         return found
 
-    @property
+    @cached_property
     def rules_tried(self) -> Sequence[str]:
-        """Return what chooses triggers; live nothing unless it is asked for."""
-        return self.rules if not self.live or "rules" in self.model_fields_set else ()
+        """Return what chooses triggers: if none is named nothing live, and nothing that has too little to learn."""
+        if "rules" in self.model_fields_set:
+            return self.rules
+        return () if self.live else tuple(rule for rule in self.rules if rule not in PROMISING or not self.too_few)
+
+    @cached_property
+    def too_few(self) -> str:
+        """Return which source of latencies is too short for a rule that keeps to `epsilon`, or nothing."""
+        from s2a_bench.policy.conformal import fewest
+
+        needed = fewest(self.epsilon)
+        return next(
+            (
+                f"{each.name} has {self._learnable(each)} latencies to learn from (of a recording the first half); "
+                f"a stall in {self.epsilon:.2%} of the cycles takes {needed}"
+                for each in self.sources
+                if self._learnable(each) < needed
+            ),
+            "",
+        )
+
+    def _learnable(self, source: Source) -> int:
+        recorded = source.recorded_ns
+        return self.calibration_cycles if recorded is None else min(self.calibration_cycles, recorded.size // 2)
+
+    def learnt(self, source: Source) -> int:
+        """Return how many latencies of a source rules learn from, before the others are judged."""
+        return self._learnable(source) if self.with_rules else 0
 
     @cached_property
     def triggered(self) -> Mode | None:
@@ -202,8 +229,6 @@ class ChunksConfig(Options):
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
-        from s2a_bench.policy.conformal import check
-
         for field in ("modes", "latency"):
             if not getattr(self, field):
                 raise UsageError(f"`{field}`: name at least one")
@@ -216,14 +241,11 @@ class ChunksConfig(Options):
         _ = self.plant
         for source in self.sources:
             recorded = source.recorded_ns
-            learnt = self.calibration_cycles if recorded is None else min(self.calibration_cycles, recorded.size // 2)
-            if self.with_rules:
-                try:
-                    check(learnt, self.epsilon)
-                except UsageError as error:
-                    raise UsageError(f"{error}; or leave the `rules` out ({source.name})") from error
-            if recorded is not None and recorded.size - learnt * self.with_rules < 2:  # noqa: PLR2004 - a boundary
+            if recorded is not None and recorded.size - self.learnt(source) < 2:  # noqa: PLR2004 - a boundary
                 raise UsageError(f"`latency`: {source.name} has {recorded.size} latencies; two or more are needed")
+        if self.with_rules and self.too_few and {*PROMISING} & {*self.rules_tried}:
+            others = ",".join(rule for rule in RULES if rule not in PROMISING)
+            raise UsageError(f"`rules`: {self.too_few}; raise `epsilon`, or take `rules` {others}")
 
     def _check_live(self) -> None:
         """Refuse what only virtual time has, and what no server could be told."""
@@ -258,10 +280,12 @@ class ChunksConfig(Options):
             )
 
     def _check_learning(self) -> None:
+        from s2a_bench.policy.conformal import fewest
+
         if "oracle" in self.rules_tried:
             raise UsageError("`rules`: nobody is an oracle live; take calibrated, tracked, maximum or mean")
-        if {"calibrated", "tracked"} & {*self.rules_tried} and self.with_rules:
-            needed = math.ceil(1 / self.epsilon) - 1
+        if {*PROMISING} & {*self.rules_tried} and self.with_rules:
+            needed = fewest(self.epsilon)
             if self.requests.warmup < needed:
                 raise UsageError(
                     f"`warmup`: {self.requests.warmup} requests are too few to learn from for `epsilon` "

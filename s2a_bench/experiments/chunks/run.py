@@ -19,6 +19,7 @@ from s2a_bench.machine import environment
 from s2a_bench.policy.chunks.closed import closed
 from s2a_bench.policy.chunks.metrics import measure
 from s2a_bench.provenance import Origins, Provenance
+from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
         "seeds": {"latencies": config.seed},
+        "warnings": [warning.to_manifest() for warning in _warnings(config)],
         "provenance": Origins(
             Provenance.computed(), {cell.cell: cell.drawn.source.provenance for cell in tried}
         ).to_manifest(),
@@ -122,6 +124,13 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
         if config.export_delays is not None:
             write_delays(config.export_delays, delay_rows(drawn[0], tried[0].mode, config.setting))
         return writer.path
+
+
+def _warnings(config: ChunksConfig) -> Iterator[RunWarning]:
+    if missing := ", ".join(rule for rule in config.rules if config.with_rules and rule not in config.rules_tried):
+        yield RunWarning(
+            "few-latencies", f"without the rules {missing}: {config.too_few}", "record more, or raise --eps"
+        )
 
 
 def _simulate(config: ChunksConfig, cell: Cell, follows: Follower | None, writer: RunWriter) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,22 @@ def test_a_recording_is_played_in_order_and_its_first_half_is_what_rules_learn_f
     assert {cell.rule for cell in cells(config, drawn)} == {"given", *config.rules}
     without = ChunksConfig(latency=str(file), rules="", cycles=150)
     assert draw(without, without.sources[0]).judged.size == 150
+
+
+def test_a_short_recording_has_no_rule_that_promises(tmp_path: Path) -> None:
+    file = tmp_path / "delays.csv"
+    file.write_text("latency_ms\n" + "".join(f"{20 + place % 40}\n" for place in range(50)))
+    few = "25 latencies to learn from (of a recording the first half); a stall in 1.00% of the cycles takes 99"
+    run = ran(tmp_path, latency=str(file))
+    (warning,) = run.manifest["warnings"]
+    assert warning["code"] == "few-latencies"
+    assert few in warning["message"]
+    others = "maximum,mean,oracle"
+    assert {*run.table(CHUNKS)["rule"]} == {"given", *others.split(",")}
+    with pytest.raises(UsageError, match=re.escape(f"{few}; raise `epsilon`, or take `rules` {others}")):
+        ChunksConfig(latency=str(file), rules="tracked")
+    for way_out in ({"epsilon": 0.04}, {"rules": others}):
+        assert ChunksConfig(latency=str(file), **way_out).learnt(ChunksConfig(latency=str(file)).sources[0]) == 25
 
 
 def test_a_mode_that_never_acts_has_no_numbers_instead_of_wrong_ones(tmp_path: Path) -> None:

@@ -272,7 +272,7 @@ def test_a_tracked_robot_stalls_while_its_latencies_exceed_the_slack(rounding: R
     assert np.mean(stalls[10_000:20_000]) > 0.1
     assert np.mean(stalls[:10_000]) < 0.0115
     assert np.mean(stalls[24_000:]) < 0.0115
-    with pytest.raises(UsageError, match="98 calibration plans promise"):
+    with pytest.raises(UsageError, match="calibrating on 98 promises"):
         calibrate(np.arange(98))
     with pytest.raises(ValueError, match="any speed"):
         trigger(50, Setting(20, 8), 0)
