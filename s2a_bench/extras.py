@@ -6,6 +6,9 @@ No optional library is imported by a statement: ``gguf = extras.require("gguf", 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Final
@@ -26,8 +29,7 @@ EXTRAS: Final = {
     "zenoh": "ROS 2 over Zenoh, as rmw_zenoh speaks it",
 }
 """Extra -> what it is for."""
-BY_HAND: Final = ("ray", "carla")
-"""Extras that `make setup` leaves out."""
+_NOTED: ContextVar[dict[str, None] | None] = ContextVar("extras that are missing", default=None)
 
 
 def installed(module: str) -> bool:
@@ -38,7 +40,21 @@ def installed(module: str) -> bool:
 def need(extra: str, *modules: str) -> None:
     """Raise MissingExtra where a top-level module that an extra brings is not installed, without importing it."""
     if missing := [module for module in modules if not installed(module)]:
+        if (noted := _NOTED.get()) is not None:
+            noted[extra] = None
+            return
         raise MissingExtra(f"{EXTRAS[extra]}: the package {missing[0]} is not installed; {how_to_install(extra)}")
+
+
+@contextmanager
+def noted() -> Iterator[dict[str, None]]:
+    """Yield the extras that `need` finds missing meanwhile, which then raises nothing."""
+    missing: dict[str, None] = {}
+    token = _NOTED.set(missing)
+    try:
+        yield missing
+    finally:
+        _NOTED.reset(token)
 
 
 def require(module: str, extra: str) -> Any:
@@ -52,5 +68,4 @@ def require(module: str, extra: str) -> Any:
 
 def how_to_install(*extras: str) -> str:
     """Return the command that installs extras."""
-    checkout = "" if set(extras) & set(BY_HAND) else " (in a checkout: make setup)"
-    return f"pip install 's2a-bench[{','.join(extras)}]'{checkout}"
+    return f"pip install 's2a-bench[{','.join(extras)}]'"

@@ -28,7 +28,6 @@ else:
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-SETUP = " (in a checkout: make setup)"
 
 
 def without(modules: set[str], folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -77,9 +76,20 @@ def test_a_missing_library_is_one_line_with_the_command_and_leaves_nothing(
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     line = refused(*arguments, code=1)
-    hint = "" if extra in extras.BY_HAND else SETUP
-    ending = f": the package {module} is not installed; pip install 's2a-bench[{extra}]'{hint}"
+    ending = f": the package {module} is not installed; pip install 's2a-bench[{extra}]'"
     assert line == f"error: {extras.EXTRAS[extra]}{ending}"
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_sweep_is_listed_without_extras_and_names_all_of_them_at_once(tmp_path: Path) -> None:
+    missing = {"msgpack", "websockets", "zmq", "zenoh"}
+    listed = without(missing, tmp_path, "sweep", "transports", "--dry-run")
+    hint = "pip install 's2a-bench[websocket,zmq,zenoh]'"
+    assert listed.returncode == 0
+    assert "48 of 48 cells to run" in listed.stdout
+    assert listed.stderr.endswith(f"not everything that its cells need is installed; {hint}\n")
+    started = without(missing, tmp_path, "sweep", "transports")
+    assert (started.returncode, started.stderr) == (1, f"error: {listed.stderr}")
     assert not (tmp_path / "results").exists()
 
 
@@ -100,7 +110,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     assert "Echo engine" in done.stdout
     (said,) = (line for line in done.stderr.splitlines() if "pip install" in line)
-    assert said.endswith(f"the echo engine answers, without a model; pip install 's2a-bench[llama]'{SETUP}")
+    assert said.endswith("the echo engine answers, without a model; pip install 's2a-bench[llama]'")
     return folder
 
 
@@ -170,7 +180,7 @@ def test_every_extra_is_described_and_in_all() -> None:
     (everything,) = (Requirement(text).extras for text in offered["all"])
     assert everything | {"model"} == set(extras.EXTRAS)
     (made,) = (Requirement(text).extras for text in offered["dev"] if text.startswith("s2a-bench"))
-    assert made == everything - set(extras.BY_HAND)
+    assert made == everything - {"ray", "carla"}
 
 
 @pytest.mark.parametrize(

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from ipaddress import ip_address
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 from urllib.parse import urlsplit
 
+import typer
+
+from s2a_bench import extras
 from s2a_bench.cli.adapter import command, flags_named
 from s2a_bench.cli.experiment import ParseError, click_command, config_of, options_of
 from s2a_bench.cli.output import Json, print_json, print_line, print_table
 from s2a_bench.cli.output import console as open_console
-from s2a_bench.errors import S2AError, UsageError
+from s2a_bench.errors import MissingExtra, S2AError, UsageError
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.machine.environment import collect
 from s2a_bench.secrets import struck
@@ -37,12 +41,15 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
     trust = " --trust-file" if config.trust_file else ""
     file = read_sweep_file(source)
     repeated = command_of(file.command, f"{source}: command", trusted=config.trust_file)
-    plan = plan_sweep(file, repeated, boards)
+    with extras.noted() as missing:
+        plan = plan_sweep(file, repeated, boards)
     if resume is not None:
         check_resume(resume, plan)
     if config.dry_run:
-        _show_plan(plan, config, as_json=json_)
+        _show_plan(plan, config, missing, as_json=json_)
         return
+    if missing:
+        raise MissingExtra(_lacking(source, missing))
     with RunProgress("cells") as progress, ExitStack() as stack:
         workers = _workers(plan, config.ray, config.width)
         if resume is not None:
@@ -77,7 +84,11 @@ def _workers(plan: Plan, ray: str, width: int) -> Workers:
     return workers
 
 
-def _show_plan(plan: Plan, config: SweepConfig, *, as_json: bool) -> None:
+def _lacking(source: Path, missing: Collection[str]) -> str:
+    return f"{source}: not everything that its cells need is installed; {extras.how_to_install(*missing)}"
+
+
+def _show_plan(plan: Plan, config: SweepConfig, missing: Collection[str], *, as_json: bool) -> None:
     resume = config.resume
     cells = pending(plan, read_sweep(resume).attempts.to_dict("records") if resume else [], retry_failed=False)
     sweeps = earlier(resume.parent if resume else config.output, plan.command)
@@ -86,6 +97,8 @@ def _show_plan(plan: Plan, config: SweepConfig, *, as_json: bool) -> None:
         print_json(plan_json(cells, expected, collect()))
     else:
         print_plan(plan, cells, expected)
+    if missing:
+        typer.echo(shown(_lacking(config.source, missing)), err=True)
 
 
 sweep = command(_sweep, SweepConfig)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_STAMP_AGE_MS, PAYLOAD_BYTES, STALE_FRAMES, Fact
 from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, Handler, Server, Transport, Wiring
@@ -75,7 +76,9 @@ class Ros(Transport[RosOptions]):
 
         variant, options, mode = choice.variant, choice.options, choice.mode
         domain_id(os.environ)
-        if options.router and not is_routed(options):
+        if is_routed(options):
+            extras.need("zenoh", "zenoh")
+        elif options.router:
             raise UsageError("`router` is Zenoh's: choose `middleware` zenoh, or leave it out")
         if options.action and variant != ACTION:
             raise UsageError(f"`action` is spoken by ros/{ACTION}, not by ros/{variant}")
