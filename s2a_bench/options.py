@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from s2a_bench.errors import UsageError
-from s2a_bench.text import read_text
+from s2a_bench.text import like, none_of, read_text
 
 Made = TypeVar("Made", bound="Options")
 
@@ -170,7 +170,7 @@ def _line(error: ErrorDetails, options: type[Options]) -> str:
         values = ",".join(f"{prefix}{value}" for value in listed(error["input"]))
         return f"`{field}` has another name: write `{instead}` {values}"
     if error["type"] == "extra_forbidden":
-        return f"`{field}` is none of the options {', '.join(options.model_fields)}"
+        return f"`{field}` is none of the options {', '.join(options.model_fields)}{like(field, options.model_fields)}"
     if error["type"] == "missing":
         return f"`{field}` is needed"
     if error["type"] == "too_short":
@@ -196,7 +196,7 @@ def one_of(names: Callable[[], Iterable[str]]) -> AfterValidator:
     def check(value: Any) -> Any:
         for each in value if isinstance(value, tuple) else (value,):
             if each not in (known := tuple(names())):
-                raise ValueError(f"'{each}' is none of {', '.join(known)}")
+                raise ValueError(none_of(each, known))
         return value
 
     return AfterValidator(check)

@@ -13,6 +13,7 @@ from pkgutil import resolve_name
 from typing import Generic, TypeVar
 
 from s2a_bench.errors import UsageError
+from s2a_bench.text import none_of
 
 T = TypeVar("T")
 
@@ -38,8 +39,8 @@ class Registry(Mapping[str, T], Generic[T]):
             built_in: T = resolve_name(self._builtins[name])
             return built_in
         if name not in self._offered:
-            known = ", ".join(self)
-            raise UsageError(f"`{self.field}`: '{name}' is none of {known}; packages add to them as '{self.group}'")
+            unknown = none_of(name, self, f" (packages add to them as '{self.group}')")
+            raise UsageError(f"`{self.field}`: {unknown}")
         point = self._offered[name]
         try:
             offered: T = point.load()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection, Iterable
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Final
 
@@ -33,3 +35,14 @@ def visible(text: str) -> str:
 def one_line(text: str) -> str:
     r"""Return a text on one line: line feeds are ``\n``, tabs spaces."""
     return visible(text.replace("\n", "\\n").replace("\t", " "))
+
+
+def like(name: str, names: Iterable[str]) -> str:
+    """Return the question that ends an error about an unknown name; nothing where no known name is close."""
+    close = get_close_matches(name.lower(), [*names], 1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def none_of(name: str, names: Collection[str], more: str = "") -> str:
+    """Return that a name is unknown, which ones there are, ``more``, and which one was perhaps meant."""
+    return f"'{name}' is none of {', '.join(filter(None, names))}{more}{like(name, names)}"

@@ -9,13 +9,13 @@ import re
 import reprlib
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from difflib import get_close_matches
 from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from s2a_bench.errors import UsageError
+from s2a_bench.text import like
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -78,12 +78,6 @@ def parse(table: type[T], text: str, where: str, parse_float: Callable[[str], An
     except ValidationError as error:
         first = min(error.errors(), key=lambda each: each["type"] != "extra_forbidden")
         raise UsageError(f"{where}: {_line(first, table, content)}") from None
-
-
-def like(key: str, names: Iterable[str]) -> str:
-    """Guess what was meant."""
-    close = get_close_matches(key, list(names), 1)
-    return f"; did you mean {close[0]}?" if close else ""
 
 
 def _line(error: ErrorDetails, table: type[TomlTable], content: Any) -> str:

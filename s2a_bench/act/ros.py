@@ -39,6 +39,7 @@ from s2a_bench.ros.action import Status
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.router import ROUTER, Router, endpoint_of
 from s2a_bench.ros.service import appeared
+from s2a_bench.text import none_of
 from s2a_bench.types import Vector
 
 TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"
@@ -81,7 +82,7 @@ class Ros(SkillKind, ActionKind):
         if self.joints and len(set(self.names)) < len(self.names):
             raise UsageError(f"joints = '{self.joints}' names one twice")
         if self.middleware and self.middleware not in MIDDLEWARES:
-            raise UsageError(f"middleware = '{self.middleware}' is none of {', '.join(MIDDLEWARES)}")
+            raise UsageError(f"middleware = {none_of(self.middleware, MIDDLEWARES)}")
         endpoint_of(self.router)
 
     @property

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 from s2a_bench.boards.gaps import FAMILIES, Constant, Gaps, from_table, read_family
 from s2a_bench.errors import UsageError
+from s2a_bench.text import like
 
 if TYPE_CHECKING:
     import numpy as np
@@ -90,8 +91,8 @@ def family(written: str) -> Gaps:
     table = read_family(written, "latency")
     name = table["family"]
     mean_ms = table.pop("mean_ms", None)
-    if name not in {*FAMILIES, "bimodal"}:
-        raise UsageError(f"`latency`: '{name}' is none of the families {', '.join(FAMILIES)}, bimodal")
+    if name not in (known := (*FAMILIES, "bimodal")):
+        raise UsageError(f"`latency`: '{name}' is none of the families {', '.join(known)}{like(str(name), known)}")
     if not isinstance(mean_ms, int | float) or not 0 < mean_ms <= LONGEST_MS:
         raise UsageError(f"`latency`: {written}: mean_ms should be above 0 and at most {LONGEST_MS:g}, as in {EXAMPLE}")
     if name == "bimodal":

@@ -14,7 +14,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from s2a_bench.boards.gaps import Gaps, from_table
 from s2a_bench.errors import UsageError
-from s2a_bench.text import read_text
+from s2a_bench.text import none_of, read_text
 from s2a_bench.toml_file import Line, TomlTable, parse
 
 SHIPPED: Final = Path(__file__).parent.parent / "profiles"
@@ -210,7 +210,7 @@ def find_profile(name: str) -> Path:
     files = profile_files()
     if name not in files:
         where = ", ".join(map(str, search_path()))
-        raise UsageError(f"`profile`: '{name}' is none of {', '.join(files)} (looked in {where}), and no path")
+        raise UsageError(f"`profile`: {none_of(name, files, f' (looked in {where}), and no path')}")
     return files[name]
 
 

@@ -55,7 +55,6 @@ app = typer.Typer(
     cls=TopCommands,
     name="s2a-bench",
     help="Measure how a vision-language model is wired to a robot, and when the robot may act.",
-    no_args_is_help=True,
     **PLAIN,
 )
 
@@ -86,7 +85,9 @@ def main() -> None:
     except ParseError as error:
         context = getattr(error, "ctx", None)
         hint = f" (see '{context.command_path} --help')" if context else ""
-        code = _say(f"error: {error.format_message()}{hint}", error.exit_code)
+        close = getattr(error, "possibilities", None)  # of an unknown option, the closest first
+        message = f"{error.message}; did you mean {close[0]}?" if close else error.format_message()
+        code = _say(f"error: {message}{hint}", error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         code = _say("interrupted", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output has gone, as with `| head`

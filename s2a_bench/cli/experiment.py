@@ -18,6 +18,7 @@ from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import shown as shown_line
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, write_shown
+from s2a_bench.text import like
 from s2a_bench.writers.tables import fits, lay_out
 
 if TYPE_CHECKING:
@@ -52,6 +53,18 @@ class Commands(TyperGroup):
         elif cmd_name not in self.commands and cmd_name in self.experiments:
             self.commands[cmd_name] = click_command(cmd_name)
         return super().get_command(ctx, cmd_name)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take no word at all for a wish for help."""
+        parsed: list[str] = super().parse_args(ctx, args or ["--help"])
+        return parsed
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return a command by its name; fails naming the one that was perhaps meant."""
+        known = self.list_commands(ctx)
+        if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
+            ctx.fail(f"No such command '{args[0]}'{like(args[0], known)}")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """List every command with its sentence, without importing what experiments are made of."""

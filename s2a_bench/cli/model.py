@@ -29,9 +29,7 @@ SCHEMA = "s2a-bench-model/1"
 """Of `--json`; described by ``docs/schema/s2a-bench-model-1.json``."""
 
 
-app = typer.Typer(
-    cls=Commands, no_args_is_help=True, help="Fetch model files, write dummy ones, say what is in them.", **PLAIN
-)
+app = typer.Typer(cls=Commands, help="Fetch model files, write dummy ones, say what is in them.", **PLAIN)
 
 
 def _fetch(config: FetchConfig, *, json_: Json = False) -> None:

@@ -20,7 +20,6 @@ from s2a_bench.writers.tables import TextTable
 
 app = typer.Typer(
     cls=Commands,
-    no_args_is_help=True,
     help="Measure this machine as a hardware profile, and look at profiles.",
     **PLAIN,
 )

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from s2a_bench.errors import UsageError
-from s2a_bench.text import read_text
+from s2a_bench.text import none_of, read_text
 
 FLAG: Final = "--ros-args"
 END: Final = "--"
@@ -116,7 +116,7 @@ def _take(found: Read, values: Mapping[str, Any], known: Sequence[str], where: s
         elif shared:
             found.notes.append(f"{where}: {name} is no parameter of this node and left out")
         else:
-            raise UsageError(f"`ros_args` {where}: '{name}' is none of {', '.join(known)}")
+            raise UsageError(f"`ros_args` {where}: {none_of(name, known)}")
 
 
 def _read_file(found: Read, path: Path, known: Sequence[str], node_name: str) -> None:

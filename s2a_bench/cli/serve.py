@@ -17,7 +17,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.inference import ANSWERS, EngineConfig, acting, check_engine, declared
 from s2a_bench.options import Options, group, option, placed, places
 from s2a_bench.provenance import Provenance
-from s2a_bench.text import read_text
+from s2a_bench.text import none_of, read_text
 from s2a_bench.toml_file import loads
 from s2a_bench.transport import ACTIONS, SERVER, SERVING, TRANSPORTS, Transport, Wiring
 from s2a_bench.transport.limits import SET, Limits
@@ -133,7 +133,7 @@ def _sorted(values: Mapping[str, Any], where: str, chosen: Transport[Any]) -> So
     known = _known(chosen)
     for name, value in values.items():
         if name not in known:
-            raise UsageError(f"{where}: '{name}' is none of {', '.join(known).replace('_', '-')}")
+            raise UsageError(f"{where}: {none_of(name, known).replace('_', '-')}")
         if isinstance(value, bool) and chosen.options.model_fields.get(name, _NUMBER).annotation is not bool:
             raise UsageError(f"{where}: {name} = {value} should be a number or a text")
     of_engine, of_limits = (

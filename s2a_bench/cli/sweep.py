@@ -17,7 +17,7 @@ import typer
 from s2a_bench import extras
 from s2a_bench.cli.adapter import command, flags_named
 from s2a_bench.cli.experiment import ParseError, click_command, config_of, options_of
-from s2a_bench.cli.output import Json, print_json, print_line, print_table
+from s2a_bench.cli.output import Json, print_json, print_line, print_table, shown
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import MissingExtra, S2AError, UsageError
 from s2a_bench.experiments import EXPERIMENTS
@@ -30,7 +30,7 @@ from s2a_bench.sweep.as_json import plan_json, sweep_json
 from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.sweep.plan import Plan, plan_sweep
 from s2a_bench.sweep.run import Expected, SweepRun, check_resume, earlier, expect, only_one, pending, start_sweep
-from s2a_bench.text import visible
+from s2a_bench.text import none_of, visible
 from s2a_bench.writers.tables import TextTable
 
 
@@ -159,7 +159,7 @@ def command_of(name: str, key: str = "command", *, trusted: bool = False) -> Com
     """
     known = sorted(EXPERIMENTS)
     if name not in known:
-        raise UsageError(f"{key}: '{name}' is none of {', '.join(known)}")
+        raise UsageError(f"{key}: {none_of(name, known)}")
     flags: dict[str, Any] = {}
     for parameter in click_command(name).params:
         if parameter.param_type_name == "argument":

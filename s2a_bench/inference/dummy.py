@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from s2a_bench import extras
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import Quant, Size
+from s2a_bench.text import none_of
 
 if TYPE_CHECKING:
     from gguf import GGUFWriter
@@ -277,9 +278,9 @@ def write_dummy(
     where the folder cannot be written.
     """
     if size not in SHAPES:
-        raise UsageError(f"`size`: '{size}' is none of {', '.join(SHAPES)}")
+        raise UsageError(f"`size`: {none_of(size, SHAPES)}")
     if quant not in _FILE_TYPES:
-        raise UsageError(f"`quant`: '{quant}' is none of {', '.join(_FILE_TYPES)}")
+        raise UsageError(f"`quant`: {none_of(quant, _FILE_TYPES)}")
     shape = SHAPES[size]
     files = dummy_files(folder, size, quant, seed)
     vocab = make_vocab(full=size == "full")

@@ -17,6 +17,7 @@ from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import EngineError, UsageError
 from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_MS
 from s2a_bench.inference import Engine, EngineConfig, chunk
+from s2a_bench.text import none_of
 from s2a_bench.types import Piece, Request, Token
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def _settings(config: EngineConfig) -> tuple[Profile, str, Draw]:
     profile = load_profile(config.profile)
     gaps = config.gaps or ("trace" if profile.trace_s else "parametric")
     if gaps not in GAPS:
-        raise UsageError(f"`gaps`: '{gaps}' is none of {', '.join(GAPS)}")
+        raise UsageError(f"`gaps`: {none_of(gaps, GAPS)}")
     return profile, gaps, GAPS[gaps](profile)
 
 

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.plan.skillset import Argument, Durations, Gap, Skill, SkillSet, Value
-from s2a_bench.text import read_text
+from s2a_bench.text import none_of, read_text
 from s2a_bench.toml_file import Line, TomlTable, parse
 
 SKILL_SETS = ("household", "driving")
@@ -148,7 +148,7 @@ def load_skills(choice: str) -> SkillSet:
     if choice in SKILL_SETS:
         return parse_skills(files("s2a_bench.plan").joinpath("skills", f"{choice}.toml").read_text("utf-8"), choice)
     if not choice.endswith(".toml"):
-        raise UsageError(f"`skills`: '{choice}' is none of {', '.join(SKILL_SETS)}, and no path of a .toml file")
+        raise UsageError(f"`skills`: {none_of(choice, SKILL_SETS, ', and no path of a .toml file')}")
     try:
         text = read_text(choice)
     except OSError as error:

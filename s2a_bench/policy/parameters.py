@@ -11,6 +11,7 @@ from dataclasses import Field, fields, is_dataclass
 from typing import Any, TypeVar, get_type_hints
 
 from s2a_bench.errors import UsageError
+from s2a_bench.text import like
 
 T = TypeVar("T")
 
@@ -30,7 +31,8 @@ def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
         parameter, _, text = pair.partition("=")
         if parameter not in types or parameter in values:
             wrong = "is given twice" if parameter in values else "is no parameter"
-            raise UsageError(f"`{field}`: {name}: '{parameter}' {wrong}; {known}")
+            meant = "" if parameter in values else like(parameter, types)
+            raise UsageError(f"`{field}`: {name}: '{parameter}' {wrong}; {known}{meant}")
         values[parameter] = _value(types[parameter], text, f"`{field}`: {name}: {parameter} = '{text}'", known)
     try:
         return made_by(**values)

@@ -15,6 +15,7 @@ from typing import Any, Literal, Protocol, TypeAlias
 
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros.router import Router
+from s2a_bench.text import none_of
 
 Tuning: TypeAlias = Literal["tuned", "default"]
 
@@ -335,7 +336,7 @@ def open_middleware(
     """
     name = name or default_middleware(os.environ)
     if name not in MIDDLEWARES:
-        raise UsageError(f"middleware: '{name}' is none of {', '.join(MIDDLEWARES)}")
+        raise UsageError(f"middleware: {none_of(name, MIDDLEWARES)}")
     try:
         implementation = resolve_name(MIDDLEWARES[name])
     except ModuleNotFoundError as error:

@@ -12,6 +12,7 @@ from xml.sax.saxutils import quoteattr
 
 from s2a_bench.errors import UsageError
 from s2a_bench.ros import Tuning
+from s2a_bench.text import none_of
 
 PEER = re.compile(r"[A-Za-z0-9._:%-]+")
 RANGES = ("OFF", "LOCALHOST", "SUBNET", "SYSTEM_DEFAULT")
@@ -40,7 +41,7 @@ def configuration(environ: Mapping[str, str], tuning: Tuning) -> str | None:
         return None
     reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST").upper()
     if reach not in RANGES:
-        raise UsageError(f"ROS_AUTOMATIC_DISCOVERY_RANGE: '{reach}' is none of {', '.join(RANGES)}")
+        raise UsageError(f"ROS_AUTOMATIC_DISCOVERY_RANGE: {none_of(reach, RANGES)}")
     peers = [peer for peer in environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
     for peer in peers:
         if not PEER.fullmatch(peer):

@@ -25,6 +25,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import MSGParser, make_typesdict
 
 from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.text import none_of
 from s2a_bench.types import Frame, Pixels
 
 if TYPE_CHECKING:
@@ -146,7 +147,7 @@ def char_as_uint8(description: Description) -> Description:
 def _types(version: str) -> tuple[Typestore, Defaults]:
     """Build a type store, and collect the defaults of the types that came from files."""
     if version not in VERSIONS:
-        raise UsageError(f"llama_msgs version '{version}' is none of {', '.join(VERSIONS)}")
+        raise UsageError(f"llama_msgs version {none_of(version, VERSIONS)}")
     humble = os.environ.get("ROS_DISTRO") == "humble"
     store = get_typestore(Stores.ROS2_HUMBLE if humble else Stores.ROS2_JAZZY)
     for name, (constants, fields) in store.fielddefs.items():

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, Protocol
 
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Floats
+from s2a_bench.text import none_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -81,6 +82,6 @@ SIMULATORS: dict[str, str] = {
 def simulator(name: str, **settings: object) -> Simulator:
     """Build a simulator with its defaults or other settings; raises UsageError for an unknown name."""
     if name not in SIMULATORS:
-        raise UsageError(f"`simulator`: '{name}' is none of {', '.join(SIMULATORS)}")
+        raise UsageError(f"`simulator`: {none_of(name, SIMULATORS)}")
     build: Callable[..., Simulator] = resolve_name(SIMULATORS[name])
     return build(**settings)

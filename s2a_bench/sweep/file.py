@@ -13,8 +13,8 @@ from pydantic import Field
 
 from s2a_bench.boards.profile import search_path
 from s2a_bench.errors import UsageError
-from s2a_bench.text import read_text
-from s2a_bench.toml_file import TomlTable, like, parse
+from s2a_bench.text import like, none_of, read_text
+from s2a_bench.toml_file import TomlTable, parse
 
 Axes: TypeAlias = Mapping[str, Sequence[Any]]
 Setting: TypeAlias = dict[str, Any]
@@ -87,7 +87,7 @@ def find_sweep(name: str) -> Path:
     folders = [folder / "sweeps" for folder in search_path()]
     files = {path.stem: path for folder in reversed(folders) for path in sorted(folder.glob("*.toml"))}
     if name not in files:
-        raise UsageError(f"'{name}' is none of {', '.join(sorted(files))}, and no path of a sweep file")
+        raise UsageError(none_of(name, sorted(files), ", and no path of a sweep file"))
     return files[name]
 
 

@@ -13,7 +13,7 @@ from s2a_bench.boards.profile import find_profile
 from s2a_bench.errors import UsageError
 from s2a_bench.sweep import Cell, Command
 from s2a_bench.sweep.file import BOARD, OWN, Setting, SweepFile, rounds
-from s2a_bench.toml_file import like
+from s2a_bench.text import like
 
 HASHED_WHOLE = 1 << 20
 """Bytes up to which a file that a setting names is known by its content; a larger one, by size and time."""

@@ -40,8 +40,6 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar
 
-from pydantic import AfterValidator
-
 from s2a_bench import options as base
 from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
@@ -71,13 +69,7 @@ PROGRAM: Final = "program"
 """``side`` of an option that, when set, names somebody else's server for the run to start: see `Options.program`."""
 
 
-def _known(payload: str) -> str:
-    if payload and payload not in PAYLOADS:
-        raise ValueError(f"'{payload}' is none of {', '.join(PAYLOADS)}")
-    return payload
-
-
-Payload = Annotated[str, AfterValidator(_known)]
+Payload = Annotated[str, base.one_of(lambda: ("", *PAYLOADS))]
 """One of `PAYLOADS`, or nothing."""
 
 

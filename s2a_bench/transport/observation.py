@@ -29,7 +29,7 @@ from pydantic import AfterValidator
 
 from s2a_bench import extras, toml_file
 from s2a_bench.errors import RequestFailed, UsageError
-from s2a_bench.text import read_text
+from s2a_bench.text import none_of, read_text
 from s2a_bench.transport import ACTIONS, Capabilities, Choice, Transport
 from s2a_bench.transport.listening import ListeningOptions, read_key
 from s2a_bench.types import Pixels, Vector
@@ -206,7 +206,7 @@ def template_of(told: str) -> Template:
         return Template(toml_file.loads((HERE / f"{told}.toml").read_text("utf-8"), told), told)
     path = Path(told)
     if not path.suffix:
-        raise UsageError(f"`template`: '{told}' is none of {', '.join(known)}, nor a TOML or JSON file")
+        raise UsageError(f"`template`: {none_of(told, known, ', nor a TOML or JSON file')}")
     try:
         text = read_text(path, FILE_LETTERS)
     except (OSError, UnicodeDecodeError, ValueError) as error:

@@ -16,6 +16,7 @@ from urllib.parse import parse_qsl, quote
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import extra_of
+from s2a_bench.text import like
 from s2a_bench.transport import (
     ACTIONS,
     EXTERNAL,
@@ -165,7 +166,8 @@ def _standing_for(
     for variant in [named.variant] if named.variant else measured if every else measured[:1]:
         if variant not in (transport.variants or ("",)):
             known = ", ".join(transport.variants) or "none: it has no variants"
-            raise UsageError(f"`transport`: '{variant}' is none of {transport.name}'s {known}")
+            meant = like(variant, transport.variants)
+            raise UsageError(f"`transport`: '{variant}' is none of {transport.name}'s {known}{meant}")
         can = transport.capabilities(Choice(asked, variant))
         default, filled, holding = (_filled(options, can.payloads) for options in (plain, asked, can.options))
         yield Pipeline(_canonical(transport, variant, filled, default, own), transport, variant, holding, own)
@@ -175,7 +177,10 @@ def _checked(model: type[O], values: Mapping[str, Any], owner: str) -> O:
     """Make a model of values, texts included; raises UsageError, naming what is wrong and what there is."""
     for name in values:
         if name not in model.model_fields:
-            raise UsageError(f"`transport`: {owner} has no option '{name}'; it has {', '.join(model.model_fields)}")
+            known = model.model_fields
+            raise UsageError(
+                f"`transport`: {owner} has no option '{name}'; it has {', '.join(known)}{like(name, known)}"
+            )
     return model(**values)
 
 

@@ -60,3 +60,8 @@ def test_no_help_imports_anything_heavy() -> None:
 
 def test_the_version_is_printed() -> None:
     assert called("--version").stdout.strip() == __version__
+
+
+@pytest.mark.parametrize("group", ["", "model", "profile"])
+def test_no_command_at_all_is_a_wish_for_help(group: str) -> None:
+    assert called(*group.split()).stdout == called(*group.split(), "--help").stdout

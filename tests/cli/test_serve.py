@@ -190,7 +190,7 @@ def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -
         ("= 1", "no TOML"),
         ("max-tokens = 0", "max-tokens: 0 should be greater than or equal to 1"),
         ("max-waiting = -1", "--max-waiting: -1 should be greater than or equal to 0"),
-        ("max-pixels = 5", "'max_pixels' is none of engine, model"),
+        ("max-pixels = 5", "'max-pixels' is none of engine, model"),
         ('max-body-mib = "much"', "--max-body-mib: 'much' should be a valid number"),
         ("max-waiting = true", "max_waiting = True should be a number"),
         ("result-timeout = inf", "result-timeout: inf should be less than or equal to 86400"),

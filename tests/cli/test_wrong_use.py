@@ -59,6 +59,8 @@ WRONG = {
     ],
     "timeline": [
         ("--policy eager", "--policy: 'eager' is none of naive, wait-then-act, stream-to-act"),
+        ("--policy stream-to-at", "; did you mean stream-to-act?"),
+        ("--policy 'stream-to-act?cauton=2'", "; did you mean caution?"),
         ("--profile abacus", "--profile: 'abacus' is none of"),
         ("--rate fast", "--rate: 'fast' should be a valid number"),
         ("--tokens-per-skill 1.5", "--tokens-per-skill: '1.5' should be a valid integer"),
@@ -99,6 +101,14 @@ WRONG = {
         ("--bogus", "No such option: --bogus"),
         ("--requests many", "'--requests'"),
         ("--runs 20", "--runs has another name: write --requests 20"),
+        ("--trnsport ros", "No such option: --trnsport; did you mean --transport?"),
+        ("--transport HTTP", "; did you mean http?"),
+        ("--transport http/best-efort", "; did you mean best-effort?"),
+        ("--transport http?conection=x", "; did you mean connection?"),
+        ("--engine lama", "'lama' is none of llama, echo, replay; did you mean llama?"),
+        ("--dialect olama --url http://x", "; did you mean ollama?"),
+        ("--transport websocket --template drod", "; did you mean droid?"),
+        ("--engine replay --profile jetson-agx", "; did you mean jetson-agx-orin?"),
         ("--port 70000", "--port: 70000 should be less than"),
         ("--payload gif", "--payload: 'gif' is none of raw, yuyv, jpeg, jpeg-preencoded, png"),
         ("--transport http,pigeon", "--transport: 'pigeon'"),
@@ -135,6 +145,7 @@ WRONG = {
     "sweep": [
         ("", "name a sweep file, or the folder of a sweep with --resume"),
         ("nothing", "'nothing' is none of paper, quick, transports, and no path"),
+        ("papr", "; did you mean paper?"),
         ("none.toml", "cannot read the sweep file none.toml"),
         ("paper --retry-failed", "--retry-failed: name the sweep's folder with --resume"),
         ("paper --ray local --board x", "--board and --ray are two things"),
@@ -153,6 +164,7 @@ WRONG = {
     "": [
         ("--bogus", "No such option: --bogus"),
         ("fly", "No such command 'fly'"),
+        ("latncy", "No such command 'latncy'; did you mean latency? (see 's2a-bench --help')"),
     ],
 }
 """Command -> the rest of the line, what is said, and the exit code where it is not 2."""

@@ -18,6 +18,7 @@ from s2a_bench.harness.config import FirstVariants
 from s2a_bench.inference import STAND_IN, EngineConfig
 from s2a_bench.options import Names, Options, group, one_of, option
 from s2a_bench.policy.chunks import COMPARED, MODES, Rounding
+from s2a_bench.text import none_of
 from s2a_bench.transport import TRANSPORTS
 from s2a_bench.transport.defaults import ACTING
 
@@ -155,7 +156,7 @@ class ChunksConfig(Options):
 
         known = {written: written.partition("?")[0] for written in self.modes}
         if unknown := [name for name in known.values() if name not in MODES]:
-            raise UsageError(f"`modes`: '{unknown[0]}' is none of {', '.join(MODES)}")
+            raise UsageError(f"`modes`: {none_of(unknown[0], MODES)}")
         made = [build(MODES[name], written, "modes") for written, name in known.items()]
         found = {canonical(each.name, each): each for each in made}
         for name, each in found.items():

@@ -13,6 +13,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import FirstVariants
 from s2a_bench.inference import ANSWERS, ENGINES, FLASH_ATTENTION, MODEL, EngineConfig
 from s2a_bench.options import Names, group, listed, one_of, option
+from s2a_bench.text import none_of
 from s2a_bench.transport.defaults import LLAMA_SERVER, LOOPBACK
 
 IN_PROCESS: Final = "in-process"
@@ -27,7 +28,7 @@ TWINS: Final = (IN_PROCESS, LLAMA_SERVER)
 def _ways(written: str) -> str:
     for way in listed(written) or ("",):
         if way not in FLASH_ATTENTION:
-            raise ValueError(f"'{way}' is none of {', '.join(FLASH_ATTENTION)}")
+            raise ValueError(none_of(way, FLASH_ATTENTION))
     return ",".join(listed(written))
 
 

@@ -18,6 +18,7 @@ from s2a_bench.policy import Floats, Schedule
 from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, EGO_LOOP_S, EGO_MOST_MPS2, Cars, DrivingPlan
 from s2a_bench.scenario.ccrb.follower import needed
 from s2a_bench.scenario.longitudinal import LockStep, each
+from s2a_bench.text import none_of
 
 WAITING, ACTING, GAP, DONE = 0, 1, 2, 3
 PHASES: Final = ("waiting", "acting", "gap", "done")
@@ -39,7 +40,7 @@ class Ego(LockStep):
     def __init__(self, cars: Cars, plan: DrivingPlan, schedule: Schedule, rollouts: int) -> None:
         gaps = np.broadcast_to(np.asarray(cars.gap), (rollouts,))
         if unknown := set(gaps.tolist()) - set(GAPS):
-            raise UsageError(f"`gap`: '{min(unknown)}' is none of {', '.join(GAPS)}")
+            raise UsageError(f"`gap`: {none_of(min(unknown), GAPS)}")
         shape = (len(plan.lane), rollouts)
         self._start_s = np.broadcast_to(np.asarray(schedule.start_s, float), shape)
         self._duration_s = np.broadcast_to(np.asarray(schedule.duration_s, float), shape)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import field_validator
 
 from s2a_bench.errors import UsageError
-from s2a_bench.options import TextOrFile, option
+from s2a_bench.options import TextOrFile, one_of, option
 from s2a_bench.transport import PROGRAM, SERVING, Program
 from s2a_bench.transport.access import WebOptions
 from s2a_bench.transport.http.dialects import DIALECTS
@@ -29,7 +29,9 @@ class HttpOptions(WebOptions):
         "keep-alive", "keep-alive, per-request (a new connection each), client-per-request (a new client object each)"
     )
     served_model: str = option("", "the model's name at the url [default: the first that it lists]")
-    dialect: str = option("", f"what the url speaks: {', '.join(DIALECTS)} [default: ask]")
+    dialect: Annotated[str, one_of(lambda: ("", *DIALECTS))] = option(
+        "", f"what the url speaks: {', '.join(DIALECTS)} [default: ask]"
+    )
     api_docs: bool = option(False, "also serve /openapi.json, /docs and /redoc", side=SERVING)
     extra_body: TextOrFile = option("", "JSON, or @FILE, merged into every request to the url (RFC 7396)")
     llama_server: Path | None = option(
@@ -38,13 +40,6 @@ class HttpOptions(WebOptions):
         side=PROGRAM,
         risk="program",
     )
-
-    @field_validator("dialect")
-    @classmethod
-    def _is_spoken(cls, dialect: str) -> str:
-        if dialect and dialect not in DIALECTS:
-            raise ValueError(f"'{dialect}' is none of {', '.join(DIALECTS)}")
-        return dialect
 
     @field_validator("extra_body")
     @classmethod

@@ -7,11 +7,12 @@ import re
 from collections.abc import Iterable, Mapping
 from itertools import count
 from secrets import token_hex
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from s2a_bench.options import Names, option
+from s2a_bench.options import Names, one_of, option
+from s2a_bench.ros import MIDDLEWARES
 from s2a_bench.ros.router import ROUTER, endpoint_of
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, Options
 
@@ -48,7 +49,7 @@ class RosOptions(Options):
     )
     namespace: str = option("", "namespace of the topics [default: a new one for each run]", side=SERVER)
     domain_id: int | None = option(None, "DDS domain [default: ROS_DOMAIN_ID, else 0]", ge=0, le=232, side=SERVER)
-    middleware: str = option(
+    middleware: Annotated[str, one_of(lambda: ("", *MIDDLEWARES))] = option(
         "", "cyclonedds, zenoh, rclpy [default: rclpy in a sourced ROS 2 environment]", side=SERVER
     )
     router: str = option(
@@ -119,15 +120,6 @@ class RosOptions(Options):
         if text:
             endpoint_of(text)
         return text
-
-    @field_validator("middleware")
-    @classmethod
-    def _is_known(cls, name: str) -> str:
-        from s2a_bench.ros import MIDDLEWARES
-
-        if name and name not in MIDDLEWARES:
-            raise ValueError(f"'{name}' is none of {', '.join(MIDDLEWARES)}")
-        return name
 
     @property
     def tuned(self) -> bool:
