@@ -86,7 +86,7 @@ def test_a_run_leaves_the_callers_process_as_it_was_and_is_like_one_of_the_comma
     def run(*command: str | Path) -> None:
         subprocess.run([sys.executable, *command], check=True, capture_output=True, env=environment)
 
-    options = ("--transport", "loopback", "--engine", "echo", "--size", "64x48", "--runs", "6")
+    options = ("--transport", "loopback", "--engine", "echo", "--size", "64x48", "--requests", "6")
     run("-m", "s2a_bench", "latency", *options, "--output", tmp_path)
     run("-W", "error", "-c", QUIET, tmp_path)
     command, library, untuned = sorted(tmp_path.iterdir())

@@ -86,7 +86,8 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
             kind, argument, hidden = _kind(field.annotation), bool(extra.get("argument")), bool(extra.get("hidden"))
             yield Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument, hidden)
     for name in options.OLD:
-        yield Flag(name.replace("_", "-"), (name,), str, "", hidden=True)
+        about = f"the name that --{options.OLD[name][0]} had"
+        yield Flag(name.replace("_", "-"), (name,), str, about, hidden=True)
 
 
 def command(function: Callable[..., None], *options: type[Options], about: str = "") -> Callable[..., None]:

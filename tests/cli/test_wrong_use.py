@@ -37,7 +37,7 @@ WRONG = {
         ("--modes 'queue?speed=2'", "--modes: queue: 'speed' is no parameter"),
         ("--modes 'queue?execute=99'", "a chunk has 16 actions (--horizon)"),
         ("--rules guess", "--rules: 'guess' is none of calibrated"),
-        ("--eps 0.001 --calibration-cycles 100", "--eps: 100 calibration plans promise"),
+        ("--rules calibrated --eps 0.001 --calibration-cycles 100", "or take --rules maximum,mean,oracle"),
         ("--rounding up", "--rounding"),
         ("--live --zmq gr00t", "--zmq has another name: write --transport zmq/gr00t"),
     ],
