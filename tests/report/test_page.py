@@ -334,6 +334,18 @@ def test_runs_of_unlike_machines_are_told_apart(make_run: MakeRun) -> None:
     assert report.caveats[0] in Page(page_of(*runs)).text
 
 
+def test_another_version_or_setting_is_no_other_machine_and_one_line_for_all_runs(make_run: MakeRun) -> None:
+    facts = {"environment": {"cpu": "A", "governor": "powersave", "packages": {"numpy": "1"}}, "tuning": {}}
+    runs = []
+    for place, governor in enumerate(("powersave", "performance", "performance")):
+        facts["environment"] |= {"governor": governor, "packages": {"numpy": str(place)}}
+        settings = {"configuration": {"seed": place}, "tuning": {"process": place > 0}}
+        runs.append(make_run(n=2, manifest={**facts, **settings}).path)
+    report = make_report(read_chapters(runs, against_paper=False), against_paper=False)
+    said = "The runs are not alike in governor, tuning process, package numpy, configuration seed."
+    assert report.caveats == [said]
+
+
 def test_a_folder_given_twice_is_one_chapter(computed: Path) -> None:
     assert len(read_chapters([computed, computed / ".." / computed.name], against_paper=False)) == 1
 

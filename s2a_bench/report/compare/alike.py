@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,7 +11,8 @@ from s2a_bench.provenance import Origins
 if TYPE_CHECKING:
     from s2a_bench.store.run import Run
 
-_MACHINE: Final = ("cpu", "machine", "board", "cores", "affinity", "governor", "power_mode")
+_KIND: Final = ("cpu", "machine", "board", "cores")
+_MACHINE: Final = (*_KIND, "affinity", "governor", "power_mode")
 """Facts of the environment that make it another machine, or the same one in another state."""
 
 _MODEL: Final = ("engine", "dummy", "model_sha256", "mmproj_sha256", "profile", "gaps", "latency")
@@ -22,6 +23,9 @@ _ORIGIN: Final = ("engine", "weights", "tokens", "link", "clock")
 
 _PASSING: Final = ("host", "clock_id", "load", "gpus", "packages", "memory_bytes")
 """Facts of the environment that say nothing about likeness, or that are looked at more closely."""
+
+SETTING: Final = "configuration "
+"""What the names of options begin with."""
 
 _TOLD: Final = 8
 """So many differences are told in words; the JSON has all."""
@@ -56,9 +60,22 @@ def differences(baseline: Run, other: Run) -> list[Difference]:
         *_of("", *(_rest(facts, (*_MACHINE, *_PASSING)) for facts in machines), fatal=False),
         *_of("", *(_gpus(facts, "driver") for facts in machines), fatal=False),
         *_of("package ", *(facts.get("packages", {}) for facts in machines), fatal=False),
-        *_of("configuration ", *(_flat(manifest.get("configuration", {})) for manifest in sides), fatal=False),
+        *_of(SETTING, *(_flat(manifest.get("configuration", {})) for manifest in sides), fatal=False),
     ]
     return sorted(found, key=lambda difference: not difference.fatal)
+
+
+def of_machine(difference: Difference) -> bool:
+    """Whether a difference makes it another machine: no other state of it, no other version."""
+    return difference.fatal and difference.what in {*_KIND, "GPU name"}
+
+
+def names_of(found: Iterable[Difference]) -> str:
+    """Name what both sides know and differ in, machine, model and provenance aside, the first `_TOLD`."""
+    aside = "model ", "provenance "
+    known = (one for one in found if _ABSENT not in {one.baseline, one.other} and not of_machine(one))
+    names = [*dict.fromkeys(one.what for one in known if not one.what.startswith(aside))]
+    return ", ".join(names[:_TOLD]) + (f", and {len(names) - _TOLD} more" if len(names) > _TOLD else "")
 
 
 def in_words(found: Sequence[Difference]) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments import Shown, experiment_of
-from s2a_bench.report.compare.alike import differences
+from s2a_bench.report.compare.alike import SETTING, Difference, differences, names_of, of_machine
 from s2a_bench.report.page.sweeps import overview, pooled, words_of
 from s2a_bench.store.run import Run, fits, read_run
 from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep
@@ -68,20 +68,23 @@ def repeat_command(manifest: Mapping[str, Any]) -> str:
     return shlex.join(["s2a-bench", *map(str, manifest.get("argv", [])[1:])])
 
 
-def mixed_machines(chapters: Sequence[Chapter]) -> list[str]:
-    """Return which runs come from machines unlike the first one's; their numbers are nowhere pooled."""
-    if not chapters:
-        return []
-    first = chapters[0]
-    said = []
-    for chapter in chapters[1:]:
-        found = [each for each in differences(first.run, chapter.run) if each.fatal]
-        if what := "; ".join(str(each) for each in found if not each.what.startswith("model ")):
+def told_apart(chapters: Sequence[Chapter]) -> list[str]:
+    """Return which runs come from another machine than the first, and in one line what else is not the same."""
+    said: list[str] = []
+    others: list[Difference] = []
+    of_command: dict[str, Run] = {}
+    for chapter in chapters:
+        same = of_command.setdefault(str(chapter.manifest["command"]), chapter.run)
+        found = differences(chapters[0].run, chapter.run)
+        others += [each for each in found if not each.what.startswith(SETTING)]
+        others += [each for each in differences(same, chapter.run) if each.what.startswith(SETTING)]
+        if what := "; ".join(str(each) for each in found if of_machine(each)):
             said.append(
-                f"{chapter.title} ran on another machine than {first.title} ({what}): "
+                f"{chapter.title} ran on another machine than {chapters[0].title} ({what}): "
                 "their numbers stand side by side, and none is made of both."
             )
-    return said
+    names = names_of(others)
+    return [*said, f"The runs are not alike in {names}."] if names else said
 
 
 def _chapter(run: Run, title: str, against_paper: bool, **more: Any) -> Chapter:
