@@ -65,7 +65,8 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
                     sitting.work(sitting.pending(retry_failed=config.retry_failed), workers)
                 sitting.finish()
         except (S2AError, KeyboardInterrupt):
-            progress.say(f"sweep so far: {writer.path}; go on with: s2a-bench sweep --resume {writer.path}{trust}")
+            if writer.path.exists():
+                progress.say(f"sweep so far: {writer.path}; go on with: s2a-bench sweep --resume {writer.path}{trust}")
             raise
     swept = read_sweep(writer.path)
     if json_:

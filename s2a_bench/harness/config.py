@@ -35,6 +35,8 @@ Skills: go_to(location), open(object), close(object), pick(object), place(object
 Rules: Output only numbered skill calls, one per line.
 Do not output any explanation."""
 """The paper's prompt (section IV-E)."""
+DEFAULT_TASK = "pick up the red block and place it in the box"
+"""What policies are told, which answer with actions."""
 
 
 def _options() -> type[Options]:
@@ -102,7 +104,9 @@ class RequestsConfig(Options):
     mode: Literal["request", "stream"] = option("request", "request (a frame each), stream (a camera runs)")
     fps: float = option(30.0, "rate of the camera in --mode stream", ge=0.1, le=1000)
     max_tokens: int = option(32, "tokens an answer [default: 32, quick: 8]", ge=1, le=2**20)
-    prompt: TextOrFile = option(DEFAULT_PROMPT, "text, or @FILE [default: the paper's prompt]")
+    prompt: TextOrFile = option(
+        DEFAULT_PROMPT, "text, or @FILE [default: the paper's prompt; where actions answer, a task]"
+    )
     grammar: Grammar = option("", "GBNF file that every answer obeys")
     seed: int = option(0, "seed of the order, the source and the sampling", ge=0, le=2**31 - 1)
     nonce: str = option(
@@ -210,6 +214,12 @@ class RequestsConfig(Options):
         return named and all(each.transport is not cell.transport for each in others)
 
     @property
+    def told_prompt(self) -> str:
+        """Return the prompt; unless one was given, policies are told a task."""
+        given = "prompt" in self.model_fields_set or self.answer != ACTIONS
+        return self.prompt if given else DEFAULT_TASK
+
+    @property
     def reads_model(self) -> bool:
         """Whether a server of this run loads a model's files."""
         return self.own_engine or self.starts_program
@@ -242,7 +252,9 @@ class RequestsConfig(Options):
             raise UsageError(f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png")
         if self.state and not pipeline.capabilities.accepts_state:
             raise UsageError(f"`state`: a request of {pipeline.name} has no place for it; leave one of them out")
-        choice = Choice(pipeline.options, pipeline.variant, mode=self.mode, engine=self.engine.name)
+        choice = Choice(
+            pipeline.options, pipeline.variant, mode=self.mode, engine=self.engine.name, cameras=self.cameras
+        )
         pipeline.transport.require(choice)
         require_payload(pipeline)
         self.served_engine.but(**dict(pipeline.engine))  # raises UsageError for a value in its name
@@ -300,7 +312,8 @@ class RequestsConfig(Options):
         observation = f"{self.cameras} x {size}" if self.cameras > 1 else size
         observation += f" as {self.resize[0]}x{self.resize[1]}" if self.resize else ""
         observation += f", state of {self.state}" if self.state else ""
-        more = {"width": width, "height": height, "size": size, "observation": observation, "tuned": self.tuned}
+        more = {"prompt": self.told_prompt, "observation": observation, "tuned": self.tuned}
+        more |= {"width": width, "height": height, "size": size}
         return {**own, **more, "engine": self.served_engine.to_manifest(), "pipelines": told}
 
 

@@ -138,7 +138,7 @@ def resolve(config: RequestsConfig) -> Plan:
             config.source, config.size, config.fps, config.seed, nonce, stream, config.cameras, config.resize
         ),
         request=RequestPlan(
-            config.prompt, config.grammar, max_pieces, config.seed, config.state, config.mode, size, stages
+            config.told_prompt, config.grammar, max_pieces, config.seed, config.state, config.mode, size, stages
         ),
         servers=ServersPlan(
             engine, bool(config.grammar), config.tuned, config.timeout_s, config.deadline_s, max_pieces

@@ -31,6 +31,7 @@ from s2a_bench.transport import Program
 
 READY_TIMEOUT_S = 600.0
 """A model of several GB may have to come from a slow disk."""
+NOT_READY = f"was not ready after {READY_TIMEOUT_S:.0f} s"
 STOP_TIMEOUT_S = 3.0
 LOOK_S = 1.0
 """How long the end of a process is waited for in one go."""
@@ -92,13 +93,19 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
 
     def death(self) -> ServerDied:
         """Describe how the process ended, with the last line it wrote."""
-        how = how_it_ended(self._process.poll(), self._cure)
-        died = f"the {self.name} server (pid {self.pid}) died, {how}"
-        if self.log is None:
-            return ServerDied(died)
-        lines = self.log.read_text(errors="replace").strip().splitlines()
-        last = f": {lines[-1][:200]}" if lines else ""
-        return ServerDied(f"{died}{last}; its log is {self.log}")
+        log = f"; its log is {self.log}" if self.log else ""
+        return ServerDied(f"the {self.name} server (pid {self.pid}) died, {self._end()}{self._last_lines(1)}{log}")
+
+    def no_start(self, why: str = "") -> ServerDied:
+        """Describe why it never was ready by the last lines it wrote: a run without samples keeps no log."""
+        return ServerDied(f"the {self.name} server {why or f'did not start, {self._end()}'}{self._last_lines(4)}")
+
+    def _end(self) -> str:
+        return how_it_ended(self._process.poll(), self._cure)
+
+    def _last_lines(self, count: int) -> str:
+        lines = self.log.read_text(errors="replace").strip().splitlines()[-count:] if self.log else []
+        return f": {' / '.join(line.strip()[:200] for line in lines)}" if lines else ""
 
     def stop(self) -> None:
         """Ask the process to stop, then make it; an impatient second Ctrl-C makes it at once."""
@@ -140,15 +147,14 @@ class OwnProcess(ServerProcess):
         with DefaultSelector() as selector:
             selector.register(stdout, EVENT_READ)
             if not selector.select(READY_TIMEOUT_S):
-                see = f"; see {self.log}" if self.log else ""
-                raise ServerDied(f"the {self.name} server was not ready after {READY_TIMEOUT_S:.0f} s{see}")
+                raise self.no_start(NOT_READY)
         line = stdout.readline()
         if not line:
             with suppress(subprocess.TimeoutExpired):  # dumping core, perhaps
                 self._process.wait(STOP_TIMEOUT_S)
             self._process.kill()
             self._process.wait()
-            raise self.death()
+            raise self.no_start()
         answer = json.loads(line)
         if "error" in answer:
             kind = getattr(errors, answer["kind"], EngineError)
@@ -244,7 +250,7 @@ class LlamaServer(ServerProcess):
         deadline = now_ns() + int(READY_TIMEOUT_S * 1e9)
         while now_ns() < deadline:
             if not self.alive():
-                raise self.death()
+                raise self.no_start()
             try:
                 ready = httpx.get(self.address + "/health", trust_env=False).is_success and self.alive()
             except httpx.TransportError:
@@ -254,7 +260,7 @@ class LlamaServer(ServerProcess):
             if ready:
                 return
             clock.sleep_until_ns(now_ns() + 100_000_000)
-        raise ServerDied(f"llama-server was not ready after {READY_TIMEOUT_S:.0f} s; see {self.log}")
+        raise self.no_start(NOT_READY)
 
 
 class WheelServer(OwnProcess):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import socket
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -44,7 +45,8 @@ class RunWriter(AbstractContextManager["RunWriter"]):
     """Writes one run folder. Use as a context manager; not thread-safe.
 
     Leaving the block finishes the run: "finished", "interrupted" on KeyboardInterrupt, "failed" on any other
-    exception, unless `finish` was called before.
+    exception, unless `finish` was called before. A folder that `create` made is removed on an exception before the
+    first row, unless it holds a folder.
     """
 
     def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
@@ -52,6 +54,8 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         self.path = path
         self._manifest = manifest
         self._finished = False
+        self._made: Sequence[Path] = ()
+        self._rows = 0
         self._codes: dict[str, str] = {}
         try:
             reserve(path)
@@ -77,6 +81,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         host = socket.gethostname()
         stem = f"{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}-{_slug(command)}-{_slug(host)}"
         try:
+            made = [folder for folder in (Path(root), *Path(root).parents) if not folder.exists()]
             path = _make_unique(Path(root), stem)
         except (FileExistsError, NotADirectoryError) as error:
             raise StoreError(f"`output` {root}: {error.filename} is not a folder; name another one") from error
@@ -98,6 +103,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         }
         manifests.merge(whole, manifest)
         run = cls(path, whole)
+        run._made = (path, *made)
         for table in (run._samples, TOKENS) if tables is None else tables:
             run.append(table, [])
         return run
@@ -125,7 +131,9 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         """Append rows to a table in one write; the first call creates its file."""
         if table.name not in self._files:
             self._files[table.name] = table, CsvFile(self.path / f"{table.name}.csv", table.columns)
-        self._files[table.name][1].append(table, rows, self._provenance)
+        kept = [*rows]
+        self._files[table.name][1].append(table, kept, self._provenance)
+        self._rows += len(kept)
 
     def _provenance(self, row: object) -> str:
         """Return where a row's numbers come from: what it says itself, its cell's engine told, or the run's."""
@@ -181,6 +189,8 @@ class RunWriter(AbstractContextManager["RunWriter"]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if error is not None and self._made and not (self._rows or self._finished) and self._discard():
+            return
         state = "finished" if error is None else "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         try:
             self.finish(state, None if error is None else str(error) or type(error).__name__)
@@ -188,6 +198,19 @@ class RunWriter(AbstractContextManager["RunWriter"]):
             # What went wrong first matters more; the CSV files are complete.
             if error is None:
                 raise
+
+    def _discard(self) -> bool:
+        """Remove the folder, and those made for it if they are empty; return False where it holds a folder."""
+        if any(map(Path.is_dir, self.path.iterdir())):
+            return False
+        self._finished = True
+        for _, file in self._files.values():
+            file.close()
+        shutil.rmtree(self.path, ignore_errors=True)
+        with suppress(OSError):
+            for folder in self._made[1:]:
+                folder.rmdir()
+        return True
 
 
 @dataclass(frozen=True, slots=True)

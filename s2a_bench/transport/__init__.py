@@ -256,6 +256,8 @@ class Choice(Generic[O]):
     variant: str = ""
     mode: str = ""
     engine: str = ""
+    cameras: int = 1
+    """Pictures a request."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,7 +47,10 @@ def examine(url: str) -> list[Finding]:
         raise UsageError(f"`url`: that is no URL: {error}") from error
     if not host or parts.scheme not in {*known, GRPC}:
         schemes = ", ".join(f"{scheme}://" for scheme in (*known, GRPC))
-        raise UsageError(f"`url`: '{parts.scheme}://{host or ''}' should begin with one of {schemes} and name a host")
+        said = f"{parts.scheme}://{host or ''}" if parts.scheme else url.rpartition("@")[2]
+        raise UsageError(
+            f"`url`: '{said}' should look like http://192.168.0.5:8000: one of {schemes}, a host, and its port"
+        )
     own: Examine = grpc if parts.scheme == GRPC else resolve_name(known[parts.scheme])
     findings = [in_plain_text(parts)]
     try:

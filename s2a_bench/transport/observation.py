@@ -38,6 +38,8 @@ HERE: Final = Path(__file__).with_name("templates")
 DEFAULT: Final = "openpi"
 FILE_LETTERS, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
 """The most that a template has: bytes, values, dictionaries and lists within each other, pictures."""
+STATE: Final = 10**6
+"""More numbers than a place for the state can want."""
 WHOLE: Final = range(-(1 << 63), 1 << 64)
 """What MessagePack has room for."""
 
@@ -94,6 +96,19 @@ class Template:
         except _Missing as missing:
             raise RequestFailed(f"`template` {self.name}: {missing}") from None
         return filled
+
+    def check_pictures(self, cameras: int) -> None:
+        """Raise UsageError where it has places for fewer pictures, or wants more."""
+        why = f"has places for {self.pictures}" if cameras > self.pictures else ""
+        try:
+            self._make(_Given([np.zeros((1, 1, 3), np.uint8)] * cameras, np.zeros(STATE, np.float32), ""))
+        except _Missing:
+            why = f"wants {self.pictures}"
+        if why:
+            raise UsageError(
+                f"`cameras`: {cameras} a request, and `template` {self.name} {why}; "
+                f"use `cameras` {self.pictures}, or another template"
+            )
 
     def _refuse(self, path: str, why: str) -> NoReturn:
         raise UsageError(f"`template` {self.name}: {path or 'it'} {why}")
@@ -275,6 +290,7 @@ class PolicyTransport(Transport[P]):
         return Capabilities(options, payloads, self.answer_kinds, template.takes_state, self.facts)
 
     def require(self, choice: Choice[P]) -> None:
-        """Refuse a key that is not there; raises MissingExtra too."""
+        """Refuse a key that is not there, and a template for other pictures; raises MissingExtra too."""
         extras.need(self.name, *self.modules)
+        template_of(choice.options.template_name).check_pictures(choice.cameras)
         read_key(choice.options.api_key_env)

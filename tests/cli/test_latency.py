@@ -141,7 +141,7 @@ def test_json_is_the_only_thing_on_standard_output(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_stream_mode_knows_the_age_of_the_frame(tmp_path: Path) -> None:
-    done = run(*SMALL, "--transport", "http,ros", "--mode", "stream", "--fps", "60", output=tmp_path)
+    done = run(*SMALL, "--transport", "http,ros", "--mode", "stream", "--fps", "60", "--verbose", output=tmp_path)
     assert "Frame path" in done.stdout
     kept = only_run(tmp_path)
     assert (kept.samples["error"] == "").all()

@@ -74,7 +74,7 @@ def test_in_process_http_and_ros_stand_beside_llama_bench(tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_the_engines_settings_reach_it_and_the_terminal_shows_all(tmp_path: Path) -> None:
     settings = ["--batch", "64", "--context", "1024", "--kv-type", "q8_0", "--flash-attention", "on"]
-    done = run(*SMALL, *settings, "--against", "paper", output=tmp_path)
+    done = run(*SMALL, *settings, "--against", "paper", "--verbose", output=tmp_path)
     kept = only_run(tmp_path)
     model = kept.manifest["model"]
     expected = {"batch": 64, "context": 1024, "kv_type": "q8_0", "flash_attention": "on", "sampling": "model"}

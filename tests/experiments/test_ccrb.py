@@ -279,7 +279,7 @@ def test_six_numbers_are_varied_over_the_same_points(made: Callable[..., Run]) -
     assert shares["build_s"].max() > 2 * at_defaults["build_s"] > 0
     assert set(show(run).figures) == {"scenario", "sensitivity"}
     assert len(build_sensitivity(run).axes) == len(VARIED)
-    assert any("build" in note for note in show(run).notes)
+    assert any("build" in said for said in show(run).sentences)
     assert [row["varied"] for row in json_of(run)["sensitivity"]] == list(rows["varied"])
 
 

@@ -377,6 +377,28 @@ def test_the_way_out_of_the_block_is_the_state_of_the_run(tmp_path: Path, open_r
     assert (read_run(run.path).manifest["state"], read_run(run.path).manifest["error"]) == ("failed", "server died")
 
 
+@pytest.mark.parametrize("error", [StoreError("no server"), KeyboardInterrupt()])
+@pytest.mark.parametrize("there", [".", "kept", "kept/results"])
+def test_a_failure_before_the_first_row_leaves_what_was_there_before(
+    tmp_path: Path, error: BaseException, there: str
+) -> None:
+    (tmp_path / there).mkdir(parents=True, exist_ok=True)
+    before = sorted(tmp_path.rglob("*"))
+    run = RunWriter.create(tmp_path / "kept" / "results", "latency", {"stages": STAGES})
+    with pytest.raises(type(error)), run:  # noqa: PT012 - the block is what is tested
+        (run.path / "server-http.log").write_text("no model")
+        raise error
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_failure_before_the_first_row_keeps_a_folder_that_holds_runs(tmp_path: Path) -> None:
+    run = RunWriter.create(tmp_path, "latency", {}, [])
+    with pytest.raises(StoreError), run:  # noqa: PT012 - the block is what is tested
+        (run.path / "cell").mkdir()
+        raise StoreError("no room")
+    assert read_run(run.path).manifest["state"] == "failed"
+
+
 def test_a_run_that_goes_on_is_read_with_its_new_rows_before_it_finishes(tmp_path: Path) -> None:
     samples = samples_table(STAGES)
     run = kept(tmp_path, sample("r1"))

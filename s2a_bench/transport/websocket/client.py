@@ -38,7 +38,7 @@ class WebsocketClient:
     """One variant of openpi's protocol."""
 
     def __init__(self, wiring: Wiring[WebsocketOptions], alive: Callable[[], bool]) -> None:
-        """Prepare to ask the server at ``wiring.address``; the first request connects."""
+        """Prepare to ask the server at ``wiring.address``; the first request, or `describe`, connects."""
         self.camera = None
         self._wiring, self._alive = wiring, alive
         self._ours = not wiring.black_box
@@ -93,11 +93,15 @@ class WebsocketClient:
                     return self._exchanged(self._link, body, trace)
             trace.facts[RECONNECTS] = 1.0
             self._link.close()
+        link = self._connected(bounds)
+        trace.mark("connect")
+        return self._exchanged(link, body, trace)
+
+    def _connected(self, bounds: Bounds) -> Link:
         self._link = None
         self._link = Link(self._url, self._headers, bounds, self._wiring.timeout_s)
         self._greeted(self._link)
-        trace.mark("connect")
-        return self._exchanged(self._link, body, trace)
+        return self._link
 
     def _exchanged(self, link: Link, body: bytes, trace: Trace) -> tuple[bytes, int]:
         packed_ns = trace.marks[-1][1]
@@ -166,7 +170,12 @@ class WebsocketClient:
             trace.marks.append(("server", first_ns))
 
     def describe(self) -> dict[str, str]:
-        """Return who is asked and what it said of itself, for the manifest."""
+        """Return who is asked and what it says of itself, for the manifest; a server that is not ours is asked now."""
+        if not self._ours and self._link is None:
+            try:
+                self._connected(Bounds(self._url, self._wiring.deadline_of(1), 1))
+            except Broken as error:
+                raise RequestFailed(str(error)) from error
         return {"url": self._url, "template": self._template.name, **self._metadata}
 
     def close(self) -> None:

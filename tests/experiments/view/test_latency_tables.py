@@ -255,7 +255,7 @@ def test_the_terminal_shows_the_stages_what_they_say_and_where_the_rest_is(
     assert {row[-1] for row in (group_table(run) if count > 5 else stage_table(run, full=False)).rows} <= {
         *tables.split()
     }
-    assert "Echo engine." in said
+    assert "Echo engine." in " ".join(said.split())
     assert "mean ± sd" not in tables or count < 3
     assert "more tables (summary, summary-e2e" in said
 
