@@ -27,10 +27,8 @@ REQUESTS = 50
 
 def both(output: Path, requests: int = REQUESTS, **options: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return e2e without model in ms of every request, from inside and from outside."""
-    run = s2a.latency(
-        transports=["http/as-deployed"], engine="llama", requests=requests, output=output, tune=True, **options
-    )
-    good = run.samples[~run.samples["warmup"] & (run.samples["error"] == "")]
+    run = s2a.latency(transports=["http/as-deployed"], engine="llama", requests=requests, output=output, **options)
+    good = run.samples[run.samples["error"] == ""]
     facts = [json.loads(str(told)) for told in good["facts"]]
     model_ms = np.array([told[PROMPT_MS] - told[PREPROCESS_MS] for told in facts])
     inside, e2e = (good[f"{name}_ns"].to_numpy(dtype=float) / 1e6 for name in ("e2e_without_model", "e2e"))

@@ -41,7 +41,7 @@ _undo: ExitStack | None = None
 def allowed(yes: bool = True) -> Iterator[None]:
     """Allow this process to be tuned inside the block; after it the settings are those from before.
 
-    What glibc cannot take back: the threads of this process may share one arena from then on.
+    What glibc cannot take back: its thresholds are no longer its own to move, and new threads may share one arena.
     """
     global _undo  # noqa: PLW0603 - settings of a process are global
     if _undo is not None or not yes:
