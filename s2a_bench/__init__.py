@@ -1,24 +1,14 @@
 """s2a-bench: what wiring a vision-language model to a robot costs, and when the robot may act on what it streams.
 
 The library's face: every experiment is a function (`latency`, `throughput`, `timeline`, `chunks`, `boundary`,
-`ccrb`), `load` opens a run folder, `compare` compares two. See docs/library.md.
+`ccrb`), `load` opens a run folder, `compare` compares two. See docs/library.md; their types are in __init__.pyi.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 __version__ = "0.1.0"
-
-if TYPE_CHECKING:
-    from s2a_bench.library import Comparison, Run, command, compare, load
-
-    boundary = command("boundary")
-    ccrb = command("ccrb")
-    chunks = command("chunks")
-    latency = command("latency")
-    throughput = command("throughput")
-    timeline = command("timeline")
 
 __all__ = [
     "Comparison",

@@ -246,10 +246,10 @@ Names = Annotated[tuple[str, ...], SEVERAL]
 Numbers = Annotated[tuple[float, ...], SEVERAL]
 WholeNumbers = Annotated[tuple[int, ...], SEVERAL]
 
-Size = Annotated[tuple[int, int], BeforeValidator(_size)]
+Size = Annotated[tuple[int, int], BeforeValidator(_size, json_schema_input_type=str | tuple[int, int])]
 """Width and height; as text 640x480."""
 
-Square = Annotated[tuple[int, int], BeforeValidator(_square)]
+Square = Annotated[tuple[int, int], BeforeValidator(_square, json_schema_input_type=str | tuple[int, int])]
 """Width and height; as text 224x224, or 224 for both."""
 
 TextOrFile = Annotated[str, BeforeValidator(_text)]

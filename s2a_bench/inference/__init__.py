@@ -155,7 +155,7 @@ class EngineConfig(Options):
     )
     profile: str = option("", "what --engine replay plays: a name of 'profile list', or a path")
     gaps: str = option("", "replay: trace, parametric, constant [default: trace if recorded]")
-    latency: Annotated[str, BeforeValidator(_written)] = option(
+    latency: Annotated[str, BeforeValidator(_written, json_schema_input_type=str | float)] = option(
         "",
         "echo: how long until an answer is there, whole: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]",
     )

@@ -68,7 +68,7 @@ VIRTUAL: Final = ("cycles", "calibration_cycles", "tokens_per_action")
 FASTEST_LIVE_HZ: Final = 10_000.0
 MOST_LIVE_TICKS: Final = 1_000_000
 
-Sources = Annotated[tuple[str, ...], BeforeValidator(split)]
+Sources = Annotated[tuple[str, ...], BeforeValidator(split, json_schema_input_type=tuple[str | float, ...])]
 """Several sources of latencies; as text with commas between them, which may hold the parameters of a family too."""
 
 
