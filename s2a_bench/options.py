@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
@@ -25,6 +26,9 @@ class Options(BaseModel):
     """Base of configurations; an option is a field made with `option`, a group of options a field of such a class."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    PANEL: ClassVar[str] = ""
+    """The heading in ``--help`` over the options that this class declares, those with one of their own aside."""
 
     OLD: ClassVar[Mapping[str, tuple[str, str]]] = {}
     """Names that options had -> the field that is given instead, and what goes before each of its values."""
@@ -84,22 +88,34 @@ def option(
     hidden: bool = False,
     side: str = "",
     risk: Literal["", "program", "url", "key"] = "",
+    panel: str = "",
+    first: bool = False,
+    names: Callable[[], Iterable[str]] | None = None,
     **bounds: Any,
 ) -> Any:
     """Declare a field: ``about`` is its help, ``flag`` its name on the command line where that is not the field's.
 
     On the command line an ``argument`` is given by its place instead of a flag, and a ``hidden`` flag is left out of
     the help. ``side`` is for the options of a transport, see `transport`. ``risk`` says that the value names
-    a program to run, a server that requests go to, or a key for it. A field whose ``default`` is `...` has to be given.
+    a program to run, a server that requests go to, or a key for it. ``panel`` is the heading in ``--help`` where that
+    is not its class's; ``--help`` of a command with many flags shows those that are ``first``. ``names`` returns what a
+    shell completes, for a value that `one_of` does not check. A field whose ``default`` is `...` has to be given.
     ``bounds`` are pydantic's: ge, gt, le, lt, min_length, pattern.
     """
     extra: dict[str, Any] = {"flag": flag, "argument": argument, "hidden": hidden, "side": side, "risk": risk}
+    extra |= {"panel": panel, "first": first, "names": names}
     return Field(default, description=about, json_schema_extra=extra, **bounds)
 
 
-def group(options: type[Options], *, only: Iterable[str] = (), about: str = "") -> Any:
-    """Declare a group of options, of which ``only`` some are flags; ``about`` stands before the help of each."""
-    return Field(default_factory=options, json_schema_extra={"only": list(only), "about": about})
+def group(
+    options: type[Options], *, only: Iterable[str] = (), about: str = "", first: Iterable[str] | None = None
+) -> Any:
+    """Declare a group of options, of which ``only`` some are flags; ``about`` stands before the help of each.
+
+    The flags that are ``first`` in ``--help`` are those that ``options`` declares so, unless they are named here.
+    """
+    extra: dict[str, Any] = {"only": [*only], "about": about, "first": None if first is None else [*first]}
+    return Field(default_factory=options, json_schema_extra=extra)
 
 
 def group_of(field: FieldInfo) -> type[Options] | None:
@@ -111,6 +127,17 @@ def group_of(field: FieldInfo) -> type[Options] | None:
 def extra_of(field: FieldInfo) -> Mapping[str, Any]:
     """Return what `option` or `group` declared of a field besides what pydantic knows."""
     return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+
+
+def declared(options: type[Options], name: str) -> tuple[str, bool]:
+    """Return the heading of a field's option in ``--help``, and whether it is one of the first there.
+
+    A class that declares a field anew, with another default, need not repeat them.
+    """
+    bases = [each for each in options.__mro__ if issubclass(each, Options) and name in each.model_fields]
+    extras = [extra_of(each.model_fields[name]) for each in bases]
+    panel = next((str(each["panel"]) for each in extras if each.get("panel")), bases[-1].PANEL)
+    return panel, any(each.get("first") for each in extras)
 
 
 Place: TypeAlias = tuple[str, ...]
@@ -192,14 +219,29 @@ def listed(value: Any) -> tuple[Any, ...]:
 
 def one_of(names: Callable[[], Iterable[str]]) -> AfterValidator:
     """Return a validator: the value, or each of several, is one of ``names()``, asked when it is needed."""
+    return AfterValidator(OneOf(names))
 
-    def check(value: Any) -> Any:
+
+@dataclass(frozen=True, slots=True)
+class OneOf:
+    """The check of `one_of`, which knows the names."""
+
+    names: Callable[[], Iterable[str]]
+
+    def __call__(self, value: Any) -> Any:
         for each in value if isinstance(value, tuple) else (value,):
-            if each not in (known := tuple(names())):
+            if each not in (known := tuple(self.names())):
                 raise ValueError(none_of(each, known))
         return value
 
-    return AfterValidator(check)
+
+def names_of(field: FieldInfo) -> Callable[[], Iterable[str]] | None:
+    """Return what lists the names that an option's value may be, or begin with; None where there are none."""
+    checks = (getattr(each, "func", None) for each in field.metadata)
+    kinds = (field.annotation, *get_args(field.annotation))
+    literal = next((get_args(each) for each in kinds if get_origin(each) is Literal), ())
+    found = next((each.names for each in checks if isinstance(each, OneOf)), extra_of(field).get("names"))
+    return found or ((lambda: literal) if literal else None)
 
 
 def _size(value: Any) -> Any:

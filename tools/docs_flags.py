@@ -42,11 +42,11 @@ def table(command: str, without: str = "", group: str = "") -> str:
 
 
 def flags(command: str) -> dict[str, str]:
-    """Return the row of every flag and argument that is not hidden, by the parameter's name."""
+    """Return the row of every flag and argument that sets something and is not hidden, by the parameter's name."""
     commands: Any = get_command(app)
     rows = {}
     for parameter in commands.get_command(None, command).params:
-        if not getattr(parameter, "hidden", False):
+        if parameter.expose_value and not getattr(parameter, "hidden", False):
             about = PREFIX.sub("", parameter.help or "")
             default = DEFAULT.search(about)
             given = default[1] if default else "" if parameter.default in (None, False) else str(parameter.default)

@@ -55,7 +55,7 @@ app = typer.Typer(
     cls=TopCommands,
     name="s2a-bench",
     help="Measure how a vision-language model is wired to a robot, and when the robot may act.",
-    **PLAIN,
+    **PLAIN | {"add_completion": True},
 )
 
 
@@ -77,7 +77,7 @@ def main() -> None:
     try:
         check_limits()
         with tuning.allowed():
-            code = app(args=folded(sys.argv[1:]), standalone_mode=False)
+            code = app(args=folded(sys.argv[1:]), prog_name=app.info.name, standalone_mode=False)
         if code == INTERRUPTED:  # newer typer turns Ctrl-C into this code itself
             _say("interrupted", INTERRUPTED)
     except S2AError as error:

@@ -26,6 +26,12 @@ PLAIN: tuple[type, ...] = (bool, int, float, Path)
 """What typer reads by itself; every other type is read from text by its field."""
 
 
+MANY = 16
+"""Flags of a command that its help shows at once."""
+HELP_ALL = "help_all"
+"""The parameter that shows every flag, and the key in a context's `meta` that wants it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Flag:
     """One option of a command: where in the configuration its value goes."""
@@ -42,6 +48,12 @@ class Flag:
     hidden: bool = False
     whose: str = ""
     """What stands before the help, as its group says."""
+    panel: str = ""
+    """The heading that it stands under in the help."""
+    first: bool = False
+    """Whether it is among those that the help of a command with many flags shows."""
+    names: Callable[[], Iterable[str]] | None = None
+    """What lists the names that its value, or each of several, may be or begin with."""
 
     @property
     def spelled(self) -> str:
@@ -57,8 +69,12 @@ class Flag:
                 metavar=self.spelled + "..." * (get_origin(self.kind) is list), help=about, show_default=False
             )
             if self.argument
-            else typer.Option(self.spelled, help=about, show_default=False, hidden=self.hidden)
+            else typer.Option(
+                self.spelled, help=about, show_default=False, hidden=self.hidden, rich_help_panel=self.panel or None
+            )
         )
+        if self.names:
+            declared.autocompletion = _completion(self.names)
         kind: Any = self.kind if self.needed else Union[self.kind, None]  # noqa: UP007 - made at run time
         return inspect.Parameter(
             self.key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, declared]
@@ -71,20 +87,23 @@ class Flag:
 
 def flags_of(options: type[Options]) -> Iterator[Flag]:
     """Yield the flags of a configuration, those of a group in its place."""
-    from s2a_bench.options import extra_of, group_of
+    from s2a_bench.options import declared, extra_of, group_of, names_of
 
     for name, field in options.model_fields.items():
         extra = extra_of(field)
         group = group_of(field)
         if group is not None:
-            only, about = extra.get("only"), extra.get("about", "")
+            only, about, first = extra.get("only"), extra.get("about", ""), extra.get("first")
             for flag in flags_of(group):
                 if not only or {flag.path[0], *group.OLD.get(flag.path[0], ())} & {*only}:
-                    yield replace(flag, path=(name, *flag.path), whose=f"{about}{flag.whose}")
+                    shown = flag.first if first is None else flag.path[0] in first
+                    yield replace(flag, path=(name, *flag.path), whose=f"{about}{flag.whose}", first=shown)
         else:
             flag_name = str(extra.get("flag") or name.replace("_", "-"))
             kind, argument, hidden = _kind(field.annotation), bool(extra.get("argument")), bool(extra.get("hidden"))
-            yield Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument, hidden)
+            panel, first = declared(options, name)
+            flag = Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument, hidden)
+            yield replace(flag, panel=panel, first=first, names=names_of(field))
     for name in options.OLD:
         about = f"the name that --{options.OLD[name][0]} had"
         yield Flag(name.replace("_", "-"), (name,), str, about, hidden=True)
@@ -98,14 +117,42 @@ def command(function: Callable[..., None], *options: type[Options], about: str =
     """
     own = _keywords(function)
     flags = distinct([flag for each in options for flag in flags_of(each)], taken=own)
+    listed = [flag for flag in flags if not (flag.hidden or flag.argument)]
+    rest = [flag.key for flag in listed if not flag.first] if len(listed) > MANY else []
+    more = [_help_all(len(listed) + len(own))] if rest else []
 
     def run(**given: Any) -> None:
         with flags_named(*options):
             function(*(build(each, given) for each in options), **{name: given[name] for name in own})
 
-    run.__signature__ = inspect.Signature([*(flag.parameter for flag in flags), *own.values()])  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature([*(flag.parameter for flag in flags), *own.values(), *more])  # type: ignore[attr-defined]
     run.__doc__ = about
+    run.rest = rest  # type: ignore[attr-defined]
     return run
+
+
+def _help_all(count: int) -> inspect.Parameter:
+    """Return the flag that shows the help with every flag of a command."""
+
+    def show(ctx: typer.Context, value: bool) -> None:
+        if value and not ctx.resilient_parsing:
+            ctx.meta[HELP_ALL] = True
+            typer.echo(ctx.get_help())
+            raise typer.Exit
+
+    about = f"Show all {count} options and exit."
+    flag = typer.Option("--help-all", is_eager=True, expose_value=False, callback=show, help=about)
+    return inspect.Parameter(HELP_ALL, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, flag])
+
+
+def _completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Return what completes a name, or the last of several with commas."""
+
+    def complete(incomplete: str) -> list[str]:
+        done = incomplete[: incomplete.rfind(",") + 1]
+        return [f"{done}{name}" for name in names() if name]
+
+    return complete
 
 
 def distinct(flags: Sequence[Flag], taken: Iterable[str] = ()) -> list[Flag]:

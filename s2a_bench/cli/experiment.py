@@ -10,9 +10,9 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
-from s2a_bench.cli.adapter import build, command, flags_named
+from s2a_bench.cli.adapter import HELP_ALL, build, command, flags_named
 from s2a_bench.cli.output import Json, print_json, print_line
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.cli.output import shown as shown_line
@@ -66,14 +66,20 @@ class Commands(TyperGroup):
             ctx.fail(f"No such command '{args[0]}'{like(args[0], known)}")
         return super().resolve_command(ctx, args)
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """List every command with its sentence, without importing what experiments are made of."""
-        abouts = {name: experiment.about for name, experiment in EXPERIMENTS.loaded() if name in self.experiments}
-        abouts |= {name: about for name, (_, about) in self.lazy.items()}
-        for name in {*self.list_commands(ctx)}.difference(self.experiments, abouts):
-            abouts[name] = self.get_command(ctx, name).get_short_help_str(limit=150)
+    def _abouts(self) -> dict[str, str]:
+        """Return every command's sentence by its name, without importing what experiments are made of."""
+        abouts = {name: made.get_short_help_str(limit=150) for name, made in self.commands.items()}
+        abouts |= {name: experiment.about for name, experiment in EXPERIMENTS.loaded() if name in self.experiments}
+        return dict(sorted({**abouts, **{name: about for name, (_, about) in self.lazy.items()}}.items()))
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Complete the names of commands, which are not made for that: the process ends with it."""
+        self.commands = {name: TyperCommand(name, help=about) for name, about in self._abouts().items()}
+        return super().shell_complete(ctx, incomplete)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 - Click's signature
         with formatter.section("Commands"):
-            formatter.write_dl(sorted(abouts.items()))
+            formatter.write_dl([*self._abouts().items()])
 
 
 def _click(name: str, made: Any, about: str | None = None) -> Any:
@@ -81,10 +87,33 @@ def _click(name: str, made: Any, about: str | None = None) -> Any:
     group = made
     if not isinstance(made, typer.Typer):
         group = typer.Typer(**PLAIN)
-        group.command(name, help=about)(made)
-    found = typer.main.get_command(group)
+        group.command(name, help=about, cls=Flagged)(made)
+    found: Any = typer.main.get_command(group)
     found.name = name
+    found.rest = getattr(made, "rest", ())
     return found
+
+
+class Flagged(TyperCommand):
+    """A command with many flags: its help has them under headings, and at first those alone that matter first."""
+
+    rest: Collection[str] = ()
+    """The parameters that only `--help-all` shows."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """List the flags under their headings, in the order of their declarations, those without one last."""
+        panels: dict[str, list[tuple[str, str]]] = {"Arguments": []}
+        for each in sorted(self.get_params(ctx), key=lambda each: each.name == HELP_ALL):
+            record = each.get_help_record(ctx)
+            if record and (HELP_ALL in ctx.meta or each.name not in self.rest):
+                panel = "Arguments" if each.param_type_name == "argument" else getattr(each, "rich_help_panel", "")
+                panels.setdefault(panel or "", []).append(record)
+        panels["Options"] = panels.pop("", [])
+        width = max(len(flag) for records in panels.values() for flag, _ in records)
+        for panel, records in panels.items():
+            if records:
+                with formatter.section(panel):
+                    formatter.write_dl([(flag.ljust(width), about) for flag, about in records])
 
 
 @cache

@@ -44,7 +44,12 @@ def list_(json_: Json = False) -> None:
 
 
 @app.command("show")
-def show(name: Annotated[str, typer.Argument(help="a name of 'profile list', or a path")], json_: Json = False) -> None:
+def show(
+    name: Annotated[
+        str, typer.Argument(help="a name of 'profile list', or a path", autocompletion=lambda: [*profile_files()])
+    ],
+    json_: Json = False,
+) -> None:
     """Show one profile: its numbers, where they are from, and what is known of board, model and fit."""
     path = find_profile(name)
     profile = read_profile(path)

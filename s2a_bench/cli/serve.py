@@ -19,7 +19,7 @@ from s2a_bench.options import Options, group, option, placed, places
 from s2a_bench.provenance import Provenance
 from s2a_bench.text import none_of, read_text
 from s2a_bench.toml_file import loads
-from s2a_bench.transport import ACTIONS, SERVER, SERVING, TRANSPORTS, Transport, Wiring
+from s2a_bench.transport import ACTIONS, SERVER, SERVING, TRANSPORTS, Transport, Wiring, paths
 from s2a_bench.transport.limits import SET, Limits
 from s2a_bench.transport.pipeline import Pipeline, answer_over, one_pipeline
 
@@ -54,7 +54,7 @@ def _config() -> type[Options]:
     """Make the options of `serve`: the engine's, a group of what each transport's server is told, and the limits."""
     about = "http, ros, or another, as TRANSPORT[/VARIANT][?OPTION=VALUE&...]"
     fields: dict[str, Any] = {
-        "pipeline": (str, option(..., about, flag="transport", argument=True)),
+        "pipeline": (str, option(..., about, flag="transport", argument=True, names=paths)),
         "engine": (EngineConfig, group(EngineConfig, only=[name for name in ENGINE if name != "gaps"])),
     }
     for name, each in TRANSPORTS.loaded():

@@ -20,10 +20,12 @@ from s2a_bench.transport import (
     PAYLOADS,
     PROGRAM,
     SERVER,
+    TRANSPORT,
     TRANSPORTS,
     Choice,
     Payload,
     named_by,
+    paths,
 )
 from s2a_bench.transport.defaults import COMPARED
 from s2a_bench.transport.pipeline import Pipeline, answer_over, carries_alone, pipelines, require_payload
@@ -64,6 +66,7 @@ else:
 class RequestsConfig(Options):
     """The settings of one run of requests."""
 
+    PANEL: ClassVar[str] = "Requests"
     QUICK: ClassVar[dict[str, int]] = {"requests": 10, "warmup": 2, "max_tokens": 8}
     """What ``quick`` sets, unless told."""
     COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
@@ -81,24 +84,43 @@ class RequestsConfig(Options):
         COMPARED,
         f"{', '.join(TRANSPORTS)}; several with commas, with /VARIANT and ?OPTION=VALUE: ros/topic?payload=yuyv",
         flag="transport",
+        panel=TRANSPORT,
+        first=True,
+        names=paths,
     )
-    source: str = option("synthetic", f"{', '.join(SOURCES)}, as video:FILE")
-    size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]")
-    cameras: int = option(1, "pictures a request, read one after the other from the source", ge=1, le=16)
+    source: str = option(
+        "synthetic",
+        f"{', '.join(SOURCES)}, as video:FILE",
+        panel="Pictures",
+        first=True,
+        names=lambda: SOURCES,
+    )
+    size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]", panel="Pictures", first=True)
+    cameras: int = option(
+        1, "pictures a request, read one after the other from the source", ge=1, le=16, panel="Pictures"
+    )
     resize: Square | None = option(
-        None, "WIDTHxHEIGHT, or 224 for 224x224: pictures are scaled to it before they travel [default: as captured]"
+        None,
+        "WIDTHxHEIGHT, or 224 for 224x224: pictures are scaled to it before they travel [default: as captured]",
+        panel="Pictures",
     )
-    state: int = option(0, "numbers (float32) of the robot's state that go with a request", ge=0, le=4096)
-    payload: Payload = option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: http jpeg, ros raw]")
-    options: TransportOptions = group(TransportOptions)
+    state: int = option(
+        0, "numbers (float32) of the robot's state that go with a request", ge=0, le=4096, panel="Pictures"
+    )
+    payload: Payload = option(
+        "", f"how a picture travels: {', '.join(PAYLOADS)} [default: http jpeg, ros raw]", panel="Pictures"
+    )
+    options: TransportOptions = group(TransportOptions, first=())
     """The options of every transport, for names that do not say them themselves."""
     url: str = option(
         "",
         "a server that runs already (a black box), of the transport that its scheme names: "
         f"{', '.join(f'{scheme}://' for _, each in TRANSPORTS.loaded() for scheme in each.urls.schemes)}",
+        panel=TRANSPORT,
+        first=True,
     )
     engine: EngineConfig = group(EngineConfig)
-    requests: int = option(50, "requests a pipeline [default: 50, quick: 10]", ge=1, le=10**9)
+    requests: int = option(50, "requests a pipeline [default: 50, quick: 10]", ge=1, le=10**9, first=True)
     warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
     launches: int = option(1, "fresh sets of servers, --requests each; ratios then hold beyond one", ge=1, le=1000)
     mode: Literal["request", "stream"] = option("request", "request (a frame each), stream (a camera runs)")
@@ -130,7 +152,7 @@ class RequestsConfig(Options):
         le=1000,
     )
     record: Path | None = option(None, "also record frames, requests and tokens, as run.mcap (rosbag2)")
-    quick: bool = option(False, "fewer samples: a first look")
+    quick: bool = option(False, "fewer samples: a first look", first=True)
 
     def __init__(self, **given: Any) -> None:
         """Keep what is given, few samples where a quick look is asked for; raises UsageError naming the field."""

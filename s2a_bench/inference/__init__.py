@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Prot
 from pydantic import BeforeValidator
 
 from s2a_bench import extras
+from s2a_bench.boards.profile import profile_files
 from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import MissingExtra, UsageError
 from s2a_bench.facts import Fact
@@ -148,18 +149,21 @@ def _written(value: Any) -> Any:
 class EngineConfig(Options):
     """Which engine, on which files, with which settings; plain data, so that a server process can be told."""
 
+    PANEL: ClassVar[str] = "Model"
+
     name: Annotated[str, one_of(lambda: ENGINES)] = option(
         MODEL,
         f"{', '.join(ENGINES)}; echo leaves the transport alone, replay plays --profile (EMULATED)",
         flag="engine",
+        first=True,
     )
-    profile: str = option("", "what --engine replay plays: a name of 'profile list', or a path")
+    profile: str = option("", "what --engine replay plays: a name of 'profile list', or a path", names=profile_files)
     gaps: str = option("", "replay: trace, parametric, constant [default: trace if recorded]")
     latency: Annotated[str, BeforeValidator(_written, json_schema_input_type=str | float)] = option(
         "",
         "echo: how long until an answer is there, whole: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]",
     )
-    model: Path | None = option(None, "GGUF model [default: the tiny dummy]")
+    model: Path | None = option(None, "GGUF model [default: the tiny dummy]", first=True)
     mmproj: Path | None = option(None, "GGUF vision tower that goes with --model")
     threads: int = option(0, "CPU threads of the model; 0: all", ge=0, le=LARGEST)
     gpu_layers: int = option(0, "model layers on the GPU; -1: all", ge=-1, le=LARGEST)

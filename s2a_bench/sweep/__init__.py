@@ -18,7 +18,7 @@ from typing import Any, Final, Literal, Protocol, TypeAlias
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, Options, option
 from s2a_bench.store.run import read_run
-from s2a_bench.sweep.file import find_sweep
+from s2a_bench.sweep.file import find_sweep, sweep_files
 
 Flag: TypeAlias = Literal["value", "hidden", "switch", "toggle", "argument"]
 """A switch is given or not; a toggle has its opposite too, as --animation and --no-animation; no hint names what is
@@ -105,7 +105,10 @@ class SweepConfig(Options):
     """A sweep to start, or one to go on with."""
 
     file: str = option(
-        "", "sweep file (TOML), or the name of one: paper, quick, transports; not needed with --resume", argument=True
+        "",
+        "sweep file (TOML), or the name of one: paper, quick, transports; not needed with --resume",
+        argument=True,
+        names=sweep_files,
     )
     resume: Path | None = option(None, "folder of a sweep that was interrupted: run what it has not run yet")
     retry_failed: bool = option(False, "with --resume: run the cells that failed once more")

@@ -61,6 +61,7 @@ OWN = {
     "json": "the sweep has --json itself",
     "data-only": "cells keep data only, always",
     "help": "it is no setting",
+    "help-all": "it is no setting",
 }
 """Flags that a sweep sets itself, and what to do instead."""
 MOST_CELLS = 100_000
@@ -80,14 +81,19 @@ class SweepFile:
     """The fixed settings and those of the axes together, one each cell."""
 
 
+def sweep_files() -> dict[str, Path]:
+    """Return the file of every name that can be given, sorted by name; a name found twice is the first folder's."""
+    folders = [folder / "sweeps" for folder in search_path()]
+    return dict(sorted((path.stem, path) for folder in reversed(folders) for path in folder.glob("*.toml")))
+
+
 def find_sweep(name: str) -> Path:
     """Return a sweep file given as a path, or by a name in ./profiles/sweeps, the user's folder or the package."""
     if "/" in name or name.endswith(".toml"):
         return Path(name)
-    folders = [folder / "sweeps" for folder in search_path()]
-    files = {path.stem: path for folder in reversed(folders) for path in sorted(folder.glob("*.toml"))}
+    files = sweep_files()
     if name not in files:
-        raise UsageError(none_of(name, sorted(files), ", and no path of a sweep file"))
+        raise UsageError(none_of(name, files, ", and no path of a sweep file"))
     return files[name]
 
 

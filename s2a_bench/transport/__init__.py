@@ -56,6 +56,9 @@ PAYLOADS: Final = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
 LOSSLESS: Final = frozenset({"", "raw", "yuyv", "png"})
 """Payloads after which the engine sees the camera's very pixels; "" where nothing travels."""
 
+TRANSPORT: Final = "Transport"
+"""The heading in ``--help`` over options that say how requests travel."""
+
 SERVER: Final = "server"
 """``side`` of an option that the server's process is told too: cells that differ in it get servers of their own."""
 
@@ -88,6 +91,7 @@ class Options(base.Options):
     An option is the client's business unless its ``side`` says something else.
     """
 
+    PANEL: ClassVar[str] = TRANSPORT
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {}
     """Values that options have in `serve` unless told."""
     NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = ()
@@ -376,6 +380,12 @@ def declared(name: str) -> Transport[Any]:
         return TRANSPORTS[name]
     except UsageError:
         return _Undeclared()
+
+
+def paths() -> Iterator[str]:
+    """Yield what the name of a pipeline may begin with: every transport, and its variants as TRANSPORT/VARIANT."""
+    for name, transport in TRANSPORTS.loaded():
+        yield from (name, *(f"{name}/{variant}" for variant in transport.variants))
 
 
 def named_by(url: str) -> str:

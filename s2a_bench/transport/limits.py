@@ -7,7 +7,7 @@ manifest of a run; three are flags of `serve`. `Bounds` are those of one answer.
 from __future__ import annotations
 
 import re
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed
@@ -29,6 +29,8 @@ class Limits(Options):
 
     Users set those that `SET` names; the others are the same for every server.
     """
+
+    PANEL: ClassVar[str] = "Limits"
 
     body_mib: float = option(64.0, "largest body of a request, MiB", flag="max-body-mib", gt=0, le=MIB)
     header_kib: float = option(64.0, "longest headers of a request, KiB", gt=0, le=MIB)

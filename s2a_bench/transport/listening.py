@@ -34,14 +34,17 @@ class ListeningOptions(Options):
     SCHEMES: ClassVar[tuple[str, ...]] = ()
     """Of the URLs."""
 
-    host: str = option("127.0.0.1", "address that our server binds; others than this machine need a key", side=SERVING)
-    port: int = option(0, "port of the server; 0: any free one", ge=0, le=65535, side=SERVER)
+    host: str = option(
+        "127.0.0.1", "address that our server binds; others than this machine need a key", side=SERVING, first=True
+    )
+    port: int = option(0, "port of the server; 0: any free one", ge=0, le=65535, side=SERVER, first=True)
     url: str = option("", "a server that runs already (a black box)", side=EXTERNAL, risk="url")
     api_key_env: str = option(
         "",
         "NAME of the environment variable with the API key: of the url, or that our server wants",
         side=SERVER,
         risk="key",
+        first=True,
     )
     no_auth: bool = option(False, "let everybody in who reaches the host, without a key", side=SERVING)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -33,19 +34,37 @@ EVERY = pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
 
 @EVERY
 def test_help_is_code_zero_and_names_every_flag(path: tuple[str, ...]) -> None:
-    shown = CliRunner().invoke(app, [*path, "--help"])
+    flags = [each.opts[0] for each in COMMANDS[path].params if not getattr(each, "hidden", False)]
+    shown = CliRunner().invoke(app, [*path, "--help-all" if "--help-all" in flags else "--help"])
     assert shown.exit_code == 0
     assert shown.stdout.split()[: 2 + len(path)] == ["Usage:", "s2a-bench", *path]
-    for parameter in COMMANDS[path].params:
-        if parameter.param_type_name == "option" and not parameter.hidden:
-            assert parameter.opts[0] in shown.stdout
+    assert [flag for flag in flags if flag.startswith("-") and flag not in shown.stdout] == []
+    assert max(map(len, shown.stdout.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    ("command", "headings"),
+    [
+        ("latency", ["Transport", "Pictures", "Model", "Requests", "Options"]),
+        ("throughput", ["Transport", "Pictures", "Model", "Requests", "Options"]),
+        ("timeline", ["Plans", "Tokens that are modelled", "A model that answers", "Options"]),
+        ("chunks", ["Control loop", "Transport", "Options"]),
+        ("ccrb", ["Drives", "Scenario", "A model that answers", "Options"]),
+        ("serve", ["Arguments", "Model", "Transport", "ROS 2", "Options"]),
+    ],
+)
+def test_help_shows_first_what_matters_first(command: str, headings: list[str]) -> None:
+    lines = called(command, "--help").stdout.splitlines()
+    assert [line.removesuffix(":") for line in lines if re.fullmatch(r"[A-Z].*:", line)] == headings
+    assert 8 <= sum(line.startswith("  --") for line in lines) <= 14
+    assert re.fullmatch(r"  --help-all +Show all \d\d options and exit.", lines[-1])
 
 
 @EVERY
 def test_every_command_and_every_flag_is_explained(path: tuple[str, ...]) -> None:
     command = COMMANDS[path]
     assert command.help
-    assert [parameter.name for parameter in command.params if not getattr(parameter, "help", None)] == []
+    assert [each.name for each in command.params if not (each.hidden or each.help)] == []
 
 
 def test_no_help_imports_anything_heavy() -> None:
@@ -60,6 +79,32 @@ def test_no_help_imports_anything_heavy() -> None:
 
 def test_the_version_is_printed() -> None:
     assert called("--version").stdout.strip() == __version__
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("thr", "throughput"),
+        ("model ", "dummy fetch info"),
+        ("latency --fl", "--flash-attention"),
+        ("latency --transport http,ros", "http,ros http,ros/topic http,ros/action"),
+        ("serve http/b", "http/best-effort http/binary"),
+        ("latency --engine ", "llama echo replay"),
+        ("latency --mode ", "request stream"),
+        ("latency --dialect o", "openai ollama openvla"),
+        ("ccrb --profile j", "jetson-agx-orin jetson-orin-nano"),
+        ("timeline --policy naive,s2a", "naive,s2a-clairvoyant naive,s2a-mean"),
+        ("chunks --modes q", "queue"),
+        ("sweep ", "paper quick transports"),
+        ("profile show r", "rtx-4080"),
+    ],
+)
+def test_a_shell_completes_names(line: str, offered: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = f"s2a-bench {line}"
+    monkeypatch.setenv("_S2A_BENCH_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(words.count(" ")))
+    assert called().stdout.split() == offered.split()
 
 
 @pytest.mark.parametrize("group", ["", "model", "profile"])

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 from pydantic import Field
 
 from s2a_bench import extras
+from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Names, Numbers, Options, group, one_of, option
 from s2a_bench.policy import COMPARED, POLICIES
 from s2a_bench.scenario import SIMULATORS
 from s2a_bench.scenario.ccrb.options import SKILL_SET, CcrbOptions
+from s2a_bench.transport import paths
 
 if TYPE_CHECKING:
     from s2a_bench.harness.timelines.config import TimelineConfig
@@ -23,9 +25,15 @@ if TYPE_CHECKING:
 class Asked(Options):
     """Which model answers, over which transport."""
 
-    live: bool = option(False, "take the tokens of a model that really answers, about the rendered scene")
-    transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]")
-    engine: EngineConfig = group(EngineConfig, only=("name", "model", "mmproj", "threads", "pace"), about="--live: ")
+    PANEL: ClassVar[str] = "A model that answers"
+
+    live: bool = option(False, "take the tokens of a model that really answers, about the rendered scene", first=True)
+    transport: str = option(
+        "", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]", names=paths
+    )
+    engine: EngineConfig = group(
+        EngineConfig, only=("name", "model", "mmproj", "threads", "pace"), about="--live: ", first=()
+    )
 
     def check(self) -> None:
         """Refuse what needs ``live``; raises UsageError naming the field."""
@@ -48,13 +56,21 @@ DRAWN: Final = ("all_followers", "sensitivity", "seeds", "seed_points")
 class CcrbConfig(Options):
     """What is driven; the defaults are the operating point at which the paper's outcome comes about."""
 
+    PANEL: ClassVar[str] = "Drives"
+
     policies: Names = option(
         COMPARED,
         f"{', '.join(POLICIES)}, with parameters as in NAME?parameter=value&other=value; several with commas",
         flag="policy",
+        first=True,
+        names=lambda: POLICIES,
     )
-    profile: str = option("jetson-agx-orin", "the board: a name of 'profile list', or a path")
-    rate: float | None = option(None, "a board of which only the tokens/s are known", gt=0, allow_inf_nan=False)
+    profile: str = option(
+        "jetson-agx-orin", "the board: a name of 'profile list', or a path", first=True, names=profile_files
+    )
+    rate: float | None = option(
+        None, "a board of which only the tokens/s are known", gt=0, allow_inf_nan=False, first=True
+    )
     prompt_s: float | None = option(
         None,
         "seconds before decoding, c [default: the profile's; with --rate 0]",
@@ -65,15 +81,15 @@ class CcrbConfig(Options):
     tokens_per_skill: int = option(6, "L, the delimiter included", ge=1, le=1000)
     scenario: CcrbOptions = Field(default_factory=CcrbOptions)
     simulator: Annotated[str, one_of(lambda: SIMULATORS)] = option(
-        "longitudinal", "longitudinal (along the lane), embedded (highway-env), carla"
+        "longitudinal", "longitudinal (along the lane), embedded (highway-env), carla", first=True
     )
     host: str = option("localhost:2000", "carla: where the server is, HOST or HOST:PORT")
     ttc: bool = option(False, "add s2a-ttc: stream-to-act that starts by the lead's deadline")
-    phase: bool = option(False, "also the phase diagram over rate and rear gap, for every gap behaviour")
+    phase: bool = option(False, "also the phase diagram over rate and rear gap, for every gap behaviour", first=True)
     phase_rates: Numbers = option((2.0, 12.0), "tokens/s of the phase diagram: from, to")
     phase_gaps_m: Numbers = option((6.0, 30.0), "m to the car behind in the phase diagram: from, to", flag="phase-gaps")
     phase_points: tuple[int, int] = option((41, 25), "rates and gaps of the phase diagram", hidden=True)
-    random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000)
+    random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000, first=True)
     all_followers: bool = option(False, "also a table of every follower at Euro NCAP's four combinations")
     sensitivity: bool = option(False, "also a figure of six numbers varied one at a time")
     seeds: int = option(10, "draws of --all-followers and --sensitivity", ge=1, le=1000)

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 from pydantic import BeforeValidator
 
 from s2a_bench import extras
+from s2a_bench.act import ROBOTS
 from s2a_bench.boards.latency import EXAMPLE
+from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.latencies import split
 from s2a_bench.harness.config import FirstVariants
@@ -75,26 +77,33 @@ Sources = Annotated[tuple[str, ...], BeforeValidator(split, json_schema_input_ty
 class ChunksConfig(Options):
     """Modes and rules under latencies."""
 
+    PANEL: ClassVar[str] = "Control loop"
+
     modes: Names = option(
         COMPARED,
         f"{', '.join(MODES)}, each with ?parameter=value&...; several with commas",
+        first=True,
+        names=lambda: MODES,
     )
     latency: Sources = option(
         (EXAMPLE,),
         "observation to usable chunk (with streamed: to its first action): ms, FAMILY:mean_ms=...,key=value, FILE.csv, "
         "a run folder, or a profile; several with commas",
+        first=True,
+        names=profile_files,
     )
     slow_down: float = option(1.0, "all actions so many times slower (time-scaling)", ge=1, le=1000)
     slowest: float = option(
         1.0, "so many times slower calibrated and oracle may make actions where no trigger is enough", ge=1, le=1000
     )
-    control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=1e6, allow_inf_nan=False)
-    horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096)
+    control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=1e6, allow_inf_nan=False, first=True)
+    horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096, first=True)
     rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
     rules: Annotated[Names, one_of(lambda: RULES)] = option(
         RULES,
         "further rows for the first queue, its trigger chosen by each; empty text for none "
         f"[default: {','.join(RULES)}; --live: none]",
+        first=True,
     )
     epsilon: float = option(0.01, "share of cycles that may stall, for the rules", flag="eps", gt=0, lt=1)
     cycles: int | None = option(
@@ -111,6 +120,8 @@ class ChunksConfig(Options):
         "plant",
         "what takes the actions: plant?frequency_hz=5&damping=1, live also ros?topic=/NAME, call?function=MODULE:NAME; "
         "empty text for none",
+        first=True,
+        names=lambda: ROBOTS,
     )
     export_delays: Path | None = option(
         None, "also write each request's times, L and d as CSV, for other simulators; of one source of latencies"
@@ -118,10 +129,12 @@ class ChunksConfig(Options):
     seed: int = option(0, "seed of everything that is drawn", ge=0)
 
     live: bool = option(
-        False, "act in real time on what a server answers; with `engine` echo, `latency` is how long its answers take"
+        False,
+        "act in real time on what a server answers; with `engine` echo, `latency` is how long its answers take",
+        first=True,
     )
     seconds: float = option(20.0, "--live: how long each mode acts", gt=0, le=86_400)
-    requests: LiveRequests = group(LiveRequests, only=SHOWN, about="--live: ")
+    requests: LiveRequests = group(LiveRequests, only=SHOWN, about="--live: ", first=("transports",))
 
     @property
     def virtual(self) -> bool:

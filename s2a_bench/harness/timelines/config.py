@@ -7,21 +7,23 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 from pydantic import Field
 
-from s2a_bench.act import SkillKind, kind
-from s2a_bench.boards.profile import load_profile
+from s2a_bench.act import ROBOTS, SkillKind, kind
+from s2a_bench.boards.profile import load_profile, profile_files
 from s2a_bench.boards.tokens import NO_JITTER, Board, board_of_profile, board_of_rate
 from s2a_bench.errors import UsageError
+from s2a_bench.frames import SOURCES
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import SEVERAL, Names, Options, Size, TextOrFile, group, option
-from s2a_bench.plan import SkillSet, load_skills
+from s2a_bench.plan import SKILL_SETS, SkillSet, load_skills
 from s2a_bench.policy import COMPARED, POLICIES, PlanShape, Policy, Timing, policies
 from s2a_bench.policy.conformal import GUARANTEE, Guarantee
 from s2a_bench.policy.conformal import check as check_calibration
 from s2a_bench.stats.seeds import Verbatim
+from s2a_bench.transport import paths
 from s2a_bench.transport.defaults import BLACK_BOX, FOLLOWED
 
 if TYPE_CHECKING:
@@ -82,22 +84,29 @@ class Setting:
 class Compared(Options):
     """Options about what is compared, wherever the tokens are from."""
 
+    PANEL: ClassVar[str] = "Plans"
+
     policies: Names = option(
         COMPARED,
         f"{', '.join(POLICIES)}, with parameters as in NAME?parameter=value&other=value; several with commas",
         flag="policy",
         min_length=1,
+        first=True,
+        names=lambda: POLICIES,
     )
     profiles: Names = option(
         (),
         f"boards: names of 'profile list', or paths [default: {','.join(PROFILES)}; --real-time: {REAL_TIME_PROFILE}; "
         "none with --rate]; with --live what --engine replay plays",
         flag="profile",
+        first=True,
+        names=profile_files,
     )
     tokens_per_skill: Counts = option(
         (),
         "L, the delimiter included; several with commas "
         f"[default: {','.join(map(str, LENGTHS))}; --live: {LIVE_LENGTH}]",
+        first=True,
     )
     n_skills: Counts = option((8,), "N, skills a plan; several with commas", min_length=1)
     t_nom_s: Seconds = option(
@@ -108,14 +117,18 @@ class Compared(Options):
     seed: int = option(0, "seed of everything that is drawn", ge=0)
     epsilon: float = option(0.01, "share of plans that may stall: lambda is calibrated or tracked for it")
     track: bool = option(False, "let online policies follow lambda from plan to plan (needs jitter, or --live)")
-    real_time: bool = option(False, "play the boards' tokens on the clock and execute while you watch")
-    live: bool = option(False, "execute what a model really answers, as it arrives")
+    real_time: bool = option(False, "play the boards' tokens on the clock and execute while you watch", first=True)
+    live: bool = option(False, "execute what a model really answers, as it arrives", first=True)
 
 
 class Modelled(Options):
     """Options about tokens that no model writes."""
 
-    rates: Rates = option((), "boards of which only the tokens/s are known; several with commas", flag="rate")
+    PANEL: ClassVar[str] = "Tokens that are modelled"
+
+    rates: Rates = option(
+        (), "boards of which only the tokens/s are known; several with commas", flag="rate", first=True
+    )
     prompt_s: float | None = option(
         None,
         "seconds before decoding, c [default: the profile's; with --rate 0]",
@@ -129,6 +142,7 @@ class Modelled(Options):
         NO_JITTER,
         "none (tokens come evenly, as in the paper), profile (as the profile says), or a family of gaps, as "
         "lognormal:cv=0.2",
+        first=True,
     )
     guarantee: Guarantee = option("high-confidence", GUARANTEE)
     calibration_plans: int = option(400, "other plans that prior and lambda are learned from")
@@ -140,15 +154,21 @@ class Modelled(Options):
 class Live(Options):
     """Options about a model that answers."""
 
-    transport: str = option("", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]")
-    skills: str = option("household", "--live: household, driving, or a TOML file")
+    PANEL: ClassVar[str] = "A model that answers"
+
+    transport: str = option(
+        "", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]", first=True, names=paths
+    )
+    skills: str = option("household", "--live: household, driving, or a TOML file", names=lambda: SKILL_SETS)
     requests: int = option(1, "--live: plans that the model is asked for, a cell", ge=1)
     task: TextOrFile = option("", "--live: what the robot should do, text or @FILE")
-    robot: str = option("timed", "--live: timed, ros, call?function=MODULE:NAME; timed only waits")
-    engine: EngineConfig = group(
-        EngineConfig, only=("name", "model", "mmproj", "threads", "gpu_layers", "pace"), about="--live: "
+    robot: str = option(
+        "timed", "--live: timed, ros, call?function=MODULE:NAME; timed only waits", names=lambda: ROBOTS
     )
-    source: str = option("synthetic", "--live: the camera")
+    engine: EngineConfig = group(
+        EngineConfig, only=("name", "model", "mmproj", "threads", "gpu_layers", "pace"), about="--live: ", first=()
+    )
+    source: str = option("synthetic", "--live: the camera", names=lambda: SOURCES)
     size: Size = option((640, 480), "--live: WIDTHxHEIGHT of the frames [default: 640x480]")
     url: str = option("", "--live: an HTTP server that runs already (a black box)")
     dialect: str = option("", "--live: what --url speaks [default: ask]")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, one_of, option
@@ -27,6 +27,8 @@ SKILL_SET: Final = "driving"
 class CcrbOptions(Options):
     """One scenario; the defaults are the operating point at which the paper's outcome comes about."""
 
+    PANEL: ClassVar[str] = "Scenario"
+
     n_skills: int = option(5, "N, speed set-points down to rest", flag="skills", ge=1, le=100)
     t_nom_s: float | None = option(
         None, "seconds a set-point takes [default: the skill set's 0.8]", flag="t-nom", gt=0, le=60
@@ -39,9 +41,9 @@ class CcrbOptions(Options):
         gt=0,
         le=-EGO_LEAST_MPS2,
     )
-    front_gap_m: float = option(40.0, "m to the lead; Euro NCAP: 12 or 40", flag="front-gap", gt=0, le=1000)
+    front_gap_m: float = option(40.0, "m to the lead; Euro NCAP: 12 or 40", flag="front-gap", gt=0, le=1000, first=True)
     lead_decel_mps2: float = option(2.0, "m/s^2 of the lead; Euro NCAP: 2 or 6", flag="lead-decel", gt=0, le=10)
-    rear_gap_m: float = option(14.0, "m to the car behind", flag="rear-gap", gt=0, le=1000)
+    rear_gap_m: float = option(14.0, "m to the car behind", flag="rear-gap", gt=0, le=1000, first=True)
     reaction_s: float = option(1.3, "seconds until the car behind reacts", flag="reaction", ge=0, le=10)
     gap: Gap = option("stop", f"what the ego does while no skill is valid: {', '.join(GAPS)}", flag="gap-behaviour")
     follower: Annotated[str, one_of(lambda: FOLLOWERS)] = option(

@@ -28,6 +28,7 @@ BASE_NAME = r"^[A-Za-z_][A-Za-z0-9_]*$"
 class RosOptions(Options):
     """Where topics and actions are, and what carries them."""
 
+    PANEL: ClassVar[str] = "ROS 2"
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {
         "namespace": "/llama",
         "router": ROUTER,
@@ -47,7 +48,7 @@ class RosOptions(Options):
         "an action that runs already, as /llama/generate_response of llama_ros (a black box)",
         side=EXTERNAL,
     )
-    namespace: str = option("", "namespace of the topics [default: a new one for each run]", side=SERVER)
+    namespace: str = option("", "namespace of the topics [default: a new one for each run]", side=SERVER, first=True)
     domain_id: int | None = option(None, "DDS domain [default: ROS_DOMAIN_ID, else 0]", ge=0, le=232, side=SERVER)
     middleware: Annotated[str, one_of(lambda: ("", *MIDDLEWARES))] = option(
         "", "cyclonedds, zenoh, rclpy [default: rclpy in a sourced ROS 2 environment]", side=SERVER

@@ -15,7 +15,7 @@ from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import option
 from s2a_bench.transport import Client, Handler, Server, Urls, Wiring
 from s2a_bench.transport.access import WebOptions
-from s2a_bench.transport.observation import DEFAULT, PolicyOptions, PolicyTransport, TemplateName
+from s2a_bench.transport.observation import DEFAULT, PolicyOptions, PolicyTransport, TemplateName, names
 
 VARIANTS = ("openpi", "openpi-stream")
 OPENPI, STREAM = VARIANTS
@@ -33,7 +33,9 @@ class WebsocketOptions(WebOptions, PolicyOptions):
 
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 8000}
 
-    template: TemplateName = option(DEFAULT, "what the policy is told: a template's name, or a TOML or JSON file")
+    template: TemplateName = option(
+        DEFAULT, "what the policy is told: a template's name, or a TOML or JSON file", names=names
+    )
 
     @property
     def template_name(self) -> str:

@@ -18,7 +18,7 @@ from s2a_bench import extras
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.options import option
 from s2a_bench.transport import SERVER, Client, Handler, Server, Urls, Wiring
-from s2a_bench.transport.observation import PolicyOptions, PolicyTransport, TemplateName
+from s2a_bench.transport.observation import PolicyOptions, PolicyTransport, TemplateName, names
 
 GR00T = "gr00t"
 PACKAGES = ("msgpack", "zmq")
@@ -37,7 +37,9 @@ class ZmqOptions(PolicyOptions):
         side=SERVER,
     )
     template: TemplateName | Literal[""] = option(
-        "", "what the policy is told: a template's name, or a TOML or JSON file [default: that of the layout]"
+        "",
+        "what the policy is told: a template's name, or a TOML or JSON file [default: that of the layout]",
+        names=names,
     )
 
     @field_validator("url")
