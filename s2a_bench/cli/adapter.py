@@ -63,7 +63,7 @@ class Flag:
     @property
     def parameter(self) -> inspect.Parameter:
         """Return it as a parameter of the function that typer reads; None says that it was not given."""
-        default, about = inspect.Parameter.empty if self.needed else None, self.whose + self.about
+        default, about = inspect.Parameter.empty if self.needed else None, with_flags(self.whose + self.about)
         declared: Any = (
             typer.Argument(
                 metavar=self.spelled + "..." * (get_origin(self.kind) is list), help=about, show_default=False
@@ -118,7 +118,8 @@ def command(function: Callable[..., None], *options: type[Options], about: str =
     own = _keywords(function)
     flags = distinct([flag for each in options for flag in flags_of(each)], taken=own)
     listed = [flag for flag in flags if not (flag.hidden or flag.argument)]
-    rest = [flag.key for flag in listed if not flag.first] if len(listed) > MANY else []
+    later = [flag.key for flag in listed if not flag.first]
+    rest = later if MANY < len(listed) > len(later) else []
     more = [_help_all(len(listed) + len(own))] if rest else []
 
     def run(**given: Any) -> None:
