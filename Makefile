@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-chunks bench-coverage bench-policy bench-ray test test-all check check-platforms fuzz hostile core mutate setup clean
+.PHONY: bench bench-chunks bench-coverage bench-policy bench-ray docs test test-all check check-platforms fuzz hostile core mutate setup clean
 
 # The main job: the transports alone (no model) with raw pixels and with JPEG, for which wheels suffice; then llama.cpp
 # is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
@@ -33,6 +33,13 @@ bench-policy: setup
 bench-ray: setup
 	$(BIN)/python -m pip install --quiet -e '.[ray]' -c constraints.txt
 	$(BIN)/python -m benchmarks.sweep_scaling
+
+# Every code block of README and docs that this machine can run; then, with the base install alone, those that need no more.
+docs: setup
+	S2A_DOCS=whole $(BIN)/python -m pytest tests/test_examples.py
+	$(MAKE) VENV=$(VENV)-base core
+	$(VENV)-base/bin/python -m pip install --quiet pytest -c constraints.txt
+	$(VENV)-base/bin/python -m pytest --noconftest tests/test_examples.py
 
 # In two processes, one a core. A file is one process's, and so are all hostile peers: tests/conftest.py.
 test: setup

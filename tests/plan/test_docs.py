@@ -9,7 +9,7 @@ PAGE = (Path(__file__).parents[2] / "docs/plans.md").read_text("utf-8")
 
 
 def example(language: str) -> str:
-    (found,) = re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+    (found,) = re.findall(rf"```{language}[^\n]*\n(.*?)```", PAGE, re.DOTALL)
     return str(found)
 
 
