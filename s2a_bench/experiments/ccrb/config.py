@@ -68,9 +68,7 @@ class CcrbConfig(Options):
     profile: str = option(
         "jetson-agx-orin", "the board: a name of 'profile list', or a path", first=True, names=profile_files
     )
-    rate: float | None = option(
-        None, "a board of which only the tokens/s are known", gt=0, allow_inf_nan=False, first=True
-    )
+    rate: float | None = option(None, "a board of which only the tokens/s are known", gt=0, allow_inf_nan=False)
     prompt_s: float | None = option(
         None,
         "seconds before decoding, c [default: the profile's; with --rate 0]",
