@@ -39,7 +39,7 @@ class _ChunksLatencyThroughput(TypedDict, total=False):
     max_frame_age: float
     middleware: str
     namespace: str
-    payload: str
+    payload: _Several[str]
     port: int
     prompt: str
     qos: Literal["reliable", "sensor_data"]

@@ -120,8 +120,9 @@ def marks_of(durations: Durations, start_ns: int, factor: float = 1.0) -> list[t
 
 
 def row_of(cell: str, durations: Durations, block: int, **facts: Any) -> SampleRow:
-    pipeline, _, variant = cell.partition("/")
-    payload = {"http": "jpeg", "ros": "raw"}.get(pipeline, "none")
+    path, _, named = cell.partition("?payload=")
+    pipeline, _, variant = path.partition("/")
+    payload = named or {"http": "raw", "ros": "raw"}.get(pipeline, "none")
     whole: dict[str, Any] = {
         "cell": cell,
         "pipeline": pipeline,

@@ -35,7 +35,8 @@ from s2a_bench.stats import Ratio, Summary, summary_of
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import Count, about, with_fields
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
-from s2a_bench.transport import declared
+from s2a_bench.transport import PAYLOADS, declared
+from s2a_bench.transport.pipeline import without
 from s2a_bench.writers.as_json import summaries
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import wrapped
@@ -90,6 +91,8 @@ class Cell:
     """Stage -> group of the run, in the order of the path."""
     emulated: bool
     """Whether the engine's times come from a profile, or from latencies that were given."""
+    mixed: bool = False
+    """Whether the run was asked to compare payloads, by naming one in a pipeline's name."""
 
     @property
     def n(self) -> int:
@@ -103,9 +106,20 @@ class Cell:
     def path(self) -> tuple[str, str]:
         return self.about["pipeline"], self.about["variant"]
 
+    @property
+    def payload(self) -> str:
+        """Return how its pictures travel; nothing where they do not."""
+        return self.about["payload"].removeprefix("none")
+
+    @property
+    def label(self) -> str:
+        """Return its name without the payload, which stands beside it."""
+        return without(self.name, "payload")
+
     def is_compared_with(self, base: Cell) -> bool:
-        """Whether the transport declares that its cells are divided by those of another."""
-        return base.pipeline in declared(self.pipeline).compared_with
+        """Whether its transport declares that its cells are divided by those of another, and both have one payload."""
+        alike = self.mixed or not (self.payload and base.payload) or self.payload == base.payload
+        return alike and base.pipeline in declared(self.pipeline).compared_with
 
     def values(self, metric: RequestMetric | str) -> Floats:
         """Return a metric's values, times in ms: one a request that has it, or one a token."""
@@ -324,15 +338,27 @@ def launches_of(run: Run) -> list[tuple[int, list[Cell]]]:
 
 def _cells(run: Run, samples: pd.DataFrame) -> list[Cell]:
     tokens, stages = run.tokens, run.stages
-    cells = [
-        _cell(str(name), samples[samples["cell"] == name], tokens[tokens["cell"] == name], stages, run.origins.of(name))
-        for name in samples["cell"].unique()
-    ]
+    mixed = any("payload=" in name for name in run.manifest["configuration"].get("transports", ()))
+    cells = []
+    for name in map(str, samples["cell"].unique()):
+        mine, told = (rows[rows["cell"] == name] for rows in (samples, tokens))
+        cells.append(_cell(name, mine, told, stages, run.origins.of(name), mixed))
     return sorted(cells, key=_place)
 
 
+def payloads_of(cells: Iterable[Cell]) -> list[str]:
+    """Return how pictures travel, each way once."""
+    return [each for each in dict.fromkeys(cell.payload for cell in cells) if each]
+
+
+def titles(cells: Sequence[Cell]) -> list[str]:
+    """Return what cells are called where no column says their payloads: those are named where there are several."""
+    several = len(payloads_of(cells)) > 1
+    return [f"{cell.label} {cell.payload}".rstrip() if several else cell.name for cell in cells]
+
+
 def ratios(cells: list[Cell], seed: int) -> Iterator[tuple[str, Cell, Cell, Ratio]]:
-    """Yield metric, cell, base and ratio: every cell over those of the transports that its own is compared with.
+    """Yield metric, cell, base and ratio: every cell over those that it is compared with.
 
     A pair is left out where a cell lacks the metric, as e2e without inference behind a black box.
     """
@@ -432,7 +458,12 @@ def stages_present(cells: list[Cell]) -> list[str]:
 
 
 def _cell(
-    name: str, samples: pd.DataFrame, tokens: pd.DataFrame, stages: Mapping[str, str], origin: Provenance
+    name: str,
+    samples: pd.DataFrame,
+    tokens: pd.DataFrame,
+    stages: Mapping[str, str],
+    origin: Provenance,
+    mixed: bool,
 ) -> Cell:
     """Sort the samples of one cell into those that count and those that are only counted."""
     about = {
@@ -442,14 +473,15 @@ def _cell(
     failed = samples["error"] != ""
     good = samples[~samples["warmup"] & ~failed]
     errors = int((failed & ~samples["warmup"]).sum())
-    return Cell(name, about, good, tokens, int(samples["warmup"].sum()), errors, stages, origin.emulated)
+    return Cell(name, about, good, tokens, int(samples["warmup"].sum()), errors, stages, origin.emulated, mixed)
 
 
-def _place(cell: Cell) -> tuple[float, str, int, str]:
-    """Sort by the transport's order, its variants in theirs, then by name."""
+def _place(cell: Cell) -> tuple[int, float, str, int, str]:
+    """Sort by the payload, the transport's order, its variants in theirs, then by name."""
+    travels = PAYLOADS.index(cell.payload) if cell.payload in PAYLOADS else len(PAYLOADS)
     transport, variant = declared(cell.pipeline), cell.about["variant"]
     known = transport.variants.index(variant) if variant in transport.variants else len(transport.variants)
-    return transport.order, cell.pipeline, known, cell.name
+    return travels, transport.order, cell.pipeline, known, cell.name
 
 
 def _numbers(column: pd.Series[Any]) -> Floats:

@@ -23,7 +23,7 @@ from s2a_bench.transport import (
     TRANSPORT,
     TRANSPORTS,
     Choice,
-    Payload,
+    Payloads,
     named_by,
     paths,
 )
@@ -107,8 +107,10 @@ class RequestsConfig(Options):
     state: int = option(
         0, "numbers (float32) of the robot's state that go with a request", ge=0, le=4096, panel="Pictures"
     )
-    payload: Payload = option(
-        "", f"how a picture travels: {', '.join(PAYLOADS)} [default: http jpeg, ros raw]", panel="Pictures"
+    payload: Payloads = option(
+        (),
+        f"how a picture travels: {', '.join(PAYLOADS)}; several with commas, each in cells of its own [default: raw]",
+        panel="Pictures",
     )
     options: TransportOptions = group(TransportOptions, first=())
     """The options of every transport, for names that do not say them themselves."""
@@ -170,8 +172,15 @@ class RequestsConfig(Options):
     def pipelines(self) -> list[Pipeline]:
         """Return what is compared, a cell each; raises UsageError."""
         told = {name: given.given_values() for name, given in self.options}
-        told[""] = {"payload": self.payload}
-        return pipelines(self.names, told, self.engine.name, self.OF_ENGINE, every=self.EVERY_VARIANT)
+        strict, every = bool(self.payload), self.EVERY_VARIANT
+        payloads = self.payload or self.usual_payloads
+        engine = self.engine.name, self.OF_ENGINE
+        return pipelines(self.names, told, *engine, every=every, payloads=payloads, strict=strict, mode=self.mode)
+
+    @property
+    def usual_payloads(self) -> tuple[str, ...]:
+        """Return how pictures travel unless told, over the pipelines that can carry it."""
+        return ("raw",)
 
     @cached_property
     def answer(self) -> str:

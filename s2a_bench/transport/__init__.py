@@ -74,6 +74,7 @@ PROGRAM: Final = "program"
 
 Payload = Annotated[str, base.one_of(lambda: ("", *PAYLOADS))]
 """One of `PAYLOADS`, or nothing."""
+Payloads = Annotated[tuple[Payload, ...], base.SEVERAL]
 
 
 @dataclass(frozen=True, slots=True)

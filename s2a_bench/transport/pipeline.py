@@ -108,20 +108,45 @@ def pipelines(
     of_engine: Collection[str] = (),
     *,
     every: bool = True,
+    payloads: Sequence[str] = (),
+    strict: bool = True,
+    mode: str = "",
 ) -> list[Pipeline]:
     """Return the pipelines that names stand for, each once; raises UsageError.
 
-    ``options`` (transport -> option -> value) hold what flags give, for names that do not say it themselves. A
-    ``payload`` under the transport "" is for all that can carry it. A name without a variant stands for ``every`` one
-    that is measured by default, or for the first of them; ``engine`` is what answers, as that may decide which they
-    are. ``of_engine`` are options of it that names may hold as well.
+    ``options`` (transport -> option -> value) hold what flags give, for names that do not say it themselves. A name
+    that says no payload stands for a pipeline with each of the ``payloads`` that it can carry in the ``mode``; one that
+    can carry none of them gets the first if ``strict``, which `require_payload` refuses, else its own. A name without a
+    variant stands for ``every`` one that is measured by default, or for the first of them; ``engine`` is what answers,
+    as that may decide which they are. ``of_engine`` are options of it that names may hold as well.
     """
     given = {name: dict(values) for name, values in (options or {}).items()}
     found: dict[str, Pipeline] = {}
     for text in names:
-        for pipeline in _standing_for(_parse(text), given, engine, of_engine, every=every):
+        wanted = _Payloads(tuple(payloads), strict=strict, mode=mode)
+        for pipeline in _standing_for(_parse(text), given, wanted, engine, of_engine, every=every):
             found.setdefault(pipeline.name, pipeline)
     return list(found.values())
+
+
+@dataclass(frozen=True, slots=True)
+class _Payloads:
+    """How pictures are to travel: see `pipelines`."""
+
+    names: tuple[str, ...] = ()
+    strict: bool = False
+    mode: str = ""
+
+    @property
+    def only(self) -> str:
+        """Return what all pipelines have to carry, or nothing."""
+        return self.names[0] if self.strict and len(self.names) == 1 else ""
+
+    def over(self, can: Sequence[str]) -> Sequence[str]:
+        """Return those for a pipeline that ``can`` carry some; nothing where no picture travels."""
+        if not can:
+            return ("",)
+        return [each for each in self.names if each in can] or (self.names if self.strict else can)[:1]
 
 
 def answer_over(asked: str, compared: Sequence[Pipeline]) -> str:
@@ -145,32 +170,37 @@ def carries_alone(kind: str, compared: Sequence[Pipeline]) -> str:
 def one_pipeline(text: str, **options: Any) -> Pipeline:
     """Return the one pipeline of a name, its first variant where it names none; ``options`` are as if by flags."""
     named = _parse(text)
-    return next(_standing_for(named, {named.transport: options}, every=False))
+    return next(_standing_for(named, {named.transport: options}, _Payloads(), every=False))
 
 
 def _standing_for(
     named: _Named,
     given: Mapping[str, Mapping[str, Any]],
+    wanted: _Payloads,
     engine: str = "",
     of_engine: Collection[str] = (),
     *,
     every: bool,
 ) -> Iterator[Pipeline]:
     transport = TRANSPORTS[named.transport]
-    flags = {**given.get("", {}), **given.get(transport.name, {})}
+    flags = given.get(transport.name, {})
     told = {name: value for name, value in named.options.items() if name not in of_engine}
     own = tuple(sorted(named.options.items() - told.items()))
     plain = _checked(transport.options, flags, transport.name)
     asked = _checked(transport.options, {**flags, **told}, transport.name)
-    measured = transport.measured(Choice(asked, engine=engine))
+    alike = asked if asked.payload else asked.model_copy(update={"payload": wanted.only})
+    measured = transport.measured(Choice(alike, engine=engine))
     for variant in [named.variant] if named.variant else measured if every else measured[:1]:
         if variant not in (transport.variants or ("",)):
             known = ", ".join(transport.variants) or "none: it has no variants"
             meant = like(variant, transport.variants)
             raise UsageError(f"`transport`: '{variant}' is none of {transport.name}'s {known}{meant}")
-        can = transport.capabilities(Choice(asked, variant))
-        default, filled, holding = (_filled(options, can.payloads) for options in (plain, asked, can.options))
-        yield Pipeline(_canonical(transport, variant, filled, default, own), transport, variant, holding, own)
+        can = transport.capabilities(Choice(asked, variant, mode=wanted.mode))
+        payloads = wanted.over(can.payloads)
+        default = _filled(plain, payloads[0])
+        for payload in payloads[: 1 if asked.payload else None]:
+            name = _canonical(transport, variant, _filled(asked, payload), default, own)
+            yield Pipeline(name, transport, variant, _filled(can.options, payload), own)
 
 
 def _checked(model: type[O], values: Mapping[str, Any], owner: str) -> O:
@@ -184,8 +214,8 @@ def _checked(model: type[O], values: Mapping[str, Any], owner: str) -> O:
     return model(**values)
 
 
-def _filled(options: Options, can: Sequence[str]) -> Options:
-    return options if options.payload or not can else options.model_copy(update={"payload": can[0]})
+def _filled(options: O, payload: str) -> O:
+    return options if options.payload else options.model_copy(update={"payload": payload})
 
 
 def require_payload(pipeline: Pipeline) -> None:
@@ -197,6 +227,13 @@ def require_payload(pipeline: Pipeline) -> None:
             f"`payload`: over {path} a picture travels as {', '.join(can)}, not {pipeline.payload}; say it for this "
             f"transport alone: {path}?payload={can[0]}"
         )
+
+
+def without(name: str, option: str) -> str:
+    """Return a cell's name without one of its options."""
+    path, _, query = name.partition("?")
+    kept = "&".join(each for each in query.split("&") if each.partition("=")[0] != option)
+    return f"{path}?{kept}" if kept else path
 
 
 def _canonical(

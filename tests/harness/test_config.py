@@ -159,12 +159,30 @@ def test_cells_follow_the_flags() -> None:
     assert http.options.connection == "per-request"  # type: ignore[attr-defined]
 
 
-def test_a_payload_that_is_not_given_is_each_transports_own() -> None:
-    assert [cell.payload for cell in RequestsConfig(transports=("http/binary", "ros", "loopback")).pipelines] == [
-        "jpeg",
-        "raw",
-        "",
-    ]
+HTTP_AND_ROS = ["http/binary", "http/binary?payload=jpeg", "ros/topic", "ros/topic?payload=jpeg"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "cells"),
+    [
+        ({}, [*HTTP_AND_ROS, "loopback"]),
+        ({"quick": True}, ["http/binary", "ros/topic", "loopback"]),
+        ({"mode": "stream"}, ["http/binary", "ros/topic", "loopback"]),
+        ({"payload": "raw,jpeg"}, [*HTTP_AND_ROS, "loopback"]),
+        ({"payload": "jpeg"}, ["http/binary", "ros/topic", "loopback"]),
+        ({"transports": "http/binary?payload=png,ros"}, ["http/binary?payload=png", "ros/topic"]),
+        ({"transports": "ros/topic,ros/action"}, [*HTTP_AND_ROS[2:], "ros/action"]),
+        ({"transports": "http/as-deployed,ros", "url": "http://x"}, ["http/as-deployed", *HTTP_AND_ROS[2:]]),
+    ],
+)
+def test_a_latency_run_sends_the_same_payloads_over_every_transport(asked: dict[str, Any], cells: list[str]) -> None:
+    config = LatencyConfig(**{"transports": ("http/binary", "ros", "loopback"), "engine": {"name": "echo"}, **asked})
+    assert names(config) == cells
+
+
+def test_what_cannot_carry_the_usual_payload_keeps_its_own() -> None:
+    cells = RequestsConfig(transports=("http/as-deployed", "ros", "loopback"), url="http://x").pipelines
+    assert [cell.payload for cell in cells] == ["jpeg", "raw", ""]
 
 
 def test_a_foreign_action_is_the_only_ros_cell() -> None:

@@ -65,9 +65,15 @@ class Ros(Transport[RosOptions]):
         return (ACTION,) if choice.options.action else super().measured(choice)
 
     def capabilities(self, choice: Choice[RosOptions]) -> Capabilities[RosOptions]:
-        """Return it without actions and state for the action: llama_msgs has no fields for a robot's."""
+        """Return it for the action without actions and state, which llama_msgs has no fields for.
+
+        A goal carries sensor_msgs/Image.
+        """
         can = super().capabilities(choice)
-        return replace(can, answer_kinds=(TOKENS,), accepts_state=False) if choice.variant == ACTION else can
+        if choice.variant != ACTION:
+            return can
+        payloads = self.payloads[:2] if choice.mode == "request" else self.payloads
+        return replace(can, payloads=payloads, answer_kinds=(TOKENS,), accepts_state=False)
 
     def require(self, choice: Choice[RosOptions]) -> None:
         """Refuse what a goal cannot carry, and a stream that nobody keeps."""

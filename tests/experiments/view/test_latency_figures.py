@@ -51,7 +51,7 @@ def texts(figure: Figure) -> list[str]:
 
 def test_bars_are_means_with_their_sd_beside(make_run: MakeRun) -> None:
     figure = build_latency_bars(make_run(HAND, n=4, spread=0))
-    assert row_names(figure) == ["http/as-deployed\n(jpeg)", "ros/topic\n(raw)"]
+    assert row_names(figure) == ["http/as-deployed\n(raw)", "ros/topic\n(raw)"]
     assert [bar.get_width() for bar in bars(figure)] == [8.0, 4.0]
     assert texts(figure) == ["8.00 ± 0.00", "4.00 ± 0.00"]
     assert figure.axes[0].get_xlim()[0] == 0

@@ -110,7 +110,7 @@ def test_the_stage_table_by_hand(make_run: MakeRun) -> None:
     ]
     assert table.notes == (
         "n = 4 samples a cell, warm-ups left out.",
-        "640x480; payload: http jpeg, ros raw.",
+        "640x480; payload: raw.",
         "Echo engine.",
         "4 of 8 samples have a residual above 5% of e2e without inference.",
     )
@@ -139,6 +139,44 @@ def test_the_summary_table_by_hand(make_run: MakeRun, make_row: Callable[..., Sa
     failed, launch = table.notes[-2:]
     assert failed == "1 samples failed and are in no number here; samples.csv says why."
     assert launch.startswith("The intervals hold for this launch only")
+
+
+BLOCKS = {
+    **{name: HAND[name] for name in ("http/as-deployed", "ros/topic")},
+    "http/as-deployed?payload=jpeg": {"capture": 1, "network": 8, "inference": 100, "return": 1},
+    "ros/topic?payload=jpeg": {"capture": 1, "network": 3, "inference": 100, "return": 1},
+}
+
+
+def test_payloads_are_blocks_and_ratios_stay_inside_them(make_run: MakeRun) -> None:
+    run = make_run(BLOCKS, n=4, spread=0)
+    table = summary_table(run, brief=True)
+    assert table.header == ("payload", "cell", "median", "p99", "ratio to ros/topic")
+    assert [(*row[:3], row[4].split()[0]) for row in table.rows] == [
+        ("raw", "http/as-deployed", "26.0", "5.76"),
+        ("", "ros/topic", "4.51", "1"),
+        ("jpeg", "http/as-deployed", "10.0", "2.00"),
+        ("", "ros/topic", "5.00", "1"),
+    ]
+    assert table.rules == {2}
+    assert stage_table(run).header[2:] == (
+        *("http/as-deployed raw", "ros/topic raw"),
+        *("http/as-deployed jpeg", "ros/topic jpeg"),
+    )
+    first, *medians, one, other = show(run).sentences
+    assert "over http/as-deployed, ros/topic; raw and jpeg frames of 640x480" in first
+    assert medians[1].startswith("End to end without inference with jpeg pictures, medians: http/as-deployed 10.0 ms")
+    assert one.startswith("http/as-deployed takes 5.76 times as long as ros/topic with raw pictures")
+    assert other.startswith("http/as-deployed takes 2.00 times as long as ros/topic with jpeg pictures")
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_unlike_payloads_are_compared_where_that_was_asked_for(make_run: MakeRun, asked: bool) -> None:
+    names = ("http?payload=jpeg", "ros") if asked else ("http", "ros")
+    run = make_run(HAND, n=4, spread=0, payloads={"http": "jpeg"}, manifest={"configuration": {"transports": names}})
+    said = "http/as-deployed with jpeg pictures takes 5.76 times as long as ros/topic with raw pictures"
+    assert any(sentence.startswith(said) for sentence in show(run).sentences) is asked
+    assert any("ratio" in name for name in summary_table(run).header) is asked
 
 
 def test_a_black_box_is_absent_where_its_inference_is_unknown(make_run: MakeRun, black_box: Any) -> None:

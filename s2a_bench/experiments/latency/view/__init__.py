@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -20,12 +20,14 @@ from s2a_bench.experiments.requests import (
     groups_present,
     launches_note,
     numbers_ms,
+    payloads_of,
     pieces_of,
     ratio_between,
     ratios,
     span_of,
     spelled,
     stages_present,
+    titles,
 )
 from s2a_bench.stats import summary_of
 from s2a_bench.trace import RESIDUAL_LIMIT
@@ -61,35 +63,46 @@ def latency_sentences(run: Run) -> list[str]:
     if not (cells := cells_of(run)):
         return []
     about = cells[0].about
-    names = ", ".join(cell.name for cell in cells)
+    names = ", ".join(dict.fromkeys(cell.label for cell in cells))
     requests = span_of((cell.n for cell in cells), "request")
-    said = [f"{requests} a cell over {names}; frames of {asked(run, cells)}, {about['mode']} mode."]
+    pictures = " ".join((" and ".join(payloads_of(cells)), "frames")).lstrip()
+    said = [f"{requests} a cell over {names}; {pictures} of {asked(run, cells)}, {about['mode']} mode."]
     comparable = any(cell.values_ms("e2e_without_inference").size for cell in cells)
     metric = "e2e_without_inference" if comparable else "e2e"
-    medians = [
-        f"{cell.name} {number(middle.median)} ms" for cell in cells if (middle := summary_of(cell.values_ms(metric)))
-    ]
-    if medians:
-        said.append(f"{spelled(metric)}, medians: {', '.join(medians)}.")
-    found, beside = [], []
+    for payload in dict.fromkeys(cell.payload for cell in cells):
+        medians = [
+            f"{cell.label} {number(middle.median)} ms"
+            for cell in cells
+            if cell.payload == payload and (middle := summary_of(cell.values_ms(metric)))
+        ]
+        if medians:
+            said.append(f"{spelled(metric)}{_of(payload)}, medians: {', '.join(medians)}.")
+    found: list[str] = []
+    beside: list[str] = []
     for of, cell, base, ratio in ratios(cells, run.bootstrap_seed):
         if declared(base.pipeline).in_process:
             continue
         if of == metric:
-            found.append(_times(cell.name, base.name, ratio))
+            found.append(_times(cell, base, ratio))
         if of == "e2e_without_model" and cell.has_ingest:
-            beside.append(f"Without model, {_times(cell.name, base.name, ratio)}")
+            beside.append(f"Without model, {_times(cell, base, ratio)}")
     return said + found[:_MOST] + beside[:_MOST]
 
 
-def _times(cell: str, base: str, ratio: Ratio) -> str:
+def _of(payload: str) -> str:
+    """Return whose pictures are meant, behind a name."""
+    return f" with {payload} pictures" if payload else ""
+
+
+def _times(cell: Cell, base: Cell, ratio: Ratio) -> str:
     between = ""
     if ratio.low is not None and ratio.high is not None:
         over = f"over {ratio.launches} launches" if ratio.launches > 1 else "of one launch"
         bounds = interval(ratio).partition(" ")[2][1:-1].replace(",", " to")
         between = f" (ratio of medians {over}, 95 % interval {bounds})"
     value = "an unknown number of" if ratio.value is None else number(ratio.value)
-    return f"{cell} takes {value} times as long as {base}{between}."
+    of = "" if cell.payload == base.payload else _of(cell.payload)
+    return f"{cell.label}{of} takes {value} times as long as {base.label}{_of(base.payload or cell.payload)}{between}."
 
 
 _FOOT = ("residual", "e2e_without_inference", "preprocess", "e2e_without_model", "inference", "e2e")
@@ -125,7 +138,7 @@ def stage_table(run: Run, *, full: bool = True) -> TextTable:
     for metric in _foot(cells):
         add("", metric.replace("_", " "), [cell.values_ms(metric) for cell in cells])
     title = "Stages in ms: median (mean ± sd)" if full else "Stages in ms: medians"
-    header = ("group", "stage", *(cell.name for cell in cells))
+    header = ("group", "stage", *titles(cells))
     brief = None
     if full:
         brief = group_table(run) if len(cells) > _STAGE_CELLS else stage_table(run, full=False)
@@ -141,28 +154,43 @@ def group_table(run: Run) -> TextTable:
     for cell in cells:
         values = [cell.group_ms(group) for group in groups]
         values += [cell.values_ms(metric) for metric in foot]
-        rows.append((cell.name, *(_entry(found) for found in values)))
-    header = ("cell", *groups, *(_HEADINGS[metric] for metric in foot))
-    return TextTable("Groups of stages in ms: medians", header, rows, 1, notes=_notes(run, cells))
+        rows.append(tuple(_entry(found) for found in values))
+    header = (*groups, *(_HEADINGS[metric] for metric in foot))
+    return _by_cell("Groups of stages in ms: medians", header, cells, rows, _notes(run, cells))
+
+
+def _by_cell(
+    title: str, header: Sequence[str], cells: Sequence[Cell], rows: Sequence[tuple[str, ...]], notes: Iterable[str]
+) -> TextTable:
+    """Lay out a row a cell, and where there are several payloads a block each."""
+    if len(payloads_of(cells)) < 2:  # noqa: PLR2004 - one payload, which the notes say
+        named = [(cell.name, *row) for cell, row in zip(cells, rows, strict=True)]
+        return TextTable(title, ("cell", *header), named, 1, notes=tuple(notes))
+    blocks: dict[str, list[tuple[str, ...]]] = {}
+    for cell, row in zip(cells, rows, strict=True):
+        blocks.setdefault(cell.payload, []).append((cell.payload or ABSENT, cell.label, *row))
+    return TextTable.grouped(title, ("payload", "cell", *header), blocks.values(), 2, notes, once=1)
 
 
 def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
     """Lay out what a publication quotes: n, spread, percentiles, and the ratios to what is compared with."""
     cells = cells_of(run)
-    bases = [
-        base for base in cells if base.values_ms(metric).size and any(cell.is_compared_with(base) for cell in cells)
-    ]
+    bases: dict[str, list[Cell]] = {}
+    for base in cells:
+        if base.values_ms(metric).size and any(cell.is_compared_with(base) for cell in cells):
+            bases.setdefault(base.name if base.mixed else base.label, []).append(base)
     figures = (MEAN_SD, "median", "p90", "p99")
     rows = []
     found: list[Ratio] = []
     for cell in cells:
-        over = {base.name: _ratio(cell, base, metric, run.bootstrap_seed) for base in bases}
-        found += [ratio for ratio in over.values() if ratio]
-        ratios = ("1" if cell.name == base else interval(ratio) for base, ratio in over.items())
-        rows.append((cell.name, str(cell.n), str(cell.errors), *entries(cell.values_ms(metric), *figures), *ratios))
-    header = ("cell", "n", "errors", *figures, *(f"ratio to {base.name}" for base in bases))
+        alike = [next((base for base in each if cell.is_compared_with(base)), None) for each in bases.values()]
+        over = [ratio_between(cell, base, metric, run.bootstrap_seed) if base else None for base in alike]
+        found += filter(None, over)
+        ratios = ("1" if cell in each else interval(ratio) for each, ratio in zip(bases.values(), over, strict=True))
+        rows.append((str(cell.n), str(cell.errors), *entries(cell.values_ms(metric), *figures), *ratios))
+    header = ("n", "errors", *figures, *(f"ratio to {base}" for base in bases))
     title = f"{spelled(metric)} in ms; ratios of medians [95 % interval]"
-    return TextTable(title, header, rows, 1, notes=(*_notes(run, cells), *launches_note(found)))
+    return _by_cell(title, header, cells, rows, (*_notes(run, cells), *launches_note(found)))
 
 
 def token_table(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> TextTable | None:
@@ -171,13 +199,10 @@ def token_table(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> TextTab
     if not cells:
         return None
     columns = [metric for metric in metrics if metric.shown]
-    rows: list[tuple[str, ...]] = [
-        (cell.name, *(text for metric in columns for text in entries(cell.values(metric), *metric.shown)))
-        for cell in cells
-    ]
-    header = ("cell", *(f"{metric.title} {statistic}" for metric in columns for statistic in metric.shown))
+    rows = [tuple(text for metric in columns for text in entries(cell.values(metric), *metric.shown)) for cell in cells]
+    header = [f"{metric.title} {statistic}" for metric in columns for statistic in metric.shown]
     title = f"{pieces_of(run).capitalize()} in ms: from one to the next (gap), and engine to client (delay)"
-    return TextTable(title, header, rows, 1, notes=engine_notes(run, cells))
+    return _by_cell(title, header, cells, rows, engine_notes(run, cells))
 
 
 def fact_table(run: Run) -> TextTable | None:
@@ -190,7 +215,7 @@ def fact_table(run: Run) -> TextTable | None:
         if any(values):
             entries = (number(median(found)) if found else ABSENT for found in values)
             rows.append((fact, meant["unit"], *entries))
-    header = ("fact", "unit", *(cell.name for cell in cells))
+    header = ("fact", "unit", *titles(cells))
     return TextTable("Facts: medians", header, rows, 2, notes=_notes(run, cells)) if rows else None
 
 
@@ -205,18 +230,11 @@ def _entry(values: Floats, *, full: bool = False) -> str:
     return f"{middle} ({entries(values, MEAN_SD)[0]})" if full and values.size else middle
 
 
-def _ratio(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | None:
-    return ratio_between(cell, base, metric, seed) if cell.is_compared_with(base) else None
-
-
 def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
     counts = span_of(cell.n for cell in cells)
     notes = [f"n = {counts} samples a cell, warm-ups left out." if counts else "No samples."]
     if cells:
-        payloads = dict.fromkeys(
-            f"{cell.pipeline} {cell.about['payload']}" for cell in cells if cell.about["payload"] not in {"none", ""}
-        )
-        notes.append(f"{asked(run, cells)}; payload: {', '.join(payloads) or 'none'}.")
+        notes.append(f"{asked(run, cells)}; payload: {', '.join(payloads_of(cells)) or 'none'}.")
     if shape := chunks(run):
         notes.append(f"Each answer is a chunk of {shape} numbers, not tokens.")
     notes += engine_notes(run, cells)
@@ -253,7 +271,7 @@ def frame_table(run: Run) -> TextTable | None:
     rows.append(("", "age when inference starts", *(_entry(cell.values_ms("frame_age")) for cell in cells)))
     return TextTable(
         "Frame path in ms: medians over the frames that a prompt was about",
-        ("group", "stage", *(cell.name for cell in cells)),
+        ("group", "stage", *titles(cells)),
         rows,
         2,
         frozenset({rule + 1}),

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from s2a_bench.experiments.requests import Cell, stand_ins
+from s2a_bench.experiments.requests import Cell, payloads_of, stand_ins
 from s2a_bench.stats.line import Estimate, Line, crossing, fit_line
 from s2a_bench.transport import declared
 from s2a_bench.writers.figures import new_figure
@@ -59,11 +59,11 @@ def against_bytes(runs: Split) -> list[Pipeline]:
     for run, cells in runs:
         if run.manifest["command"] != "latency" or run.samples.empty or not (pixels := _pixels(run)):
             continue
-        payloads = {cell.about["payload"] for cell in cells} - {"", "none"}
+        payloads = payloads_of(cells)
         for cell in cells:
-            payload = cell.about["payload"] if cell.about["payload"] in payloads else "/".join(sorted(payloads))
+            payload = cell.payload or "/".join(sorted(payloads))
             if cell.values_ms(METRIC).size:
-                found.setdefault((cell.name, payload), []).append((pixels, cell))
+                found.setdefault((cell.label, payload), []).append((pixels, cell))
     lines = [_pipeline(name, payload, sized) for (name, payload), sized in found.items()]
     order = sorted(
         lines, key=lambda each: (each.payload != "raw", each.payload, declared(each.path[0]).order, each.name)

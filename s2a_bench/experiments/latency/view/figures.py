@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.paper import CAVEAT, LABEL, paper_latency
-from s2a_bench.experiments.requests import Cell, asked, cells_of, chunks, groups_present, spelled, title_of
+from s2a_bench.experiments.requests import Cell, asked, cells_of, chunks, groups_present, spelled, title_of, titles
 from s2a_bench.stats import summarise
 from s2a_bench.writers.figures import (
     LINE_CHARS,
@@ -88,7 +88,8 @@ def build_latency_distribution(run: Run) -> Figure:
     """Draw the empirical distribution of e2e without inference, a line a cell; logarithmic where it spreads widely."""
     cells, metric = _shown(run)
     looks = cell_looks({cell.name: cell.path for cell in cells})
-    lines = {cell.name: (cell.values_ms(metric), looks[cell.name]) for cell in cells}
+    named = zip(titles(cells), cells, strict=True)
+    lines = {title: (cell.values_ms(metric), looks[cell.name]) for title, cell in named}
     return build_distribution(_title(run, cells, "Distribution", metric), lines, "samples", _axis_label(metric))
 
 
@@ -126,9 +127,8 @@ def _axis_label(metric: str) -> str:
 
 def _label(cell: Cell) -> str:
     """Name a row by its cell, and by what travels where that is not said yet."""
-    payload = cell.about["payload"]
-    name = cell.name.replace("?", "\n?")
-    return name if payload in {"none", ""} or payload in name else f"{name}\n({payload})"
+    name = cell.label.replace("?", "\n?")
+    return f"{name}\n({cell.payload})" if cell.payload else name
 
 
 def _part(cell: Cell, name: str) -> Floats:
