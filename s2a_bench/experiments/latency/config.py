@@ -19,6 +19,7 @@ class LatencyConfig(RequestsConfig):
         (),
         f"how a picture travels: {', '.join(PAYLOADS)}; several with commas, each in cells of its own "
         "[default: raw,jpeg; quick, stream: raw]",
+        panel="Pictures",
     )
 
     engine: EngineConfig = group(
