@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -142,41 +143,54 @@ def row_of(cell: str, durations: Durations, block: int, **facts: Any) -> SampleR
     return SampleRow(**whole | facts)
 
 
+def made_run(
+    folder: Path,
+    cells: Mapping[str, Durations] = PLAUSIBLE,
+    *,
+    n: int = 50,
+    launches: int = 1,
+    spread: float = 0.15,
+    n_tokens: int = 3,
+    manifest: Mapping[str, Any] | None = None,
+    extra: tuple[SampleRow, ...] = (),
+    payloads: Mapping[str, str] | None = None,
+    **facts: Any,
+) -> Run:
+    """Make a run of lognormal durations (``spread`` > 0) or exact ones (``spread`` = 0), ``n`` over all launches."""
+    rng = np.random.default_rng(1)
+    with RunWriter.create(folder, "latency", known(manifest or {})) as run:
+        for block in range(-5, n):
+            load = rng.lognormal(0, spread)
+            for cell, durations in cells.items():
+                marks = marks_of(durations, 10**9, load * rng.lognormal(0, spread))
+                place = {"warmup": block < 0, "launch": max(block, 0) * launches // n}
+                row = row_of(cell, durations, block, marks=marks, n_tokens=n_tokens, **place, **facts)
+                row = replace(row, payload=(payloads or {}).get(row.pipeline, row.payload))
+                run.sample(row)
+                run.tokens(
+                    TokenRow(row.request_id, cell, i, i, "x", None, marks[-1][1] + i * 2_000_000)
+                    for i in range(n_tokens)
+                )
+        for row in extra:
+            run.sample(row)
+    return read_run(run.path)
+
+
+def spoken_run(folder: Path, rate: float, *, engine: str = "llama", **manifest: Any) -> Run:
+    """Make a throughput run whose engine generates at a rate."""
+    durations = {"convert": 10, "inference": 5, "return": 0}
+    with RunWriter.create(folder, "throughput", manifest) as run:
+        for block in range(10):
+            facts = {"predicted_n": 48.0, "predicted_ms": 48e3 / rate}
+            row = row_of("in-process", durations, block, engine=engine, facts=facts, n_tokens=2)
+            run.sample(replace(row, pipeline="loopback"))
+            run.tokens(TokenRow(row.request_id, row.cell, i, i, "x", None, 10**10 + i * 10**7) for i in range(2))
+    return read_run(run.path)
+
+
 @pytest.fixture
 def make_run(tmp_path: Path) -> MakeRun:
-    """Make a run of lognormal durations (``spread`` > 0) or exact ones (``spread`` = 0), ``n`` over all launches."""
-
-    def make(
-        cells: Mapping[str, Durations] = PLAUSIBLE,
-        *,
-        n: int = 50,
-        launches: int = 1,
-        spread: float = 0.15,
-        n_tokens: int = 3,
-        manifest: Mapping[str, Any] | None = None,
-        extra: tuple[SampleRow, ...] = (),
-        payloads: Mapping[str, str] | None = None,
-        **facts: Any,
-    ) -> Run:
-        rng = np.random.default_rng(1)
-        with RunWriter.create(tmp_path, "latency", known(manifest or {})) as run:
-            for block in range(-5, n):
-                load = rng.lognormal(0, spread)
-                for cell, durations in cells.items():
-                    marks = marks_of(durations, 10**9, load * rng.lognormal(0, spread))
-                    place = {"warmup": block < 0, "launch": max(block, 0) * launches // n}
-                    row = row_of(cell, durations, block, marks=marks, n_tokens=n_tokens, **place, **facts)
-                    row = replace(row, payload=(payloads or {}).get(row.pipeline, row.payload))
-                    run.sample(row)
-                    run.tokens(
-                        TokenRow(row.request_id, cell, i, i, "x", None, marks[-1][1] + i * 2_000_000)
-                        for i in range(n_tokens)
-                    )
-            for row in extra:
-                run.sample(row)
-        return read_run(run.path)
-
-    return make
+    return partial(made_run, tmp_path)
 
 
 @pytest.fixture

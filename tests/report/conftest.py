@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from s2a_bench.provenance import Origins, Provenance
-from s2a_bench.store.requests import SampleRow, TokenRow
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import Run
+from tests.made_runs import spoken_run
 
 MakeRun = Callable[..., Run]
-MakeRow = Callable[..., SampleRow]
-DURATIONS = {"convert": 10, "inference": 5, "return": 0}
 REAL = Provenance("llama", "MiniCPM-V 2.6", "ab", "Q4_K_M", "real", "measured")
 
 
@@ -45,16 +43,5 @@ def beside(make_run: MakeRun) -> MakeRun:
 
 
 @pytest.fixture
-def spoken(tmp_path: Path, make_row: MakeRow) -> MakeRun:
-    """Make a throughput run whose engine generates at a rate."""
-
-    def made(rate: float, *, engine: str = "llama", **manifest: Any) -> Run:
-        with RunWriter.create(tmp_path, "throughput", manifest) as run:
-            for block in range(10):
-                facts = {"predicted_n": 48.0, "predicted_ms": 48e3 / rate}
-                row = make_row("in-process", DURATIONS, block, engine=engine, facts=facts, n_tokens=2)
-                run.sample(replace(row, pipeline="loopback"))
-                run.tokens(TokenRow(row.request_id, row.cell, i, i, "x", None, 10**10 + i * 10**7) for i in range(2))
-        return read_run(run.path)
-
-    return made
+def spoken(tmp_path: Path) -> MakeRun:
+    return partial(spoken_run, tmp_path)
