@@ -38,6 +38,7 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    world.filters["parts"] = re.compile(r" (?=[(\[])").split  # a number, and its spread or interval
     world.filters["short"] = lambda value: f"{value:.6g}"
     world.globals.update(most_panels=MOST_PANELS)
     source = world.loader

@@ -3,7 +3,6 @@
 document.documentElement.classList.add("with-js");
 const tip = document.getElementById("tip");
 const LEAST = 1e-3; // the closest look: this share of the whole
-const finePointer = matchMedia("(hover: hover)");
 
 function show(text, x, y) {
   tip.textContent = text;
@@ -109,7 +108,7 @@ for (const panel of document.querySelectorAll(".panel")) {
     else hide();
   });
   for (const over of ["pointerup", "pointercancel"]) svg.addEventListener(over, () => { drag = null; });
-  svg.addEventListener("pointerleave", () => { if (finePointer.matches) hide(); });
+  svg.addEventListener("pointerleave", (event) => { if (event.pointerType !== "touch") hide(); });
 
   const buttons = document.createElement("div");
   buttons.className = "zoom";
