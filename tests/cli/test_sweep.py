@@ -206,7 +206,6 @@ def test_a_failed_cell_keeps_its_error_and_is_retried_when_told(tmp_path: Path) 
     assert "Cells that failed" in done.stdout
     folder = only(output)
     (failed,) = read_sweep(folder).cells.query("state == 'failed'").to_dict("records")
-    assert "0 of 120 answers" in failed["error"]
     assert failed["error"].startswith("--calibrate: 0 of 120 answers have the 15 tokens")
     assert failed["folder"] == ""
     sweep("--resume", folder, code=1)
