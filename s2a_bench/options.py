@@ -6,6 +6,7 @@ A configuration that exists is valid: what makes no sense raises UsageError, whi
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -206,6 +207,12 @@ def _line(error: ErrorDetails, options: type[Options]) -> str:
         return f"`{field}`: {error['ctx']['error']}"
     said = re.sub("^(Input|Value|String) ", "", error["msg"])
     return f"`{field}`: {error['input']!r} {said}"
+
+
+def need_program(field: str, path: Path) -> None:
+    """Raise UsageError where the path of a field is no program that can be run."""
+    if not (path.is_file() and os.access(path, os.X_OK)):
+        raise UsageError(f"`{field}`: {path} is no program that can be run")
 
 
 def listed(value: Any) -> tuple[Any, ...]:

@@ -157,10 +157,14 @@ class RequestsConfig(Options):
     quick: bool = option(False, "fewer samples: a first look", first=True)
 
     def __init__(self, **given: Any) -> None:
-        """Keep what is given, few samples where a quick look is asked for; raises UsageError naming the field."""
+        """Keep what is given, few samples where a quick look is asked for, and of a URL alone the transport it names.
+
+        Raises UsageError naming the field.
+        """
         given = {**self.QUICK, **given} if given.get("quick") else given
         if given.get("url"):
             given["options"] = _with_url(given["url"], given.get("options") or {})
+            given.setdefault("transports", (named_by(given["url"]),))
         super().__init__(**given)
 
     @property

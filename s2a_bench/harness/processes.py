@@ -225,12 +225,10 @@ class LlamaServer(ServerProcess):
     _cure = COMPILE_AGAIN
 
     def __init__(self, program: Program, engine: EngineConfig, log: Path, *, has_grammar: bool) -> None:
-        """Start the program on its port, or any free one for 0; raises UsageError when it cannot be run.
+        """Start the program on its port, or any free one for 0.
 
         Without a grammar dummy weights, which end at random, are kept going to the token limit, as by our own engine.
         """
-        if not (program.path.is_file() and os.access(program.path, os.X_OK)):
-            raise UsageError(f"`llama_server`: {program.path} is no program that can be run")
         port = _free_port(program.port)
         command = [str(program.path.absolute()), *llama_flags(engine), "--mmproj", str(engine.mmproj)]
         command += ["--host", "127.0.0.1", "--port", str(port), "--ctx-size", str(engine.context), "--parallel", "1"]

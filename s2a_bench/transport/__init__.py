@@ -390,9 +390,17 @@ def paths() -> Iterator[str]:
 
 
 def named_by(url: str) -> str:
-    """Return the transport that a URL's scheme names; ``http`` where none does, whose options say what is wrong."""
-    scheme = url.partition("://")[0].lower()
-    return next((name for name, each in TRANSPORTS.loaded() if scheme in each.urls.schemes), "http")
+    """Return the transport that a URL's scheme names; raises UsageError where none does.
+
+    It is ``http`` for a text without a scheme, of which its options say what is wrong.
+    """
+    scheme, mark, _ = url.partition("://")
+    known = {scheme: name for name, each in TRANSPORTS.loaded() for scheme in each.urls.schemes}
+    if mark and scheme.lower() not in known:
+        raise UsageError(
+            f"`url`: no transport here speaks {scheme}://, only {', '.join(f'{each}://' for each in known)}"
+        )
+    return known.get(scheme.lower(), "http")
 
 
 def open_client(wiring: Wiring[Any], alive: Callable[[], bool] = lambda: True) -> Client:

@@ -32,6 +32,7 @@ WRONG = {
         ("--engine echo", "--engine echo computes nothing"),
         ("--reference /no/such", "--reference: /no/such is no program that can be run"),
         ("--against us", "--against: 'us' should be paper"),
+        ("--url http://x --transport ros", "--url needs http among --transport"),
         ("--bogus", "No such option: --bogus"),
     ],
     "timeline": [
@@ -55,6 +56,8 @@ WRONG = {
         ("--transport http?conection=x", "; did you mean connection?"),
         ("--engine lama", "'lama' is none of llama, echo, replay; did you mean llama?"),
         ("--transport http/fast", "--transport: 'fast'"),
+        ("--url grpc+http://x", "--url: no transport here speaks grpc+http://, only http://"),
+        ("--transport http/llama-server --llama-server /no/such", "--llama-server: /no/such is no program that can"),
         ("--http binary", "--http has another name: write --transport http/binary"),
         ("--bogus", "No such option: --bogus"),
         ("--payload gif", "--payload: 'gif' is none of raw, yuyv, jpeg, jpeg-preencoded, png"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,9 @@ def test_a_reference_needs_what_llama_bench_can_do(tmp_path: Path, fields: dict[
 
 
 def test_the_engine_llama_server_is_llama_cpps_own_beside_ours() -> None:
-    config = ThroughputConfig(engine={"name": "llama-server", "threads": 1}, options={"http": {"llama_server": "/x"}})
+    config = ThroughputConfig(
+        engine={"name": "llama-server", "threads": 1}, options={"http": {"llama_server": sys.executable}}
+    )
     assert [pipeline.name for pipeline in config.pipelines] == ["loopback", "http/llama-server"]
     assert (config.engine.name, config.engine.threads, config.greedy) == ("llama", 1, False)
     assert config.but(requests=3).pipelines == config.pipelines
@@ -72,7 +75,7 @@ def test_the_engine_llama_server_is_llama_cpps_own_beside_ours() -> None:
         ThroughputConfig(engine={"name": "llama-server"}, transports="ros")
     with pytest.raises(UsageError, match="`sampling` greedy is our own engine's; leave it out with `llama_server`"):
         ThroughputConfig(
-            engine={"name": "llama-server", "sampling": "greedy"}, options={"http": {"llama_server": "/x"}}
+            engine={"name": "llama-server", "sampling": "greedy"}, options={"http": {"llama_server": sys.executable}}
         )
     with pytest.raises(UsageError, match="'llamaserver' is none of llama, echo, replay"):
         ThroughputConfig(engine={"name": "llamaserver"})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.inference import EngineConfig, need_engine
 from s2a_bench.transport import http
 
+PROGRAM = Path(sys.executable)
 URL = {"http": {"url": "http://x"}}
 
 
@@ -57,8 +59,8 @@ def test_llama_cpps_own_server_is_a_cell_where_it_has_the_same_to_do(
         assert (program is not None) is (cell.variant == "llama-server")
 
 
-def test_a_named_llama_server_adds_its_cell(tmp_path: Path) -> None:
-    config = RequestsConfig(options={"http": {"llama_server": tmp_path}})
+def test_a_named_llama_server_adds_its_cell() -> None:
+    config = RequestsConfig(options={"http": {"llama_server": PROGRAM}})
     assert names(config)[:4] == [f"http/{name}" for name in http.VARIANTS]
     assert [cell.black_box for cell in config.pipelines[:4]] == [False, False, False, True]
 
@@ -67,8 +69,11 @@ def test_a_named_llama_server_adds_its_cell(tmp_path: Path) -> None:
     ("asked", "message"),
     [
         ({}, "there is none on PATH"),
-        ({"engine": EngineConfig(name="echo"), "options": {"http": {"llama_server": "x"}}}, "runs a model"),
-        ({"payload": "raw", "options": {"http": {"llama_server": "x"}}}, "travels as jpeg, jpeg-preencoded, not raw"),
+        ({"engine": EngineConfig(name="echo"), "options": {"http": {"llama_server": PROGRAM}}}, "runs a model"),
+        (
+            {"payload": "raw", "options": {"http": {"llama_server": PROGRAM}}},
+            "travels as jpeg, jpeg-preencoded, not raw",
+        ),
         ({"options": {"http": {"url": "http://x"}}}, "leave it out with `url`"),
     ],
 )
@@ -111,8 +116,8 @@ def test_of_two_urls_both_are_asked_or_refused() -> None:
         LatencyConfig(transports="websocket?url=ws://127.0.0.1:1", url="http://127.0.0.1:2")
 
 
-def test_a_llama_server_is_started_afresh_for_every_launch(tmp_path: Path) -> None:
-    assert RequestsConfig(launches=3, options={"http": {"llama_server": tmp_path}}).launches == 3
+def test_a_llama_server_is_started_afresh_for_every_launch() -> None:
+    assert RequestsConfig(launches=3, options={"http": {"llama_server": PROGRAM}}).launches == 3
 
 
 MODEL = ({"model": Path("m.gguf")}, {"mmproj": Path("p.gguf")}, {"gpu_layers": -1})
@@ -178,6 +183,19 @@ HTTP_AND_ROS = ["http/binary", "http/binary?payload=jpeg", "ros/topic", "ros/top
 def test_a_latency_run_sends_the_same_payloads_over_every_transport(asked: dict[str, Any], cells: list[str]) -> None:
     config = LatencyConfig(**{"transports": ("http/binary", "ros", "loopback"), "engine": {"name": "echo"}, **asked})
     assert names(config) == cells
+
+
+@pytest.mark.parametrize(
+    ("url", "cells"),
+    [
+        ("http://x", ["http/as-deployed", "http/best-effort"]),
+        ("ws://x", ["websocket/openpi"]),
+        ("tcp://x:1", ["zmq/gr00t"]),
+    ],
+)
+def test_a_url_alone_is_asked_over_the_transport_that_its_scheme_names(url: str, cells: list[str]) -> None:
+    config = LatencyConfig(url=url)
+    assert names(config.answered(pytest.fail)) == cells
 
 
 def test_what_cannot_carry_the_usual_payload_keeps_its_own() -> None:
@@ -257,6 +275,11 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"size": "641x480"}, "`size`: 641x480"),
         ({"size": (8, 8)}, "`size`: 8x8"),
         ({"options": {"http": {"url": "http://[::1"}}}, "`url`: 'http://[::1'"),
+        ({"options": {"http": {"llama_server": "/no/such"}}}, "`llama_server`: /no/such is no program that can be run"),
+        (
+            {"url": "gopher://x"},
+            "`url`: no transport here speaks gopher://, only http://, https://, ws://, wss://, tcp://",
+        ),
         ({"options": {"http": {"url": "localhost:1"}}}, "`url`: 'localhost:1' should start with http"),
         ({"options": {"ros": {"action": "generate"}}}, "`action`: 'generate' should look like /name"),
         ({"options": {"ros": {"action": "/x"}}, "transports": ("http",)}, "`action` needs ros among `transport`"),
@@ -278,7 +301,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"options": {"http": {"url": "http://u:p@x"}}}, "`url`: leave the password out"),
         ({"options": URL, "transports": "http/binary"}, "`transport` http/binary needs our own server"),
         (
-            {"options": {"http": {"llama_server": "x"}}, "engine": EngineConfig(name="echo")},
+            {"options": {"http": {"llama_server": PROGRAM}}, "engine": EngineConfig(name="echo")},
             "`llama_server` runs a model",
         ),
         ({"mode": "stream", "payload": "jpeg-preencoded"}, "jpeg-preencoded has no meaning in `mode` stream"),

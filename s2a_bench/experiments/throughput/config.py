@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final
@@ -12,7 +11,7 @@ from pydantic import AfterValidator, field_validator
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import FirstVariants
 from s2a_bench.inference import ANSWERS, ENGINES, FLASH_ATTENTION, MODEL, EngineConfig
-from s2a_bench.options import Names, group, listed, one_of, option
+from s2a_bench.options import Names, group, listed, need_program, one_of, option
 from s2a_bench.text import none_of
 from s2a_bench.transport.defaults import LLAMA_SERVER, LOOPBACK
 
@@ -116,8 +115,7 @@ class ThroughputConfig(FirstVariants):
             raise UsageError(f"`sampling` greedy is our own engine's; leave it out with `{self.foreign}`")
         if self.reference is None:
             return
-        if not (self.reference.is_file() and os.access(self.reference, os.X_OK)):
-            raise UsageError(f"`reference`: {self.reference} is no program that can be run")
+        need_program("reference", self.reference)
         if not self.engine.kind.needs_model:
             raise UsageError(f"`reference` runs a model file; leave out `engine` {self.engine.name}")
         if named:

@@ -10,6 +10,7 @@ from pathlib import Path
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, RECONNECTS, Fact
+from s2a_bench.options import need_program
 from s2a_bench.transport import (
     ACTIONS,
     TOKENS,
@@ -136,6 +137,8 @@ class Http(Transport[HttpOptions]):
                     f"`transport` http/{LLAMA_SERVER}: there is none on PATH; name one with `llama_server`, or take "
                     "the wheel: pip install 's2a-bench[llama-server]'"
                 )
+            if options.llama_server != WHEEL:
+                need_program("llama_server", options.llama_server)
             if choice.engine != "llama":
                 raise UsageError(f"`llama_server` runs a model; leave out `engine` {choice.engine}")
         read_key(options.api_key_env)
