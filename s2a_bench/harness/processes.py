@@ -77,18 +77,21 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
             return False
         return True
 
-    def wait_end(self) -> None:
-        """Wait until the process has ended, or a signal's handler raises.
+    def wait_end(self, interrupted: Callable[[], object]) -> None:
+        """Wait until the process has ended; raises KeyboardInterrupt.
 
         Popen's own wait would keep its lock where a signal comes as it takes it, and so could never be called again.
-        No wait is without end, as a signal that comes just before one does not break it off.
+        No wait is without end, as a signal that comes just before one does not break it off, and ``interrupted`` is
+        asked, as Python drops what a signal's handler raises in a destructor, or in what runs after a fork.
         """
         ended = os.pidfd_open(self.pid)
         try:
-            while not select.select([ended], [], [], LOOK_S)[0]:
+            while not interrupted() and not select.select([ended], [], [], LOOK_S)[0]:
                 pass
         finally:
             os.close(ended)
+        if interrupted():
+            raise KeyboardInterrupt
         self._process.wait()
 
     def death(self) -> ServerDied:
@@ -176,21 +179,32 @@ def keep_serving(job: ServerJob, ready: Callable[[ServerProcess], None], died: C
     ``ready`` is called whenever the server has started, ``died`` with one line after the first death. The server that
     is started again has the first one's address.
     """
+    signals: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        signals.append(number)
+        raise KeyboardInterrupt
+
+    def serve(job: ServerJob) -> tuple[str, ServerDied]:
+        return _serve(job, ready, lambda: signals)
+
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, interrupt)
     with suppress(KeyboardInterrupt):
-        address, death = _serve(job, ready)
+        address, death = serve(job)
         died(f"{death}; it is started again, once")
-        _, death = _serve(replace(job, wiring=replace(job.wiring, address=address, restarted=True)), ready)
+        _, death = serve(replace(job, wiring=replace(job.wiring, address=address, restarted=True)))
         raise death
 
 
-def _serve(job: ServerJob, ready: Callable[[ServerProcess], None]) -> tuple[str, ServerDied]:
+def _serve(
+    job: ServerJob, ready: Callable[[ServerProcess], None], interrupted: Callable[[], object]
+) -> tuple[str, ServerDied]:
     """Serve until the process ends; return its address, and how it ended."""
     with OwnServer(job.wiring.transport, job) as server:
         server.wait_ready()
         ready(server)
-        server.wait_end()
+        server.wait_end(interrupted)
         return server.address, server.death()
 
 

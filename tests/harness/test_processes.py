@@ -6,8 +6,10 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
+from threading import Timer
 
 import pytest
 
@@ -52,9 +54,20 @@ def handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
+def another_thread_receives_it() -> None:
+    """As a signal that comes just before the wait."""
+    Timer(0.3, lambda: signal.pthread_kill(threading.get_ident(), signal.SIGINT)).start()
+
+
+def what_it_raises_is_dropped() -> None:
+    """As in what runs after a fork."""
+    with suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
 @pytest.mark.usefixtures("handlers")
-def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same() -> None:
-    """As one that comes just before the wait; here another thread of this process receives it."""
+@pytest.mark.parametrize("interrupt", [another_thread_receives_it, what_it_raises_is_dropped])
+def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same(interrupt: Callable[[], None]) -> None:
     late: list[int] = []
 
     def ready(server: ServerProcess) -> None:
@@ -62,14 +75,11 @@ def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same() -> None:
             late.append(server.pid)
             os.kill(server.pid, signal.SIGKILL)
 
-        def interrupt() -> None:
-            signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+        guard.append(Timer(30, kill))
+        guard[0].start()
+        interrupt()
 
-        guard.append(threading.Timer(30, kill))
-        for timer in (threading.Timer(0.3, interrupt), *guard):
-            timer.start()
-
-    guard: list[threading.Timer] = []
+    guard: list[Timer] = []
     died: list[str] = []
     keep_serving(ServerJob(wiring("http/binary"), EngineConfig(name="echo")), ready, died.append)
     guard[0].cancel()
