@@ -33,15 +33,23 @@ def connect(told: Wiring[Any], seconds: float) -> socket.socket:
     return socket.create_connection((host, int(port)), timeout=seconds)
 
 
-def sends(*pieces: bytes, then: Then = "waits", seconds: float = 2.0, every_s: float = 0.0) -> Attack:
-    """Return a client that sends pieces, one each ``every_s``; it listens for ``seconds`` at most."""
-    return sends_made(lambda: pieces, then=then, seconds=seconds, every_s=every_s)
+def sends(*pieces: bytes, **more: Any) -> Attack:
+    """Return a client like that of `sends_made`, whose pieces are known."""
+    return sends_made(lambda: pieces, **more)
 
 
 def sends_made(
-    make: Callable[[], Iterable[bytes]], *, then: Then = "waits", seconds: float = 2.0, every_s: float = 0.0
+    make: Callable[[], Iterable[bytes]],
+    *,
+    then: Then = "waits",
+    seconds: float = 2.0,
+    every_s: float = 0.0,
+    first: int = 0,
 ) -> Attack:
-    """Return a client like that of `sends`, whose pieces are made when it is called."""
+    """Return a client that sends pieces, one each ``every_s``; it listens for ``seconds`` at most.
+
+    After its first piece it goes on when ``first`` bytes have come.
+    """
 
     def attack(told: Wiring[Any]) -> str:
         said, clock = b"", SystemClock()
@@ -49,6 +57,8 @@ def sends_made(
             try:
                 for piece in make():
                     connection.sendall(piece)
+                    while len(said) < first and (heard := connection.recv(1 << 16)):
+                        said += heard
                     if every_s:
                         clock.sleep_until_ns(now_ns() + round(every_s * 1e9))
             except OSError:
