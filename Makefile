@@ -12,7 +12,6 @@ BIN := $(VENV)/bin
 # is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
 # in three launches of a third of the runs, as launches differ by more than samples.
 bench: core
-	$(BIN)/s2a-bench latency --engine echo --transport http,ros,shm,loopback --launches 3 --requests 34 --payload raw
 	$(BIN)/s2a-bench latency --engine echo --transport http,ros,shm,loopback --launches 3 --requests 34
 	@$(PYTHON) tools/setup.py
 	$(BIN)/s2a-bench latency

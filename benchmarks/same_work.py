@@ -27,7 +27,8 @@ REQUESTS = 50
 
 def both(output: Path, requests: int = REQUESTS, **options: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return e2e without model in ms of every request, from inside and from outside."""
-    run = s2a.latency(transports=["http/as-deployed"], engine="llama", requests=requests, output=output, **options)
+    asked = {"transports": ["http/as-deployed"], "payload": "jpeg", "engine": "llama", "requests": requests, **options}
+    run = s2a.latency(**asked, output=output)
     good = run.samples[run.samples["error"] == ""]
     facts = [json.loads(str(told)) for told in good["facts"]]
     model_ms = np.array([told[PROMPT_MS] - told[PREPROCESS_MS] for told in facts])

@@ -19,7 +19,7 @@ from rich.text import Text
 
 DRAWING = Path(__file__).parent.parent / "docs" / "figures" / "terminal.svg"
 WIDTH = 106
-COMMAND = "latency --engine echo --transport http,ros,loopback --payload raw"
+COMMAND = "latency --engine echo"
 FORMAT = re.sub(r"@font-face \{\{.*?\}\}\s*", "", CONSOLE_SVG_FORMAT, flags=re.DOTALL)
 """rich's own, without the fonts that it would fetch."""
 

@@ -25,7 +25,7 @@ from s2a_bench.trace import budget
 from tests.cli.program import program, refused
 
 ROOT = Path(__file__).parent.parent.parent
-DRAWN = ["--engine", "echo", "--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3"]
+DRAWN = ["--quick", "--engine", "echo", "--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3"]
 SMALL = [*DRAWN, "--data-only"]
 
 
@@ -189,12 +189,12 @@ def test_one_run_compares_payloads_and_options_on_servers_of_their_own(tmp_path:
 
 
 def test_the_engine_saw_the_pixels_of_the_camera(tmp_path: Path) -> None:
-    names = "http/binary?payload=raw,http/best-effort?payload=png,http/binary,ros,ros/topic?payload=yuyv,loopback"
+    names = "http/binary?payload=raw,http/best-effort?payload=png,http/binary?payload=jpeg,ros,ros/topic?payload=yuyv,loopback"
     run(*SMALL, "--transport", names, output=tmp_path)
     samples = only_run(tmp_path).samples
     assert samples[["rgb_source", "rgb_engine"]].notna().all().all()
     changed = samples[samples["rgb_source"] != samples["rgb_engine"]]
-    assert set(changed["cell"]) == {"http/binary"}
+    assert set(changed["cell"]) == {"http/binary?payload=jpeg"}
 
 
 def test_the_untuned_case_is_recorded_as_such(tmp_path: Path) -> None:
@@ -391,7 +391,7 @@ def test_a_single_picture_is_another_one_in_every_sample_and_the_same_in_every_c
 def test_a_real_model_answers_over_both_pipelines(tmp_path: Path) -> None:
     grammar = tmp_path / "yes.gbnf"
     grammar.write_text('root ::= "yes" | "no"\n')
-    few = ["--requests", "2", "--warmup", "1", "--max-tokens", "5", "--threads", "1"]
+    few = ["--quick", "--requests", "2", "--warmup", "1", "--max-tokens", "5", "--threads", "1"]
     run(*few, "--grammar", str(grammar), "--transport", "http/as-deployed,ros", output=tmp_path / "r")
     kept = only_run(tmp_path / "r")
     assert kept.manifest["model"]["dummy"] is True
