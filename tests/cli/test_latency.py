@@ -25,7 +25,7 @@ from s2a_bench.trace import budget
 from tests.cli.program import program, refused
 
 ROOT = Path(__file__).parent.parent.parent
-DRAWN = ["--quick", "--engine", "echo", "--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3"]
+DRAWN = ["--engine", "echo", "--quick", "--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3"]
 SMALL = [*DRAWN, "--data-only"]
 
 
@@ -189,7 +189,7 @@ def test_one_run_compares_payloads_and_options_on_servers_of_their_own(tmp_path:
 
 
 def test_the_engine_saw_the_pixels_of_the_camera(tmp_path: Path) -> None:
-    names = "http/binary?payload=raw,http/best-effort?payload=png,http/binary?payload=jpeg,ros,ros/topic?payload=yuyv,loopback"
+    names = "http/binary,http/best-effort?payload=png,http/binary?payload=jpeg,ros,ros/topic?payload=yuyv,loopback"
     run(*SMALL, "--transport", names, output=tmp_path)
     samples = only_run(tmp_path).samples
     assert samples[["rgb_source", "rgb_engine"]].notna().all().all()

@@ -17,7 +17,7 @@ from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 
 ECHO = LatencyConfig(
-    engine=EngineConfig(name="echo"), transports=("http/binary", "loopback"), max_tokens=2, size=(64, 48)
+    engine=EngineConfig(name="echo"), transports=("http/binary", "loopback"), payload="raw", max_tokens=2, size=(64, 48)
 )
 
 
