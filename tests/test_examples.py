@@ -138,9 +138,9 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Path]:
     return folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def servers() -> Iterator[list[subprocess.Popen[str]]]:
-    """What a session left running with ``&``."""
+    """What a session starts with ``&``; it ends with it."""
     running: list[subprocess.Popen[str]] = []
     yield running
     for server in running:
