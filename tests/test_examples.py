@@ -166,8 +166,8 @@ def test_an_example_runs(block: Block, folders: Callable[[Path], Path], servers:
     if block.language == "python":
         run([sys.executable, "-W", "error", "-c", block.code], folder)
     for command in block.commands:
-        if command.endswith("&"):
-            servers.append(start(command.removesuffix("&"), folder))
+        if (plain := COMMENT.sub("", command).rstrip()).endswith("&"):
+            servers.append(start(plain.removesuffix("&"), folder))
         else:
             run(["bash", "-c", command], folder)
 
