@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 EVENTS: Final = 100_000
 """Moments of events that reactions are measured at."""
-SHARES: Final = np.linspace(0, 1, 51)
-"""Of the quantiles of reaction times that are kept."""
+SHARES: Final = np.linspace(0, 1, 401)
+"""Of the quantiles of reaction times that are kept: closer than the line of a figure is wide."""
 NO_NAMES: Final[Mapping[int, str]] = {}
 _SIDE: Final = 0.975
 """Confidence of each end of a two-sided 95 % interval."""
