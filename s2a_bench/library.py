@@ -6,6 +6,7 @@ docs/library.md has examples. Nothing here prints; a run leaves the caller's pro
 from __future__ import annotations
 
 import io
+from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from html import escape
@@ -19,6 +20,7 @@ from s2a_bench.machine import tuning
 from s2a_bench.options import Options, placed
 from s2a_bench.progress import NullProgress, Progress
 from s2a_bench.store import run as store
+from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import TextTable
 
@@ -82,10 +84,11 @@ class Run:
         return pd.DataFrame(table.rows, columns=list(table.header))
 
     def plot(self, name: str) -> Figure:
-        """Draw one of the run's figures, which a notebook shows as any other picture."""
+        """Draw one of the run's figures, which a notebook shows with its caption."""
         with paper_column():
             figure = self._one(self._shown.figures, "figure", name)()
-        setattr(figure, "_repr_png_", partial(_png, figure))  # noqa: B010 - IPython asks for it
+        for asked, shown in (("_repr_png_", _png), ("_repr_html_", _figure_html)):  # by IPython
+            setattr(figure, asked, partial(shown, figure))
         return figure
 
     def figures(self) -> dict[str, Figure]:
@@ -210,6 +213,13 @@ def _png(figure: Figure) -> tuple[bytes, dict[str, int]]:
         figure.savefig(drawn, dpi=2 * SHOWN_DPI)
     width, height = figure.get_size_inches() * SHOWN_DPI
     return drawn.getvalue(), {"width": round(width), "height": round(height)}
+
+
+def _figure_html(figure: Figure) -> str:
+    drawn, size = _png(figure)
+    title, *notes = map(escape, caption_of(figure))
+    picture = f'<img width="{size["width"]}" alt="{title}" src="data:image/png;base64,{b64encode(drawn).decode()}">'
+    return f"<figure>{picture}<figcaption><b>{title}.</b> {' '.join(notes)}</figcaption></figure>"
 
 
 def _html(table: TextTable) -> str:

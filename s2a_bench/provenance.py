@@ -107,9 +107,9 @@ class Provenance:
             return "engine UNKNOWN (the server does not tell)"
         model = ", ".join(filter(None, (self.model, self.quantisation, _WEIGHTS.get(self.weights, ""))))
         engine = "no engine" if self.engine == NONE else self.engine + (f" ({model})" if model else "")
-        weights = " with DUMMY WEIGHTS" if self.engine == NONE and self.weights == "dummy" else ""
         tokens = f"tokens {self.tokens.upper() if self.tokens in _LOUD else self.tokens}"
-        tokens += f" after {self.profile}{weights}" if self.profile else ""
+        tokens += f" after {self.profile}" if self.profile else ""
+        tokens += " with DUMMY WEIGHTS" if self.engine == NONE and self.weights == "dummy" else ""
         link = ["link EMULATED"] if self.link == "emulated" else []
         clock = ["virtual time"] if self.clock == "virtual" else []
         return ", ".join((engine, tokens, *link, *clock))
@@ -165,6 +165,17 @@ class Origins:
             alike.setdefault(replace(each, profile=""), []).append(each.profile)
         lines = (replace(each, profile=", ".join(filter(None, profiles))).line for each, profiles in alike.items())
         return f"{ORIGIN}{'; '.join(dict.fromkeys(lines))}."
+
+    @property
+    def brief(self) -> str:
+        """Return the line without the names of models and profiles, for where there is room for one line only."""
+        alike: dict[Provenance, dict[str, None]] = {}
+        for each in self.every:
+            engine = each.engine if each.engine in {NONE, UNKNOWN} else ""
+            link = each.link if each.link in _UNPLAIN else ""
+            kind = replace(each, engine=engine, model="", model_sha256="", quantisation="", profile="", link=link)
+            alike.setdefault(kind, {})[each.engine] = None
+        return "; ".join(replace(kind, engine=", ".join(engines)).line for kind, engines in alike.items())
 
     @property
     def code(self) -> str:

@@ -31,7 +31,7 @@ def build_targets(run: Run) -> Figure:
     rows = first_seed(rows_of(run))
     rows = rows[rows["policy"] == ONLINE]
     hard = rows[rows["rho"] > HARD]
-    figure = new_figure(4.9, f"{ONLINE}: {len(rows)} settings, {int(rows['plans'].max()):,} plans each\n{_DRAWN}")
+    figure = new_figure(4.9, (f"{ONLINE}: {len(rows)} settings, {int(rows['plans'].max()):,} plans each", _DRAWN))
     whole = figure.subplots(3, 1, sharex=True)
     panels = {"p_any_stall": "P(any stall)", "start_regret": r"start regret over $S_0$", "end_regret": "end regret"}
     for axes, (column, label) in zip(whole, panels.items(), strict=True):
@@ -60,7 +60,7 @@ def build_frontier(run: Run) -> Figure:
     rows = first_seed(rows_of(run))
     epsilon = float(run.manifest["configuration"]["epsilon"])
     plans = int(rows["plans"].max())
-    figure = new_figure(5.2, f"What rare stalls cost; {plans:,} plans a point\n{_DRAWN}")
+    figure = new_figure(5.2, (f"What rare stalls cost; {plans:,} plans a point", _DRAWN))
     worlds = _by(rows, WORLD)
     grid = figure.subplots(-(-len(worlds) // 2), 2, sharex=True, squeeze=False)
     families = list(rows["family"].unique())
@@ -100,8 +100,8 @@ def build_drift(run: Run) -> Figure:
     epsilon = float(run.manifest["configuration"]["epsilon"])
     plans = int(rows["plans"].max())
     worlds, drifts = _by(rows, WORLD), list(rows["drift"].unique())
-    title = f"Drift from the third block on; {plans:,} plans a block. {_DRAWN}"
-    figure = new_figure(0.6 + 1.5 * len(worlds), title, WIDE_IN)
+    caption = (f"Drift from the third block on; {plans:,} plans a block", _DRAWN)
+    figure = new_figure(0.6 + 1.5 * len(worlds), caption, WIDE_IN)
     grid = figure.subplots(len(worlds), len(drifts), sharex=True, sharey=True, squeeze=False)
     for line_of_axes, (_, world) in zip(grid, worlds, strict=True):
         for axes, drift in zip(line_of_axes, drifts, strict=True):
@@ -134,8 +134,8 @@ def build_misfit(run: Run) -> Figure:
     rows = rows.assign(
         kind=[text.split()[0] for text in rows["condition"]], step=[text.split()[-1] for text in rows["condition"]]
     )
-    title = f"One belief is wrong; {int(rows['plans'].max()):,} plans a point. {_DRAWN}"
-    figure = new_figure(3.4, title, WIDE_IN)
+    caption = (f"One belief is wrong; {int(rows['plans'].max()):,} plans a point", _DRAWN)
+    figure = new_figure(3.4, caption, WIDE_IN)
     grid = figure.subplots(2, len(kinds), sharex="col", sharey="row")
     for column, (kind, what) in enumerate(kinds.items()):
         for (_, part), (colour, line, marker) in zip(_by(rows[rows["kind"] == kind], WORLD), _LOOKS, strict=False):

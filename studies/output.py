@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,7 +55,7 @@ def show(
     whole = {name: replace(table, provenance=line) for name, table in tables.items()}
     write_texts(run, whole, csvs)
     if figures:
-        save(run.path / "figures", {name: lambda build=build: marked(build(), line) for name, build in figures.items()})  # type: ignore[misc]
+        save(run.path / "figures", {name: partial(marked, build, run) for name, build in figures.items()})
     for warning in run.manifest["warnings"]:
         print(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}", file=sys.stderr)
     for table in whole.values():

@@ -121,4 +121,5 @@ def test_a_notebook_shows_figures_without_magics(tmp_path: Path, monkeypatch: py
     for (output,) in drawn:
         assert base64.b64decode(output.data["image/png"]).startswith(b"\x89PNG")
         assert output.metadata["image/png"]["width"] == 525
+        assert "<figcaption><b>Stall-free region of naive execution.</b> N = " in output.data["text/html"]
     assert "Boards: is naive stall-free?" in shown[0].data["text/html"]

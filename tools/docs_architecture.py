@@ -71,7 +71,9 @@ def draw() -> Figure:
     plan = floors()
     rooms = {room for floor in plan for room in floor}
     imports, lines = arrows(rooms)
-    figure = new_figure(FLOOR_IN * len(plan) + 0.3, "Rooms and arrows: everything imports downwards", WIDTH_IN)
+    title = "Rooms and arrows: everything imports downwards"
+    figure = new_figure(FLOOR_IN * len(plan) + 0.3, (title,), WIDTH_IN)
+    figure.suptitle(title, x=0.01, horizontalalignment="left")
     axes = figure.subplots()
     axes.set_axis_off()
     axes.set_xlim(0, 10)

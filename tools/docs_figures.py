@@ -8,27 +8,20 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
-from s2a_bench.experiments.boundary.view import build_boundary
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
-from s2a_bench.experiments.chunks.view.figures import (
-    build_lanes,
-    build_reactions,
-    build_smoothness,
-    build_stability,
-    build_triggers,
-)
 from s2a_bench.experiments.timeline.run import run_timeline
-from s2a_bench.experiments.timeline.view.cells import timelines_of
-from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours
+from s2a_bench.experiments.timeline.view.figures import policy_colours
 from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
@@ -66,13 +59,12 @@ class Quiet:
 
 def timelines(config: TimelineConfig) -> Figure:
     """Draw a timeline run."""
-    run = _run(lambda output: run_timeline(config, output, Quiet()))
-    return build_timelines(run, timelines_of(run))
+    return drawn(_run(lambda output: run_timeline(config, output, Quiet())), "timeline")
 
 
 def boundary(config: BoundaryConfig) -> Figure:
     """Draw a boundary run."""
-    return build_boundary(_run(lambda output: run_boundary(config, output, Quiet())))
+    return drawn(_run(lambda output: run_boundary(config, output, Quiet())), "boundary")
 
 
 def chunks(latency: str) -> Run:
@@ -88,9 +80,8 @@ def safe_start_figure() -> Figure:
     naive_s = work_conserving(arrival_s, nominal_s, arrival_s[0])
     skills = np.arange(1, 9)
     colours = policy_colours([])
-    figure = new_figure(
-        2.5, "When skill i starts, and when it has arrived\nL = 6, R = 4.8 tokens/s, T = 1 s, c = 0.5 s"
-    )
+    figure = new_figure(2.5, ("When skill i starts, and when it has arrived",))
+    figure.suptitle("computed: L = 6, R = 4.8 tokens/s, T = 1 s, c = 0.5 s", x=0.01, ha="left", color="#444444")
     axes = figure.subplots()
     axes.fill_betweenx(skills, 0, arrival_s[:, 0], color="#EEEEEE", linewidth=0, label="not arrived yet")
     axes.plot(naive_s[:, 0], skills, "o-", color=colours["naive"], markersize=6, label="naive: starts on arrival")
@@ -119,8 +110,14 @@ RUNS = TemporaryDirectory()
 
 
 def _run(make: Callable[[Path], Path]) -> Run:
-    """Make a run in a folder that goes again."""
-    return read_run(make(Path(RUNS.name)))
+    """Make a run in a folder that goes again; virtual time is the same on every host and day."""
+    run = read_run(make(Path(RUNS.name)))
+    return replace(run, manifest={name: run.manifest[name] for name in run.manifest if name not in {"host", "started"}})
+
+
+def drawn(run: Run, name: str) -> Figure:
+    """Draw a figure of a run as its experiment does."""
+    return EXPERIMENTS[str(run.manifest["command"])].show(run).figures[name]()
 
 
 FIGURES: dict[str, Callable[[], Figure]] = {
@@ -132,11 +129,11 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "timeline": lambda: timelines(TimelineConfig()),
     "boundary": lambda: boundary(BoundaryConfig()),
     "boundary-jitter": lambda: boundary(BoundaryConfig(jitter="lognormal:cv=0.2")),
-    "chunks-lanes": lambda: build_lanes(chunks(SPREAD)),
-    "chunks-stability": lambda: build_stability(chunks(SPREAD)),
-    "chunks-triggers": lambda: build_triggers(chunks(f"{SPREAD},{SLOW_ONES}")),
-    "chunks-reactions": lambda: build_reactions(chunks("80")),
-    "chunks-smoothness": lambda: build_smoothness(chunks(SPREAD)),
+    "chunks-lanes": lambda: drawn(chunks(SPREAD), "lanes"),
+    "chunks-stability": lambda: drawn(chunks(SPREAD), "stability"),
+    "chunks-triggers": lambda: drawn(chunks(f"{SPREAD},{SLOW_ONES}"), "triggers"),
+    "chunks-reactions": lambda: drawn(chunks("80"), "reactions"),
+    "chunks-smoothness": lambda: drawn(chunks(SPREAD), "smoothness"),
 }
 
 

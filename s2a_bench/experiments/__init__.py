@@ -151,12 +151,6 @@ class Compared:
     own: Callable[[Run], Iterable[Metric]] = lambda _: ()
 
 
-def _marked(build: Callable[[], Figure], line: str) -> Figure:
-    from s2a_bench.writers.figures import marked
-
-    return marked(build(), line)
-
-
 def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:
     """Index metrics by their names."""
     return {metric.name: metric for metric in metrics}
@@ -191,10 +185,12 @@ class Experiment:
 
     def show(self, run: Run, **asked: Any) -> Shown:
         """Return what one of its runs shows; every table and figure says where its numbers come from."""
+        from s2a_bench.writers.figures import marked
+
         shown: Shown = resolve_name(self.view)(run, **asked)
         line = run.origins.line
         tables = {name: replace(table, provenance=table.provenance or line) for name, table in shown.tables.items()}
-        figures = {name: partial(_marked, build, line) for name, build in shown.figures.items()}
+        figures = {name: partial(marked, build, run) for name, build in shown.figures.items()}
         return replace(shown, tables=tables, figures=figures)
 
     def cell_class(self) -> type | None:

@@ -39,7 +39,6 @@ from s2a_bench.transport import PAYLOADS, declared
 from s2a_bench.transport.pipeline import without
 from s2a_bench.writers.as_json import summaries
 from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.figures import wrapped
 from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
@@ -604,8 +603,9 @@ def span_of(counts: Iterable[int], what: str = "") -> str:
     return f"{span} {what}{'s' * (found[-1] != 1)}" if what else span
 
 
-def title_of(run: Run, cells: list[Cell], what: str, facts: Sequence[str], more: Sequence[str] = ()) -> str:
+def caption_for(
+    run: Run, cells: list[Cell], what: str, facts: Sequence[str], notes: Sequence[str] = ()
+) -> tuple[str, ...]:
     """Return what a figure draws, from how many samples of what, and what did not really answer."""
-    note = engine_note(run, cells)
-    said = [f"n = {span_of(cell.n for cell in cells)} a cell", *facts, *([note] if note else []), *more]
-    return wrapped((what, ", ".join(said)))
+    said = ", ".join((f"n = {span_of(cell.n for cell in cells)} a cell", *facts))
+    return (what, f"{said}.", *notes, *engine_notes(run, cells))

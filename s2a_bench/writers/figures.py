@@ -1,18 +1,22 @@
-"""What every figure is made with: one column wide, rows named on the left, numbers beside them, PNG and PDF."""
+"""What every figure is made with: one column wide, rows named on the left, numbers beside them, PNG and PDF.
+
+A figure's caption, a title and notes in plain text, is declared where the figure is made and is not drawn: the page,
+LaTeX, notebooks and ``captions.md`` set it below. Drawn is one line that says where the numbers come from.
+"""
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2a_bench.errors import StoreError
-from s2a_bench.provenance import ORIGIN
+from s2a_bench.provenance import joined
 from s2a_bench.store.files import why
+from s2a_bench.text import one_line
 from s2a_bench.writers.style import GREY, WIDTH_IN, paper_column
-from s2a_bench.writers.tables import required
+from s2a_bench.writers.tables import markdown_text, number, required
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,28 +24,34 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
+    from s2a_bench.store.run import Run
+
 WIDE_SPREAD = 10
 """Values that spread by more than this factor get a logarithmic axis, or a panel of shares."""
 
 LINE_CHARS = 62
 """As many characters of 7 point fit into one column."""
 
-
-def wrapped(lines: Iterable[str], width_in: float = WIDTH_IN) -> str:
-    """Break lines to a figure's width; of mathematics less is drawn than written."""
-    chars = round(LINE_CHARS * width_in / WIDTH_IN)
-    return "\n".join(textwrap.fill(line, chars + 14 * ("$" in line), break_on_hyphens=False) for line in lines)
+WHISKERS = "Bars are medians; whiskers reach from the 10th to the 90th percentile."
 
 
-def new_figure(height_in: float, title: str, width_in: float = WIDTH_IN) -> Figure:
-    """Make a figure that draws itself with Agg, without pyplot and its global state."""
+def new_figure(height_in: float, caption: Iterable[str], width_in: float = WIDTH_IN) -> Figure:
+    """Make a figure that draws itself with Agg, without pyplot and its global state.
+
+    ``caption`` are a title, without a full stop, and notes.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width_in, height_in + 0.13 * title.count("\n")), layout="constrained")
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(title, x=0.01, horizontalalignment="left")
+    figure.set_label("\n".join(map(one_line, caption)))
     return figure
+
+
+def caption_of(figure: Figure) -> tuple[str, ...]:
+    """Return a figure's title and notes; the last one says where its numbers come from."""
+    return tuple(str(figure.get_label()).split("\n"))
 
 
 def name_rows(axes: Axes, names: list[str]) -> None:
@@ -51,9 +61,17 @@ def name_rows(axes: Axes, names: list[str]) -> None:
     axes.tick_params(axis="y", length=0)
 
 
-def write_beside(axes: Axes, place: int, text: str) -> None:
+def write_beside(axes: Axes, place: float, text: str) -> None:
     """Write a number to the right of the axes, where no bar can cover it."""
     axes.text(1.02, place, text, transform=axes.get_yaxis_transform(), verticalalignment="center")
+
+
+def draw_over(axes: Axes, x: Sequence[float], y: Sequence[float], style: str, label: str = "") -> None:
+    """Draw a dark line with a white edge, to be seen on a bar of any colour."""
+    from matplotlib.patheffects import withStroke
+
+    edge = [withStroke(linewidth=2.4, foreground="white")]
+    axes.plot(x, y, style, color="black", linewidth=0.9, markersize=4, path_effects=edge, label=label)
 
 
 def logarithmic(axes: Axes, spread: float) -> None:
@@ -68,41 +86,50 @@ def logarithmic(axes: Axes, spread: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """One row of `build_bars`; ``sd`` is None where it is not known."""
+    """One row of `build_bars`; ``whisker`` is from where to where it reaches, None where that is not known."""
 
     name: str
-    mean: float
-    sd: float | None
+    value: float
+    whisker: tuple[float, float] | None
     text: str
     colour: str = GREY
 
+    @classmethod
+    def of(cls, name: str, values: NDArray[np.float64], colour: str) -> Bar:
+        """Return the median of values with `WHISKERS`."""
+        import numpy as np
 
-def build_bars(title: str, bars: Sequence[Bar], label: str, paper: str = "", *, scaled: bool = False) -> Figure:
-    """Draw mean ± sd, a row a bar, from zero; ``paper`` explains the grey ones.
+        low, median, high = np.percentile(values, (10, 50, 90)).tolist()
+        return cls(name, median, (low, high), number(median), colour)
+
+
+def build_bars(
+    caption: Iterable[str], bars: Sequence[Bar], label: str, paper: str = "", *, scaled: bool = False
+) -> Figure:
+    """Draw a row a bar, from zero; ``paper`` names the grey ones.
 
     If ``scaled``, bars too far apart for one scale become points on a logarithmic axis.
     """
     from matplotlib.patches import Patch
 
-    figure = new_figure(0.75 + 0.34 * len(bars) + (0.2 + 0.125 * paper.count("\n") if paper else 0), title)
+    figure = new_figure(0.75 + 0.34 * len(bars) + (0.2 if paper else 0), caption)
     axes = figure.subplots()
-    means = [bar.mean for bar in bars]
-    wide = scaled and max(means) > WIDE_SPREAD * min(means)
+    values = [bar.value for bar in bars]
+    wide = scaled and max(values) > WIDE_SPREAD * min(values)
     for place, bar in enumerate(bars):
         if wide:
             axes.plot(
-                bar.mean, place, "o", markersize=5, color=bar.colour, markeredgecolor="black", markeredgewidth=0.5
+                bar.value, place, "o", markersize=5, color=bar.colour, markeredgecolor="black", markeredgewidth=0.5
             )
         else:
-            axes.barh(place, bar.mean, 0.62, color=bar.colour, edgecolor="black", linewidth=0.5)
-        if bar.sd is not None:
-            low = min(bar.sd, bar.mean * 0.999)  # a time or a rate is above zero, whatever the standard deviation is
-            axes.errorbar(bar.mean, place, xerr=[[low], [bar.sd]], color="black", capsize=2, linewidth=0.8)
+            axes.barh(place, bar.value, 0.62, color=bar.colour, edgecolor="black", linewidth=0.5)
+        if bar.whisker:
+            draw_over(axes, bar.whisker, (place, place), "|-")
         write_beside(axes, place, bar.text)
     name_rows(axes, [bar.name for bar in bars])
     if wide:
-        logarithmic(axes, max(means) / min(means))
-        axes.set_xlim(min(means) / 2, max(means) * 2)
+        logarithmic(axes, max(values) / min(values))
+        axes.set_xlim(min(values) / 2, max(values) * 2)
         axes.grid(visible=True, axis="x", linewidth=0.3, color="#DDDDDD")
     else:
         axes.set_xlim(left=0)
@@ -114,10 +141,14 @@ def build_bars(title: str, bars: Sequence[Bar], label: str, paper: str = "", *, 
 
 
 def build_distribution(
-    title: str, lines: Mapping[str, tuple[NDArray[np.float64], tuple[str, str]]], of: str, label: str, columns: int = 2
+    caption: Iterable[str],
+    lines: Mapping[str, tuple[NDArray[np.float64], tuple[str, str]]],
+    of: str,
+    label: str,
+    columns: int = 2,
 ) -> Figure:
     """Draw empirical distributions: name -> values, colour and line style; logarithmic if they spread widely."""
-    figure = new_figure(2.35 + 0.14 * -(-len(lines) // 2), title)
+    figure = new_figure(2.35 + 0.14 * -(-len(lines) // 2), caption)
     axes = figure.subplots()
     for name, (values, (colour, style)) in lines.items():
         axes.ecdf(values, label=name, color=colour, linestyle=style)
@@ -132,30 +163,46 @@ def build_distribution(
     return figure
 
 
-def marked(figure: Figure, provenance: str) -> Figure:
-    """Write below a figure's title where its numbers come from, and return it; it grows by the lines' height."""
-    lines = textwrap.wrap(provenance, round(LINE_CHARS * figure.get_figwidth() / WIDTH_IN))
-    figure.set_figheight(figure.get_figheight() + 0.13 * len(lines))
-    figure.suptitle("\n".join((figure.get_suptitle(), *lines)), x=0.01, horizontalalignment="left")
+_DAY = len("2026-11-23")
+
+
+def source_line(runs: Iterable[Run]) -> str:
+    """Return in one line who answered runs, whether anything was emulated, paced or a dummy, the hosts and the days."""
+    manifests = [run.manifest for run in runs]
+    facts = (str(each.get(name, ""))[:most] for name, most in (("host", None), ("started", _DAY)) for each in manifests)
+    return " · ".join(dict.fromkeys((joined(run.origins for run in runs).brief, *filter(None, facts))))
+
+
+def marked(build: Callable[[], Figure], *runs: Run) -> Figure:
+    """Build a figure of runs; where its numbers come from is drawn above it in one line, and ends its caption."""
+    figure = build()
+    line = figure.suptitle(source_line(runs), x=0.01, horizontalalignment="left", color="#444444", parse_math=False)
+    too_wide = line.get_window_extent().width / (0.95 * figure.bbox.width)
+    line.set_fontsize(float(line.get_fontsize()) / max(1.0, too_wide))
+    figure.set_label("\n".join((*caption_of(figure), joined(run.origins for run in runs).line)))
     return figure
 
 
 def save(folder: Path, builders: Mapping[str, Callable[[], Figure]]) -> list[Path]:
-    """Build each figure and write it as ``<name>.png`` and ``<name>.pdf``; raises StoreError where that fails.
+    """Build each figure and write it as ``<name>.png`` and ``<name>.pdf``, and what they show as ``captions.md``.
 
-    Raises ValueError for a figure that does not say where its numbers come from.
+    Raises StoreError where that fails, ValueError for a figure that does not say where its numbers come from.
     """
     written = []
+    captions = []
     try:
         folder.mkdir(exist_ok=True)
         for name, build in builders.items():
             with paper_column():
                 figure = build()
-                required(name, figure.get_suptitle().partition(ORIGIN)[1])
+                required(name, figure.get_suptitle())
+                title, *notes = map(markdown_text, caption_of(figure))
+                captions.append(f"**{name}**: {' '.join((f'{title}.', *notes))}\n")
                 for suffix in ("png", "pdf"):
                     path = folder / f"{name}.{suffix}"
                     figure.savefig(path)
                     written.append(path)
+        (folder / "captions.md").write_text("\n".join(captions), encoding="utf-8")
     except OSError as error:
         raise StoreError(f"cannot write {folder}: {why(error, folder)}; the samples are kept") from error
     return written

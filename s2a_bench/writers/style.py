@@ -39,6 +39,12 @@ RESIDUAL_FILL: Final = ("#FFFFFF", "//////")
 _OTHER_LOOKS: Final = (("#56B4E9", "-."), ("#F0E442", "--"), ("#999999", ":"), ("#666666", "-"))
 
 
+def ink_on(colour: str) -> str:
+    """Return the colour of text that is read on ``#RRGGBB``."""
+    red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
+    return "white" if 0.299 * red + 0.587 * green + 0.114 * blue < 128 else "black"  # noqa: PLR2004 - half way
+
+
 def cell_looks(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, str]]:
     """Return name -> colour and line style, for cells given as name -> (transport, variant).
 

@@ -11,6 +11,7 @@ from s2a_bench.experiments.latency.view.against_bytes import against_bytes, cros
 from s2a_bench.experiments.requests import split
 from s2a_bench.store.run import Run
 from s2a_bench.transport import TRANSPORTS
+from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import _OTHER_LOOKS
 
 MakeRun = Callable[..., Run]
@@ -73,7 +74,7 @@ def test_tables_and_figure_say_what_answered(runs: list[Run]) -> None:
     assert tables["crossings"].rows == [("ros/topic, raw", "http/binary, raw", "1.33 [1.33, 1.33]")]
     assert all("Echo engine." in table.notes for table in tables.values())
     figure = figures["time_against_bytes"]()
-    assert "Echo engine." in figure.get_suptitle()
+    assert "Echo engine." in caption_of(figure)
     (axes,) = figure.axes
     assert [line.get_label() for line in axes.lines] == ["http/binary", "ros/topic", "loopback"]
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")

@@ -9,6 +9,7 @@ import subprocess
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 from itertools import product
 from pathlib import Path
@@ -31,7 +32,9 @@ from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import Run, RunWriter, read_run
 from s2a_bench.store.sweep import CELLS, CellRow
 from s2a_bench.testing import NullProgress
+from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.latex import PREAMBLE, document, escape, to_siunitx
+from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable
 
 MakeRun = Callable[..., Run]
@@ -364,6 +367,20 @@ def test_files_lie_in_a_folder_a_run(tmp_path: Path, computed: Path, make_run: M
     markdown = (tmp_path / "all.md").read_text()
     assert "| Jetson AGX Orin | 6 | naive | 1.75 | 11.50 | 7 |" in markdown
     assert "## The paper's claims" in markdown
+
+
+def test_a_figures_caption_stands_below_it_on_the_page_and_in_latex(tmp_path: Path, computed: Path) -> None:
+    chapters = read_chapters([computed], against_paper=False)
+    report = make_report(chapters, against_paper=False)
+    write_report(report, ReportConfig(runs=[computed], output=tmp_path / "page.html", latex=tmp_path / "tex"))
+    with paper_column():
+        title, *notes = caption_of(chapters[0].content.figures["timeline"]())
+    assert any(note.startswith("EMULATED") for note in notes)
+    page, tex = (tmp_path / "page.html").read_text(), (tmp_path / "tex" / "report.tex").read_text()
+    assert f'role="img" aria-label="{title}"' in page
+    below = "".join(f"<p>{note}</p>" for note in notes)
+    assert f"<figcaption><p><b>{title}.</b></p>{below}</figcaption>" in unescape(page)
+    assert f"\\caption{{{escape(' '.join((f'{title}.', *notes)))}}}\\end{{figure}}" in tex
 
 
 def test_an_svg_for_html_has_no_addresses_and_ids_of_its_own() -> None:

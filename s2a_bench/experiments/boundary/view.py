@@ -14,7 +14,7 @@ from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
 from s2a_bench.store.schema import PROVENANCE, Positive, about
 from s2a_bench.writers.as_json import cell_of_row, frame
 from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.figures import new_figure, wrapped
+from s2a_bench.writers.figures import new_figure, write_beside
 from s2a_bench.writers.tables import ABSENT, EMULATED, PAPERS, Note, TextTable, number
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def build_boundary(run: Run) -> Figure:
 
     Without jitter regions are shaded by the formula and every trial is a mark; with jitter P(a plan stalls) is shaded.
     """
-    figure = new_figure(3.5, _title(run))
+    figure = new_figure(3.4, _caption(run))
     axes = figure.subplots()
     nominal = grid_of(run, "t_nom")
     low, high = float(nominal["tokens_per_s"].min()), float(nominal["tokens_per_s"].max())
@@ -203,14 +203,14 @@ def build_boundary(run: Run) -> Figure:
 
 
 def _shade_regions(axes: Axes, tokens: np.ndarray, lines: dict[str, float], low: float, high: float) -> None:
-    """Shade what the formula says, and write it into the regions."""
+    """Shade what the formula says."""
     nominal, least = tokens / lines["t_nom"], tokens / lines["t_min"]
-    axes.fill_between(tokens, least, high, color=_FREE, alpha=_SHADE, linewidth=0)
-    axes.fill_between(tokens, nominal, least, color=_BETWEEN, alpha=_SHADE, linewidth=0)
-    axes.fill_between(tokens, low, nominal, color=_STALLS, alpha=_SHADE, linewidth=0)
-    box = {"facecolor": "white", "alpha": 0.85, "linewidth": 0, "pad": 1.5}
-    axes.text(0.03, 0.68, "stall-free", transform=axes.transAxes, color=_INK, bbox=box)
-    axes.text(0.97, 0.04, "naive stalls", transform=axes.transAxes, color=_INK, ha="right", bbox=box)
+    for below, above, colour, label in (
+        (least, high, _FREE, "stall-free"),
+        (nominal, least, _BETWEEN, r"stall-free only at $T_\mathrm{nom}$"),
+        (low, nominal, _STALLS, "naive stalls"),
+    ):
+        axes.fill_between(tokens, below, above, color=colour, alpha=_SHADE, linewidth=0, label=label)
 
 
 def _mark_trials(axes: Axes, run: Run) -> None:
@@ -233,27 +233,15 @@ def _shade_shares(figure: Figure, axes: Axes, run: Run) -> None:
         shading="nearest",
         rasterized=True,
     )
-    figure.colorbar(mesh, ax=axes, label="P(a plan stalls), naive at $T_\\mathrm{nom}$", pad=0.02)
+    figure.colorbar(mesh, ax=axes, location="top", label="P(a plan stalls), naive at $T_\\mathrm{nom}$", pad=0.02)
 
 
 def _mark_boards(axes: Axes, run: Run) -> None:
-    """Draw a line a board, with its granularities: filled where naive is stall-free at T_nom."""
+    """Draw a line a board, named beside it, with its granularities: filled where naive is stall-free at T_nom."""
     for title, rate, points in marks_of(run):
         nominal = points[points["duration"] == "t_nom"]
         axes.axhline(rate, color=_INK, linewidth=0.5, linestyle=":")
-        box = {"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1}
-        axes.annotate(
-            f"{title}, {rate:g}",
-            (1, rate),
-            (-2, 3),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            ha="right",
-            va="bottom",
-            fontsize=6,
-            color=_INK,
-            bbox=box,
-        )
+        write_beside(axes, rate, f"{title}\n{rate:g} tokens/s")
         for free, face in ((True, _INK), (False, "white")):
             chosen = nominal[nominal["stall_free"] == free]
             axes.plot(
@@ -267,16 +255,13 @@ def _mark_boards(axes: Axes, run: Run) -> None:
             )
 
 
-def _title(run: Run) -> str:
+def _caption(run: Run) -> tuple[str, ...]:
     asked = run.manifest["configuration"]
     t_nom_s = asked["t_nom_s"]
-    facts = [f"N = {asked['n_skills']}", f"$T_\\mathrm{{nom}}$ = {t_nom_s:g} s"]
-    facts += [f"$T_\\mathrm{{min}}$ = {asked['t_min'] * t_nom_s:g} s"]
-    facts += [f"{asked['plans']} plans a point" if is_random(run) else "tokens come evenly"]
-    lines = ["Stall-free region of naive execution", ", ".join(facts)]
-    lines += [f"jitter {asked['jitter']}"] if is_random(run) else []
-    if any(board["origin"] == "paper" for board in run.manifest["boards"]):
-        lines.append(
-            "Squares: boards at the paper's rates (not measured here), filled where the formula says stall-free"
-        )
-    return wrapped(lines)
+    facts = [f"N = {asked['n_skills']}", f"T_nom = {t_nom_s:g} s", f"T_min = {asked['t_min'] * t_nom_s:g} s"]
+    jitter = f"{asked['plans']} plans a point, jitter {asked['jitter']}"
+    facts.append(jitter if is_random(run) else "tokens come evenly")
+    paper = any(board["origin"] == "paper" for board in run.manifest["boards"])
+    whose = " at the paper's rates (not measured here)" if paper else ""
+    squares = f"Squares: boards{whose}, filled where the formula says stall-free."
+    return ("Stall-free region of naive execution", f"{', '.join(facts)}.", *([squares] if marks_of(run) else []))

@@ -19,7 +19,6 @@ class LatencyConfig(RequestsConfig):
         (),
         f"how a picture travels: {', '.join(PAYLOADS)}; several with commas, each in cells of its own "
         "[default: raw,jpeg; quick, stream: raw]",
-        panel="Pictures",
     )
 
     engine: EngineConfig = group(

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.paper import paper_throughput
 from s2a_bench.experiments.requests import (
     OF_ANSWERS,
+    caption_for,
     engine_notes,
     failure_notes,
     launches_note,
     span_of,
-    title_of,
 )
 from s2a_bench.experiments.throughput.metrics import (
     BIN,
@@ -29,15 +31,15 @@ from s2a_bench.experiments.throughput.metrics import (
     throughput_csv,
     throughput_json,
 )
-from s2a_bench.stats import summarise, summary_of
-from s2a_bench.writers.figures import Bar, build_bars, build_distribution, new_figure
+from s2a_bench.stats import summary_of
+from s2a_bench.writers.figures import WHISKERS, Bar, build_bars, build_distribution, new_figure
 from s2a_bench.writers.style import cell_looks
 from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interval, mean_sd, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.requests import Cell
+    from s2a_bench.experiments.requests import Cell, Floats
     from s2a_bench.store.run import Run
 
 PAPER_LABEL: Final = "the paper's claim (table II), other machines"
@@ -91,23 +93,28 @@ def speed_table(run: Run) -> TextTable:
     rows: list[tuple[str, ...]] = [
         (
             *(cell.name, str(cell.n), str(cell.errors)),
-            *(entries(cell.values(metric), MEAN_SD)[0] for metric in metrics),
+            *(_median_mean(cell.values(metric)) for metric in metrics),
             *("1" if cell.name == base else interval(ratios.get((cell.name, base))) for base in bases),
         )
         for cell in cells
     ]
     if reference:
-        rates = (ABSENT, mean_sd(summarise(reference)), ABSENT)[: len(metrics)]
+        rates = (ABSENT, _median_mean(np.array(reference)), ABSENT)[: len(metrics)]
         over = ("1" if base == LLAMA_BENCH else ABSENT for base in bases)
         rows.append((LLAMA_BENCH, str(len(reference)), "0", *rates, *over))
     return TextTable(
-        "Tokens a second: mean ± sd" + ("; ratios of decode medians [95 % interval]" if bases else ""),
+        "Tokens a second: median (mean ± sd)" + ("; ratios of decode medians [95 % interval]" if bases else ""),
         ("cell", "n", "errors", *(OF_ANSWERS[name].title for name in metrics), *(f"ratio to {base}" for base in bases)),
         rows,
         1,
         frozenset({len(cells)}) if reference else frozenset(),
         (*_notes(run, cells, launches_note(ratios.values())), *failure_notes(cells, "requests")),
     )
+
+
+def _median_mean(values: Floats) -> str:
+    median, mean = entries(values, "median", MEAN_SD)
+    return f"{median} ({mean})" if values.size else median
 
 
 def prompt_table(run: Run) -> TextTable:
@@ -187,23 +194,22 @@ def throughput_figures(run: Run, *, against_paper: bool = False) -> dict[str, Ca
 
 
 def build_throughput_bars(run: Run, *, against_paper: bool = False) -> Figure:
-    """Draw mean ± sd of N / T_eval, a row a cell (the paper's table II), and llama-bench's decode rate where it ran.
+    """Draw medians of N / T_eval, a row a cell (the paper's table II), and llama-bench's decode rate where it ran.
 
     Bars from zero; points on a logarithmic axis where the rates are too far apart for one scale.
     """
     cells = [cell for cell in throughput_cells(run) if cell.values(ENGINE_METRIC).size]
     looks = cell_looks({cell.name: cell.path for cell in cells})
-    rows = [(cell.name, summarise(cell.values(ENGINE_METRIC)), looks[cell.name][0]) for cell in cells]
+    bars = [Bar.of(cell.name, cell.values(ENGINE_METRIC), looks[cell.name][0]) for cell in cells]
     if reference := reference_values(run):
-        rows.append((f"{LLAMA_BENCH}\n(decode)", summarise(reference), _REFERENCE_FILL))
-    bars = [Bar(name, found.mean, found.sd, mean_sd(found), colour) for name, found, colour in rows]
+        bars.append(Bar.of(f"{LLAMA_BENCH}\n(decode)", np.array(reference), _REFERENCE_FILL))
     if against_paper:
         bars += [
             Bar(f"paper:\n{claim.name}", claim.tokens_per_s, None, f"{claim.tokens_per_s:g}")
             for claim in paper_throughput()
         ]
-    title = _title(run, cells, "Tokens a second")
-    return build_bars(title, bars, "tokens/s", PAPER_LABEL if against_paper else "", scaled=True)
+    caption = _caption(run, cells, "Tokens a second, medians", WHISKERS)
+    return build_bars(caption, bars, "tokens/s", PAPER_LABEL if against_paper else "", scaled=True)
 
 
 def build_gap_distribution(run: Run) -> Figure:
@@ -215,8 +221,8 @@ def build_gap_distribution(run: Run) -> Figure:
         for cell in cells
         for gaps in [cell.values("itl")]
     }
-    title = _title(run, cells, "Gaps between tokens, as the client saw them")
-    return build_distribution(title, lines, "gaps", "gap (ms)", columns=1)
+    caption = _caption(run, cells, "Gaps between tokens, as the client saw them")
+    return build_distribution(caption, lines, "gaps", "gap (ms)", columns=1)
 
 
 def build_rate_by_position(run: Run) -> Figure:
@@ -224,12 +230,10 @@ def build_rate_by_position(run: Run) -> Figure:
 
     Not means: tokens that arrive together after a pause have any rate at all.
     """
-    import numpy as np
-
     cells = [cell for cell in throughput_cells(run) if rates_by_position(cell)]
     looks = cell_looks({cell.name: cell.path for cell in cells})
-    title = _title(run, cells, f"Decode rate by position, bins of {BIN}: medians")
-    figure = new_figure(2.2 + 0.14 * -(-len(cells) // 2), title)
+    caption = _caption(run, cells, f"Decode rate by position, bins of {BIN}: medians", "Bands: quartiles.")
+    figure = new_figure(2.2 + 0.14 * -(-len(cells) // 2), caption)
     axes = figure.subplots()
     highest = 0.0
     for cell in cells:
@@ -249,7 +253,7 @@ def build_rate_by_position(run: Run) -> Figure:
     return figure
 
 
-def _title(run: Run, cells: list[Cell], what: str) -> str:
+def _caption(run: Run, cells: list[Cell], what: str, *notes: str) -> tuple[str, ...]:
     tokens = summary_of(cells[0].n_tokens.to_numpy(dtype="float64"))
     facts = [f"{tokens.median:.0f} tokens an answer"] if tokens else []
-    return title_of(run, cells, what, [*facts, *sorted({cell.about["size"] for cell in cells})])
+    return caption_for(run, cells, what, [*facts, *sorted({cell.about["size"] for cell in cells})], notes)

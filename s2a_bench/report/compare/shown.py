@@ -20,7 +20,7 @@ from s2a_bench.stats.batches import BATCHES
 from s2a_bench.stats.change import POWER
 from s2a_bench.store.manifest import RunWarning, plain
 from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.figures import marked, name_rows, new_figure, wrapped, write_beside
+from s2a_bench.writers.figures import marked, name_rows, new_figure, write_beside
 from s2a_bench.writers.latex import to_latex
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable, number, to_markdown
@@ -301,8 +301,12 @@ def build_forest(compared: ComparedRuns) -> Figure | None:
     if not panels:
         return None
     heights = [len(rows) + 2.2 for rows in panels.values()]
-    lines = (f"{compared.command}: B against A", title(compared))
-    figure = new_figure(0.75 + 0.17 * sum(heights), wrapped(lines))
+    caption = (
+        f"{compared.command}: changes from A to B with their 95 % intervals",
+        *notes(compared),
+        f"Grey: less than {compared.least * 100:g} %.",
+    )
+    figure = new_figure(0.75 + 0.17 * sum(heights), caption)
     every = figure.subplots(len(panels), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (name, rows) in zip(every, panels.items(), strict=True):
         _panel(axes, rows, compared.least)
@@ -347,9 +351,8 @@ def write_comparison(folder: Path, compared: ComparedRuns, whole: Mapping[str, A
             (folder / name).write_text(text, encoding="utf-8")
         written = [folder / name for name in texts]
         with paper_column():
-            figure = build_forest(compared)
-            if figure:
-                marked(figure, compared.origins.line)
+            if figure := build_forest(compared):
+                marked(lambda: figure, *compared.baseline, *compared.other)
                 for suffix in ("png", "pdf"):
                     written.append(folder / f"compare.{suffix}")
                     figure.savefig(written[-1])

@@ -19,6 +19,7 @@ from s2a_bench.report.page.page import render, tally
 from s2a_bench.store.run import fits
 from s2a_bench.text import visible
 from s2a_bench.writers.csv_text import CsvTable
+from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.latex import document, escape, to_siunitx
 from s2a_bench.writers.style import WIDTH_IN, paper_column
 from s2a_bench.writers.tables import TextTable, markdown_text, to_markdown
@@ -31,11 +32,12 @@ if TYPE_CHECKING:
 class Drawn:
     """One figure: SVG to be put into HTML, and PDF where it was asked for.
 
-    ``alt`` is its title; a ``wide`` one takes both columns of a paper.
+    ``title`` and ``notes`` are its caption; a ``wide`` one takes both columns of a paper.
     """
 
     svg: str
-    alt: str
+    title: str
+    notes: Sequence[str]
     wide: bool
     pdf: bytes | None
 
@@ -49,10 +51,12 @@ def draw(name: str, builders: Mapping[str, Callable[[], Figure]], *, pdf: bool) 
         prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', name)}-{place}-"
         with paper_column(), mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": prefix}):
             figure = build()
+            title, *notes = caption_of(figure)
             svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
             found[figure_name] = Drawn(
                 inline(svg[svg.index("<svg") :], prefix),
-                _alt(figure),
+                title,
+                notes,
                 figure.get_figwidth() > WIDTH_IN,
                 _saved(figure, "pdf", "CreationDate") if pdf else None,
             )
@@ -71,12 +75,6 @@ def inline(svg: str, prefix: str) -> str:
     svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg)
     svg = svg.replace("xlink:href=", "href=")
     return re.sub(r'(\bid="|href="#|url\(#)', lambda found: found[1] + prefix, svg)
-
-
-def _alt(figure: Figure) -> str:
-    """Return the title in one line, its mathematics as plain as it goes."""
-    title = " ".join(figure.get_suptitle().split())
-    return re.sub(r"\\mathrm\{(\w+)\}", r"\1", title.replace("$", ""))
 
 
 _MARK = f"<!-- {GENERATOR} -->"
@@ -146,8 +144,9 @@ def _latex(report: Report, drawn: dict[str, dict[str, Drawn]]) -> Iterator[tuple
         for name, figure in drawn.get(chapter.name, {}).items():
             if figure.pdf:
                 yield f"{chapter.name}/{name}.pdf", figure.pdf
-                path = f"{chapter.name}/{name}.pdf"
-                lines.append(f"\\begin{{figure}}[htbp]\\centering\\includegraphics{{{path}}}\\end{{figure}}")
+                graphic = f"\\includegraphics{{{chapter.name}/{name}.pdf}}"
+                caption = escape(" ".join((f"{figure.title}.", *figure.notes)))
+                lines.append(f"\\begin{{figure}}[htbp]\\centering{graphic}\\caption{{{caption}}}\\end{{figure}}")
         parts.append("\n".join(lines))
     yield "report.tex", document("s2a-bench report", parts)
 

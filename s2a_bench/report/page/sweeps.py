@@ -6,7 +6,7 @@ Only what is computed is put together: measured cells stay runs of their own, si
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -25,8 +25,6 @@ from s2a_bench.writers.figures import marked
 from s2a_bench.writers.tables import MEAN_SD, TextTable, entries
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from s2a_bench.experiments.requests import Split
 
 
@@ -52,13 +50,9 @@ def overview(sweep: Sweep, runs: Runs) -> Shown:
     line = sweep.origins.line
     tables = {name: replace(table, provenance=line) for name, table in (lines | tables).items()}
     csvs = {"cells.csv": CsvTable.of_frame(sweep.cells)}
-    drawn = {name: partial(_marked, build, line) for name, build in figures.items()}
+    drawn = {name: partial(marked, build, *(run for _, run in runs)) for name, build in figures.items()}
     main = [*lines, *(["overview"] if measured else [])]
     return Shown(said, tables, main, csvs=csvs, figures=drawn)
-
-
-def _marked(build: Callable[[], Figure], line: str) -> Figure:
-    return marked(build(), line)
 
 
 def cell_table(sweep: Sweep) -> TextTable:

@@ -88,6 +88,10 @@ def test_lanes_show_the_modes_and_the_calibrated_trigger(run: Run) -> None:
     stalls = [found for found in axes.collections if getattr(found, "get_hatch", lambda: None)()]
     assert len(stalls) >= 6
     assert any(text.get_text() == "\N{MINUS SIGN}8" for text in axes.texts)
+    (ages,) = axes.child_axes
+    assert [label.get_text() for label in ages.get_yticklabels()][::2] == ["0"] * 10
+    curve, at = next(line for line in axes.lines if len(line.get_xdata()) > 2), ages.get_yticks()
+    assert at[0] <= np.nanmin(curve.get_ydata()) <= np.nanmax(curve.get_ydata()) <= at[1]
 
 
 def test_stalls_are_a_line_a_mode_over_mean_latency(run: Run) -> None:
@@ -112,6 +116,8 @@ def test_reactions_have_the_closed_form_drawn_over_them(run: Run) -> None:
     upper, lower = drawn(run, build_reactions).axes
     dotted = [line for line in upper.lines if line.get_linestyle() == ":"]
     assert len(dotted) == 5
+    simulated = [line for line in lower.lines if line.get_drawstyle() == "steps-post"]
+    assert {len(line.get_xdata()) for line in simulated} == {401}
     ms = np.asarray(dotted[0].get_xdata())
     assert (ms[0], ms[-1]) == (pytest.approx(60), pytest.approx(2 * 60 + 320))
     assert lower.get_title(loc="left") == "lognormal:mean_ms=80,cv=.5"

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -18,6 +19,7 @@ from s2a_bench.experiments.latency.view.figures import (
 from s2a_bench.experiments.paper import LABEL
 from s2a_bench.store.run import Run
 from s2a_bench.trace import GROUPS
+from s2a_bench.writers.figures import Bar, caption_of
 from s2a_bench.writers.style import GREY, GROUP_FILLS, cell_looks, paper_column
 
 MakeRun = Callable[..., Run]
@@ -49,22 +51,26 @@ def texts(figure: Figure) -> list[str]:
     return [text.get_text() for text in figure.axes[0].texts]
 
 
-def test_bars_are_means_with_their_sd_beside(make_run: MakeRun) -> None:
+def test_bars_are_medians_and_whiskers_are_seen_on_every_colour(make_run: MakeRun) -> None:
     figure = build_latency_bars(make_run(HAND, n=4, spread=0))
     assert row_names(figure) == ["http/as-deployed\n(raw)", "ros/topic\n(raw)"]
     assert [bar.get_width() for bar in bars(figure)] == [8.0, 4.0]
-    assert texts(figure) == ["8.00 ± 0.00", "4.00 ± 0.00"]
+    assert texts(figure) == ["8.00", "4.00"]
+    assert all(line.get_path_effects() for line in figure.axes[0].get_lines())
+    assert Bar.of("skewed", np.array([1.0, 2.0, 12.0]), GREY) == Bar("skewed", 2.0, (1.2, 10.0), "2.00")
     assert figure.axes[0].get_xlim()[0] == 0
     assert figure.axes[0].get_xlabel() == "e2e without inference (ms)"
     assert legend(figure) == []
 
 
-def test_the_title_says_how_many_and_what_did_not_really_answer(make_run: MakeRun) -> None:
-    echo = build_latency_bars(make_run(HAND, n=4)).get_suptitle()
-    assert echo == "Mean ± sd: end to end without inference\nn = 4 a cell, 640x480, request mode, echo engine"
+def test_the_caption_says_how_many_and_what_did_not_really_answer(make_run: MakeRun) -> None:
+    title, asked, _, engine = caption_of(build_latency_bars(make_run(HAND, n=4)))
+    assert title == "Medians: end to end without inference"
+    assert asked == "n = 4 a cell, 640x480, request mode."
+    assert engine == "Echo engine."
     dummy = make_run(HAND, n=4, engine="llama", manifest={"model": {"dummy": True}})
     for build in (build_latency_bars, build_stage_breakdown, build_latency_distribution):
-        assert "dummy weights" in build(dummy).get_suptitle()
+        assert "Dummy weights." in caption_of(build(dummy))
 
 
 def test_the_papers_values_appear_only_when_asked_for_and_as_another_machines(make_run: MakeRun) -> None:
@@ -75,21 +81,20 @@ def test_the_papers_values_appear_only_when_asked_for_and_as_another_machines(ma
     assert [bar.get_width() for bar in bars(figure)][2:] == [101.8, 15.5]
     assert {mpl.colors.to_hex(bar.get_facecolor()).upper() for bar in bars(figure)[2:]} == {GREY}
     assert texts(figure)[2:] == ["101.8 ± 8.6", "15.5 ± 1.0"]
-    (label,) = legend(figure)
-    assert label.startswith(LABEL)
-    assert LABEL == "paper (Jetson AGX Orin), another machine"
-    assert "does not say that inference is left out" in label
+    assert legend(figure) == [LABEL] == ["paper (Jetson AGX Orin), another machine"]
+    assert any("does not say that inference is left out" in note for note in caption_of(figure))
 
 
-def test_the_stacked_groups_and_the_residual_end_at_the_mean_of_the_whole(make_run: MakeRun) -> None:
+def test_the_stacked_groups_are_medians_beside_that_of_the_whole(make_run: MakeRun) -> None:
     figure = build_stage_breakdown(make_run(HAND, n=4, spread=0))
     assert len(figure.axes) == 1
-    assert legend(figure) == ["capture", "encode", "pack", "network", "return", "residual"]
+    assert legend(figure) == ["capture", "encode", "pack", "network", "return", "residual", "whole"]
     parts = bars(figure)
     assert [bar.get_width() for bar in parts[:6]] == [1, 3, 0, 2, 0.5, 1.5]
     assert [bar.get_x() for bar in parts[:6]] == [0, 1, 4, 4, 6, 6.5]
     assert parts[5].get_hatch() == "//////"
     assert texts(figure) == ["8.00", "4.00"]
+    assert [list(line.get_xdata()) for line in figure.axes[0].get_lines()] == [[8, 8], [4, 4]]
 
 
 def test_cells_that_differ_widely_get_a_panel_of_shares(make_run: MakeRun) -> None:
@@ -119,7 +124,7 @@ def test_a_narrow_distribution_stays_linear(make_run: MakeRun) -> None:
 
 def test_a_black_box_is_left_out_by_name_or_shown_with_its_inference(make_run: MakeRun, black_box: Any) -> None:
     mixed = build_latency_bars(make_run(HAND | {"http/black-box": black_box}, n=4))
-    assert "http/black-box not shown (inference unknown)" in mixed.get_suptitle().replace("\n", " ")
+    assert "http/black-box not shown (inference unknown)" in " ".join(caption_of(mixed))
     assert len(bars(mixed)) == 2
     alone = build_stage_breakdown(make_run({"http/black-box": black_box}, n=4, spread=0))
     assert alone.axes[0].get_xlabel() == "e2e, inference included (ms)"
@@ -158,7 +163,8 @@ def test_png_and_pdf_are_written_below_the_run_and_leave_no_global_state(make_ru
     before = dict(mpl.rcParams)
     write_shown(run, EXPERIMENT.show(run, against="paper"))
     assert dict(mpl.rcParams) == before
-    paths = sorted((run.path / "figures").iterdir())
+    *paths, captions = sorted((run.path / "figures").iterdir(), key=lambda path: (path.suffix == ".md", path))
+    assert captions.read_text().startswith("**latency_bars**: Medians: end to end without inference. n = 3 a cell")
     names = ["distribution", "latency_bars", "stages"]
     assert [path.name for path in paths] == [f"{name}.{suffix}" for name in names for suffix in ("pdf", "png")]
     for path in paths:

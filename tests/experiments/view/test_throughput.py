@@ -43,6 +43,7 @@ from s2a_bench.experiments.throughput.view import (
 )
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import lay_out
 from tests.made_runs import SCHEMA, known
@@ -262,12 +263,12 @@ def test_bars_start_at_zero_and_the_papers_are_labelled(make: Make) -> None:
     bars = [patch.get_width() for patch in figure.axes[0].patches if isinstance(patch, Rectangle)]
     assert bars == [pytest.approx(40.0)]
     assert figure.axes[0].get_xlim()[0] == 0
-    assert "dummy weights" in figure.get_suptitle()
+    assert "Dummy weights." in caption_of(figure)
     assert not figure.legends
     beside = build_throughput_bars(run, against_paper=True)
     names = [label.get_text() for label in beside.axes[0].get_yticklabels()]
     assert names == ["in-process", *(f"paper:\n{claim.name}" for claim in paper_throughput())]
-    assert [text.get_text() for text in beside.axes[0].texts] == ["40.0 ± 0.0", "34.2", "4.8", "0.58"]
+    assert [text.get_text() for text in beside.axes[0].texts] == ["40.0", "34.2", "4.8", "0.58"]
     assert [text.get_text() for legend in beside.legends for text in legend.get_texts()] == [PAPER_LABEL]
     assert beside.axes[0].get_xscale() == "log"
     assert not [patch for patch in beside.axes[0].patches if isinstance(patch, Rectangle)]  # no bar without a zero

@@ -31,6 +31,7 @@ from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
 from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
 from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import TextTable
 
@@ -140,10 +141,10 @@ def test_each_panel_has_the_time_axis_it_needs(computed: Run) -> None:
 
 
 def test_the_figure_says_what_is_emulated_and_assumed(computed: Run, live: Run) -> None:
-    title = drawn(computed).get_suptitle()
-    assert "EMULATED in virtual time" in title
-    assert "assumption of ours" in title
-    assert "EMULATED" not in drawn(live).get_suptitle()
+    caption = " ".join(caption_of(drawn(computed)))
+    assert "EMULATED in virtual time" in caption
+    assert "assumption of ours" in caption
+    assert "EMULATED" not in " ".join(caption_of(drawn(live)))
 
 
 def test_the_legend_explains_only_what_is_drawn(computed: Run, live: Run) -> None:

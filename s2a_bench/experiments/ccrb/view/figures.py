@@ -26,7 +26,7 @@ from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.cars import Cars
 from s2a_bench.scenario.ccrb.words import NAIVE, NO_SCORE, ORDERING, PAPER, ahead, law, operating_point, said
 from s2a_bench.store.requests import SKILLS
-from s2a_bench.writers.figures import new_figure, wrapped
+from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.style import WIDE_IN
 
 if TYPE_CHECKING:
@@ -55,9 +55,17 @@ REGIONS: Final = {
     "others": ("both others have an impact, in other ways", "#8FD3BE"),
     NAIVE: ("only naive has an impact", "#E69F00"),
     "wait": ("only wait-then-act has an impact", "#56B4E9"),
-    "nobody": ("nobody has an impact", "#FFFFFF"),
+    "nobody": ("nobody has an impact", "#F3F3F3"),
     "all": ("all three have an impact", "#444444"),
     "mine": ("stream-to-act has an impact, another does not", "#CC79A7"),
+}
+
+_POINT: Final[dict[str, Any]] = {
+    "color": "white",
+    "linestyle": "",
+    "marker": "*",
+    "markeredgecolor": "black",
+    "markersize": 9,
 }
 
 
@@ -67,7 +75,7 @@ def build_scenario(run: Run) -> Figure:
     survives, rows = survives_of(found), found.to_dict("records")
     paths = {row["policy"]: _path(run, row) for row in rows}
     skills = dict(list(run.table(SKILLS).groupby("cell", sort=False)))
-    figure = new_figure(4.6, wrapped((_title(run), *origin_notes(run)), WIDE_IN), WIDE_IN)
+    figure = new_figure(4.5, (_title(run), *origin_notes(run)), WIDE_IN)
     grid = figure.subplots(3, len(rows), squeeze=False, sharex=True, sharey="row")
     token_s = token_times_s(run)
     until_s = max(float(path["time_s"].iloc[-1]) for path in paths.values())
@@ -202,6 +210,7 @@ def region_of(scenes: pd.DataFrame) -> list[str]:
 
 def build_phase(run: Run) -> Figure:
     """Draw a panel a gap behaviour, the operating point marked, the findings above each."""
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     asked = configuration(run)
@@ -210,25 +219,31 @@ def build_phase(run: Run) -> Figure:
     )
     survives = scenes_of(run, "phase", GAPS[0])["survives"]
     check = f" It survives an ego with fast tokens at {survives.mean():.0%}." if survives.notna().all() else ""
-    lines = [
-        f"Who has an impact? {scene[0].upper()}{scene[1:]}. {ORDERING}",
-        f"Rear: {law(asked)}.{check} EMULATED: tokens come evenly.",
-    ]
-    figure = new_figure(2.9, wrapped(lines, WIDE_IN), WIDE_IN)
-    grid = figure.subplots(1, len(GAPS), sharex=True, sharey=True)
+    caption = (
+        "Who has an impact, for each behaviour of the ego while no skill is valid",
+        f"{scene[0].upper()}{scene[1:]}.",
+        f"{ORDERING} The percentages are its shares of the plane.",
+        f"Rear: {law(asked)}.{check}",
+        "EMULATED: tokens come evenly.",
+    )
+    figure = new_figure(4.6, caption, WIDE_IN)
+    grid = figure.subplots(2, -(-len(GAPS) // 2), sharex=True, sharey=True)
     seen: set[str] = set()
-    for axes, gap in zip(grid, GAPS, strict=True):
+    for axes, gap in zip(grid.flat, GAPS, strict=True):
         scenes = scenes_of(run, "phase", gap)
         seen |= _draw_panel(axes, scenes, asked, run)
         share = share_of(scenes, "paper").value
-        axes.set_title(f"{gap}: {share:.1%} paper's ordering\n{_here(run, gap, asked)}", loc="left")
+        axes.set_title(f"{gap}: the paper's ordering {share:.1%}, {_here(run, gap, asked)}", loc="left")
+    for axes in grid[-1]:
         axes.set_xlabel("R (tokens/s)")
-    grid[0].set_ylabel("rear gap (m)")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("rear gap (m)")
     handles: list[object] = [
         Patch(facecolor=colour, edgecolor="#888888", linewidth=0.4, label=label)
         for name, (label, colour) in REGIONS.items()
         if name in seen
     ]
+    handles.append(Line2D([], [], label="operating point", **_POINT))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
 
@@ -256,7 +271,7 @@ def _draw_panel(axes: Axes, scenes: pd.DataFrame, asked: dict[str, Any], run: Ru
     axes.set_xticks(ticks, [f"{rate:g}" for rate in ticks])
     axes.set_xticks([], minor=True)
     rate = run.manifest["boards"][0]["tokens_per_s"]
-    axes.plot(rate, asked["rear_gap_m"], "*", color="white", markeredgecolor="black", markersize=9)
+    axes.plot(rate, asked["rear_gap_m"], **_POINT)
     return set(np.unique(named))
 
 
@@ -271,12 +286,13 @@ def build_sensitivity(run: Run) -> Figure:
     found, asked = run.table(SENSITIVITY), configuration(run)
     shares = found.assign(share=100 * found["paper"] / found["points"])
     seeds, points = found["seed"].nunique(), int(found["points"].iloc[0])
-    held = f"The paper's ordering as a share of {plane_words(asked)}: {ahead(asked)}, gap behaviour {asked['gap']}."
-    lines = [
-        f"{held} Mean, least and most of {seeds} seeds of {points} points; dotted: the default.",
-        f"Rear: {law(asked)}. EMULATED: tokens come evenly. {NO_SCORE}",
-    ]
-    figure = new_figure(3.4, wrapped(lines, WIDE_IN), WIDE_IN)
+    caption = (
+        f"The paper's ordering as a share of {plane_words(asked)}: {ahead(asked)}, gap behaviour {asked['gap']}",
+        f"Mean, least and most of {seeds} seeds of {points} points; dotted: the default.",
+        f"Rear: {law(asked)}.",
+        f"EMULATED: tokens come evenly. {NO_SCORE}",
+    )
+    figure = new_figure(3.3, caption, WIDE_IN)
     grid = figure.subplots(2, 3, sharey=True)
     for axes, varied in zip(grid.flat, VARIED_TITLES, strict=True):
         _draw_share(axes, shares[shares["varied"] == varied], float(asked.get(varied, getattr(Cars(), varied))))

@@ -12,8 +12,8 @@ import numpy as np
 
 from s2a_bench.experiments.chunks.rows import MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
 from s2a_bench.experiments.chunks.view.tables import rows_of, sources_of
-from s2a_bench.writers.figures import LINE_CHARS, new_figure, wrapped
-from s2a_bench.writers.style import STALL_LOOK, WIDE_IN
+from s2a_bench.writers.figures import LINE_CHARS, new_figure
+from s2a_bench.writers.style import STALL_LOOK, WIDE_IN, ink_on
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,8 +34,8 @@ LOOKS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 _RULES: Final = {"calibrated": "o", "tracked": "s", "maximum": "^", "mean": "v", "oracle": "*"}
 _INK: Final = "#222222"
 _MOST_PANELS: Final = 8
-_BULK: Final = 0.985
-"""The axis of reaction times ends a little behind this quantile; chunk_reactions.csv has the rest."""
+_BULK: Final = 0.9975
+"""The axis of reaction times ends at this quantile; chunk_reactions.csv has the rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +70,13 @@ def lanes_of(run: Run) -> list[Lane]:
 
 def build_lanes(run: Run) -> Figure:
     """Draw the lanes below one another: actions coloured by chunk, stalls hatched, requests above, ages below."""
+    from matplotlib.legend_handler import HandlerTuple
+
     lanes = lanes_of(run)
-    asked = run.manifest["configuration"]
     several = len({lane.source for lane in lanes}) > 1
-    setting = f"H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {asked['rounding']}"
     source = "" if several else f" @ {lanes[0].source}"
-    title = f"What each control tick executes{source}, {setting}"
-    figure = new_figure(0.75 + 0.55 * len(lanes), wrapped((title,), WIDE_IN), WIDE_IN)
+    caption = _caption(run, f"What each control tick executes{source}")
+    figure = new_figure(0.75 + 0.55 * len(lanes), caption, WIDE_IN)
     axes = figure.subplots()
     oldest = max(int(lane.ticks["age_ticks"].fillna(0).max()) for lane in lanes) or 1
     for place, lane in enumerate(lanes):
@@ -86,7 +86,19 @@ def build_lanes(run: Run) -> Figure:
     axes.set_ylim(len(lanes) - 0.33, -0.6)
     axes.set_xlim(0, max(len(lane.ticks) for lane in lanes))
     axes.set_xlabel("control tick")
-    figure.legend(handles=_legend(oldest), loc="outside lower center", ncols=5, columnspacing=1.0)
+    ages = axes.secondary_yaxis("right")
+    bounds = [_age_at(place, age) for place in range(len(lanes)) for age in (0, 1)]
+    ages.set_yticks(bounds, ["0", str(oldest)] * len(lanes), fontsize=5)
+    ages.set_ylabel("age of the observation (ticks)")
+    legend = _legend()
+    figure.legend(
+        legend.values(),
+        legend.keys(),
+        handler_map={tuple: HandlerTuple(ndivide=None, pad=0)},
+        loc="outside lower center",
+        ncols=5,
+        columnspacing=1.0,
+    )
     return figure
 
 
@@ -107,17 +119,22 @@ def draw_lane(axes: Axes, lane: Lane, place: int, oldest: int) -> None:
         axes.plot([leaves], [top - 0.07], "|", color="#666666", markersize=3, markeredgewidth=0.7)
         if row["thrown_away"] and row["executed"] and row["start_tick"] + row["executed"] < len(chunk):
             end = row["start_tick"] + row["executed"]
-            axes.annotate(
-                f"\N{MINUS SIGN}{row['thrown_away']}", (end, place), ha="right", va="center", fontsize=4, color="white"
-            )
+            ink = ink_on(COLOURS[chunk[end - 1] % len(COLOURS)])
+            text = f"\N{MINUS SIGN}{row['thrown_away']}"
+            axes.annotate(text, (end, place), ha="right", va="center", fontsize=5, color=ink)
     age = lane.ticks["age_ticks"].to_numpy(dtype="float64", na_value=np.nan)
     axes.step(
         np.arange(age.size + 1),
-        place + _BAR / 2 + 0.03 + _AGE * np.append(age, age[-1]) / oldest,
+        _age_at(place, np.append(age, age[-1]) / oldest),
         where="post",
         color="#D55E00",
         linewidth=0.7,
     )
+
+
+def _age_at(place: float, share: Any) -> Any:
+    """Return where a share of the greatest age is drawn, below the bar of the lane at ``place``."""
+    return place + _BAR / 2 + 0.03 + _AGE * share
 
 
 def runs_of(values: np.ndarray) -> list[tuple[int, int]]:
@@ -137,16 +154,17 @@ def short(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
-def _legend(oldest: int) -> list[object]:
+def _legend() -> dict[str, Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    return [
-        Patch(color=COLOURS[0], label="actions of one chunk (\N{MINUS SIGN}k: thrown away)"),
-        Patch(**STALL_LOOK, label="stall"),
-        Line2D([], [], color="#666666", linewidth=0.7, marker="|", markersize=3, label="request to usable chunk"),
-        Line2D([], [], color="#D55E00", linewidth=0.7, label=f"age of the observation, down to {oldest} ticks"),
-    ]
+    return {
+        "actions, a colour a chunk": tuple(Patch(color=colour) for colour in COLOURS),
+        "k of its actions thrown away": Line2D([], [], color=_INK, linestyle="", marker="$-k$", markersize=8),
+        "stall": Patch(**STALL_LOOK),
+        "request to usable chunk": Line2D([], [], color="#666666", linewidth=0.7, marker="|", markersize=3),
+        "age of the observation": Line2D([], [], color="#D55E00", linewidth=0.7),
+    }
 
 
 def chunk_figures(run: Run) -> dict[str, Callable[[], Figure]]:
@@ -182,8 +200,10 @@ def _over_means(run: Run, what: str, shown: Mapping[str, str]) -> Figure:
     modes = [str(mode) for mode in rows["mode"].unique()][: len(LOOKS)]
     columns = 2 if max(map(len, modes)) <= LINE_CHARS // 3 else 1
     foot_in = 0.17 * -(-(len(modes) + 1) // columns)
-    title = _title(run, what, f"shape of {rows['latency'].iloc[0]}")
-    figure = new_figure(0.9 + 1.3 * len(shown) + foot_in, title)
+    caption = _caption(
+        run, what, f"Latencies are those of {rows['latency'].iloc[0]}, all longer or shorter by one factor."
+    )
+    figure = new_figure(0.8 + 1.3 * len(shown) + foot_in, caption)
     panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
     latency_ms = rows["latency_s"].to_numpy(dtype="float64") * 1e3
     for axes, (name, label) in zip(panels, shown.items(), strict=True):
@@ -208,8 +228,8 @@ def build_triggers(run: Run) -> Figure:
     rows = run.table(TRIGGERS)
     epsilon = float(run.manifest["configuration"]["epsilon"])
     groups = sources_of(rows_of(run))[:_MOST_PANELS]
-    more = "line: closed form; dots: simulated; 0 lies at the bottom"
-    figure = new_figure(2.6 + 0.16 * len(groups), _title(run, "P(stall) against the trigger of queue", more))
+    more = "Line: closed form; dots: simulated, with 95 % intervals; 0 lies at the bottom."
+    figure = new_figure(2.5 + 0.16 * len(groups), _caption(run, "P(stall) against the trigger of queue", more))
     axes = figure.subplots()
     sources: list[Any] = []
     rules: list[Any] = []
@@ -259,20 +279,21 @@ def build_reactions(run: Run) -> Figure:
     rows = run.table(REACTIONS)
     groups = sources_of(rows_of(run))[:_MOST_PANELS]
     names = list(dict.fromkeys(_who(cell) for _, cells in groups for cell in cells if _drawn(cell)))
-    what = "from an event to the first tick that knows of it"
+    what = "From an event to the first tick that knows of it; the last 0.25 % of the slowest mode lie beyond the axis."
     foot_in = 0.17 * -(-(len(names) + 1) // 2)
-    figure = new_figure(0.6 + foot_in + 1.6 * len(groups), _title(run, "Reaction time", what))
+    figure = new_figure(0.5 + foot_in + 1.6 * len(groups), _caption(run, "Reaction times", what))
     panels = figure.subplots(len(groups), 1, squeeze=False)[:, 0]
     for axes, (source, cells) in zip(panels, groups, strict=True):
         for cell in filter(_drawn, cells):
             mine = rows[rows["cell"] == cell["cell"]]
             told = mine[mine["closed_s"].notna()]
-            axes.plot(mine["reaction_s"] * 1e3, mine["share"], color=LOOKS[names.index(_who(cell)) % len(LOOKS)])
+            colour = LOOKS[names.index(_who(cell)) % len(LOOKS)]
+            axes.step(mine["reaction_s"] * 1e3, mine["share"], where="post", color=colour)
             axes.plot(told["closed_s"] * 1e3, told["share"], ":", color="black", linewidth=0.8)
         axes.set_title(short(source, LINE_CHARS), loc="left", pad=2)
         axes.set_ylim(0, 1)
         shown = rows[rows["cell"].isin([cell["cell"] for cell in cells if _drawn(cell)]) & (rows["share"] <= _BULK)]
-        axes.set_xlim(0, float(shown["reaction_s"].max()) * 1e3 * 1.15)
+        axes.set_xlim(0, float(shown["reaction_s"].max()) * 1e3)
         axes.set_ylabel("share")
     panels[-1].set_xlabel("reaction time (ms)")
     handles: list[Any] = [
@@ -292,7 +313,7 @@ def _who(cell: dict[str, Any]) -> str:
     return str(cell["mode"]) if cell["rule"] == "given" else f"{cell['mode']}, {cell['rule']}"
 
 
-def _title(run: Run, what: str, more: str) -> str:
+def _caption(run: Run, what: str, *notes: str) -> tuple[str, ...]:
     asked = run.manifest["configuration"]
     setting = f"H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {asked['rounding']}"
-    return wrapped((f"{what}, {setting}", more))
+    return (f"{what}, {setting}", *notes)

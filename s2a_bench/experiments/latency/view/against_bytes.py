@@ -151,11 +151,8 @@ def build_lines(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> Figur
     payloads = list(dict.fromkeys(each.payload for each in drawn))
     names = {each.name: each.path for each in drawn}
     looks = cell_looks(names)
-    title = "Time against bytes: medians and fitted lines"
-    if answered:
-        title += f"\n{' '.join(answered)}"
     height = 0.6 + 2.3 * len(payloads) + 0.14 * -(-len(names) // 2)
-    figure = new_figure(height, title)
+    figure = new_figure(height, ("Time against bytes: medians and fitted lines", *answered))
     panels = figure.subplots(len(payloads), 1, squeeze=False, sharex=True)[:, 0]
     for axes, payload in zip(panels, payloads, strict=True):
         _draw(axes, [each for each in drawn if each.payload == payload], looks)

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable
+from statistics import median
 from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.paper import CAVEAT, LABEL, paper_latency
-from s2a_bench.experiments.requests import Cell, asked, cells_of, chunks, groups_present, spelled, title_of, titles
-from s2a_bench.stats import summarise
+from s2a_bench.experiments.requests import Cell, asked, caption_for, cells_of, chunks, groups_present, spelled, titles
 from s2a_bench.writers.figures import (
-    LINE_CHARS,
+    WHISKERS,
     WIDE_SPREAD,
     Bar,
     build_bars,
     build_distribution,
+    draw_over,
     name_rows,
     new_figure,
     write_beside,
 )
 from s2a_bench.writers.style import GROUP_FILLS, RESIDUAL_FILL, cell_looks
-from s2a_bench.writers.tables import mean_sd, number
+from s2a_bench.writers.tables import number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,24 +30,30 @@ if TYPE_CHECKING:
 
 
 def build_latency_bars(run: Run, *, against_paper: bool = False) -> Figure:
-    """Draw mean ± sd of e2e without inference, a bar a cell (the paper's figure 4), from zero on a linear axis."""
+    """Draw medians of e2e without inference, a bar a cell (the paper's figure 4), from zero on a linear axis."""
     cells, metric = _shown(run)
     looks = cell_looks({cell.name: cell.path for cell in cells})
-    found = [(cell, summarise(cell.values_ms(metric))) for cell in cells]
-    bars = [Bar(_label(cell), each.mean, each.sd, mean_sd(each), looks[cell.name][0]) for cell, each in found]
+    bars = [Bar.of(_label(cell), cell.values_ms(metric), looks[cell.name][0]) for cell in cells]
+    notes = [WHISKERS]
     if against_paper:
+        notes.append(f"Grey: {LABEL}, mean ± sd; {CAVEAT}.")
         bars += [
-            Bar(f"paper:\n{claim.name}", claim.mean_ms, claim.sd_ms, f"{claim.mean_ms:g} ± {claim.sd_ms:.1f}")
+            Bar(
+                f"paper:\n{claim.name}",
+                claim.mean_ms,
+                (claim.mean_ms - claim.sd_ms, claim.mean_ms + claim.sd_ms),
+                f"{claim.mean_ms:g} ± {claim.sd_ms:.1f}",
+            )
             for claim in paper_latency()
         ]
-    paper = f"{LABEL}\n{textwrap.fill(CAVEAT, LINE_CHARS - 12)}" if against_paper else ""
-    return build_bars(_title(run, cells, "Mean ± sd", metric), bars, _axis_label(metric), paper)
+    caption = _caption(run, cells, "Medians", metric, *notes)
+    return build_bars(caption, bars, _axis_label(metric), LABEL if against_paper else "")
 
 
 def build_stage_breakdown(run: Run) -> Figure:
-    """Draw the mean of every group of stages, stacked, the residual hatched (the paper's figure 6).
+    """Draw the median of every group of stages, stacked, the residual hatched (the paper's figure 6).
 
-    Means, because they add up to the mean of the whole; medians do not. Where the cells differ by more than
+    A line marks the median of the whole, which medians of parts do not add up to. Where the cells differ by more than
     `WIDE_SPREAD` a second panel shows each group's share, so that the short bars can be read too.
     """
     from matplotlib.patches import Patch
@@ -55,32 +61,36 @@ def build_stage_breakdown(run: Run) -> Figure:
     cells, metric = _shown(run)
     groups = [group for group in groups_present(cells) if group != "inference" or metric == "e2e"]
     fills = {group: GROUP_FILLS[group] for group in groups} | {"residual": RESIDUAL_FILL}
-    # A sample without a group spent no time there: the sum over the cell's samples is what adds up.
-    counts = [cell.values_ms(metric).size for cell in cells]
-    parts = [{name: _part(cell, name).sum() / n for name in fills} for cell, n in zip(cells, counts, strict=True)]
-    wholes = [sum(part.values()) for part in parts]
-    shares = bool(wholes) and max(wholes) > WIDE_SPREAD * min(wholes)
+    wholes = [median(cell.values_ms(metric).tolist()) for cell in cells]
+    parts = [{name: _median(cell, name, cell.values_ms(metric).size) for name in fills} for cell in cells]
+    shares = max(wholes) > WIDE_SPREAD * min(wholes)
     panels = 2 if shares else 1
-    height = 0.95 + panels * (0.3 + 0.34 * len(cells)) + 0.16 * -(-len(fills) // 4)
-    figure = new_figure(height, _title(run, cells, "Stages, means", metric))
+    legend_rows = -(-(len(fills) + 1) // 4)
+    height = 0.85 + panels * (0.3 + 0.34 * len(cells)) + 0.16 * legend_rows
+    notes = ["The line is the median of the whole; medians of the stages need not add up to it."]
+    notes += ["Shares are of the sum of the stages."] if shares else []
+    figure = new_figure(height, _caption(run, cells, "Stages, medians", metric, *notes))
     all_axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
     for axes, share in zip(all_axes, (False, True), strict=False):
         for place, (part, whole) in enumerate(zip(parts, wholes, strict=True)):
-            left = 0.0
+            left, all_of_it = 0.0, sum(part.values())
             for name, (colour, hatch) in fills.items():
-                width = part[name] * (100 / whole if share else 1)
+                width = part[name] * (100 / all_of_it if share else 1)
                 axes.barh(place, width, 0.66, left, color=colour, hatch=hatch, edgecolor=_edge(name), linewidth=0.3)
                 left += width
             if not share:
+                draw_over(axes, (whole, whole), (place - 0.42, place + 0.42), "-", "" if place else "whole")
                 write_beside(axes, place, number(whole))
         name_rows(axes, [_label(cell) for cell in cells])
-        axes.set_xlim(0, 100 if share else None)
+        axes.set_xlim(0, 100 if share else 1.02 * max(*wholes, *(sum(part.values()) for part in parts)))
         axes.set_xlabel("share (%)" if share else _axis_label(metric))
-    handles = [
+    handles: list[object] = [
         Patch(facecolor=colour, hatch=hatch, edgecolor=_edge(name), linewidth=0.3, label=name)
         for name, (colour, hatch) in fills.items()
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, columnspacing=1.0)
+    handles += [line for line in all_axes[0].get_lines() if line.get_label() == "whole"]
+    columns = -(-len(handles) // legend_rows)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, columnspacing=1.0)
     return figure
 
 
@@ -90,7 +100,7 @@ def build_latency_distribution(run: Run) -> Figure:
     looks = cell_looks({cell.name: cell.path for cell in cells})
     named = zip(titles(cells), cells, strict=True)
     lines = {title: (cell.values_ms(metric), looks[cell.name]) for title, cell in named}
-    return build_distribution(_title(run, cells, "Distribution", metric), lines, "samples", _axis_label(metric))
+    return build_distribution(_caption(run, cells, "Distribution", metric), lines, "samples", _axis_label(metric))
 
 
 def latency_figures(run: Run, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
@@ -113,12 +123,12 @@ def _shown(run: Run) -> tuple[list[Cell], str]:
     return [], "e2e"
 
 
-def _title(run: Run, cells: list[Cell], what: str, metric: str) -> str:
+def _caption(run: Run, cells: list[Cell], what: str, metric: str, *notes: str) -> tuple[str, ...]:
     facts = [asked(run, cells), *sorted({f"{cell.about['mode']} mode" for cell in cells})]
     facts += [f"chunks of {shape}"] if (shape := chunks(run)) else []
     shown = {cell.name for cell in cells}
-    left_out = [f"{cell.name} not shown (inference unknown)" for cell in cells_of(run) if cell.name not in shown]
-    return title_of(run, cells, f"{what}: {spelled(metric).lower()}", facts, left_out)
+    left_out = [f"{cell.name} not shown (inference unknown)." for cell in cells_of(run) if cell.name not in shown]
+    return caption_for(run, cells, f"{what}: {spelled(metric).lower()}", facts, (*notes, *left_out))
 
 
 def _axis_label(metric: str) -> str:
@@ -131,8 +141,10 @@ def _label(cell: Cell) -> str:
     return f"{name}\n({cell.payload})" if cell.payload else name
 
 
-def _part(cell: Cell, name: str) -> Floats:
-    return cell.values_ms("residual") if name == "residual" else cell.group_ms(name)
+def _median(cell: Cell, name: str, n: int) -> float:
+    """Return the median of a group over all samples; one without the group spent no time there."""
+    values: Floats = cell.values_ms("residual") if name == "residual" else cell.group_ms(name)
+    return float(median((*values.tolist(), *[0.0] * (n - values.size))))
 
 
 def _edge(name: str) -> str:

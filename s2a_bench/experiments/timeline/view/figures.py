@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments.paper import paper_colours
 from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, panels, timelines_of
-from s2a_bench.writers.figures import new_figure, wrapped
-from s2a_bench.writers.style import STALL_LOOK, WIDE_IN, WIDTH_IN
+from s2a_bench.writers.figures import new_figure
+from s2a_bench.writers.style import STALL_LOOK, WIDE_IN, WIDTH_IN, ink_on
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,12 +46,11 @@ def build_timelines(run: Run, cells: Sequence[Timelines]) -> Figure:
     policies = list(dict.fromkeys(cell.policy for cell in cells))
     colours = policy_colours(policies)
     width_in = WIDTH_IN if len(titles) == 1 else WIDE_IN
-    title = _title(run, cells, width_in)
     lanes = len(policies) + 1
     columns = _LEGEND_COLUMNS[width_in]
     handles = _legend(cells)
     foot_in = 0.55 + 0.17 * -(-len(handles) // columns)
-    figure = new_figure(foot_in + len(lengths) * (0.42 + 0.15 * lanes), title, width_in)
+    figure = new_figure(foot_in + len(lengths) * (0.42 + 0.15 * lanes), _caption(run, cells), width_in)
     grid = figure.subplots(len(lengths), len(titles), squeeze=False)
     for row, tokens in enumerate(lengths):
         for column, board in enumerate(titles):
@@ -108,7 +107,6 @@ def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: flo
     """Draw one lane: a line while the robot waits, then skills (what is longer than planned is paler) and stalls."""
     skills = cell.skills.to_dict("records")
     axes.hlines(lane, 0, cell.moment_s("start_s"), "#BBBBBB", linewidth=0.8)
-    ink = "white" if _dark(colour) else "black"
     for skill in skills:
         start, end, stall, nominal = (skill[f"{name}_ns"] / 1e9 for name in ("start", "end", "stall", "nominal"))
         if skill["stall_ns"] > _VISIBLE_NS:
@@ -121,7 +119,7 @@ def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: flo
                 start + min(end - start, nominal) / 2,
                 lane,
                 str(skill["index"] + 1),
-                color=ink,
+                color=ink_on(colour),
                 fontsize=5,
                 ha="center",
                 va="center",
@@ -160,14 +158,9 @@ def _stretched(cell: Timelines) -> bool:
     return bool((longer_ns > _VISIBLE_NS).any())
 
 
-def _title(run: Run, cells: Sequence[Timelines], width_in: float) -> str:
+def _caption(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
     n_skills, t_nom_s = cells[0].setting[2:]
-    what = f"Execution timelines: N = {n_skills} skills, $T_\\mathrm{{nom}}$ = {t_nom_s:g} s"
+    what = f"Execution timelines: N = {n_skills} skills, T_nom = {t_nom_s:g} s"
     if (plans := max(cell.n for cell in cells)) > 1:
         what += f"; plan 1 of {plans}"
-    return wrapped((what, *origin_notes(run, cells)), width_in)
-
-
-def _dark(colour: str) -> bool:
-    red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
-    return 0.299 * red + 0.587 * green + 0.114 * blue < 128  # noqa: PLR2004 - half way
+    return (what, *origin_notes(run, cells))

@@ -1,0 +1,89 @@
+"""What every figure of every experiment has: a caption that is not drawn, and one line that says where it is from."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from matplotlib.text import Text
+
+from s2a_bench.experiments import EXPERIMENTS
+from s2a_bench.experiments.boundary.config import BoundaryConfig
+from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.chunks.config import ChunksConfig
+from s2a_bench.harness.timelines.config import TimelineConfig
+from s2a_bench.provenance import Origins, Provenance
+from s2a_bench.store.run import Run, read_run
+from s2a_bench.testing import NullProgress
+from s2a_bench.writers.figures import caption_of, source_line
+from s2a_bench.writers.style import paper_column
+
+Make = Callable[[Path, Any], Run]
+FIGURES = {
+    "boundary": ("boundary",),
+    "ccrb": ("scenario", "phase"),
+    "chunks": ("lanes", "stability", "triggers", "reactions", "smoothness"),
+    "latency": ("latency_bars", "stages", "distribution"),
+    "throughput": ("throughput_bars", "gaps", "positions"),
+    "timeline": ("timeline",),
+}
+
+
+def computed(name: str, config: Any, root: Path, _: Any) -> Run:
+    return read_run(EXPERIMENTS[name].run_with(config, root, NullProgress()))
+
+
+def measured(name: str, _: Path, make_run: Any) -> Run:
+    llama = {"engine": "llama", "model": "tiny.gguf", "dummy": True}
+    paced = Provenance.of_engine({**llama, "paced_tokens_per_s": 4.8})
+    origins = Origins(Provenance.of_engine(llama), {"loopback": paced})
+    cells = {"loopback": {"capture": 0.2, "inference": 100, "return": 0.2}}
+    run: Run = make_run(cells, n=3, engine="llama", manifest={"provenance": origins.to_manifest()})
+    return Run(run.path, {**run.manifest, "command": name}, run.tables)
+
+
+RUNS: dict[str, Make] = {
+    "boundary": partial(computed, "boundary", BoundaryConfig(points=5, most_tokens=3)),
+    "ccrb": partial(computed, "ccrb", CcrbConfig(phase=True, phase_points=(3, 2))),
+    "chunks": partial(computed, "chunks", ChunksConfig(cycles=50)),
+    "latency": partial(measured, "latency"),
+    "throughput": partial(measured, "throughput"),
+    "timeline": partial(computed, "timeline", TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))),
+}
+EMULATED, DUMMY = "no engine, tokens EMULATED, virtual time", "llama (DUMMY WEIGHTS), tokens PACED"
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_a_figure_has_one_line_of_provenance_and_a_caption(name: str, tmp_path: Path, make_run: Any) -> None:
+    run = RUNS[name](tmp_path, make_run)
+    host, day = run.manifest["host"], run.manifest["started"][:10]
+    with paper_column():
+        figures = {each: build() for each, build in EXPERIMENTS[name].show(run).figures.items()}
+    assert tuple(figures) == FIGURES[name]
+    for figure in figures.values():
+        line = figure.get_suptitle()
+        assert line == f"{DUMMY if name in {'latency', 'throughput'} else EMULATED} · {host} · {day}"
+        title, *notes, origin = caption_of(figure)
+        assert title
+        assert not title.endswith(".")
+        assert all(note.endswith((".", "!")) for note in notes)
+        assert origin == run.origins.line
+        assert not any(title in text.get_text() for text in figure.findobj(Text))
+
+
+def test_the_line_stays_one_line_and_fits_whatever_answered(make_run: Any) -> None:
+    names = [f"engine-{place}" for place in range(6)]
+    cells = {name: Provenance(name, weights="dummy", tokens="paced", link="emulated") for name in names}
+    told = {"provenance": Origins(Provenance(), cells).to_manifest(), "host": "a$b$c"}
+    run = make_run(n=3)
+    run = Run(run.path, {**run.manifest, **told}, run.tables)
+    with paper_column():
+        figure = EXPERIMENTS["latency"].show(run).figures["latency_bars"]()
+    assert all(name in figure.get_suptitle() for name in (*names, "a$b$c", "DUMMY WEIGHTS", "PACED", "link EMULATED"))
+    figure.draw_without_rendering()
+    assert figure.get_tightbbox().x1 <= figure.get_figwidth()
+
+
+def test_what_a_manifest_does_not_say_is_left_out() -> None:
+    assert source_line([Run(Path(), {})]) == "engine UNKNOWN (the server does not tell)"
