@@ -17,6 +17,7 @@ from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.smoke import smoke_test
 from tests.made_runs import black_box, fast_board, make_row, make_run, plausible  # noqa: F401 - fixtures
 
+os.environ.pop("COLUMNS", None)  # tables are as wide as where nobody says
 pytest.register_assert_rewrite("tests.ros.action_suite", "tests.ros.middleware_suite")
 
 # These machines are shared: time is not judged. What is drawn is the same each time, as what judges a change must be;

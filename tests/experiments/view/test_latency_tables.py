@@ -150,9 +150,10 @@ BLOCKS = {
 
 def test_payloads_are_blocks_and_ratios_stay_inside_them(make_run: MakeRun) -> None:
     run = make_run(BLOCKS, n=4, spread=0)
-    table = summary_table(run, brief=True)
-    assert table.header == ("payload", "cell", "median", "p99", "ratio to ros/topic")
-    assert [(*row[:3], row[4].split()[0]) for row in table.rows] == [
+    table = summary_table(run)
+    figures = "n", "errors", "mean ± sd", "median", "p90", "p99"
+    assert table.header == ("payload", "cell", *figures, "ratio to ros/topic")
+    assert [(*row[:2], row[5], row[8].split()[0]) for row in table.rows] == [
         ("raw", "http/as-deployed", "26.0", "5.76"),
         ("", "ros/topic", "4.51", "1"),
         ("jpeg", "http/as-deployed", "10.0", "2.00"),
