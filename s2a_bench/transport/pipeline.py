@@ -146,7 +146,7 @@ class _Payloads:
         """Return those for a pipeline that ``can`` carry some; nothing where no picture travels."""
         if not can:
             return ("",)
-        return [each for each in self.names if each in can] or (self.names if self.strict else can)[:1]
+        return [each for each in self.names if each in can] or ((self.strict and self.names) or can)[:1]
 
 
 def answer_over(asked: str, compared: Sequence[Pipeline]) -> str:

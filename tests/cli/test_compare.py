@@ -113,7 +113,11 @@ def test_throughput_is_compared_with_higher_as_better(tmp_path: Path) -> None:
         ),
         ([ECHO, ECHO, "--metric", "speed"], 2, "--metric: 'speed' is no metric of these latency runs; there are e2e"),
         ([ECHO, ECHO, "--fail-if", "e2e"], 2, "--fail-if: 'e2e' should look like e2e.median>5%"),
-        ([ECHO, ECHO, "--fail-if", "zmq:e2e>5%"], 2, "--fail-if: no cell with e2e is called 'zmq'; there are http/as-"),
+        (
+            [ECHO, ECHO, "--fail-if", "zmq:e2e>5%"],
+            2,
+            "--fail-if: no cell with e2e is called 'zmq'; there are ros/topic, http/as-",
+        ),
         ([ECHO, ECHO, "--strict"], 2, "--strict: there is no gate; add --fail-if"),
         ([ECHO, ECHO, "--min-effect", "-1"], 2, "--min-effect"),
         ([f"{ECHO},{ECHO}", ECHO], 2, "A: a folder is named twice"),

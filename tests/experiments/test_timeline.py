@@ -186,7 +186,7 @@ def test_jitter_that_is_wrong_is_named(jitter: str, message: str) -> None:
         ({"t_max": 0.9}, "`t_max`: 0.9 should be greater than or equal to 1"),
         ({"t_nom_cv": 0.6}, "`t_nom_cv`: 0.6"),
         ({"prompt_s": -1.0}, "`prompt_s`: -1"),
-        ({"epsilon": 0.001}, "`epsilon`: 400 calibration plans promise"),
+        ({"epsilon": 0.001}, "`epsilon`: calibrating on 400 promises 0.0025 at best"),
         ({"seed": -1}, "`seed`: -1"),
         ({"jitter": "lognormal:cv=1", "plans": 10**6}, "`plans`: .* skills are more than"),
         ({"n_skills": (1000,), "tokens_per_skill": (1000,)}, "`n_skills`, `tokens_per_skill`: 1000000 tokens a plan"),

@@ -218,8 +218,8 @@ def test_versions_and_settings_are_told_and_not_refused(launch: Launch) -> None:
 
 
 def test_another_setting_under_the_same_name_is_refused_unless_told(launch: Launch) -> None:
-    first, second = launch(1, cells=("http/binary",)), launch(2, cells=("http/binary",), payload="raw")
-    with pytest.raises(UnlikeRuns, match="cells of one name differ: http/binary payload: jpeg against raw; `unlike`"):
+    first, second = launch(1, cells=("http/binary",)), launch(2, cells=("http/binary",), payload="jpeg")
+    with pytest.raises(UnlikeRuns, match="cells of one name differ: http/binary payload: raw against jpeg; `unlike`"):
         opened(first, second)
     assert len(compared(first, second, "e2e", unlike=True).comparisons) == 1
 
@@ -393,7 +393,7 @@ def test_the_json_object_is_what_its_schema_says(launch: Launch) -> None:
     assert [one["verdict"] for one in whole["comparisons"]] == ["worse"] * 4 + ["too few"] * 4
     assert {one["outcome"] for one in whole["gates"]} == {"tripped"}
     first = whole["comparisons"][0]
-    assert first["setting"]["payload"] == "jpeg"
+    assert first["setting"]["payload"] == "raw"
     assert first["change"]["value"] == pytest.approx(first["ratio"]["value"] - 1)
     assert first["other"] / first["baseline"] == pytest.approx(first["ratio"]["value"])
 

@@ -146,7 +146,7 @@ def test_a_latency_run_says_n_and_interval(make_run: MakeRun) -> None:
     text = " ".join(page.text.split())
     assert "50 requests a cell over http/as-deployed, http/best-effort, http/binary, ros/topic, loopback" in text
     assert re.search(
-        r"http/as-deployed takes [\d.]+ times as long as ros/topic "
+        r"http/as-deployed takes [\d.]+ times as long as ros/topic with raw pictures "
         r"\(ratio of medians of one launch, 95 % interval [\d.]+ to [\d.]+",
         text,
     )

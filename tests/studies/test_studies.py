@@ -235,7 +235,7 @@ def test_a_study_is_kept_and_shown(
     text = (folder / "tables" / f"{name}.csv").read_text()
     assert text.count("\n") == len(run.table(STUDY_CELLS)) + 1
     assert ",nan" not in text.lower()
-    assert {path.name for path in (folder / "figures").iterdir()} == {f"{name}.png", f"{name}.pdf"}
+    assert {path.name for path in (folder / "figures").iterdir()} == {f"{name}.png", f"{name}.pdf", "captions.md"}
     if name == "targets":
         assert [row[0] for row in tables["targets-of-stream-to-act"].rows] == TARGETS
 
@@ -247,7 +247,7 @@ def test_a_study_is_kept_and_shown(
         ({"name": "targets", "jobs": 0}, "`jobs`: 0 should be"),
         ({"name": "targets", "plans": 0}, "`plans`: 0 should be"),
         ({"name": "targets", "seed": -1}, "`seed`: -1 should be"),
-        ({"name": "targets", "calibration_plans": 20}, "`epsilon`: 20 calibration plans promise"),
+        ({"name": "targets", "calibration_plans": 20}, "`epsilon`: calibrating on 20 promises 0.048 at best"),
         ({"name": "targets", "epsilon": 1.5}, "`epsilon`: 1.5 should be between 0 and 1"),
         ({"name": "frontier", "profile": "rtx-4080"}, "`profile`: rtx-4080 holds no recorded gaps"),
     ],
