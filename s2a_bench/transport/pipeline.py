@@ -190,13 +190,16 @@ def _standing_for(
     asked = _checked(transport.options, {**flags, **told}, transport.name)
     alike = asked if asked.payload else asked.model_copy(update={"payload": wanted.only})
     measured = transport.measured(Choice(alike, engine=engine))
-    for variant in [named.variant] if named.variant else measured if every else measured[:1]:
+    variants = [named.variant] if named.variant else measured if every else measured[:1]
+    for variant in variants:
         if variant not in (transport.variants or ("",)):
             known = ", ".join(transport.variants) or "none: it has no variants"
             meant = like(variant, transport.variants)
             raise UsageError(f"`transport`: '{variant}' is none of {transport.name}'s {known}{meant}")
         can = transport.capabilities(Choice(asked, variant, mode=wanted.mode))
         payloads = wanted.over(can.payloads)
+        if variant != variants[0] and not asked.payload and payloads[0] not in {*can.payloads, ""}:
+            continue  # nobody named it, and it can carry none of them
         default = _filled(plain, payloads[0])
         for payload in payloads[: 1 if asked.payload else None]:
             name = _canonical(transport, variant, _filled(asked, payload), default, own)

@@ -43,6 +43,7 @@ def llama_server_alone(monkeypatch: pytest.MonkeyPatch) -> None:
         ({}, True),
         ({"payload": "jpeg"}, True),
         ({"payload": "raw"}, False),
+        ({"payload": "raw,png"}, False),
         ({"engine": EngineConfig(name="echo")}, False),
         ({"options": {"http": {"url": "http://x"}}}, False),
         ({"transports": "http/binary"}, False),
