@@ -201,16 +201,16 @@ class RunWriter(AbstractContextManager["RunWriter"]):
 
     def _discard(self) -> bool:
         """Remove the folder, and those made for it if they are empty; return False where it holds a folder."""
-        if any(map(Path.is_dir, self.path.iterdir())):
-            return False
-        self._finished = True
-        for _, file in self._files.values():
-            file.close()
-        shutil.rmtree(self.path, ignore_errors=True)
-        with suppress(OSError):
+        with suppress(OSError):  # what went wrong first matters more
+            if any(map(Path.is_dir, self.path.iterdir())):
+                return False
+            self._finished = True
+            for _, file in self._files.values():
+                file.close()
+            shutil.rmtree(self.path, ignore_errors=True)
             for folder in self._made[1:]:
                 folder.rmdir()
-        return True
+        return not self.path.exists()
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from dataclasses import replace
 from datetime import datetime, timezone
 from io import FileIO
 from pathlib import Path
+from shutil import rmtree
 from types import SimpleNamespace
 
 import pandas as pd
@@ -389,6 +390,13 @@ def test_a_failure_before_the_first_row_leaves_what_was_there_before(
         (run.path / "server-http.log").write_text("no model")
         raise error
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_failure_before_the_first_row_is_told_though_the_folder_has_gone(tmp_path: Path) -> None:
+    run = RunWriter.create(tmp_path, "latency", {}, [])
+    with pytest.raises(StoreError, match="no server"), run:  # noqa: PT012 - the block is what is tested
+        rmtree(run.path)
+        raise StoreError("no server")
 
 
 def test_a_failure_before_the_first_row_keeps_a_folder_that_holds_runs(tmp_path: Path) -> None:
