@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any, Final
 
 from s2a_bench.transport import declared
+from s2a_bench.transport.pipeline import without
 
 WIDTH_IN: Final = 3.5
 """One column of a two-column paper."""
@@ -48,14 +49,14 @@ def ink_on(colour: str) -> str:
 def cell_looks(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, str]]:
     """Return name -> colour and line style, for cells given as name -> (transport, variant).
 
-    A cell as its transport declares it looks the same in every figure of every run; others get other looks: those
-    with options of their own, and those whose transport is not here.
+    A cell as its transport declares it looks the same in every figure of every run, dotted where its name has a
+    payload; others get other looks: those with options of their own, and those whose transport is not here.
     """
-    looks = {
-        name: declared(transport).style[variant]
-        for name, (transport, variant) in cells.items()
-        if "?" not in name and variant in declared(transport).style
-    }
+    looks: dict[str, tuple[str, str]] = {}
+    for name, (transport, variant) in cells.items():
+        plain, style = without(name, "payload"), declared(transport).style
+        if "?" not in plain and variant in style:
+            looks[name] = style[variant] if plain == name else (style[variant][0], ":")
     others = [name for name in cells if name not in looks]
     return looks | {name: _OTHER_LOOKS[place % len(_OTHER_LOOKS)] for place, name in enumerate(others)}
 

@@ -136,6 +136,11 @@ def test_every_group_has_a_look_and_every_cell_one_of_its_own() -> None:
     assert len(set(GROUP_FILLS.values())) == len(GROUP_FILLS)
     names = ["http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "loopback", "a", "b"]
     cells = {name: (*name.split("/"), "")[:2] for name in names} | {"http/binary?payload=png": ("http", "binary")}
+    cells |= {
+        "http/as-deployed?payload=png": ("http", "as-deployed"),
+        "shm": ("shm", ""),
+        "shm?payload=png": ("shm", ""),
+    }
     names = [*cells]
     looks = cell_looks(cells)
     assert set(looks) == set(names)
