@@ -20,7 +20,7 @@ from s2a_bench.stats.batches import BATCHES
 from s2a_bench.stats.change import POWER
 from s2a_bench.store.manifest import RunWarning, plain
 from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.figures import marked, name_rows, new_figure, write_beside
+from s2a_bench.writers.figures import caption_of, marked, name_rows, new_figure, write_beside
 from s2a_bench.writers.latex import to_latex
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable, number, to_markdown
@@ -353,6 +353,8 @@ def write_comparison(folder: Path, compared: ComparedRuns, whole: Mapping[str, A
         with paper_column():
             if figure := build_forest(compared):
                 marked(lambda: figure, *compared.baseline, *compared.other)
+                with (folder / "compare.md").open("a", encoding="utf-8") as page:
+                    page.write("\n" + "\n\n".join(caption_of(figure)) + "\n")
                 for suffix in ("png", "pdf"):
                     written.append(folder / f"compare.{suffix}")
                     figure.savefig(written[-1])
