@@ -167,7 +167,7 @@ def test_an_example_runs(block: Block, folders: Callable[[Path], Path], servers:
         run([sys.executable, "-W", "error", "-c", block.code], folder)
     for command in block.commands:
         if (plain := COMMENT.sub("", command).rstrip()).endswith("&"):
-            servers.append(start(plain.removesuffix("&"), folder))
+            start(plain.removesuffix("&"), folder, servers)
         else:
             run(["bash", "-c", command], folder)
 
@@ -186,14 +186,14 @@ def run(command: list[str], folder: Path) -> None:
     assert done.returncode in codes, f"{command[-1]}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
 
 
-def start(command: str, folder: Path) -> subprocess.Popen[str]:
-    """Start a server, and return once it says that it serves."""
+def start(command: str, folder: Path, servers: list[subprocess.Popen[str]]) -> None:
+    """Start one of the servers, and return once it says that it serves."""
     server = subprocess.Popen(
         ["bash", "-c", f"exec {command}"], cwd=folder, env=environ(), stdout=subprocess.PIPE, text=True
     )
+    servers.append(server)
     assert server.stdout is not None
     assert "serving" in server.stdout.readline()
-    return server
 
 
 def written() -> Iterator[tuple[str, str]]:

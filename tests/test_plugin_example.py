@@ -67,8 +67,9 @@ def measured(command: Command, tmp_path: Path) -> Path:
     """Measure the toy transport beside loopback."""
     done = command("latency", "--transport", "toy,loopback", *SMALL)
     assert re.search(r"toy_frame", done.stdout)
-    assert "ratio to" in done.stdout
-    return folder_of(done, tmp_path)
+    folder = folder_of(done, tmp_path)
+    assert "ratio to" in (folder / "tables" / "summary.md").read_text()
+    return folder
 
 
 def test_its_tests_are_the_shipped_suites(installed: dict[str, str]) -> None:

@@ -36,7 +36,7 @@ TRIES = 3
 
 def measured(payload: str, output: Path) -> tuple[dict[str, float], list[str]]:
     """Return the cells over their limit, with their ratio to loopback, and those whose stages leave over 5 %."""
-    own = {"alone": "shm,loopback", "actions": "websocket?payload=raw,loopback"}
+    own = {"alone": "shm?payload=raw,loopback", "actions": "websocket?payload=raw,loopback"}
     transports = own.get(payload, f"http?payload={payload},ros,loopback")
     arguments = ["latency", "--engine", "echo", "--transport", transports]
     arguments += ["--max-tokens", "1"] * (payload == "alone")
