@@ -1,6 +1,6 @@
 """The library: every experiment as a function, run folders as objects that show themselves, comparisons.
 
-docs/library.md has examples. Nothing here prints; a run leaves the caller's process as it found it.
+docs/library.md has examples. Nothing here prints; what a run changes in the caller's process is put back after it.
 """
 
 from __future__ import annotations

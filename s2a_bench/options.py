@@ -195,7 +195,8 @@ def _line(error: ErrorDetails, options: type[Options]) -> str:
     field = str(error["loc"][0]) if error["loc"] else ""
     if field in options.OLD:
         instead, prefix = options.OLD[field]
-        values = ",".join(f"{prefix}{value}" for value in listed(error["input"]))
+        given = error["input"] if isinstance(error["input"], list | tuple) else listed(str(error["input"]))
+        values = ",".join(f"{prefix}{value}" for value in given)
         return f"`{field}` has another name: write `{instead}` {values}"
     if error["type"] == "extra_forbidden":
         return f"`{field}` is none of the options {', '.join(options.model_fields)}{like(field, options.model_fields)}"

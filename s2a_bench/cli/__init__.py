@@ -85,7 +85,9 @@ def main() -> None:
     except ParseError as error:
         context = getattr(error, "ctx", None)
         hint = f" (see '{context.command_path} --help')" if context else ""
-        close = getattr(error, "possibilities", None)  # of an unknown option, the closest first
+        if close := getattr(error, "possibilities", None):  # of an unknown option, the closest first
+            old = {name for each in context.command.params if each.hidden for name in each.opts} if context else ()
+            error.possibilities = close = [name for name in close if name not in old]
         message = f"{error.message}; did you mean {close[0]}?" if close else error.format_message()
         code = _say(f"error: {message}{hint}", error.exit_code)
     except (KeyboardInterrupt, typer.Abort):

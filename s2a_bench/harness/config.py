@@ -92,7 +92,6 @@ class RequestsConfig(Options):
         "synthetic",
         f"{', '.join(SOURCES)}, as video:FILE",
         panel="Pictures",
-        first=True,
         names=lambda: SOURCES,
     )
     size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]", panel="Pictures", first=True)
@@ -111,6 +110,7 @@ class RequestsConfig(Options):
         (),
         f"how a picture travels: {', '.join(PAYLOADS)}; several with commas, each in cells of its own [default: raw]",
         panel="Pictures",
+        first=True,
     )
     options: TransportOptions = group(TransportOptions, first=())
     """The options of every transport, for names that do not say them themselves."""

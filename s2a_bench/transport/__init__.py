@@ -11,7 +11,7 @@ To add a transport, write a package with a module like this, and offer its insta
 
     class Toy(Transport[ToyOptions]):
         name, options = "toy", ToyOptions           # --transport 'toy?port=7000', serve toy
-        payloads = ("raw",)                         # the first is the default
+        payloads = ("raw",)                         # the first where raw cannot travel
         stages = {"frame_length": "pack"}           # marked by its client or server, beside those of trace.STAGES
         facts = (PAYLOAD_BYTES,)                    # the numbers beside the marks, those of its own as facts.Fact(...)
 
@@ -98,7 +98,7 @@ class Options(base.Options):
     NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = ()
     """Options that `serve` takes in the pipeline's name, its file or ``--ros-args``, and has no flag for."""
 
-    payload: Payload = base.option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: the transport's own]")
+    payload: Payload = base.option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: raw where it can]")
 
     @classmethod
     def of_sides(cls, *sides: str) -> list[str]:
@@ -272,7 +272,7 @@ class Capabilities(Generic[O]):
     options: O
     """As they hold for the variant."""
     payloads: tuple[str, ...]
-    """How pictures can travel, the default first."""
+    """How pictures can travel; the first is taken where raw cannot."""
     answer_kinds: tuple[str, ...]
     """What answers can be made of: tokens, actions."""
     accepts_state: bool
@@ -303,7 +303,7 @@ class Transport(Generic[O]):
     variants: ClassVar[tuple[str, ...]] = ()
     """What follows its name, as ``http/binary``; the first is measured unless told."""
     payloads: ClassVar[tuple[str, ...]] = ()
-    """How pictures can travel, the default first; nothing where they do not travel at all."""
+    """How pictures can travel; the first is taken where raw cannot. Nothing where they do not travel at all."""
     answer_kinds: ClassVar[tuple[str, ...]] = (TOKENS,)
     """What answers can be made of: tokens, actions."""
     accepts_state: ClassVar[bool] = False

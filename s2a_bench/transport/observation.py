@@ -105,10 +105,8 @@ class Template:
         except _Missing:
             why = f"wants {self.pictures}"
         if why:
-            raise UsageError(
-                f"`cameras`: {cameras} a request, and `template` {self.name} {why}; "
-                f"use `cameras` {self.pictures}, or another template"
-            )
+            other = f"use `cameras` {self.pictures}, or another template" if self.pictures else "use another template"
+            raise UsageError(f"`cameras`: {cameras} a request, and `template` {self.name} {why}; {other}")
 
     def _refuse(self, path: str, why: str) -> NoReturn:
         raise UsageError(f"`template` {self.name}: {path or 'it'} {why}")

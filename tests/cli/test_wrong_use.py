@@ -52,6 +52,8 @@ WRONG = {
     "latency": [
         ("--requests many", "'--requests'"),
         ("--trnsport ros", "No such option: --trnsport; did you mean --transport?"),
+        ("--requessts 9", "did you mean --requests?"),
+        ("--runss 9", "No such option: --runss; did you mean --requests?"),
         ("--transport http/best-efort", "; did you mean best-effort?"),
         ("--transport http?conection=x", "; did you mean connection?"),
         ("--engine lama", "'lama' is none of llama, echo, replay; did you mean llama?"),

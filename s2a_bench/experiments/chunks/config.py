@@ -256,7 +256,10 @@ class ChunksConfig(Options):
         for source in self.sources:
             recorded = source.recorded_ns
             if recorded is not None and recorded.size - self.learnt(source) < 2:  # noqa: PLR2004 - a boundary
-                raise UsageError(f"`latency`: {source.name} has {recorded.size} latencies; two or more are needed")
+                kept = f", and `rules` set {self.learnt(source)} aside" if self.learnt(source) else ""
+                raise UsageError(
+                    f"`latency`: {source.name} has {recorded.size} latencies{kept}; two or more are needed"
+                )
         if self.with_rules and self.too_few and {*PROMISING} & {*self.rules_tried}:
             others = ",".join(rule for rule in RULES if rule not in PROMISING)
             raise UsageError(f"`rules`: {self.too_few}; raise `epsilon`, or take `rules` {others}")
