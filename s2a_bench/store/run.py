@@ -189,7 +189,8 @@ class RunWriter(AbstractContextManager["RunWriter"]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is not None and self._made and not (self._rows or self._finished) and self._discard():
+        useless = self._made and not (self._rows or self._finished) and str(self.path) not in str(error)
+        if error is not None and useless and self._discard():
             return
         state = "finished" if error is None else "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         try:

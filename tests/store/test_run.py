@@ -392,6 +392,15 @@ def test_a_failure_before_the_first_row_leaves_what_was_there_before(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_a_failure_that_names_a_log_keeps_the_folder_with_it(tmp_path: Path) -> None:
+    run = RunWriter.create(tmp_path, "latency", {}, [])
+    log = run.path / "server-http.log"
+    with pytest.raises(StoreError), run:  # noqa: PT012 - the block is what is tested
+        log.write_text("no memory")
+        raise StoreError(f"the server died; its log is {log}")
+    assert (log.read_text(), read_run(run.path).manifest["state"]) == ("no memory", "failed")
+
+
 def test_a_failure_before_the_first_row_is_told_though_the_folder_has_gone(tmp_path: Path) -> None:
     run = RunWriter.create(tmp_path, "latency", {}, [])
     with pytest.raises(StoreError, match="no server"), run:  # noqa: PT012 - the block is what is tested
