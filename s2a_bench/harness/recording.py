@@ -59,5 +59,5 @@ class RunRecorder(AbstractContextManager["RunRecorder"]):
         """Write what waits; called between samples."""
         self._recorder.flush()
 
-    def __exit__(self, *_: object) -> None:
-        self._recorder.close()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._recorder.__exit__(kind)

@@ -125,9 +125,11 @@ class Recorder(AbstractContextManager["Recorder"]):
         finally:
             self._writer.abort()  # lets go of the file where closing did not get that far
 
-    def __exit__(self, *_: object) -> None:
-        """Finish the file however the run ended: what was recorded up to an error is worth keeping."""
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Finish the file however the run ended: what was recorded up to an error is worth keeping, nothing is not."""
         self.close()
+        if kind is not None and not self._connections:
+            shutil.rmtree(self.path) if self.path.is_dir() else self.path.unlink()
 
     def _work(self) -> None:
         """Write messages as they come, until told to stop; what goes wrong is raised where messages come from."""

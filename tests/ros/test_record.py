@@ -134,6 +134,13 @@ def test_an_empty_recording_is_valid(tmp_path: Path) -> None:
     assert read(tmp_path / "run.mcap") == []
 
 
+@pytest.mark.parametrize("name", ["run.mcap", "run"])
+def test_an_empty_recording_of_what_failed_is_removed(tmp_path: Path, name: str) -> None:
+    with pytest.raises(StoreError), Recorder(tmp_path / name):
+        raise StoreError("no server")
+    assert not any(tmp_path.iterdir())
+
+
 def test_what_was_recorded_before_an_error_is_kept(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), Recorder(tmp_path / "run.mcap") as recorder:  # noqa: PT012
         recorder.write("/a", STRING, cdr("kept"), 1)
