@@ -50,6 +50,16 @@ def test_lines_are_what_made_the_times(runs: list[Run]) -> None:
     assert met.value == pytest.approx(0.8 / 0.6, rel=1e-2)
 
 
+def test_in_process_a_cell_stands_beside_each_payload(make_run: MakeRun) -> None:
+    cells = {name: {"capture": 1.0, "inference": 1.0, "return": 0.0} for name in FIXED}
+    payloads = {"http": "raw", "ros": "jpeg", "loopback": "none"}
+    made = [
+        make_run(cells, n=5, spread=0, manifest=asked(*size, 1), payloads=payloads) for size in ((64, 48), (640, 480))
+    ]
+    found = [(each.name, each.payload) for each in against_bytes(split(made))]
+    assert found == [("http/binary", "raw"), ("loopback", "raw"), ("ros/topic", "jpeg"), ("loopback", "jpeg")]
+
+
 def test_scaled_pictures_count_as_scaled(make_run: MakeRun) -> None:
     cells = {"ros/topic": {"capture": 1.0, "inference": 1.0, "return": 0.0}}
     sizes = [asked(640, 480, 1, resize=[224, 224]), asked(640, 480, 1)]

@@ -61,9 +61,9 @@ def against_bytes(runs: Split) -> list[Pipeline]:
             continue
         payloads = payloads_of(cells)
         for cell in cells:
-            payload = cell.payload or "/".join(sorted(payloads))
             if cell.values_ms(METRIC).size:
-                found.setdefault((cell.label, payload), []).append((pixels, cell))
+                for payload in [cell.payload] if cell.payload else payloads or [""]:  # in process it is beside each
+                    found.setdefault((cell.label, payload), []).append((pixels, cell))
     lines = [_pipeline(name, payload, sized) for (name, payload), sized in found.items()]
     order = sorted(
         lines, key=lambda each: (each.payload != "raw", each.payload, declared(each.path[0]).order, each.name)
