@@ -24,7 +24,6 @@ def test_the_skill_set_of_the_page_is_one() -> None:
     )
 
 
-@pytest.mark.usefixtures("cache")
 def test_the_parser_of_the_page_says_what_the_page_says(capsys: pytest.CaptureFixture[str]) -> None:
     exec(compile(example("python"), "docs/plans.md", "exec"), {})  # noqa: S102 our own page
     assert capsys.readouterr().out == "0 open(cup) 0\n{'object': 'cup'} 2.0 hold\n"

@@ -14,7 +14,14 @@ from scipy import stats
 from s2a_bench.policy.chunks import Mode, Rounding, Setting, mode
 from s2a_bench.policy.chunks.aggregate import Aggregate
 from s2a_bench.policy.chunks.append import Queue, Streamed, Sync
-from s2a_bench.policy.chunks.closed import mean_reaction_s, replace_stall_share, slack_ticks, slow_down, stall_share
+from s2a_bench.policy.chunks.closed import (
+    Closed,
+    mean_reaction_s,
+    replace_stall_share,
+    slack_ticks,
+    slow_down,
+    stall_share,
+)
 from s2a_bench.policy.chunks.replace import Replace
 from tests.policy.chunks.drawn import plainly
 from tests.policy.chunks.forms import (
@@ -381,3 +388,16 @@ def test_a_fixed_estimate_makes_the_robot_jump_by_its_error(
     assert set(
         np.abs(mode(f"replace?execute={s}&assumed={assumed}").cycles(constant(latency), setting).jump[1:-1])
     ) == {abs(assumed - delay)}
+
+
+@pytest.mark.parametrize(
+    ("name", "latency"),
+    [
+        ("aggregate?trigger=8", 2),
+        ("streamed?start=naive&gap_s=1", 2),
+        ("replace?execute=2&under_way=many", 3),
+        ("replace?assumed=2", 2),
+    ],
+)
+def test_where_no_closed_form_holds_none_is_told(name: str, latency: int) -> None:
+    assert mode(name).closed_form(constant(latency * PERIOD), Setting(PERIOD, 16)) == Closed()
