@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.boards.gaps import Constant, Floats, Gaps, Lognormal, Recorded, from_table, read_family
 from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
+from s2a_bench.options import option
 from s2a_bench.provenance import NONE, Provenance
 
 if TYPE_CHECKING:
@@ -15,6 +16,14 @@ if TYPE_CHECKING:
 
 NO_JITTER: Final = "none"
 AS_PROFILE: Final = "profile"
+PROMPT_TIME: Final[Any] = option(
+    None,
+    "seconds before decoding, c [default: the profile's; with --rate 0]",
+    flag="prompt-time",
+    ge=0,
+    allow_inf_nan=False,
+)
+"""The option of whatever names a board by its rate."""
 
 
 @dataclass(frozen=True, slots=True)

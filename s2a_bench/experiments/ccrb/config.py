@@ -10,6 +10,7 @@ from pydantic import Field
 
 from s2a_bench import extras
 from s2a_bench.boards.profile import profile_files
+from s2a_bench.boards.tokens import PROMPT_TIME
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Names, Numbers, Options, group, one_of, option
@@ -69,13 +70,7 @@ class CcrbConfig(Options):
         "jetson-agx-orin", "the board: a name of 'profile list', or a path", first=True, names=profile_files
     )
     rate: float | None = option(None, "a board of which only the tokens/s are known", gt=0, allow_inf_nan=False)
-    prompt_s: float | None = option(
-        None,
-        "seconds before decoding, c [default: the profile's; with --rate 0]",
-        flag="prompt-time",
-        ge=0,
-        allow_inf_nan=False,
-    )
+    prompt_s: float | None = PROMPT_TIME
     tokens_per_skill: int = option(6, "L, the delimiter included", ge=1, le=1000)
     scenario: CcrbOptions = Field(default_factory=CcrbOptions)
     simulator: Annotated[str, one_of(lambda: SIMULATORS)] = option(

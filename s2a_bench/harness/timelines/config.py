@@ -13,7 +13,7 @@ from pydantic import Field
 
 from s2a_bench.act import ROBOTS, SkillKind, kind
 from s2a_bench.boards.profile import load_profile, profile_files
-from s2a_bench.boards.tokens import NO_JITTER, Board, board_of_profile, board_of_rate
+from s2a_bench.boards.tokens import NO_JITTER, PROMPT_TIME, Board, board_of_profile, board_of_rate
 from s2a_bench.errors import UsageError
 from s2a_bench.frames import SOURCES
 from s2a_bench.inference import EngineConfig
@@ -129,13 +129,7 @@ class Modelled(Options):
     rates: Rates = option(
         (), "boards of which only the tokens/s are known; several with commas", flag="rate", first=True
     )
-    prompt_s: float | None = option(
-        None,
-        "seconds before decoding, c [default: the profile's; with --rate 0]",
-        flag="prompt-time",
-        ge=0,
-        allow_inf_nan=False,
-    )
+    prompt_s: float | None = PROMPT_TIME
     t_nom_cv: float = option(0.0, "how much T_nom differs from skill to skill: sd / mean", ge=0, le=MOST_CV)
     plans: int | None = option(None, "plans a cell [default: 1; with jitter 1000]", ge=1)
     jitter: str = option(
