@@ -7,7 +7,7 @@ told is *unknown*, never what was configured.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Final
 
@@ -160,22 +160,26 @@ class Origins:
 
     @property
     def line(self) -> str:
-        alike: dict[Provenance, list[str]] = {}
-        for each in self.every:
-            alike.setdefault(replace(each, profile=""), []).append(each.profile)
-        lines = (replace(each, profile=", ".join(filter(None, profiles))).line for each, profiles in alike.items())
-        return f"{ORIGIN}{'; '.join(dict.fromkeys(lines))}."
+        return f"{ORIGIN}{self._alike('profile', lambda each: replace(each, profile=''))}."
 
     @property
     def brief(self) -> str:
         """Return the line without the names of models and profiles, for where there is room for one line only."""
-        alike: dict[Provenance, dict[str, None]] = {}
-        for each in self.every:
+
+        def kind(each: Provenance) -> Provenance:
             engine = each.engine if each.engine in {NONE, UNKNOWN} else ""
             link = each.link if each.link in _UNPLAIN else ""
-            kind = replace(each, engine=engine, model="", model_sha256="", quantisation="", profile="", link=link)
-            alike.setdefault(kind, {})[each.engine] = None
-        return "; ".join(replace(kind, engine=", ".join(engines)).line for kind, engines in alike.items())
+            return replace(each, engine=engine, model="", model_sha256="", quantisation="", profile="", link=link)
+
+        return self._alike("engine", kind)
+
+    def _alike(self, name: str, kind: Callable[[Provenance], Provenance]) -> str:
+        """Return a line for each kind of provenance, with all values of a field that its own have."""
+        found: dict[Provenance, dict[str, None]] = {}
+        for each in self.every:
+            found.setdefault(kind(each), {})[getattr(each, name)] = None
+        lines = (replace(each, **{name: ", ".join(filter(None, values))}).line for each, values in found.items())
+        return "; ".join(dict.fromkeys(lines))
 
     @property
     def code(self) -> str:
