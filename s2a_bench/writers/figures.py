@@ -54,6 +54,12 @@ def caption_of(figure: Figure) -> tuple[str, ...]:
     return tuple(str(figure.get_label()).split("\n"))
 
 
+def markdown_caption(figure: Figure) -> str:
+    """Return a figure's title and notes as a paragraph of Markdown."""
+    title, *notes = map(markdown_text, caption_of(figure))
+    return " ".join((f"{title}.", *notes))
+
+
 def name_rows(axes: Axes, names: list[str]) -> None:
     """Put the names to the left, the first one on top."""
     axes.set_yticks(range(len(names)), names)
@@ -196,8 +202,7 @@ def save(folder: Path, builders: Mapping[str, Callable[[], Figure]]) -> list[Pat
             with paper_column():
                 figure = build()
                 required(name, figure.get_suptitle())
-                title, *notes = map(markdown_text, caption_of(figure))
-                captions.append(f"**{name}**: {' '.join((f'{title}.', *notes))}\n")
+                captions.append(f"**{name}**: {markdown_caption(figure)}\n")
                 for suffix in ("png", "pdf"):
                     path = folder / f"{name}.{suffix}"
                     figure.savefig(path)

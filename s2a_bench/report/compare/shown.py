@@ -20,7 +20,7 @@ from s2a_bench.stats.batches import BATCHES
 from s2a_bench.stats.change import POWER
 from s2a_bench.store.manifest import RunWarning, plain
 from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.figures import caption_of, marked, name_rows, new_figure, write_beside
+from s2a_bench.writers.figures import markdown_caption, marked, name_rows, new_figure, write_beside
 from s2a_bench.writers.latex import to_latex
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable, number, to_markdown
@@ -347,17 +347,16 @@ def write_comparison(folder: Path, compared: ComparedRuns, whole: Mapping[str, A
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, text in texts.items():
-            (folder / name).write_text(text, encoding="utf-8")
         written = [folder / name for name in texts]
         with paper_column():
             if figure := build_forest(compared):
                 marked(lambda: figure, *compared.baseline, *compared.other)
-                with (folder / "compare.md").open("a", encoding="utf-8") as page:
-                    page.write("\n" + "\n\n".join(caption_of(figure)) + "\n")
+                texts["compare.md"] += f"\n{markdown_caption(figure)}\n"
                 for suffix in ("png", "pdf"):
                     written.append(folder / f"compare.{suffix}")
                     figure.savefig(written[-1])
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise StoreError(f"`output` {folder}: {error.strerror}; name another folder") from error
     return written
