@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.timing import turns_s
 from s2a_bench.boards.gaps import Lognormal
-from s2a_bench.policy.chunks import Mode, Setting, mode
+from s2a_bench.policy.chunks import ControlSetting, Mode, mode
 from s2a_bench.policy.chunks.cycles import step
 
 MODES = (
@@ -28,7 +28,7 @@ MODES = (
     "aggregate?trigger=6",
     "aggregate?trigger=12",
 )
-SETTING = Setting(period_ns=20_000_000, horizon=16)
+SETTING = ControlSetting(period_ns=20_000_000, horizon=16)
 LATENCY = Lognormal(0.08, 0.3)
 REQUESTS = 20_000
 STEPPED = 500

@@ -11,7 +11,7 @@ from threading import Thread
 from s2a_bench.frames import open_source
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.plan import Plan, resolve
+from s2a_bench.harness.plan import RunPlan, resolve
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.inference import EngineConfig, open_engine
@@ -44,7 +44,7 @@ def main() -> None:
         print(f"{name:15} e2e median {median(values):.3f} ms, quartiles {low:.3f} and {high:.3f}, n = {len(values)}")
 
 
-def _session(cell: Pipeline, plan: Plan, stack: ExitStack, *, pixels: bool) -> Session:
+def _session(cell: Pipeline, plan: RunPlan, stack: ExitStack, *, pixels: bool) -> Session:
     """Open a server, a client and a camera of their own."""
     engine = open_engine(EngineConfig(name="echo"))
     server = open_server(cell.wiring(), engine_handler(engine, pixels=pixels))

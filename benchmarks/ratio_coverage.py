@@ -16,7 +16,7 @@ from scipy import stats
 from scipy.signal import lfilter
 
 from s2a_bench.stats import Ratio
-from s2a_bench.stats.batches import Memory
+from s2a_bench.stats.batches import RowCorrelation
 from s2a_bench.stats.change import Noise, ratio_of_launches
 
 RATIO = 6.0
@@ -64,7 +64,7 @@ def coverage(launches: int, launch_sd: float, trials: int, correlation: float = 
         low, high = found.low or math.nan, found.high or math.nan
         held += low <= RATIO <= high
         widths.append(math.sqrt(high / low) - 1)
-        warned += launches == 1 and any(Memory.of(cell[0]).dependent for cell in cells)
+        warned += launches == 1 and any(RowCorrelation.of(cell[0]).dependent for cell in cells)
     low, high = stats.binomtest(held, trials).proportion_ci(method="wilson")
     said = f"; warned of in {warned / trials:.0%}" if launches == 1 else ""
     return f"{held / trials:6.1%} [{low:.1%}, {high:.1%}], about +- {np.median(widths):.0%}{said}"

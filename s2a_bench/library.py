@@ -201,7 +201,7 @@ def command(name: str) -> Callable[..., Run]:
     return call
 
 
-def _opened(side: Folder | Sequence[Folder]) -> list[store.Run]:
+def _opened(side: Folder | Sequence[Folder]) -> list[store.StoredRun]:
     folders = [side] if isinstance(side, (str, Path, Run)) else side
     return [store.read_run(folder.path if isinstance(folder, Run) else Path(folder)) for folder in folders]
 

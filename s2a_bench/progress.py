@@ -50,7 +50,7 @@ class NullProgress:
         self.done += 1
 
 
-class Picture(Protocol):
+class LiveView(Protocol):
     """What can be watched while it happens."""
 
     def draw(self, width: int) -> Any:
@@ -60,7 +60,7 @@ class Picture(Protocol):
         """Return what came of it, for where there is no terminal."""
 
 
-def watching(progress: Progress, picture: Picture) -> AbstractContextManager[None]:
+def watching(progress: Progress, picture: LiveView) -> AbstractContextManager[None]:
     """Show a picture for as long as the context lasts, where ``progress`` has a method ``watch`` for it."""
     watch = getattr(progress, "watch", None)
     shown: AbstractContextManager[None] = watch(picture) if watch else nullcontext()

@@ -17,9 +17,9 @@ import numpy as np
 from s2a_bench.policy import Plans
 from s2a_bench.policy.conformal import TOLERANCE_S, Tracker, choose, scores, take
 from s2a_bench.policy.estimator import GapPrior
-from s2a_bench.policy.metrics import Metrics, measure
+from s2a_bench.policy.metrics import PlanMetrics, measure
 from s2a_bench.policy.stream_to_act import StreamToAct
-from s2a_bench.policy.tracking import Tracked
+from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.stats.seeds import generator
 from studies.config import Cell, StudyConfig
 from studies.rows import StudyRow, row_of
@@ -78,7 +78,7 @@ def cell(config: StudyConfig, world: World, drift: str) -> list[StudyRow]:
     return rows
 
 
-def follow(calibration: Plans, plans: Plans, epsilon: float, arm: str) -> tuple[Floats, Metrics]:
+def follow(calibration: Plans, plans: Plans, epsilon: float, arm: str) -> tuple[Floats, PlanMetrics]:
     """Decide the plans one after another; returns each plan's lambda and how it went."""
     assert calibration.token_s is not None  # noqa: S101 - worlds draw tokens
     policy = StreamToAct(GapPrior.fit(calibration.token_s))
@@ -87,7 +87,7 @@ def follow(calibration: Plans, plans: Plans, epsilon: float, arm: str) -> tuple[
         fixed = choose(score, epsilon).caution
         schedule = replace(policy, caution=fixed).schedule(plans)
         return np.full(count, fixed), measure(plans, schedule, tolerance_s=TOLERANCE_S)
-    tracked = Tracked(policy, Tracker(score, epsilon))
+    tracked = TrackedPolicy(policy, Tracker(score, epsilon))
     window, seen = calibration.arrival_s.shape[1], calibration.token_s
     chosen, parts = [], []
     for places in np.array_split(np.arange(count), max(1, count // REFIT) if arm == "refitted" else 1):
@@ -98,10 +98,10 @@ def follow(calibration: Plans, plans: Plans, epsilon: float, arm: str) -> tuple[
         if arm == "refitted":
             assert part.token_s is not None  # noqa: S101
             seen = np.concatenate([seen, part.token_s], axis=1)[:, -window:]
-            tracked = Tracked(StreamToAct(GapPrior.fit(seen)), tracked.tracker)
-    columns = [[getattr(part, item.name) for part in parts] for item in fields(Metrics)]
-    return np.concatenate(chosen), Metrics(*map(np.concatenate, columns))
+            tracked = TrackedPolicy(StreamToAct(GapPrior.fit(seen)), tracked.tracker)
+    columns = [[getattr(part, item.name) for part in parts] for item in fields(PlanMetrics)]
+    return np.concatenate(chosen), PlanMetrics(*map(np.concatenate, columns))
 
 
-def _at(found: Metrics, places: NDArray[np.intp]) -> Metrics:
-    return Metrics(*(getattr(found, item.name)[places] for item in fields(Metrics)))
+def _at(found: PlanMetrics, places: NDArray[np.intp]) -> PlanMetrics:
+    return PlanMetrics(*(getattr(found, item.name)[places] for item in fields(PlanMetrics)))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 """Both columns of a two-column paper."""
 _LOOKS: Final = (("#0072B2", "-", "o"), ("#D55E00", "--", "s"), ("#009E73", "-.", "^"), ("#CC79A7", ":", "D"))
@@ -26,7 +26,7 @@ _LIMIT: Final[dict[str, Any]] = {"color": _INK, "linestyle": (0, (4, 2)), "linew
 _DRAWN: Final = "Plans are drawn from models of the arrivals; nothing is measured."
 
 
-def build_targets(run: Run) -> Figure:
+def build_targets(run: StoredRun) -> Figure:
     """Draw stream-to-act's share of stalled plans and regrets, a point a setting, against rho."""
     rows = first_seed(rows_of(run))
     rows = rows[rows["policy"] == ONLINE]
@@ -55,7 +55,7 @@ def build_targets(run: Run) -> Figure:
     return figure
 
 
-def build_frontier(run: Run) -> Figure:
+def build_frontier(run: StoredRun) -> Figure:
     """Draw P(any stall) against start regret as lambda grows, a panel a world, a colour a family of gaps."""
     rows = first_seed(rows_of(run))
     epsilon = float(run.manifest["configuration"]["epsilon"])
@@ -90,7 +90,7 @@ def build_frontier(run: Run) -> Figure:
     return figure
 
 
-def build_drift(run: Run) -> Figure:
+def build_drift(run: StoredRun) -> Figure:
     """Draw P(any stall) block by block: prior and lambda fixed, lambda tracked, the prior refitted too."""
     rows = first_seed(rows_of(run))
     rows = rows.assign(
@@ -127,7 +127,7 @@ def build_drift(run: Run) -> Figure:
     return figure
 
 
-def build_misfit(run: Run) -> Figure:
+def build_misfit(run: StoredRun) -> Figure:
     """Draw what a wrong length, granularity or rate costs: stalls above, late starts below, a line a world."""
     rows = first_seed(rows_of(run))
     kinds = {"N": "skills a plan", "L": "tokens a skill", "gap": "mean gap of the prior"}

@@ -17,7 +17,7 @@ from s2a_bench.writers.tables import TextTable, to_markdown
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 
 class Lines(NullProgress):
@@ -45,7 +45,7 @@ class Lines(NullProgress):
 
 
 def show(
-    run: Run,
+    run: StoredRun,
     tables: Mapping[str, TextTable],
     csvs: Mapping[str, CsvTable],
     figures: Mapping[str, Callable[[], Figure]],

@@ -11,7 +11,7 @@ import numpy as np
 from s2a_bench.boards.gaps import FAMILIES
 from s2a_bench.policy import Plans, Policy
 from s2a_bench.policy.conformal import TOLERANCE_S, upper_bound
-from s2a_bench.policy.metrics import Metrics, measure
+from s2a_bench.policy.metrics import PlanMetrics, measure
 from s2a_bench.store.schema import Table
 from studies.worlds import World
 
@@ -92,7 +92,7 @@ def row_of(
     study: str,
     world: World,
     policy: str,
-    found: Metrics,
+    found: PlanMetrics,
     *,
     caution: float | None = None,
     calibration_plans: int = 0,

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 _LOOKS: Final = {
     "fixed": ("#D55E00", "s"),
@@ -78,7 +78,7 @@ def split_tables(rows: pd.DataFrame) -> Iterator[TextTable]:
     yield TextTable("Split", ("guarantee", "rule", *columns, "worst"), lines, 2, notes=notes)
 
 
-def build_shift(run: Run) -> Figure:
+def build_shift(run: StoredRun) -> Figure:
     """Draw P(any stall) under every shift, a mark a way to go on, a line over the range of the seeds."""
     rows = _arms(rows_of(run))
     shifts = list(dict.fromkeys(rows["shift"]))
@@ -103,7 +103,7 @@ def build_shift(run: Run) -> Figure:
     return figure
 
 
-def build_split(run: Run) -> Figure:
+def build_split(run: StoredRun) -> Figure:
     """Draw start regret over S_lo against distortion, a mark a rule, a colour a guarantee."""
     rows = rows_of(run)
     figure = new_figure(3.6, f"What an early start costs{seeds(rows)}\n{DRAWN_PLANS}", WIDE_IN)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from s2a_bench.progress import Progress
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
     from s2a_bench.writers.tables import TextTable
 
 
@@ -37,7 +37,7 @@ class Study:
     about: str
     cells: Callable[[StudyConfig], Sequence[Cell]]
     tables: Callable[[pd.DataFrame], Iterator[TextTable]]
-    figure: Callable[[Run], Figure]
+    figure: Callable[[StoredRun], Figure]
 
 
 STUDIES: Final = {
@@ -95,13 +95,13 @@ def _call(cell: Cell) -> Sequence[StudyRow]:
     return cell()
 
 
-def study_tables(run: Run) -> dict[str, TextTable]:
+def study_tables(run: StoredRun) -> dict[str, TextTable]:
     """Return the tables of a study by their files' names, which are their titles: "Most stalls" is most-stalls."""
     found = STUDIES[run.manifest["configuration"]["study"]].tables(rows_of(run))
     return {re.sub(r"[^a-z0-9]+", "-", table.title.lower()).strip("-"): table for table in found}
 
 
-def show_study(run: Run) -> None:
+def show_study(run: StoredRun) -> None:
     """Write and print what a study's run comes to."""
     name = run.manifest["configuration"]["study"]
     csvs = {f"{name}.csv": CsvTable.of_frame(run.table(STUDY_CELLS))}

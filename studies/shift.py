@@ -20,7 +20,7 @@ from s2a_bench.policy.conformal import TOLERANCE_S, Tracker, choose, scores
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import measure
 from s2a_bench.policy.stream_to_act import StreamToAct
-from s2a_bench.policy.tracking import Tracked
+from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.stats.seeds import generator
 from studies.config import Cell, StudyConfig
 from studies.rows import StudyRow, row_of
@@ -122,7 +122,7 @@ def cell(config: StudyConfig, world: World, shift: str) -> list[StudyRow]:
         policy = StreamToAct(GapPrior.fit(calibration.token_s), detect=detect)
         score = scores(policy, calibration)
         fixed = replace(policy, caution=choose(score, config.epsilon, config.guarantee).caution)
-        caution, schedule = Tracked(policy, Tracker(score, config.epsilon)).follow(plans)
+        caution, schedule = TrackedPolicy(policy, Tracker(score, config.epsilon)).follow(plans)
         ways = {
             "detected" if detect else "fixed": (fixed.caution, fixed.schedule(plans)),
             "both" if detect else "tracked": (float(np.median(caution)), schedule),

@@ -14,7 +14,7 @@ from studies.worlds import HARD
 if TYPE_CHECKING:
     import pandas as pd
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 LEVELS: Final = (0.01, 0.05, 0.20)
 """Shares of stalled plans at which a frontier's regret is read off."""
@@ -34,7 +34,7 @@ def regret_at(points: pd.DataFrame, level: float, what: str = "start_regret") ->
     return float(np.interp(level, ordered["p_any_stall"].to_numpy(dtype=float), cheapest))
 
 
-def rows_of(run: Run) -> pd.DataFrame:
+def rows_of(run: StoredRun) -> pd.DataFrame:
     """Return the rows of a study."""
     return run.table(STUDY_CELLS)
 

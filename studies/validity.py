@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.inference.tokenizer import Tokenizer
     from s2a_bench.progress import Progress
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 PAPER: Final = "paper"
 """The paper's format, among the tokens a skill that are asked for."""
@@ -281,7 +281,7 @@ class Arm:
     problems: dict[str, int] = field(default_factory=dict)
 
 
-def arms_of(run: Run) -> list[Arm]:
+def arms_of(run: StoredRun) -> list[Arm]:
     """Count a run's answers."""
     rows = run.table(VALIDITY)
     formats = {about["name"]: about for about in run.manifest["formats"]}
@@ -291,7 +291,7 @@ def arms_of(run: Run) -> list[Arm]:
     ]
 
 
-def validity_tables(run: Run) -> dict[str, TextTable]:
+def validity_tables(run: StoredRun) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
     arms = arms_of(run)
     tables = {"validity": _shares(run, arms), "formats": _formats(run)}
@@ -320,7 +320,7 @@ def _names(arm: Arm) -> tuple[str, str]:
     return arm.about["name"], "with" if arm.grammar else "without"
 
 
-def _shares(run: Run, arms: list[Arm]) -> TextTable:
+def _shares(run: StoredRun, arms: list[Arm]) -> TextTable:
     """Lay out the shares, a line a format and way to ask."""
     asked = run.manifest["configuration"]
     lines: list[tuple[str, ...]] = [
@@ -334,7 +334,7 @@ def _shares(run: Run, arms: list[Arm]) -> TextTable:
     return TextTable(title, header, lines, 2, rules, tuple(_notes(run, arms)))
 
 
-def _formats(run: Run) -> TextTable:
+def _formats(run: StoredRun) -> TextTable:
     """Return what was asked for, and what it costs with this model."""
     lines: list[tuple[str, ...]] = [
         (
@@ -348,7 +348,7 @@ def _formats(run: Run) -> TextTable:
     return TextTable("Formats", ("L", "wording", "example", "tokens a skill: least / mean / most"), lines, 3)
 
 
-def _notes(run: Run, arms: list[Arm]) -> Iterator[str]:
+def _notes(run: StoredRun, arms: list[Arm]) -> Iterator[str]:
     """Return what a reader must know besides the numbers."""
     yield "[]: 95 % Clopper-Pearson; for lines as if they were independent, which those of one answer are not."
     yield f"The first {run.manifest['configuration']['n_skills']} lines of an answer count. One prompt, no picture."
@@ -361,6 +361,6 @@ def _notes(run: Run, arms: list[Arm]) -> Iterator[str]:
         yield f"{cut} of {answers} answers without grammar were cut off at their most tokens (--max-tokens)."
 
 
-def show_validity(run: Run) -> None:
+def show_validity(run: StoredRun) -> None:
     """Write and print what a run comes to."""
     output.show(run, validity_tables(run), {}, {})

@@ -13,10 +13,10 @@ import pytest
 from s2a_bench.boards.profile import to_toml
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.requests import SampleRow, TokenRow
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 
 Durations: TypeAlias = Mapping[str, float]
-MakeRun: TypeAlias = Callable[..., Run]
+MakeRun: TypeAlias = Callable[..., StoredRun]
 
 SCHEMA: Any = json.loads((Path(__file__).parents[1] / "docs" / "schema" / "s2a-bench-1.json").read_text())
 """What --json prints."""
@@ -155,7 +155,7 @@ def made_run(
     extra: tuple[SampleRow, ...] = (),
     payloads: Mapping[str, str] | None = None,
     **facts: Any,
-) -> Run:
+) -> StoredRun:
     """Make a run of lognormal durations (``spread`` > 0) or exact ones (``spread`` = 0), ``n`` over all launches."""
     rng = np.random.default_rng(1)
     with RunWriter.create(folder, "latency", known(manifest or {})) as run:
@@ -176,7 +176,7 @@ def made_run(
     return read_run(run.path)
 
 
-def spoken_run(folder: Path, rate: float, *, engine: str = "llama", **manifest: Any) -> Run:
+def spoken_run(folder: Path, rate: float, *, engine: str = "llama", **manifest: Any) -> StoredRun:
     """Make a throughput run whose engine generates at a rate."""
     durations = {"convert": 10, "inference": 5, "return": 0}
     with RunWriter.create(folder, "throughput", manifest) as run:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from s2a_bench.testing.transport import Recorder
+from s2a_bench.testing.transport import RecordingHandler
 from tests.servers.sockets import serving
 from tests.servers.speakers import Ollama, answering
 
@@ -226,7 +226,7 @@ def test_its_dialect_is_asked(command: Command, tmp_path: Path) -> None:
     class Speaker(Ollama):
         path = "/toy/chat"
 
-    asked = Recorder(["one", " two", " three"])
+    asked = RecordingHandler(["one", " two", " three"])
     spoken = ["--dialect", "toy-chat", "--served-model", "toy", "--transport", "http"]
     with serving(answering(Speaker(), asked)) as url:
         done = command("latency", "--url", url, *spoken, "--size", "64x48", "--requests", "3", "--warmup", "1")

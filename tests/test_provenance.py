@@ -17,7 +17,7 @@ from s2a_bench.report.compare.alike import differences
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
 from s2a_bench.report.page.files import make_report, write_report
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.figures import new_figure, save
 from s2a_bench.writers.latex import to_latex, to_siunitx
@@ -144,7 +144,7 @@ def test_every_table_csv_figure_page_and_json_of_every_experiment_has_it(name: s
 
 
 def test_runs_of_unlike_provenance_differ_fatally(tmp_path: Path) -> None:
-    def made(provenance: Provenance) -> Run:
+    def made(provenance: Provenance) -> StoredRun:
         with RunWriter.create(tmp_path, "latency", {"provenance": Origins(provenance).to_manifest()}) as writer:
             pass
         return read_run(writer.path)

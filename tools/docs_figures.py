@@ -25,7 +25,7 @@ from s2a_bench.experiments.timeline.view.figures import policy_colours
 from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.style import paper_column
 
@@ -67,7 +67,7 @@ def boundary(config: BoundaryConfig) -> Figure:
     return drawn(_run(lambda output: run_boundary(config, output, Quiet())), "boundary")
 
 
-def chunks(latency: str) -> Run:
+def chunks(latency: str) -> StoredRun:
     """Make a run of chunks, four modes and the rules."""
     return _run(lambda output: run_chunks(ChunksConfig(latency=latency, shown_ticks=90), output, Quiet()))
 
@@ -109,13 +109,13 @@ RUNS = TemporaryDirectory()
 """Where runs are until all is drawn: their tables are read when they are needed."""
 
 
-def _run(make: Callable[[Path], Path]) -> Run:
+def _run(make: Callable[[Path], Path]) -> StoredRun:
     """Make a run in a folder that goes again; virtual time is the same on every host and day."""
     run = read_run(make(Path(RUNS.name)))
     return replace(run, manifest={name: run.manifest[name] for name in run.manifest if name not in {"host", "started"}})
 
 
-def drawn(run: Run, name: str) -> Figure:
+def drawn(run: StoredRun, name: str) -> Figure:
     """Draw a figure of a run as its experiment does."""
     return EXPERIMENTS[str(run.manifest["command"])].show(run).figures[name]()
 

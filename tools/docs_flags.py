@@ -1,9 +1,9 @@
 """Write the tables of flags and facts in docs/*.md from the declarations: `.venv/bin/python tools/docs_flags.py`.
 
 A table of flags stands between `<!-- flags: COMMAND -->` and `<!-- /flags -->`, that of the facts between
-`<!-- facts -->` and `<!-- /facts -->`. `timeline Live` has only the flags of the class Live, which the configuration
-is derived from or has as a group, `timeline -Live` all others; `throughput -latency` has the flags that latency has
-not, or has otherwise.
+`<!-- facts -->` and `<!-- /facts -->`. `timeline LiveOptions` has only the flags of that class, which the configuration
+is derived from or has as a group, `timeline -LiveOptions` all others; `throughput -latency` has the flags that latency
+has not, or has otherwise.
 """
 
 from __future__ import annotations

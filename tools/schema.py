@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.ccrb.view.tables import CcrbFollower, CcrbSensitivity, CcrbStudy
-from s2a_bench.experiments.profile_capture import Board, ProfileJson
+from s2a_bench.experiments.profile_capture import BoardFacts, ProfileJson
 from s2a_bench.experiments.throughput.metrics import Reference
 from s2a_bench.inference.fetch import FetchedFile
 from s2a_bench.inference.gguf_file import GgufInfo
@@ -113,7 +113,7 @@ def frame_schema() -> dict[str, Any]:
 
 def profile_schema() -> dict[str, Any]:
     """Return the schema of `profile ... --json`."""
-    return _redefined("s2a-bench-profile-1", {"board": Board, "profile": ProfileJson})
+    return _redefined("s2a-bench-profile-1", {"board": BoardFacts, "profile": ProfileJson})
 
 
 def model_schema() -> dict[str, Any]:

@@ -133,7 +133,7 @@ ROBOTS: Final[Registry[type[RobotKind]]] = Registry(
     {
         "timed": "s2a_bench.act.timed:Timed",
         "plant": "s2a_bench.act.plant:Plant",
-        "ros": "s2a_bench.act.ros:Ros",
+        "ros": "s2a_bench.act.ros:RosRobot",
         "call": "s2a_bench.act.call:PythonCall",
     },
 )

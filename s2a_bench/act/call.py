@@ -20,7 +20,7 @@ _FUNCTION: Final = re.compile(r"[\w.]+:[\w.]+")
 
 @dataclass(frozen=True, slots=True)
 class PythonCall(SkillKind, ActionKind):
-    """Call ``function``, written ``module:name``, with each action, float32 (D,), or with the `Motion` of each skill.
+    """Call ``function``, written ``module:name``, with each action, float32 (D,), or each skill's `SkillMotion`.
 
     What it returns is not looked at. Actions are sent on the control loop's thread: meanwhile nothing else is executed.
     A skill has a thread of its own; `CallableRobot` has a function for each skill, and one for the gaps.
@@ -85,7 +85,7 @@ class CallableActions(ActionRobot):
         """Do nothing."""
 
 
-class Motion:
+class SkillMotion:
     """What a skill's function is given: the call, and how long it may take, which can change on the way."""
 
     def __init__(self, call: Call, end_ns: int) -> None:
@@ -143,7 +143,7 @@ class Motion:
         report(error)
 
 
-SkillFunction: TypeAlias = Callable[[Motion], object]
+SkillFunction: TypeAlias = Callable[[SkillMotion], object]
 """A skill as a function: returns when the skill is done, raises where it fails, looks after ``motion.aborted``."""
 
 
@@ -164,7 +164,7 @@ class CallableRobot:
 
     def start(self, call: Call, end_ns: int, report: Report) -> Running:
         """Call the skill's function on a new thread, which does not keep the process alive."""
-        motion = Motion(call, end_ns)
+        motion = SkillMotion(call, end_ns)
         Thread(target=motion.run, args=(self._functions[call.skill.name], report), daemon=True).start()
         return motion
 

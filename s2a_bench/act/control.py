@@ -17,7 +17,7 @@ from threading import Thread
 from typing import Final, TypeAlias
 
 from s2a_bench.clock import Clock, SystemClock
-from s2a_bench.policy.chunks import Ints, Mode, Setting
+from s2a_bench.policy.chunks import ControlSetting, Ints, Mode
 from s2a_bench.types import Vector
 
 Send: TypeAlias = "Callable[[Vector | None, int], None]"
@@ -61,7 +61,7 @@ class ControlLoop:
     """One robot that acts on chunks for so many control ticks."""
 
     def __init__(
-        self, mode: Mode, setting: Setting, send: Send, ask: Ask, ticks: int, clock: Clock | None = None
+        self, mode: Mode, setting: ControlSetting, send: Send, ask: Ask, ticks: int, clock: Clock | None = None
     ) -> None:
         self.stepper, self._setting = mode.stepper(setting), setting
         self._weight = mode.weight

@@ -80,7 +80,7 @@ class PlanFeed:
     """Told what a stream brings, by the thread that reads it: every executor that follows it is told the same."""
 
     def __init__(self, parser: Parser, tell: Callable[[Event], None]) -> None:
-        """Read with ``parser``, a new one for every answer; ``tell`` delivers to whoever follows, as `Inbox.put`."""
+        """Read with ``parser``, a new one for every answer; ``tell`` delivers each event, as `EventQueue.put`."""
         self._parser = parser
         self._tell = tell
         self.token_ns: list[int] = []
@@ -111,7 +111,7 @@ class PlanFeed:
                 self.broke(f"line {event.line + 1} ({event.problem}): {event.why}", at_ns, "invalid-line")
 
 
-class Inbox(Protocol):
+class EventQueue(Protocol):
     """Events on their way to one executor."""
 
     def put(self, event: Event) -> None:

@@ -23,8 +23,8 @@ from s2a_bench.act import Running, SkillRobot
 from s2a_bench.act.events import (
     AbortAsked,
     Event,
+    EventQueue,
     Fault,
-    Inbox,
     Requested,
     SkillCame,
     SkillOver,
@@ -32,7 +32,7 @@ from s2a_bench.act.events import (
     StreamEnded,
     TokenCame,
 )
-from s2a_bench.act.record import Command, Outcome, Record, SkillRun, What
+from s2a_bench.act.record import Outcome, Record, RobotCommand, SkillRun, What
 from s2a_bench.clock import Clock
 from s2a_bench.plan import Gap
 from s2a_bench.policy import PlanShape, Policy, Start, Timing
@@ -55,7 +55,7 @@ class Executor:
         policy: Policy,
         shape: PlanShape,
         robot: SkillRobot,
-        inbox: Inbox,
+        inbox: EventQueue,
         clock: Clock,
         *,
         gap: Gap = "hold",
@@ -263,7 +263,7 @@ class Executor:
         return 0
 
     def _log(self, at_ns: int, what: What, index: int) -> None:
-        self.record.commands.append(Command(at_ns, what, index))
+        self.record.commands.append(RobotCommand(at_ns, what, index))
 
     def _order(self, otherwise: _T, call: Callable[[], _T]) -> _T:
         """Call the robot; what it raises fails the plan."""

@@ -44,7 +44,7 @@ class SkillRun:
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class RobotCommand:
     """An order to the robot; ``index`` is the skill's, -1 for a hold before the first."""
 
     at_ns: int
@@ -63,7 +63,7 @@ class Record:
     ended_ns: int | None = None
     """When the stream ended or broke."""
     skills: list[SkillRun] = field(default_factory=list)
-    commands: list[Command] = field(default_factory=list)
+    commands: list[RobotCommand] = field(default_factory=list)
     extra: int = 0
     """Skills beyond those announced, which were not carried out."""
     outcome: Outcome | None = None

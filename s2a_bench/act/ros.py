@@ -55,7 +55,7 @@ _NAME: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
 @dataclass(frozen=True, slots=True)
-class Ros(SkillKind, ActionKind):
+class RosRobot(SkillKind, ActionKind):
     """Publish each action on ``topic`` as a message of ``type``; send skills to the node in ``namespace``.
 
     ``joints`` are the joints' names with colons between them; joint_1, joint_2, ... unless told. ``middleware``,
@@ -126,7 +126,7 @@ class Ros(SkillKind, ActionKind):
 class RosActions(ActionRobot):
     """Publishes actions."""
 
-    def __init__(self, asked: Ros, middleware: Middleware, joints: list[str], period_ns: int) -> None:
+    def __init__(self, asked: RosRobot, middleware: Middleware, joints: list[str], period_ns: int) -> None:
         """Announce the topic and take over ``middleware``; raises RobotError where nobody subscribes in time."""
         self._asked, self._middleware = asked, middleware
         type_name = TRAJECTORY if asked.type == "JointTrajectory" else ARRAY

@@ -95,7 +95,7 @@ class _Trace(TomlTable):
         return tuple(gap / 1e9 for gap in chain.from_iterable(self.gaps_ns[self.warmups :]))
 
 
-class _File(TomlTable):
+class _ProfileFile(TomlTable):
     """What the file may hold."""
 
     title: Line
@@ -126,14 +126,14 @@ def read_profile(path: Path) -> Profile:
 
 def parse_profile(name: str, text: str, where: str) -> Profile:
     """Read a profile; ``where`` begins every error. Raises UsageError naming the key that is wrong."""
-    file = parse(_File, text, where)
+    file = parse(_ProfileFile, text, where)
     try:
         return _profile(name, file)
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from error
 
 
-def _profile(name: str, file: _File) -> Profile:
+def _profile(name: str, file: _ProfileFile) -> Profile:
     facts = file.model_dump(include=set(FACTS), exclude_none=True)
     for key, table in facts.items():
         _check_fact(key, table)

@@ -23,7 +23,7 @@ from s2a_bench.writers.tables import fits, lay_out
 
 if TYPE_CHECKING:
     from s2a_bench.options import Options
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 PLAIN: dict[str, Any] = {"rich_markup_mode": None, "pretty_exceptions_enable": False, "add_completion": False}
 """How our commands look."""
@@ -174,7 +174,7 @@ def command_of(experiment: Experiment) -> Callable[..., None]:
     return command(run, *options_of(experiment), about=experiment.about)
 
 
-def present(run: Run, shown: Shown, *, verbose: bool = False) -> None:
+def present(run: StoredRun, shown: Shown, *, verbose: bool = False) -> None:
     """Print the main table, what a run says, and where the rest is; every table where ``verbose``."""
     console = open_console()
     first = [*(shown.main[:1] or shown.tables)]

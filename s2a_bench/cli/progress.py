@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from s2a_bench.cli.output import print_line, shown
 from s2a_bench.clock import now_ns
-from s2a_bench.progress import Picture
+from s2a_bench.progress import LiveView
 
 REFRESHES_HZ = 8
 PLAIN_STEPS = 5
@@ -52,7 +52,7 @@ class RunProgress:
         print_line(line, self.console)
 
     @contextmanager
-    def watch(self, picture: Picture) -> Iterator[None]:
+    def watch(self, picture: LiveView) -> Iterator[None]:
         """Show a picture while the context lasts; its last state stays on the terminal."""
         if not self.console.is_terminal:
             yield

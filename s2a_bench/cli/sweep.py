@@ -25,10 +25,10 @@ from s2a_bench.machine.environment import collect
 from s2a_bench.secrets import struck
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.sweep import CELLS, Sweep, read_sweep
-from s2a_bench.sweep import WORKERS, Cell, Command, SweepConfig, Workers
+from s2a_bench.sweep import WORKERS, CellWorkers, SweepCell, SweepCommand, SweepConfig
 from s2a_bench.sweep.as_json import plan_json, sweep_json
 from s2a_bench.sweep.file import read_sweep_file
-from s2a_bench.sweep.plan import Plan, plan_sweep
+from s2a_bench.sweep.plan import SweepPlan, plan_sweep
 from s2a_bench.sweep.run import Expected, SweepRun, check_resume, earlier, expect, only_one, pending, start_sweep
 from s2a_bench.text import none_of, visible
 from s2a_bench.writers.tables import TextTable
@@ -80,8 +80,8 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
         )
 
 
-def _workers(plan: Plan, ray: str, width: int) -> Workers:
-    workers: Workers = resolve_name(WORKERS["ray" if ray else "here"])(ENTRY, ray, plan, width)
+def _workers(plan: SweepPlan, ray: str, width: int) -> CellWorkers:
+    workers: CellWorkers = resolve_name(WORKERS["ray" if ray else "here"])(ENTRY, ray, plan, width)
     return workers
 
 
@@ -89,7 +89,7 @@ def _lacking(source: Path, missing: Collection[str]) -> str:
     return f"{source}: not everything that its cells need is installed; {extras.how_to_install(*missing)}"
 
 
-def _show_plan(plan: Plan, config: SweepConfig, missing: Collection[str], *, as_json: bool) -> None:
+def _show_plan(plan: SweepPlan, config: SweepConfig, missing: Collection[str], *, as_json: bool) -> None:
     resume = config.resume
     cells = pending(plan, read_sweep(resume).attempts.to_dict("records") if resume else [], retry_failed=False)
     sweeps = earlier(resume.parent if resume else config.output, plan.command)
@@ -107,7 +107,7 @@ sweep = command(_sweep, SweepConfig)
 MINUTE_S, HOUR_S = 60, 3600
 
 
-def print_plan(plan: Plan, cells: Sequence[Cell], expected: Expected) -> None:
+def print_plan(plan: SweepPlan, cells: Sequence[SweepCell], expected: Expected) -> None:
     """Print every cell as the command that it is, and the time to expect."""
     console = open_console()
     for cell in cells:
@@ -153,7 +153,7 @@ ENTRY = f"{__name__}:run"
 """Where a worker finds `run`."""
 
 
-def command_of(name: str, key: str = "command", *, trusted: bool = False) -> Command:
+def command_of(name: str, key: str = "command", *, trusted: bool = False) -> SweepCommand:
     """Describe a command; raises UsageError for one that cannot be swept.
 
     Its cells may run programs, and send keys and files to a URL, if the file that wants that is ``trusted``.
@@ -170,7 +170,7 @@ def command_of(name: str, key: str = "command", *, trusted: bool = False) -> Com
             value = "hidden" if parameter.hidden else "value"
             kind = value if not parameter.is_flag else "toggle" if parameter.secondary_opts else "switch"
             flags[long.removeprefix("--")] = kind
-    return Command(name, flags, lambda argv: _check(name, argv, trusted=trusted))
+    return SweepCommand(name, flags, lambda argv: _check(name, argv, trusted=trusted))
 
 
 def run(argv: Sequence[str]) -> None:

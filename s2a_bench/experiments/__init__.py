@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.options import Options
     from s2a_bench.progress import Progress
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
     from s2a_bench.writers.csv_text import CsvTable
     from s2a_bench.writers.tables import TextTable
 
@@ -131,13 +131,13 @@ class Shown:
 class View(Protocol):
     """How an experiment's runs are shown; ``asked`` are its view options."""
 
-    def __call__(self, run: Run, **asked: Any) -> Shown:
+    def __call__(self, run: StoredRun, **asked: Any) -> Shown:
         """Return what a run shows; reads the store and measures nothing."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class Comparable:
     """What the runs of an experiment can be compared by.
 
     ``origin`` says what did not really answer; ``shown`` are the metrics that are compared unless others are named.
@@ -145,10 +145,10 @@ class Compared:
     """
 
     metrics: Mapping[str, Metric]
-    subjects: Callable[[Run], list[Subject]]
-    origin: Callable[[Run], Sequence[str]]
+    subjects: Callable[[StoredRun], list[Subject]]
+    origin: Callable[[StoredRun], Sequence[str]]
     shown: tuple[str, ...]
-    own: Callable[[Run], Iterable[Metric]] = lambda _: ()
+    own: Callable[[StoredRun], Iterable[Metric]] = lambda _: ()
 
 
 def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:
@@ -172,7 +172,7 @@ class Experiment:
     view_options: str = ""
     """Class of the options that change what is shown and not what is measured."""
     compared: str = ""
-    """A `Compared`; without it, its runs are not compared."""
+    """A `Comparable`; without it, its runs are not compared."""
     cell: str = ""
     """Class of a cell of its ``--json``, a dataclass, from which docs/schema follows; not declared: any object."""
     unit: str = "samples"
@@ -183,7 +183,7 @@ class Experiment:
         folder: Path = resolve_name(self.run)(config, output, progress)
         return folder
 
-    def show(self, run: Run, **asked: Any) -> Shown:
+    def show(self, run: StoredRun, **asked: Any) -> Shown:
         """Return what one of its runs shows; every table and figure says where its numbers come from."""
         from s2a_bench.writers.figures import marked
 
@@ -198,9 +198,9 @@ class Experiment:
         cell: type | None = resolve_name(self.cell) if self.cell else None
         return cell
 
-    def compared_by(self) -> Compared | None:
+    def compared_by(self) -> Comparable | None:
         """Return what its runs are compared by; None where they are not."""
-        compared: Compared | None = resolve_name(self.compared) if self.compared else None
+        compared: Comparable | None = resolve_name(self.compared) if self.compared else None
         return compared
 
 
@@ -219,7 +219,7 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
 """The experiments by their commands."""
 
 
-def write_shown(run: Run, shown: Shown) -> None:
+def write_shown(run: StoredRun, shown: Shown) -> None:
     """Write tables, figures and what else a run shows into its folder; raises StoreError."""
     from s2a_bench.writers.csv_text import write_texts
 

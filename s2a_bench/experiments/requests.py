@@ -14,7 +14,7 @@ from dataclasses import astuple, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
-from s2a_bench.experiments import Compared, Metric, Subject, by_name
+from s2a_bench.experiments import Comparable, Metric, Subject, by_name
 from s2a_bench.facts import (
     END_N,
     FIRST_DECODE_MS,
@@ -47,11 +47,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from s2a_bench.experiments import Rows
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
     Floats: TypeAlias = NDArray[np.float64]
-    Of: TypeAlias = Callable[["Cell"], pd.Series[Any]]
-    Split: TypeAlias = Sequence[tuple[Run, list["Cell"]]]
+    Of: TypeAlias = Callable[["RequestCell"], pd.Series[Any]]
+    Split: TypeAlias = Sequence[tuple[StoredRun, list["RequestCell"]]]
 
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
 """What cells are compared by: columns of the samples, less the unit."""
@@ -77,7 +77,7 @@ class RequestMetric(Metric):
 
 
 @dataclass(frozen=True)
-class Cell:
+class RequestCell:
     """One cell of a run; ``good`` holds the samples that count, in the order in which they were taken."""
 
     name: str
@@ -115,7 +115,7 @@ class Cell:
         """Return its name without the payload, which stands beside it."""
         return without(self.name, "payload")
 
-    def is_compared_with(self, base: Cell) -> bool:
+    def is_compared_with(self, base: RequestCell) -> bool:
         """Whether its transport declares that its cells are divided by those of another, and both have one payload."""
         alike = self.mixed or not (self.payload and base.payload) or self.payload == base.payload
         return alike and base.pipeline in declared(self.pipeline).compared_with
@@ -211,13 +211,13 @@ def _some(values: pd.Series[Any]) -> pd.Series[Any]:
     return values.where(values != 0)
 
 
-def decode_rate(cell: Cell) -> pd.Series[Any]:
+def decode_rate(cell: RequestCell) -> pd.Series[Any]:
     """Return (n - 1) / (t_last - t_first), as the client saw the tokens."""
     tokens, span_s = cell.n_tokens, cell.fact("span_s")
     return ((tokens - 1) / span_s).where((tokens > 1) & (span_s > 0))
 
 
-def _engine_rate(cell: Cell) -> pd.Series[Any]:
+def _engine_rate(cell: RequestCell) -> pd.Series[Any]:
     """Return N_tokens / T_eval; ``predicted_steps`` is told where the engine's time covers another number (vLLM)."""
     steps = cell.fact(PREDICTED_STEPS).fillna(cell.n_tokens)
     return (steps / _some(cell.fact(PREDICTED_MS)) * 1e3).fillna(decode_rate(cell))
@@ -319,23 +319,23 @@ def numbers_ms(column: pd.Series[Any]) -> Floats:
     return _numbers(column) / _NS_PER_MS
 
 
-def cells_of(run: Run) -> list[Cell]:
+def cells_of(run: StoredRun) -> list[RequestCell]:
     """Split a run into its cells, in the order that their transports declare, then by name."""
     return _cells(run, run.samples)
 
 
-def split(runs: Iterable[Run]) -> Split:
+def split(runs: Iterable[StoredRun]) -> Split:
     """Return runs, each with its cells."""
     return [(run, cells_of(run)) for run in runs]
 
 
-def launches_of(run: Run) -> list[tuple[int, list[Cell]]]:
+def launches_of(run: StoredRun) -> list[tuple[int, list[RequestCell]]]:
     """Return launch and cells for every launch of a run."""
     samples = run.samples
     return [(int(launch), _cells(run, samples[samples["launch"] == launch])) for launch in samples["launch"].unique()]
 
 
-def _cells(run: Run, samples: pd.DataFrame) -> list[Cell]:
+def _cells(run: StoredRun, samples: pd.DataFrame) -> list[RequestCell]:
     tokens, stages = run.tokens, run.stages
     mixed = any("payload=" in name for name in run.manifest["configuration"].get("transports", ()))
     cells = []
@@ -345,18 +345,18 @@ def _cells(run: Run, samples: pd.DataFrame) -> list[Cell]:
     return sorted(cells, key=_place)
 
 
-def payloads_of(cells: Iterable[Cell]) -> list[str]:
+def payloads_of(cells: Iterable[RequestCell]) -> list[str]:
     """Return how pictures travel, each way once."""
     return [each for each in dict.fromkeys(cell.payload for cell in cells) if each]
 
 
-def titles(cells: Sequence[Cell]) -> list[str]:
+def titles(cells: Sequence[RequestCell]) -> list[str]:
     """Return what cells are called where no column says their payloads: those are named where there are several."""
     several = len(payloads_of(cells)) > 1
     return [f"{cell.label} {cell.payload}".rstrip() if several else cell.name for cell in cells]
 
 
-def ratios(cells: list[Cell], seed: int) -> Iterator[tuple[str, Cell, Cell, Ratio]]:
+def ratios(cells: list[RequestCell], seed: int) -> Iterator[tuple[str, RequestCell, RequestCell, Ratio]]:
     """Yield metric, cell, base and ratio: every cell over those that it is compared with.
 
     A pair is left out where a cell lacks the metric, as e2e without inference behind a black box.
@@ -373,7 +373,7 @@ def spelled(metric: str) -> str:
     return metric.replace("e2e", "End to end").replace("_", " ")
 
 
-def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | None:
+def ratio_between(cell: RequestCell, base: RequestCell, metric: str, seed: int) -> Ratio | None:
     """Divide the medians of two cells, launch by launch and block by block.
 
     None where they cannot be compared: a llama-server's `ingest` slices and resizes the picture, which our engine
@@ -386,24 +386,24 @@ def ratio_between(cell: Cell, base: Cell, metric: str, seed: int) -> Ratio | Non
     return ratio_of_launches(cell.by_launch(metric), base.by_launch(metric), seed)
 
 
-def asked(run: Run, cells: list[Cell]) -> str:
+def asked(run: StoredRun, cells: list[RequestCell]) -> str:
     """Return what each request brings, in words: the pictures' sizes, how many, and the robot's state."""
     sizes = sorted({cell.about["size"] for cell in cells})
     return str(run.manifest["configuration"].get("observation") or ", ".join(sizes))
 
 
-def pieces_of(run: Run) -> str:
+def pieces_of(run: StoredRun) -> str:
     """Return what answers are made of: tokens or actions."""
     engine: dict[str, Any] = run.manifest["configuration"].get("engine") or {}
     return "actions" if engine.get("answer") == "actions" else "tokens"
 
 
-def chunks(run: Run) -> str:
+def chunks(run: StoredRun) -> str:
     """Return the shape of each answer, in words, where answers are chunks of actions that an engine of ours makes."""
     return str((run.manifest.get("model") or {}).get("answer") or "")
 
 
-def engine_note(run: Run, cells: list[Cell]) -> Note:
+def engine_note(run: StoredRun, cells: list[RequestCell]) -> Note:
     """Return what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
     engines = dict.fromkeys(cell.about["engine"] for cell in cells)
     idle = [name for name in engines if not declared_engine(name).computes]
@@ -427,7 +427,7 @@ def stand_ins(runs: Split) -> list[str]:
     return sorted({note.sentence() for run, cells in runs if (note := engine_note(run, cells))})
 
 
-def _replayed(run: Run, cells: list[Cell]) -> dict[str, Any]:
+def _replayed(run: StoredRun, cells: list[RequestCell]) -> dict[str, Any]:
     """Return what is known of the profile that was played: by a server of ours, or by one that told in its answers."""
     model: dict[str, Any] = run.manifest.get("model") or {}
     if declared_engine(model.get("engine", "")).plays:
@@ -445,12 +445,12 @@ def _emulated(model: dict[str, Any]) -> Note:
     return Note(f"{note} ({', '.join(said)})" if said else note, EMULATED, *labels)
 
 
-def groups_present(cells: list[Cell]) -> list[str]:
+def groups_present(cells: list[RequestCell]) -> list[str]:
     """List the groups that some sample has, in the order of the path."""
     return [group for group in GROUPS if any(cell.group_ms(group).size for cell in cells)]
 
 
-def stages_present(cells: list[Cell]) -> list[str]:
+def stages_present(cells: list[RequestCell]) -> list[str]:
     """List the stages that some sample has, in the order of the path."""
     stages = cells[0].stages if cells else ()
     return [stage for stage in stages if any(cell.values_ms(stage).size for cell in cells)]
@@ -463,7 +463,7 @@ def _cell(
     stages: Mapping[str, str],
     origin: Provenance,
     mixed: bool,
-) -> Cell:
+) -> RequestCell:
     """Sort the samples of one cell into those that count and those that are only counted."""
     about = {
         key: str(samples[key].iloc[-1])  # who answers may be known from the first answer on
@@ -472,10 +472,10 @@ def _cell(
     failed = samples["error"] != ""
     good = samples[~samples["warmup"] & ~failed]
     errors = int((failed & ~samples["warmup"]).sum())
-    return Cell(name, about, good, tokens, int(samples["warmup"].sum()), errors, stages, origin.emulated, mixed)
+    return RequestCell(name, about, good, tokens, int(samples["warmup"].sum()), errors, stages, origin.emulated, mixed)
 
 
-def _place(cell: Cell) -> tuple[int, float, str, int, str]:
+def _place(cell: RequestCell) -> tuple[int, float, str, int, str]:
     """Sort by the payload, the transport's order, its variants in theirs, then by name."""
     travels = PAYLOADS.index(cell.payload) if cell.payload in PAYLOADS else len(PAYLOADS)
     transport, variant = declared(cell.pipeline), cell.about["variant"]
@@ -522,7 +522,9 @@ def cell_class(name: str, meaning: str, metrics: Iterable[RequestMetric], **own:
     return made
 
 
-def cell_json(cls: type, cell: Cell, run: Run, metrics: Iterable[RequestMetric], **own: Any) -> dict[str, Any]:
+def cell_json(
+    cls: type, cell: RequestCell, run: StoredRun, metrics: Iterable[RequestMetric], **own: Any
+) -> dict[str, Any]:
     """Return one cell's numbers; a metric that no sample has is an absent key, ``dummy`` where it is not known."""
     origin = run.origins.of(cell.name)
     described: dict[str, Any] = {
@@ -537,7 +539,9 @@ def cell_json(cls: type, cell: Cell, run: Run, metrics: Iterable[RequestMetric],
     return present(cls(**described, **own, **summaries((each.key, cell.values(each)) for each in metrics)))
 
 
-def summarised(cells: Iterable[Cell], metrics: Iterable[RequestMetric]) -> Iterator[tuple[Cell, str, Summary]]:
+def summarised(
+    cells: Iterable[RequestCell], metrics: Iterable[RequestMetric]
+) -> Iterator[tuple[RequestCell, str, Summary]]:
     """Yield every cell and metric that has values, with their summary."""
     every = list(metrics)
     for cell in cells:
@@ -546,7 +550,7 @@ def summarised(cells: Iterable[Cell], metrics: Iterable[RequestMetric]) -> Itera
                 yield cell, metric.key, found
 
 
-def ratio_table(cells: Iterable[Cell], found: Iterable[tuple[str, str, str, Ratio]]) -> CsvTable:
+def ratio_table(cells: Iterable[RequestCell], found: Iterable[tuple[str, str, str, Ratio]]) -> CsvTable:
     """Lay out metric, cell, base and ratio for programs."""
     emulated = {cell.name for cell in cells if cell.emulated}
     header = ("metric", "of", "to", "value", "ci95_low", "ci95_high", "launches", "launch_sd", "emulated")
@@ -555,19 +559,19 @@ def ratio_table(cells: Iterable[Cell], found: Iterable[tuple[str, str, str, Rati
     )
 
 
-def compared_by(metrics: Iterable[RequestMetric], shown: tuple[str, ...], **more: Any) -> Compared:
+def compared_by(metrics: Iterable[RequestMetric], shown: tuple[str, ...], **more: Any) -> Comparable:
     """Return what runs of requests are compared by, a row a request, every launch by itself."""
     named = by_name(metrics)
 
-    def subject(cell: Cell, launch: int) -> Subject:
+    def subject(cell: RequestCell, launch: int) -> Subject:
         return Subject(
             cell.name, cell.about, cell.n, cell.errors, lambda name: cell.rows(named.get(name, name)), launch=launch
         )
 
-    def subjects(run: Run) -> list[Subject]:
+    def subjects(run: StoredRun) -> list[Subject]:
         return [subject(cell, launch) for launch, cells in launches_of(run) for cell in cells]
 
-    return Compared(named, subjects, lambda run: stand_ins(split([run])), shown, **more)
+    return Comparable(named, subjects, lambda run: stand_ins(split([run])), shown, **more)
 
 
 def launches_note(ratios: Iterable[Ratio]) -> tuple[str, ...]:
@@ -584,13 +588,13 @@ def launches_note(ratios: Iterable[Ratio]) -> tuple[str, ...]:
     return (f"{differ}; the intervals (Student's t) hold for launches like these.",)
 
 
-def engine_notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
+def engine_notes(run: StoredRun, cells: list[RequestCell]) -> tuple[str, ...]:
     """Return what did not really answer, as a sentence."""
     note = engine_note(run, cells)
     return (note.sentence(),) if note else ()
 
 
-def failure_notes(cells: Iterable[Cell], what: str) -> tuple[str, ...]:
+def failure_notes(cells: Iterable[RequestCell], what: str) -> tuple[str, ...]:
     """Return how many samples or requests failed."""
     failed = sum(cell.errors for cell in cells)
     return (f"{failed} {what} failed and are in no number here; samples.csv says why.",) if failed else ()
@@ -604,7 +608,7 @@ def span_of(counts: Iterable[int], what: str = "") -> str:
 
 
 def caption_for(
-    run: Run, cells: list[Cell], what: str, facts: Sequence[str], notes: Sequence[str] = ()
+    run: StoredRun, cells: list[RequestCell], what: str, facts: Sequence[str], notes: Sequence[str] = ()
 ) -> tuple[str, ...]:
     """Return what a figure draws, from how many samples of what, and what did not really answer."""
     said = ", ".join((f"n = {span_of(cell.n for cell in cells)} a cell", *facts))

@@ -86,7 +86,7 @@ class ServersPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class RunPlan:
     """One run of requests."""
 
     cells: tuple[Pipeline, ...]
@@ -106,12 +106,12 @@ class Plan:
     manifest: Mapping[str, Any]
     """What the manifest says of the plan."""
 
-    def telling(self, **facts: Any) -> Plan:
+    def telling(self, **facts: Any) -> RunPlan:
         """Return it with more in the manifest, or in place of what was there."""
         return replace(self, manifest={**self.manifest, **facts})
 
 
-def resolve(config: RequestsConfig) -> Plan:
+def resolve(config: RequestsConfig) -> RunPlan:
     """Decide what follows from a configuration; nothing is opened, started or asked.
 
     Raises MissingExtra where what an engine of ours, or somebody else's server, needs is not installed.
@@ -131,7 +131,7 @@ def resolve(config: RequestsConfig) -> Plan:
     facts += SPENT if config.sample_resources_hz else ()
     max_pieces = engine.horizon if config.answer == ACTIONS else config.max_tokens
     nonce, size = config.nonce or new_nonce(), "{}x{}".format(*config.size)
-    return Plan(
+    return RunPlan(
         cells=cells,
         blocks=BlocksPlan(config.requests, config.warmup, config.launches, config.seed),
         feed=FeedPlan(

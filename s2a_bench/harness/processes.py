@@ -232,7 +232,7 @@ def llama_flags(engine: EngineConfig) -> list[str]:
     return [word for pair in flags.items() for word in pair]
 
 
-class LlamaServer(ServerProcess):
+class LlamaServerProcess(ServerProcess):
     """llama.cpp's own server on the same model files: a black box."""
 
     _speaks_json = False
@@ -281,7 +281,7 @@ class WheelServer(OwnProcess):
     _cure = COMPILE_AGAIN
 
     def __init__(self, program: Program, engine: EngineConfig, log: Path, *, has_grammar: bool) -> None:
-        """Start it on its port, or any free one for 0; the rest as `LlamaServer`."""
+        """Start it on its port, or any free one for 0; the rest as `LlamaServerProcess`."""
         files = load_headers(engine)
         job = llama_wheel.told(engine, program.port, ignore_end=files.dummy and not has_grammar)
         super().__init__("llama-server", llama_wheel.__name__, json.dumps(job), log)
@@ -293,7 +293,10 @@ class WheelServer(OwnProcess):
         self.facts["engine"] = {"engine": "llama-server", **_described(self._files)}
 
 
-PROGRAMS: dict[str, Callable[..., ServerProcess]] = {"llama-server": LlamaServer, "llama-server-wheel": WheelServer}
+PROGRAMS: dict[str, Callable[..., ServerProcess]] = {
+    "llama-server": LlamaServerProcess,
+    "llama-server-wheel": WheelServer,
+}
 """Kind of a transport's `Program` -> how it is started."""
 
 

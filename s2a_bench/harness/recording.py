@@ -14,7 +14,7 @@ from pathlib import Path
 from s2a_bench.clock import realtime_offset_ns
 from s2a_bench.options import Options
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.record import Recorder
+from s2a_bench.ros.record import BagRecorder
 from s2a_bench.transport.ros import ROS
 from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA, FRAME_ID
 from s2a_bench.transport.ros.options import NAMESPACE
@@ -33,7 +33,7 @@ class RunRecorder(AbstractContextManager["RunRecorder"]):
 
     def __init__(self, path: Path, namespace: str, *, live: bool) -> None:
         """Create the file, whose topics are under ``namespace``; raises StoreError, naming the path."""
-        self._recorder = Recorder(path, live=live)
+        self._recorder = BagRecorder(path, live=live)
         self._namespace = namespace
         self._offset_ns = realtime_offset_ns()
 

@@ -17,14 +17,14 @@ from s2a_bench.errors import TransportError
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
-from s2a_bench.harness.plan import BlocksPlan, FeedPlan, Plan
+from s2a_bench.harness.plan import BlocksPlan, FeedPlan, RunPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet, on_files
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.harness.warnings import Counters, SampleGuard, before_run
 from s2a_bench.machine import environment
 from s2a_bench.machine.doctor import Machine
-from s2a_bench.machine.resources.sampler import Sampler, open_sampler
+from s2a_bench.machine.resources.sampler import ResourceSampler, open_sampler
 from s2a_bench.machine.tuning import is_allowed, keep_large_blocks, limit_threads
 from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins, Provenance
@@ -45,11 +45,11 @@ Slot: TypeAlias = Callable[[Place], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Launch:
+class RunningLaunch:
     """One set of servers that runs, and what asks them."""
 
     number: int
-    plan: Plan
+    plan: RunPlan
     """With the model files that were found."""
     writer: RunWriter
     sessions: Sequence[Session]
@@ -61,7 +61,7 @@ class Launch:
     """What the run warns of besides what is seen of its requests."""
 
 
-def in_blocks(launch: Launch, others: Sequence[Slot] = ()) -> None:
+def in_blocks(launch: RunningLaunch, others: Sequence[Slot] = ()) -> None:
     """Measure every cell in turn; ``others`` is what else has a turn in every block."""
 
     def slot(session: Session) -> Slot:
@@ -76,7 +76,7 @@ class Task:
     """What a measuring command asks for besides the requests themselves."""
 
     command: str
-    drive: Callable[[Launch], None] = in_blocks
+    drive: Callable[[RunningLaunch], None] = in_blocks
     """Asks the servers of a launch."""
     clients: int = 1
     """How many clients a cell has."""
@@ -86,7 +86,7 @@ class Task:
     """Opens the one camera, whose pictures are stamped already; None: those that the plan names, a stamp a cell."""
 
 
-def run_requests(task: Task, plan: Plan, output: Path, progress: Progress) -> Path:
+def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) -> Path:
     """Measure and return the run folder; whatever happens, the samples so far are in it.
 
     Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
@@ -150,7 +150,7 @@ class _Run:
     """One run under way: what its launches share."""
 
     task: Task
-    plan: Plan
+    plan: RunPlan
     sources: _Sources
     writer: RunWriter
     progress: Progress
@@ -193,7 +193,7 @@ class _Run:
         hits = servers.cache_hits()
         keep = partial(self._keep, servers, sampler)
         try:
-            self.task.drive(Launch(number, self.plan, writer, sessions, keep, self.progress, self.warnings))
+            self.task.drive(RunningLaunch(number, self.plan, writer, sessions, keep, self.progress, self.warnings))
             self.guard.see_hits(hits, servers.cache_hits())
             for session in sessions:
                 for row in session.frames(keep=0):
@@ -205,7 +205,7 @@ class _Run:
             sampler.flush(writer)
             writer.update(resources=sampler.describe())
 
-    def _sessions(self, servers: ServerSet, sampler: Sampler, stack: ExitStack) -> Iterator[Session]:
+    def _sessions(self, servers: ServerSet, sampler: ResourceSampler, stack: ExitStack) -> Iterator[Session]:
         """Open a client and a feed for each cell."""
         plan, recorder = self.plan.feed, self.recorder
         clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
@@ -232,7 +232,7 @@ class _Run:
             made.append(Session(cell, client, feed, self.plan.request, recorder, sampler, servers.origin(cell)))
             yield made[0]
 
-    def _keep(self, servers: ServerSet, sampler: Sampler, session: Session, measured: Measured) -> None:
+    def _keep(self, servers: ServerSet, sampler: ResourceSampler, session: Session, measured: Measured) -> None:
         """Keep a request, and look whether the run can go on."""
         name, sample, writer = session.cell.name, measured.sample, self.writer
         keep_origin(writer, name, session.origin)

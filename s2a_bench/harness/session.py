@@ -24,7 +24,7 @@ from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint, t
 from s2a_bench.harness.plan import RequestPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.inference import swing
-from s2a_bench.machine.resources.sampler import Sampler
+from s2a_bench.machine.resources.sampler import ResourceSampler
 from s2a_bench.provenance import UNKNOWN, Provenance
 from s2a_bench.secrets import struck_pieces
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
@@ -67,7 +67,7 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class RequestContext:
     """What one request is told that others of the run are not, and who hears of its pieces as they arrive."""
 
     state: tuple[float, ...] | None = None
@@ -80,7 +80,7 @@ class Asked:
     """None: the run's."""
 
 
-PLAIN = Asked()
+PLAIN = RequestContext()
 UNKNOWN_ORIGIN = Provenance()
 KEPT_FRAMES = 90
 """Frames kept until an answer may name them: three seconds at 30 Hz."""
@@ -96,7 +96,7 @@ class Session:
         feed: Feed,
         request: RequestPlan,
         recorder: RunRecorder | None = None,
-        sampler: Sampler | None = None,
+        sampler: ResourceSampler | None = None,
         origin: Provenance = UNKNOWN_ORIGIN,
     ) -> None:
         """Measure ``cell`` with an open client, recording what travels if there is a recorder.
@@ -109,14 +109,14 @@ class Session:
         self.feed = feed
         self.request = request
         self._recorder = recorder
-        self._sampler = sampler or Sampler({}, 1)
+        self._sampler = sampler or ResourceSampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
         self.busy = False
         """Whether a request is under way, so that nobody else may touch the client."""
         self.prompt_n = 0
         """Tokens of the last prompt, pictures included; 0 where nobody says."""
 
-    def measure(self, place: Place, asked: Asked = PLAIN) -> Measured:
+    def measure(self, place: Place, asked: RequestContext = PLAIN) -> Measured:
         """Make one request; a failure becomes a row with its error, and says whether it is the run's end."""
         self.busy = True
         try:
@@ -124,7 +124,7 @@ class Session:
         finally:
             self.busy = False
 
-    def _measure(self, place: Place, asked: Asked) -> Measured:
+    def _measure(self, place: Place, asked: RequestContext) -> Measured:
         self.feed.get_ready()
         request_id = f"{self.cell.name}-{place.block}"
         seen: list[tuple[Piece, int]] = []
@@ -163,7 +163,7 @@ class Session:
         rows = self._rows(place, request_id, frames, trace, seen, error)
         return replace(rows, fatal=fatal, retry_after_s=retry_after_s)
 
-    def _pieces(self, request: Request, trace: Trace, asked: Asked) -> Iterator[tuple[Piece, int]]:
+    def _pieces(self, request: Request, trace: Trace, asked: RequestContext) -> Iterator[tuple[Piece, int]]:
         """Yield the pieces with the times, in ns, at which they are there, and tell who listens."""
         plan = asked.plan
         if plan is not None:

@@ -14,7 +14,7 @@ from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, STALE_FRAMES, USAGE_ZER
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Machine, examine, warnings_of
 from s2a_bench.machine.doctor.host import RMEM_WANTED
-from s2a_bench.stats.batches import Memory
+from s2a_bench.stats.batches import RowCorrelation
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import RESIDUAL_LIMIT, budget
@@ -219,7 +219,9 @@ class SampleGuard:
 
     def _alike(self) -> list[RunWarning]:
         """Look at whether neighbouring samples are too much alike; over several launches no interval asks for more."""
-        memories = {cell: Memory.of(np.array(times_ns, np.float64)) for cell, times_ns in self._times_ns.items()}
+        memories = {
+            cell: RowCorrelation.of(np.array(times_ns, np.float64)) for cell, times_ns in self._times_ns.items()
+        }
         where = ", ".join(
             f"{cell}: {memory.n} samples tell as much as {memory.effective:.0f}"
             for cell, memory in memories.items()

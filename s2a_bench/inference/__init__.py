@@ -227,7 +227,7 @@ class EngineConfig(Options):
         return f"{self.horizon} actions of {self.action_dim}"
 
 
-class _Undeclared(Engine):
+class _UndeclaredEngine(Engine):
     """What is assumed of who answered an old run, and is not here."""
 
 
@@ -242,7 +242,7 @@ def declared(name: str) -> type[Engine]:
     try:
         return ENGINES[name]
     except UsageError:
-        return _Undeclared
+        return _UndeclaredEngine
 
 
 def check_engine(config: EngineConfig) -> None:

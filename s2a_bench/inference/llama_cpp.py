@@ -38,9 +38,9 @@ from s2a_bench.inference import (
 from s2a_bench.inference.llama_decode import (
     GrammarSampler,
     GreedySampler,
-    Sampler,
     TokenBatch,
     TokenBytes,
+    TokenSampler,
     beyond_limits,
     grammar_error,
 )
@@ -76,7 +76,7 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
     def context_params(self, params: Any) -> None:
         self._context_params = params
 
-    def sampler(self, name: str, grammar: str, wanted: Mapping[str, float]) -> Sampler:
+    def sampler(self, name: str, grammar: str, wanted: Mapping[str, float]) -> TokenSampler:
         """Build the library's chain of samplers, and let a grammar judge what comes out of it.
 
         ``wanted`` replaces what ``name`` says.
@@ -86,7 +86,7 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
         last_n = int(wanted.get(PENALTY_LAST_N, LAST_N))
         self.last_n_tokens_size = self.n_ctx() if last_n < 0 else last_n
         told = {SAMPLER_ARGUMENTS[key]: value for key, value in wanted.items() if key in SAMPLER_ARGUMENTS}
-        chain: Sampler = self._init_sampler(**SAMPLINGS[name] | told)
+        chain: TokenSampler = self._init_sampler(**SAMPLINGS[name] | told)
         return GrammarSampler(chain, self._model.vocab, grammar, self._candidates) if grammar else chain
 
     def eval(self, tokens: list[int]) -> None:

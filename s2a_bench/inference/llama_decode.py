@@ -60,7 +60,7 @@ class TokenBytes(dict[int, bytes]):
         return found
 
 
-class Sampler(Protocol):
+class TokenSampler(Protocol):
     """Chooses a token; llama-cpp-python's ``LlamaSampler`` is one."""
 
     def sample(self, ctx: Any, idx: int = -1) -> int:
@@ -101,7 +101,7 @@ class TokenBatch:
         self._batch.seq_id[0][0] = 0
         self._batch.logits[0] = 1
 
-    def answer(self, ctx: Any, sampler: Sampler, position: int) -> Iterator[int]:
+    def answer(self, ctx: Any, sampler: TokenSampler, position: int) -> Iterator[int]:
         """Yield tokens for ever, the first from the logits that are there; ``position`` is the prompt's length.
 
         Raises RuntimeError where llama.cpp cannot decode.

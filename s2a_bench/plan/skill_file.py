@@ -130,7 +130,7 @@ class _Skill(TomlTable):
         return self
 
 
-class _File(TomlTable):
+class _SkillFile(TomlTable):
     """What the file may hold."""
 
     name: Line
@@ -164,14 +164,14 @@ def parse_skills(text: str, origin: str) -> SkillSet:
     Raises UsageError that names ``origin``, the file's path for the user, and the key.
     """
     where = f"`skills` {origin}"
-    file = parse(_File, text, where, Decimal)
+    file = parse(_SkillFile, text, where, Decimal)
     try:
         return _skill_set(file)
     except ValueError as error:
         raise UsageError(f"{where}: {error}") from error
 
 
-def _skill_set(file: _File) -> SkillSet:
+def _skill_set(file: _SkillFile) -> SkillSet:
     """Give arguments their vocabularies; raises ValueError naming the key."""
     skills = tuple(_skill(table, file) for table in file.skill)
     _refuse_twins((skill.name for skill in skills), "skill: ")
@@ -184,7 +184,7 @@ def _skill_set(file: _File) -> SkillSet:
     return SkillSet(file.name, file.role, file.gap, skills)
 
 
-def _skill(table: _Skill, file: _File) -> Skill:
+def _skill(table: _Skill, file: _SkillFile) -> Skill:
     least, nominal, most = map(float, table.durations)
     try:
         arguments = tuple(_argument(text, file.vocabulary) for text in table.arguments)

@@ -28,7 +28,7 @@ SURPRISE: Final = 4.0
 FRESH_CV: Final = 1.0
 
 
-class Watch:
+class ChangeWatch:
     """Follows the tokens of M plans at once, one token of each at a time."""
 
     def __init__(self, prior: GapPrior, plans: int = 1) -> None:
@@ -84,7 +84,7 @@ class Watch:
 
 def learned_along(prior: GapPrior, token_s: Floats) -> tuple[Floats, Floats]:
     """Return what is learned after each token, two arrays of the shape of ``token_s``, (tokens, M)."""
-    watch = Watch(prior, token_s.shape[1])
+    watch = ChangeWatch(prior, token_s.shape[1])
     mean_s, variance = np.empty((2, *token_s.shape))
     for row, at_s in enumerate(token_s):
         watch.token(at_s)

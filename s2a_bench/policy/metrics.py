@@ -19,7 +19,7 @@ RAMP_S = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Metrics:
+class PlanMetrics:
     """M timelines of one policy, each number an array of shape (M,)."""
 
     first_action_s: Floats
@@ -62,7 +62,9 @@ class Metrics:
     """Share of deadlines met, as `fluidity` defines it."""
 
 
-def measure(plans: Plans, schedule: Schedule, *, observed_s: float = 0.0, tolerance_s: float = TOLERANCE_S) -> Metrics:
+def measure(
+    plans: Plans, schedule: Schedule, *, observed_s: float = 0.0, tolerance_s: float = TOLERANCE_S
+) -> PlanMetrics:
     """Derive all numbers of M timelines.
 
     ``observed_s`` is when the picture was taken that the plan answers, on the same clock: 0 is the request, negative
@@ -81,7 +83,7 @@ def measure(plans: Plans, schedule: Schedule, *, observed_s: float = 0.0, tolera
     least = safe_start(arrival_s, most_s)
     late = np.maximum(first - safe, 0.0)
     span = arrival_s[-1] - safe
-    return Metrics(
+    return PlanMetrics(
         first_action_s=first,
         end_s=end,
         stalls=np.sum(stalls_s > tolerance_s, axis=0, dtype=np.int32),

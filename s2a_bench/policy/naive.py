@@ -21,11 +21,11 @@ class Naive(Policy):
         return Schedule(work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0]), plans.nominal_s)
 
     def stepper(self, shape: PlanShape) -> Stepper:  # noqa: ARG002 - naive looks at nothing but what has arrived
-        return Queue()
+        return NominalQueue()
 
 
 @dataclass(slots=True)
-class Queue:
+class NominalQueue:
     """Start whatever has arrived, in its order, at its nominal duration: what is left to do once a robot has begun."""
 
     waiting: deque[Timing] = field(default_factory=deque)

@@ -13,12 +13,12 @@ from s2a_bench.policy import Floats, Plans, PlanShape, Schedule
 from s2a_bench.policy.changes import learned_along
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.schedule import align, hold
-from s2a_bench.policy.stream_to_act import FAVOURABLE, Rule
+from s2a_bench.policy.stream_to_act import FAVOURABLE, StartRule
 
 Ints: TypeAlias = NDArray[np.intp]
 
 
-def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, rule: Rule) -> Schedule:
+def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, rule: StartRule) -> Schedule:
     """Decide for many plans at once; ``caution`` (lambda) is one number or one a plan, shape (M,).
 
     Plans need ``token_s`` and ``shape``; raises ValueError without. The stream ends with its last token or fragment.
@@ -29,7 +29,7 @@ def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, rule: Rule) -> S
     cautions = np.broadcast_to(np.asarray(caution, dtype=np.float64), arrival_s.shape[1:])
     learned = learned_along(prior, plans.token_s) if rule.detect else None
     known = _Known(prior, cautions, plans.shape, rule, learned)
-    stream = _Stream(plans.token_s, arrival_s)
+    stream = _Arrivals(plans.token_s, arrival_s)
     nominal_sum, most_sum = _sums_before(nominal_s), _sums_before(most_s)
     start_s = np.empty(arrival_s.shape)
     duration_s = np.empty(arrival_s.shape)
@@ -53,7 +53,7 @@ def _sums_before(duration_s: Floats) -> Floats:
     return np.vstack([np.zeros(duration_s.shape[1]), np.cumsum(duration_s, axis=0)])
 
 
-class _Stream:
+class _Arrivals:
     """What has come when: tokens and fragments of M plans in the order of time, one event a row."""
 
     def __init__(self, token_s: Floats, arrival_s: Floats) -> None:
@@ -78,11 +78,11 @@ class _Known:
     prior: GapPrior
     caution: Floats
     shape: PlanShape
-    rule: Rule
+    rule: StartRule
     learned: tuple[Floats, Floats] | None
     """With changes of the rate: what is learned after each token."""
 
-    def view(self, stream: _Stream, plans: Ints, event: Ints) -> _View:
+    def view(self, stream: _Arrivals, plans: Ints, event: Ints) -> _View:
         """See some of the plans as they are after one of their events each."""
         tokens, parsed = stream.tokens[event, plans], stream.parsed[event, plans]
         last_s = stream.token_s[np.maximum(tokens, 1) - 1, plans]
@@ -162,7 +162,7 @@ class _View:
         return np.asarray(each.max(axis=0, initial=-np.inf, where=self.unknown < self.missing))
 
 
-def _first_start(known: _Known, stream: _Stream, nominal_sum: Floats, most_sum: Floats) -> Floats:
+def _first_start(known: _Known, stream: _Arrivals, nominal_sum: Floats, most_sum: Floats) -> Floats:
     rule, expected = known.rule, known.shape.expected
 
     def at_s(event: int, live: Ints, until_s: Floats) -> Floats:
@@ -186,7 +186,7 @@ def _first_start(known: _Known, stream: _Stream, nominal_sum: Floats, most_sum: 
     return _first(stream, waiting, np.full(waiting.shape, -np.inf), at_s)
 
 
-def _resume(known: _Known, stream: _Stream, now_s: Floats, most_sum: Floats, skill: int) -> Floats:
+def _resume(known: _Known, stream: _Arrivals, now_s: Floats, most_sum: Floats, skill: int) -> Floats:
     """Return when the skill of that number starts: later than now where no forecast can be met."""
     unknown_s = known.shape.expected.most_s
     plans, view = _seen(known, stream, now_s)
@@ -203,7 +203,7 @@ def _resume(known: _Known, stream: _Stream, now_s: Floats, most_sum: Floats, ski
     return start_s
 
 
-def _first(stream: _Stream, plans: Ints, from_s: Floats, at_s: Callable[[int, Ints, Floats], Floats]) -> Floats:
+def _first(stream: _Arrivals, plans: Ints, from_s: Floats, at_s: Callable[[int, Ints, Floats], Floats]) -> Floats:
     """Return the first time from ``from_s`` on that ``at_s`` allows after the events so far; when all has come, then.
 
     ``at_s`` is told event, plans and when their next event is.
@@ -225,14 +225,14 @@ def _first(stream: _Stream, plans: Ints, from_s: Floats, at_s: Callable[[int, In
     return start_s
 
 
-def _seen(known: _Known, stream: _Stream, now_s: Floats) -> tuple[Ints, _View]:
+def _seen(known: _Known, stream: _Arrivals, now_s: Floats) -> tuple[Ints, _View]:
     """Return the plans of which something is still to come, as they are now."""
     plans = np.flatnonzero(now_s < stream.event_s[-1])
     event = (stream.event_s[:, plans] <= now_s[plans]).sum(axis=0) - 1
     return plans, known.view(stream, plans, event)
 
 
-def _demand(known: _Known, stream: _Stream, now_s: Floats, nominal_sum: Floats, skill: int) -> Floats:
+def _demand(known: _Known, stream: _Arrivals, now_s: Floats, nominal_sum: Floats, skill: int) -> Floats:
     """Return each plan's demand when the skill of that number (from 0) starts; -inf once all has come."""
     demand = np.full(now_s.shape, -np.inf)
     plans, view = _seen(known, stream, now_s)

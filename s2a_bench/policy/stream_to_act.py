@@ -15,10 +15,10 @@ and every *cautious* forecast meets the stretched durations before it.
 until then), at least 1 and at most T_max / T_nom; a skill whose successor is still missing is held on up to T_max.
 Where that ratio allows it, a skill is compressed, down to T_min, to recover what stretching and stalls have cost.
 
-**Variants.** `Rule` says how the stretch is split between start and reserve, and whether a change of the rate within
-the plan is looked for (`changes`). Then the forecast is made anew; and at a boundary from which stretching cannot even
-meet a favourable forecast (lambda = -FAVOURABLE) the robot holds once, until it can meet the cautious one, instead of
-stalling again and again.
+**Variants.** `StartRule` says how the stretch is split between start and reserve, and whether a change of the rate
+within the plan is looked for (`changes`). Then the forecast is made anew; and at a boundary from which stretching
+cannot even meet a favourable forecast (lambda = -FAVOURABLE) the robot holds once, until it can meet the cautious one,
+instead of stalling again and again.
 
 The stepper here is plain arithmetic on one plan; `online.schedule` does the same for arrays of plans.
 """
@@ -37,7 +37,7 @@ from s2a_bench.policy.estimator import VAGUE, GapPrior, Number
 from s2a_bench.policy.wait_then_act import Clairvoyant
 
 if TYPE_CHECKING:
-    from s2a_bench.policy.changes import Watch
+    from s2a_bench.policy.changes import ChangeWatch
 
 FAVOURABLE = 2.0
 """Standard deviations by which a favourable forecast is earlier than the mean."""
@@ -46,7 +46,7 @@ Caution: TypeAlias = Annotated[float, Field(ge=0)]
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class StartRule:
     """What variants of the online rule differ in."""
 
     elastic: bool = True
@@ -105,14 +105,14 @@ class StreamToAct(Policy):
     def stepper(self, shape: PlanShape) -> Stepper:
         watch = None
         if self.detect:
-            from s2a_bench.policy.changes import Watch
+            from s2a_bench.policy.changes import ChangeWatch
 
-            watch = Watch(self.prior)
+            watch = ChangeWatch(self.prior)
         return OnlineStepper(self.prior, self._lambda, shape, self.rule, watch)
 
     @property
-    def rule(self) -> Rule:
-        return Rule(detect=self.detect)
+    def rule(self) -> StartRule:
+        return StartRule(detect=self.detect)
 
     @property
     def _lambda(self) -> float:
@@ -134,8 +134,8 @@ class EarlyStart(StreamToAct):
         return self
 
     @property
-    def rule(self) -> Rule:
-        return Rule(spend=self.spend, within=self.within, start_caution=self.start_caution, detect=self.detect)
+    def rule(self) -> StartRule:
+        return StartRule(spend=self.spend, within=self.within, start_caution=self.start_caution, detect=self.detect)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,8 +147,8 @@ class MeanStart(StreamToAct):
     caution: Caution | None = 0.0
 
     @property
-    def rule(self) -> Rule:
-        return Rule(elastic=False, detect=self.detect)
+    def rule(self) -> StartRule:
+        return StartRule(elastic=False, detect=self.detect)
 
 
 @dataclass(slots=True)
@@ -158,8 +158,8 @@ class OnlineStepper:
     prior: GapPrior
     caution: float
     shape: PlanShape
-    rule: Rule
-    watch: Watch | None = None
+    rule: StartRule
+    watch: ChangeWatch | None = None
     """Looks for changes of the rate."""
     parsed: list[Timing] = field(default_factory=list)
     started: int = 0

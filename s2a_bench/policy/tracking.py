@@ -1,7 +1,8 @@
 """Lambda from plan to plan: a policy that learns from every plan that it has decided.
 
-A robot keeps one `Tracked` for as long as its machine stays the same. Before each plan it takes `Tracked.policy`, after
-it tells what came and whether the plan stalled: the plan's score is what its recorded arrivals say afterwards.
+A robot keeps one `TrackedPolicy` for as long as its machine stays the same. Before each plan it takes
+`TrackedPolicy.policy`, after it tells what came and whether the plan stalled: the plan's score is what its recorded
+arrivals say afterwards.
 `follow` does the same for arrays of plans. See `conformal.Tracker` for the rule and its bound.
 """
 
@@ -26,7 +27,7 @@ AT_ONCE: Final = 512
 
 
 @dataclass(slots=True)
-class Tracked:
+class TrackedPolicy:
     """A policy and the tracker of its lambda."""
 
     made: Policy
@@ -34,8 +35,8 @@ class Tracked:
     tracker: Tracker
 
     @staticmethod
-    def begin(policy: Policy, plans: Plans, epsilon: float = EPSILON) -> Tracked:
-        return Tracked(policy, Tracker(scores(policy, plans), epsilon))
+    def begin(policy: Policy, plans: Plans, epsilon: float = EPSILON) -> TrackedPolicy:
+        return TrackedPolicy(policy, Tracker(scores(policy, plans), epsilon))
 
     @property
     def policy(self) -> Policy:
@@ -69,11 +70,11 @@ class Tracked:
         return {"prior": asdict(self.made.prior), **self.tracker.state()}
 
     @staticmethod
-    def resume(policy: Policy, state: Mapping[str, Any]) -> Tracked:
+    def resume(policy: Policy, state: Mapping[str, Any]) -> TrackedPolicy:
         """Go on from a state; raises UsageError for what is none."""
         try:
             prior = GapPrior(**{name: float(value) for name, value in state["prior"].items()})
-            return Tracked(policy.informed(prior), Tracker.resume(state))
+            return TrackedPolicy(policy.informed(prior), Tracker.resume(state))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise UsageError(f"holds no state of tracking ({type(error).__name__}: {error})") from error
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Plans, PlanShape, Policy, Schedule, Start, Stepper, Timing
-from s2a_bench.policy.naive import Queue
+from s2a_bench.policy.naive import NominalQueue
 from s2a_bench.policy.schedule import safe_start, work_conserving
 
 
@@ -26,7 +26,7 @@ class WaitThenAct(Policy):
         return WaitingStepper(shape.n_skills)
 
 
-class WaitingStepper(Queue):
+class WaitingStepper(NominalQueue):
     """Count the skills; the plan is whole when all have arrived, or when the stream ends before."""
 
     def __init__(self, missing: int) -> None:
@@ -68,7 +68,7 @@ class Clairvoyant(Policy):
         return ClairvoyantStepper(shape.safe_start_s)
 
 
-class ClairvoyantStepper(Queue):
+class ClairvoyantStepper(NominalQueue):
     """Wait for S0, then start whatever has arrived."""
 
     def __init__(self, start_s: float) -> None:

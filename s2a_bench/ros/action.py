@@ -23,7 +23,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import ALL_GOALS, Accepted, ActionEvent, CancelResponse, Feedback, QoS, Rejected, Result
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.service import AT_ONCE, Asker, Caller, Service, Waits, appeared
+from s2a_bench.ros.service import AT_ONCE, Caller, ClientEnd, ServiceEnd, Waits, appeared
 
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
 STATUS_ARRAY = "action_msgs/msg/GoalStatusArray"
@@ -190,7 +190,7 @@ class AskingAction:
         self,
         type_name: str,
         version: str,
-        services: tuple[Asker, Asker, Asker],
+        services: tuple[ClientEnd, ClientEnd, ClientEnd],
         feedback: Callable[[], Iterable[memoryview]],
         topics: Iterable[Callable[[], int]],
         waiter: Waits,
@@ -286,7 +286,7 @@ class AskingAction:
             self._active.discard(goal_id)
             self._events.append(Result(goal_id, packed[self._body_at], packed))
 
-    def _replies(self, service: Asker) -> Iterator[tuple[bytes, memoryview]]:
+    def _replies(self, service: ClientEnd) -> Iterator[tuple[bytes, memoryview]]:
         for goal_id, packed in service.replies():
             if packed is not None and len(packed) > self._body_at:
                 yield goal_id, packed
@@ -346,7 +346,7 @@ class ServedAction(Generic[Caller]):
         type_name: str,
         result_timeout_s: float,
         version: str,
-        services: tuple[Service[Caller], Service[Caller], Service[Caller]],
+        services: tuple[ServiceEnd[Caller], ServiceEnd[Caller], ServiceEnd[Caller]],
         senders: tuple[Callable[[bytearray], None], Callable[[bytearray], None]],
         waiters: tuple[Waits, Waits],
     ) -> None:
@@ -475,7 +475,7 @@ class ServedAction(Generic[Caller]):
     def _publish_status(self) -> None:
         self._send_status(status_array(self._goals.listed()))
 
-    def _answer(self, service: Service[Caller], answer: Callable[[Any, Caller], None]) -> None:
+    def _answer(self, service: ServiceEnd[Caller], answer: Callable[[Any, Caller], None]) -> None:
         """Answer the requests that have arrived; what cannot be read is dropped.
 
         A cancel counts though its client has left since; who has left waits for no result.

@@ -22,8 +22,8 @@ from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import CANCEL_GOAL, FEEDBACK_QOS, STATUS_ARRAY, STATUS_QOS, AskingAction, ServedAction
 from s2a_bench.ros.config import configuration
-from s2a_bench.ros.dds import RawReader, RawWriter, Waiter, dds_qos
-from s2a_bench.ros.dds_service import Caller, ServiceClient, ServiceServer
+from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos
+from s2a_bench.ros.dds_service import Caller, DdsServiceClient, DdsServiceServer
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise, type_hash
 from s2a_bench.ros.remap import check_node_name
 from s2a_bench.ros.service import READER_QOS, Calling, Services
@@ -100,7 +100,7 @@ class _CycloneSubscription:
     def __init__(self, participant: DomainParticipant, topic: str, type_name: str, qos: QoS) -> None:
         self.topic, self._type_name = topic, type_name
         self.reader = _reader(participant, topic, type_name, qos)
-        self._waiter = Waiter(participant, [self.reader])
+        self._waiter = DdsWaiter(participant, [self.reader])
         self.interrupt = self._waiter.interrupt
         self.matched, self.publishers = self.reader.matched, self.reader.publishers
 
@@ -119,7 +119,7 @@ class _CycloneSubscription:
 class CycloneActionClient(AskingAction):
     """Waits for all readers at once."""
 
-    _goals: ServiceClient
+    _goals: DdsServiceClient
 
     def __init__(self, participant: DomainParticipant, name: str, type_name: str, version: str) -> None:
         prefix = name + "/_action/"
@@ -127,10 +127,10 @@ class CycloneActionClient(AskingAction):
         status = _reader(participant, prefix + "status", STATUS_ARRAY, STATUS_QOS)
         """Not read: a goal's status comes with its result. ROS tools expect a client to subscribe."""
         # Readers are announced in order: a server that knows the reply readers below knows the feedback reader too.
-        goals = ServiceClient(participant, prefix + "send_goal", type_name + "_SendGoal", version)
-        results = ServiceClient(participant, prefix + "get_result", type_name + "_GetResult", version)
-        cancels = ServiceClient(participant, prefix + "cancel_goal", CANCEL_GOAL, version)
-        waiter = Waiter(participant, [goals.reader, results.reader, cancels.reader, feedback])
+        goals = DdsServiceClient(participant, prefix + "send_goal", type_name + "_SendGoal", version)
+        results = DdsServiceClient(participant, prefix + "get_result", type_name + "_GetResult", version)
+        cancels = DdsServiceClient(participant, prefix + "cancel_goal", CANCEL_GOAL, version)
+        waiter = DdsWaiter(participant, [goals.reader, results.reader, cancels.reader, feedback])
         topics = feedback.matched, status.matched
         super().__init__(type_name, version, (goals, results, cancels), feedback.arrived, topics, waiter)
         self.ends = (*goals.ends, *results.ends, *cancels.ends, feedback, status)
@@ -142,21 +142,21 @@ class CycloneActionClient(AskingAction):
 class CycloneActionServer(ServedAction[Caller]):
     """Looks at what a client announces."""
 
-    send_goal: ServiceServer
+    send_goal: DdsServiceServer
 
     def __init__(
         self, participant: DomainParticipant, name: str, type_name: str, result_timeout_s: float, version: str
     ) -> None:
         prefix = name + "/_action/"
-        goals = ServiceServer(participant, prefix + "send_goal", type_name + "_SendGoal", version)
-        results = ServiceServer(participant, prefix + "get_result", type_name + "_GetResult", version)
-        cancels = ServiceServer(participant, prefix + "cancel_goal", CANCEL_GOAL, version)
+        goals = DdsServiceServer(participant, prefix + "send_goal", type_name + "_SendGoal", version)
+        results = DdsServiceServer(participant, prefix + "get_result", type_name + "_GetResult", version)
+        cancels = DdsServiceServer(participant, prefix + "cancel_goal", CANCEL_GOAL, version)
         feedback_type = type_name + "_FeedbackMessage"
         feedback = _CyclonePublisher(participant, prefix + "feedback", feedback_type, FEEDBACK_QOS, version)
         status = _CyclonePublisher(participant, prefix + "status", STATUS_ARRAY, STATUS_QOS)
         self._told: set[str] = set()
         self.ends = (*goals.ends, *results.ends, *cancels.ends, feedback, status)
-        waiters = Waiter(participant, [goals.reader]), Waiter(participant, [results.reader, cancels.reader])
+        waiters = DdsWaiter(participant, [goals.reader]), DdsWaiter(participant, [results.reader, cancels.reader])
         services, senders = (goals, results, cancels), (feedback.send, status.send)
         super().__init__(name, type_name, result_timeout_s, version, services, senders, waiters)
 
@@ -211,7 +211,7 @@ class CycloneMiddleware:
                 "or check CYCLONEDDS_URI"
             ) from error
         self._servers: list[CycloneActionServer] = []
-        self._requests = Waiter(self._participant, [])
+        self._requests = DdsWaiter(self._participant, [])
         self._services: Services[Caller] | None = None
         atexit.register(self.close)
         self._node = NodeAnnouncement(self._participant, node_name)
@@ -228,16 +228,16 @@ class CycloneMiddleware:
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Create a service; the first starts the thread that answers all."""
-        server = ServiceServer(self._joined(), name, type_name, DEFAULT_VERSION, qos)
+        server = DdsServiceServer(self._joined(), name, type_name, DEFAULT_VERSION, qos)
         self._services = self._services or Services(self._requests)
         self._services.offer(name, server, answer)
         self._requests.watch(server.reader)
         self._node.add(*server.ends)
 
     def service_client(self, name: str, type_name: str) -> Calling:
-        client = ServiceClient(self._joined(), name, type_name, DEFAULT_VERSION)
+        client = DdsServiceClient(self._joined(), name, type_name, DEFAULT_VERSION)
         self._node.add(*client.ends)
-        return Calling(name, client, Waiter(self._joined(), [client.reader]))
+        return Calling(name, client, DdsWaiter(self._joined(), [client.reader]))
 
     def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> CycloneActionClient:
         client = CycloneActionClient(self._joined(), name, type_name, version)

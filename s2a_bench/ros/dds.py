@@ -231,7 +231,7 @@ class RawReader(_Endpoint):
         return lambda: reader.read(WRITERS_AT_MOST, alive)
 
 
-class Waiter:
+class DdsWaiter:
     """Waits for any of some readers on the calling thread, which is the fastest way that does not spin."""
 
     def __init__(self, participant: DomainParticipant, readers: Sequence[RawReader]) -> None:

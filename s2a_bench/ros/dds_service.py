@@ -102,7 +102,7 @@ class _End:
         return deserialise(packed, self._received_wire, self._version).body
 
 
-class ServiceClient(_End):
+class DdsServiceClient(_End):
     """Sends requests and finds the replies that are its own."""
 
     def __init__(self, participant: DomainParticipant, name: str, type_name: str, version: str) -> None:
@@ -130,7 +130,7 @@ class ServiceClient(_End):
                 yield key, packed
 
 
-class ServiceServer(_End):
+class DdsServiceServer(_End):
     """Takes requests and sends replies to who asked."""
 
     def __init__(

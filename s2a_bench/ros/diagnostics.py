@@ -35,7 +35,7 @@ class Level(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class PartHealth:
     """How one part of a node is."""
 
     part: str
@@ -44,7 +44,7 @@ class Finding:
     values: Mapping[str, float] = field(default_factory=dict)
 
 
-def diagnostic_array(node_name: str, findings: Iterable[Finding], stamp_ns: int) -> Any:
+def diagnostic_array(node_name: str, findings: Iterable[PartHealth], stamp_ns: int) -> Any:
     """Build the message; ``stamp_ns`` is ROS time, parts are named ``node: part`` as ROS's diagnostic_updater does."""
     return ros.default(
         ARRAY,

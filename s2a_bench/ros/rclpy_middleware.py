@@ -23,7 +23,7 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
 from s2a_bench.ros.rclpy_client import RclpyActionClient
-from s2a_bench.ros.rclpy_node import ONE_SUBSCRIPTION, SpinningNode, Unserved, Waiter, qos_profile
+from s2a_bench.ros.rclpy_node import ONE_SUBSCRIPTION, RclpyWaiter, SpinningNode, Unserved, qos_profile
 from s2a_bench.ros.rclpy_server import RclpyActionServer
 from s2a_bench.ros.rclpy_types import from_ros, interface_class, message_class, to_ros
 from s2a_bench.ros.service import appeared
@@ -100,7 +100,9 @@ class _RclpySubscription:
         for handler in self._subscription.event_handlers:
             node.adopt(handler)
         handle = self._subscription.handle
-        self._waiter = Waiter(node.node, handle, ONE_SUBSCRIPTION, lambda wait_set: wait_set.add_subscription(handle))
+        self._waiter = RclpyWaiter(
+            node.node, handle, ONE_SUBSCRIPTION, lambda wait_set: wait_set.add_subscription(handle)
+        )
         self.interrupt, self.close = self._waiter.interrupt, self._waiter.close
 
     def take(self, timeout_s: float) -> bytes | None:

@@ -125,7 +125,7 @@ class Unserved(CallbackGroup):  # type: ignore[misc]
         """Nothing has begun."""
 
 
-class Waiter:
+class RclpyWaiter:
     """Waits for one entity; one thread at a time, inside `consuming`."""
 
     def __init__(self, node: Any, entity: Any, counts: Sequence[int], add: Callable[[Any], None]) -> None:
@@ -174,12 +174,12 @@ class Waiter:
             pass
 
 
-def for_waitable(node: Any, waitable: Any) -> Waiter:
+def for_waitable(node: Any, waitable: Any) -> RclpyWaiter:
     """Return what waits for a waitable of rclpy, such as an action's client or server."""
     of = waitable.get_num_entities()
     names = ("subscriptions", "guard_conditions", "timers", "clients", "services", "events")
     counts = [getattr(of, f"num_{name}") for name in names]
-    return Waiter(node, waitable, counts, waitable.add_to_wait_set)
+    return RclpyWaiter(node, waitable, counts, waitable.add_to_wait_set)
 
 
 def run_now(coroutine: Coroutine[Any, Any, None]) -> None:

@@ -1,6 +1,6 @@
 """Record topics as rosbag2 does, in MCAP, which Foxglove, ``ros2 bag`` and ``mcap`` open.
 
-While something is measured, `Recorder.write` only keeps a reference to the CDR that was sent or received anyway; the
+While something is measured, `BagRecorder.write` only keeps a reference to the CDR that was sent or received anyway; the
 file is written by `flush`, which the caller runs between samples. A writer thread would be no alternative there: it
 holds the interpreter's lock for a millisecond per VGA image, as long as what is measured. A node or a stream has no
 "between"; for them ``live=True`` starts that thread.
@@ -40,10 +40,10 @@ PLAYED_QOS = Qos(
 
 Cdr = bytes | bytearray | memoryview
 BACKLOG_BYTES = 256 * 2**20
-"""With so much CDR unwritten, `Recorder.write` writes it down itself rather than filling the memory."""
+"""With so much CDR unwritten, `BagRecorder.write` writes it down itself rather than filling the memory."""
 
 
-class Recorder(AbstractContextManager["Recorder"]):
+class BagRecorder(AbstractContextManager["BagRecorder"]):
     """A recording; ``run.mcap`` makes that one file, any other name the folder that ``ros2 bag record`` makes.
 
     The single file is written in ``run.mcap.recording/`` and moved when it is complete. Without a single message it

@@ -64,7 +64,7 @@ class End(Protocol):
         ...
 
 
-class Service(End, Protocol[Caller]):
+class ServiceEnd(End, Protocol[Caller]):
     """The server's side of one service."""
 
     reply_type: str
@@ -84,7 +84,7 @@ class Service(End, Protocol[Caller]):
         ...
 
 
-class Asker(End, Protocol):
+class ClientEnd(End, Protocol):
     """The client's side of one service."""
 
     hashed_type: str
@@ -111,13 +111,13 @@ class Services(Generic[Caller]):
     def __init__(self, waiter: Waits) -> None:
         """Start the thread; ``waiter`` wakes it for requests."""
         self._waiter = waiter
-        self._offered: dict[str, tuple[Service[Caller], Callable[[Any], Any]]] = {}
+        self._offered: dict[str, tuple[ServiceEnd[Caller], Callable[[Any], Any]]] = {}
         self._said: dict[str, str] = {}
         """Service -> what was logged of it last."""
         self._thread = Thread(target=self._serve, name="services", daemon=True)
         self._thread.start()
 
-    def offer(self, name: str, service: Service[Caller], answer: Callable[[Any], Any]) -> None:
+    def offer(self, name: str, service: ServiceEnd[Caller], answer: Callable[[Any], Any]) -> None:
         """Answer the service ``/name`` from now on."""
         self._offered = {**self._offered, name: (service, answer)}  # while the thread goes through the old ones
 
@@ -134,7 +134,7 @@ class Services(Generic[Caller]):
             self._waiter.wait_until(now_ns() + WAIT_SLICE_NS)
 
     def _handle(
-        self, name: str, service: Service[Caller], answer: Callable[[Any], Any], packed: memoryview, caller: Caller
+        self, name: str, service: ServiceEnd[Caller], answer: Callable[[Any], Any], packed: memoryview, caller: Caller
     ) -> None:
         """Answer one request, unless its client has left; what cannot be answered is dropped."""
         try:
@@ -153,7 +153,7 @@ class Services(Generic[Caller]):
 class Calling:
     """Calls one service and waits for the answer."""
 
-    def __init__(self, name: str, asker: Asker, waiter: Waits) -> None:
+    def __init__(self, name: str, asker: ClientEnd, waiter: Waits) -> None:
         self._name, self._asker, self._waiter = name, asker, waiter
         self._asked = 0
 

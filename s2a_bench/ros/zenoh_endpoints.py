@@ -21,7 +21,7 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, QoS
 from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
-from s2a_bench.ros.zenoh_node import Bell, Inbox, Node, direct, give_way, refusals
+from s2a_bench.ros.zenoh_node import Bell, Node, SampleQueue, direct, give_way, refusals
 
 CACHED_AT_MOST: Final = 1000
 """What a latched topic that keeps all keeps."""
@@ -90,7 +90,7 @@ class ZenohSubscription:
         self._oldest_ns = round(qos.lifespan_s * 1e9)
         self._said = False
         self._bell = bell or Bell()
-        self._inbox: Inbox[Any] = Inbox(topic, self._bell, qos.depth)
+        self._inbox: SampleQueue[Any] = SampleQueue(topic, self._bell, qos.depth)
         self.interrupt = self._bell.interrupt
         self._subscriber = self._declared(node.key(topic, type_name, version), qos)
         self._seen = node.announce(names.SUBSCRIPTION, topic, type_name, version, qos)
@@ -152,7 +152,7 @@ class ZenohSubscription:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class QueryOrigin:
     """Who asked: a query, and what of its attachment goes back with the reply."""
 
     query: zenoh.Query
@@ -160,7 +160,7 @@ class Asked:
     gid: bytes
 
 
-class ServiceServer:
+class ZenohServiceServer:
     """The server's side of one service."""
 
     body_at = CDR_HEADER
@@ -183,7 +183,7 @@ class ServiceServer:
         self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
         self._name, self._version = name, version
         self._key = node.key(name, type_name, version)
-        self._inbox: Inbox[zenoh.Query] = Inbox(name, bell, most_bytes=most_bytes)
+        self._inbox: SampleQueue[zenoh.Query] = SampleQueue(name, bell, most_bytes=most_bytes)
         self._said = False
         held = ref(self._inbox)
 
@@ -196,7 +196,7 @@ class ServiceServer:
             self._queryable = node.session.declare_queryable(self._key, direct(put), complete=True)
         self.seen = node.announce(names.SERVICE, name, type_name, version, qos)
 
-    def arrived(self) -> Iterator[tuple[memoryview, Asked]]:
+    def arrived(self) -> Iterator[tuple[memoryview, QueryOrigin]]:
         """Take what has arrived, a bounded number; a query that rmw_zenoh would not make is dropped, and told once."""
         for query in self._inbox.arrived():
             payload, attachment = query.payload, query.attachment
@@ -208,9 +208,9 @@ class ServiceServer:
                     self._said = True
                     _log.warning("%s: dropped a request: %s", self._name, error)
             else:
-                yield memoryview(payload.to_bytes() if payload else b""), Asked(query, sequence, gid)
+                yield memoryview(payload.to_bytes() if payload else b""), QueryOrigin(query, sequence, gid)
 
-    def drop(self, caller: Asked) -> None:
+    def drop(self, caller: QueryOrigin) -> None:
         caller.query.drop()
 
     def pack(self, body: Any) -> bytearray:
@@ -219,11 +219,11 @@ class ServiceServer:
     def unpack(self, packed: memoryview) -> Any:
         return deserialise(packed, self.request_type, self._version)
 
-    def reaches(self, caller: Asked) -> bool:  # noqa: ARG002 - a query knows its way back
+    def reaches(self, caller: QueryOrigin) -> bool:  # noqa: ARG002 - a query knows its way back
         """Return True: who has left is not waited for."""
         return True
 
-    def respond(self, packed: bytearray, caller: Asked) -> None:
+    def respond(self, packed: bytearray, caller: QueryOrigin) -> None:
         """Reply, and end the query."""
         attachment = names.attachment(caller.sequence, caller.gid)
         with refusals(self._name):
@@ -234,7 +234,7 @@ class ServiceServer:
         give_way()
 
 
-class ServiceClient:
+class ZenohServiceClient:
     """The client's side of one service."""
 
     body_at = CDR_HEADER
@@ -244,7 +244,7 @@ class ServiceClient:
         self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
         self.hashed_type = type_name
         self._node, self._name, self._version = node, name, version
-        self._inbox: Inbox[tuple[bytes, Any]] = Inbox(name, bell)
+        self._inbox: SampleQueue[tuple[bytes, Any]] = SampleQueue(name, bell)
         with refusals(name):
             self._querier = node.session.declare_querier(
                 node.key(name, type_name, version),

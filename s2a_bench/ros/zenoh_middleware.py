@@ -18,7 +18,13 @@ from s2a_bench.ros.action import CANCEL_GOAL, FEEDBACK_QOS, STATUS_ARRAY, STATUS
 from s2a_bench.ros.messages import DEFAULT_VERSION
 from s2a_bench.ros.router import Router
 from s2a_bench.ros.service import READER_QOS, Calling, Services
-from s2a_bench.ros.zenoh_endpoints import Asked, ServiceClient, ServiceServer, ZenohPublisher, ZenohSubscription
+from s2a_bench.ros.zenoh_endpoints import (
+    QueryOrigin,
+    ZenohPublisher,
+    ZenohServiceClient,
+    ZenohServiceServer,
+    ZenohSubscription,
+)
 from s2a_bench.ros.zenoh_node import Bell, Node, open_session
 
 _log = logging.getLogger(__name__)
@@ -34,25 +40,27 @@ class ZenohActionClient(AskingAction):
         )
         status = ZenohSubscription(node, prefix + "status", STATUS_ARRAY, STATUS_QOS)
         """Not read: a goal's status comes with its result. ROS tools expect a client to subscribe."""
-        goals = ServiceClient(node, prefix + "send_goal", type_name + "_SendGoal", version, bell)
-        results = ServiceClient(node, prefix + "get_result", type_name + "_GetResult", version, bell)
-        cancels = ServiceClient(node, prefix + "cancel_goal", CANCEL_GOAL, version, bell)
+        goals = ZenohServiceClient(node, prefix + "send_goal", type_name + "_SendGoal", version, bell)
+        results = ZenohServiceClient(node, prefix + "get_result", type_name + "_GetResult", version, bell)
+        cancels = ZenohServiceClient(node, prefix + "cancel_goal", CANCEL_GOAL, version, bell)
         topics = feedback.announced, status.announced
         super().__init__(type_name, version, (goals, results, cancels), feedback.arrived, topics, bell)
 
 
-class ZenohActionServer(ServedAction[Asked]):
+class ZenohActionServer(ServedAction[QueryOrigin]):
     """Looks at who else is there."""
 
-    send_goal: ServiceServer
+    send_goal: ZenohServiceServer
 
     def __init__(self, node: Node, name: str, type_name: str, result_timeout_s: float, version: str) -> None:
         prefix, for_goals, for_others = name + "/_action/", Bell(), Bell()
         feedback = ZenohPublisher(node, prefix + "feedback", type_name + "_FeedbackMessage", FEEDBACK_QOS, version)
         status = ZenohPublisher(node, prefix + "status", STATUS_ARRAY, STATUS_QOS)
-        results = ServiceServer(node, prefix + "get_result", type_name + "_GetResult", version, for_others)
-        cancels = ServiceServer(node, prefix + "cancel_goal", CANCEL_GOAL, version, for_others)
-        goals = ServiceServer(node, prefix + "send_goal", type_name + "_SendGoal", version, for_goals, most_bytes=0)
+        results = ZenohServiceServer(node, prefix + "get_result", type_name + "_GetResult", version, for_others)
+        cancels = ZenohServiceServer(node, prefix + "cancel_goal", CANCEL_GOAL, version, for_others)
+        goals = ZenohServiceServer(
+            node, prefix + "send_goal", type_name + "_SendGoal", version, for_goals, most_bytes=0
+        )
         self._node = node
         self._told: set[str] = set()
         services, senders, bells = (goals, results, cancels), (feedback.send, status.send), (for_goals, for_others)
@@ -82,7 +90,7 @@ class ZenohMiddleware:
         atexit.register(self.close)
         self._servers: list[ZenohActionServer] = []
         self._bell = Bell()
-        self._services: Services[Asked] | None = None
+        self._services: Services[QueryOrigin] | None = None
         try:
             self._node = Node(self._session, domain_id, node_name)
         except BaseException:
@@ -98,12 +106,12 @@ class ZenohMiddleware:
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Create a service; the first starts the thread that answers all."""
-        server = ServiceServer(self._joined(), name, type_name, DEFAULT_VERSION, self._bell, qos)
+        server = ZenohServiceServer(self._joined(), name, type_name, DEFAULT_VERSION, self._bell, qos)
         self._services = self._services or Services(self._bell)
         self._services.offer(name, server, answer)
 
     def service_client(self, name: str, type_name: str) -> Calling:
-        client = ServiceClient(self._joined(), name, type_name, DEFAULT_VERSION, bell := Bell())
+        client = ZenohServiceClient(self._joined(), name, type_name, DEFAULT_VERSION, bell := Bell())
         return Calling(name, client, bell)
 
     def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> ZenohActionClient:

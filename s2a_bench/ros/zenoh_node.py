@@ -94,7 +94,7 @@ def told(error: zenoh.ZError) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class AnnouncedEndpoint:
     """An endpoint of ours as others see it; it is gone when this is no longer used."""
 
     entity: names.Entity
@@ -131,13 +131,13 @@ class Node:
         """Return the key under which messages of a topic or service ``/name`` travel."""
         return names.key(self.domain_id, name, type_name, names.wire_hash(type_name, version))
 
-    def announce(self, kind: str, name: str, type_name: str, version: str, qos: QoS) -> Seen:
+    def announce(self, kind: str, name: str, type_name: str, version: str, qos: QoS) -> AnnouncedEndpoint:
         """Let others see an endpoint ``/name`` of ROS type ``pkg/kind/Name``, which is ready."""
         hashed = names.wire_hash(type_name, version)
         entity = names.Entity(kind, name.replace("/", "%"), dds_type_name(type_name), hashed)
         token = names.endpoint_token(self.domain_id, self._id, next(self._numbers), self._name, entity, qos)
         with refusals(name):
-            return Seen(entity, names.gid_of(token), self._liveliness.declare_token(token))
+            return AnnouncedEndpoint(entity, names.gid_of(token), self._liveliness.declare_token(token))
 
     def peers(self, kind: str, entity: names.Entity) -> Iterator[str]:
         """Yield the type hashes of the endpoints of a kind that have the name and type of ``entity``."""
@@ -227,7 +227,7 @@ class Bell:
             self.condition.notify_all()
 
 
-class Inbox(Generic[Item]):
+class SampleQueue(Generic[Item]):
     """What has come in for one endpoint: the last ``depth`` items, all for 0."""
 
     def __init__(self, name: str, bell: Bell, depth: int = 0, most_bytes: int = 0) -> None:

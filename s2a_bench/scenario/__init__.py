@@ -41,7 +41,7 @@ class State:
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class DriveCommand:
     """What the cars do for one step."""
 
     acceleration_mps2: Floats
@@ -64,7 +64,7 @@ class Simulator(Protocol):
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         """Begin anew with cars in one lane, arrays of shape (3, M)."""
 
-    def step(self, command: Command) -> State:
+    def step(self, command: DriveCommand) -> State:
         """Let one step pass; cars brake to a stop, never backwards."""
 
     def close(self) -> None:

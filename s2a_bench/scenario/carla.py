@@ -15,7 +15,7 @@ import numpy as np
 from s2a_bench import extras
 from s2a_bench.errors import SimulatorError, UsageError
 from s2a_bench.policy import Floats
-from s2a_bench.scenario import EGO, LEAD, REAR, ROLES, Command, State
+from s2a_bench.scenario import EGO, LEAD, REAR, ROLES, DriveCommand, State
 
 STEP_S: Final = 0.02
 """CARLA wants a tenth of a second at most; the finer the step, the longer a roll-out takes."""
@@ -80,7 +80,7 @@ class Carla:
         self._offset_m = float(position_m[EGO, 0])
         return self._state()
 
-    def step(self, command: Command) -> State:
+    def step(self, command: DriveCommand) -> State:
         """Set the speeds that the accelerations lead to, and let the server pass one step."""
         self._speed = np.maximum(self._speed + command.acceleration_mps2[:, 0] * self.step_s, 0.0)
         self._tick()

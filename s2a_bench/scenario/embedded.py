@@ -11,7 +11,7 @@ import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.policy import Floats
-from s2a_bench.scenario import EGO, LEAD, REAR, STEP_S, Command, State
+from s2a_bench.scenario import EGO, LEAD, REAR, STEP_S, DriveCommand, State
 
 ROAD_M: Final = 5000.0
 BEHIND_M: Final = 500.0
@@ -48,7 +48,7 @@ class Embedded:
             road.vehicles.append(self._cars[car])
         return self._state()
 
-    def step(self, command: Command) -> State:
+    def step(self, command: DriveCommand) -> State:
         """Let each vehicle act and step; the ego steers for its lane."""
         for car, vehicle in self._cars.items():
             # A car that would come to rest within the step just does, and none goes backwards.

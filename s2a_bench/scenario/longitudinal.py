@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from s2a_bench.policy import Floats
-from s2a_bench.scenario import STEP_S, Command, State
+from s2a_bench.scenario import STEP_S, DriveCommand, State
 
 
 class LockStep:
@@ -43,7 +43,7 @@ class Longitudinal(LockStep):
         self._state = State(position_m.astype(float), speed_mps.astype(float), np.zeros(position_m.shape))
         return self._state
 
-    def step(self, command: Command) -> State:
+    def step(self, command: DriveCommand) -> State:
         """Integrate by the trapezoidal rule, which is exact until a car comes to rest within the step."""
         before = self._state
         speed = np.maximum(before.speed_mps + command.acceleration_mps2 * self.step_s, 0.0)

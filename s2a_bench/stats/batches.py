@@ -33,7 +33,7 @@ _RESAMPLES: Final = 1000
 
 
 @final
-class Launch:
+class LaunchValues:
     """The values of one launch; percentiles of resamples are found in the sorted values, without copying them."""
 
     def __init__(self, rows: Rows) -> None:
@@ -88,7 +88,7 @@ class Launch:
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class RowCorrelation:
     """How alike neighbours of a series of ``n`` rows are, which was cut into ``k`` batches.
 
     ``r``, from 0 to 0.95, is the lag-1 correlation of ranks (outliers matter little).
@@ -99,7 +99,7 @@ class Memory:
     k: int
 
     @classmethod
-    def of(cls, levels: Floats) -> Memory:
+    def of(cls, levels: Floats) -> RowCorrelation:
         """Measure it on one number a row, in order of time."""
         from scipy import stats
 

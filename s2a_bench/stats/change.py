@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.stats import Ratio
-from s2a_bench.stats.batches import FEWEST_ROWS, Floats, Launch, Memory, Rows
+from s2a_bench.stats.batches import FEWEST_ROWS, Floats, LaunchValues, RowCorrelation, Rows
 
 Middle: TypeAlias = Literal["median", "mean"]
 
@@ -119,7 +119,7 @@ def change_between(
       interval. What differs only from launch to launch is not in it.
     """
     rng = np.random.default_rng(seed)
-    launches = [[Launch(rows) for rows in side] for side in (baseline, other)]
+    launches = [[LaunchValues(rows) for rows in side] for side in (baseline, other)]
     draws = [side[0].draw(rng) if len(side) == 1 else None for side in launches]
     if paired:
         draws[1] = draws[0]
@@ -205,7 +205,9 @@ class _Side:
     exact: bool
 
     @classmethod
-    def of(cls, launches: Sequence[Launch], statistic: str, drawn: NDArray[np.int64] | None, exact: bool) -> _Side:
+    def of(
+        cls, launches: Sequence[LaunchValues], statistic: str, drawn: NDArray[np.int64] | None, exact: bool
+    ) -> _Side:
         first = launches[0]
         points = np.array([launch.statistic(statistic) for launch in launches])
         copies = first.replicate(statistic, drawn) if drawn is not None and first.allows(statistic) else None
@@ -240,7 +242,7 @@ class _Side:
     @property
     def dependent(self) -> bool:
         """Whether it is one launch whose neighbours are too much alike."""
-        return len(self.points) == 1 and Memory.of(self.levels).dependent
+        return len(self.points) == 1 and RowCorrelation.of(self.levels).dependent
 
     @property
     def variance(self) -> tuple[float, int] | None:
@@ -252,7 +254,7 @@ class _Side:
         if self.copies is None:
             return None
         # Drawing k batches with replacement shows (k - 1) / k of the variance.
-        memory = Memory.of(self.levels)
+        memory = RowCorrelation.of(self.levels)
         k = memory.k
         # Equal values have no variance, whatever rounding says.
         varies = self.copies.max() > self.copies.min()
@@ -298,7 +300,7 @@ class _Test:
 
 
 def _superiority(
-    sides: Sequence[Sequence[Launch]], draws: Sequence[NDArray[np.int64] | None], confidence: float
+    sides: Sequence[Sequence[LaunchValues]], draws: Sequence[NDArray[np.int64] | None], confidence: float
 ) -> Ratio:
     """Return P(other > baseline) + P(equal) / 2, with a percentile interval over the batches of two single launches."""
     below, above = ([batch for launch in side for batch in launch.batches] for side in sides)

@@ -215,7 +215,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class StoredRun:
     """One run as read: the manifest, and its tables as DataFrames, each read when it is first asked for.
 
     Times are integers (Int64) in ns, `marks` and `facts` JSON text; a missing value is ``pd.NA``.
@@ -274,14 +274,14 @@ class Run:
         return self.table(frames_table(self.stages))
 
 
-def read_run(path: Path) -> Run:
+def read_run(path: Path) -> StoredRun:
     """Open a run folder for reading; raises StoreError where it is none, or another version's."""
     path = Path(path)
-    return Run(path, manifests.read(path))
+    return StoredRun(path, manifests.read(path))
 
 
 @contextmanager
-def fits(*runs: Run) -> Iterator[None]:
+def fits(*runs: StoredRun) -> Iterator[None]:
     """Raise StoreError, naming the runs, where the block misses something in their rows or manifests."""
     try:
         yield

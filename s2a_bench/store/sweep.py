@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from s2a_bench.errors import StoreError
 from s2a_bench.provenance import Origins, joined
 from s2a_bench.store.manifest import SWEEP
-from s2a_bench.store.run import Run, fits, read_run
+from s2a_bench.store.run import StoredRun, fits, read_run
 from s2a_bench.store.schema import Table
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class Sweep:
         """Return where the numbers of its finished cells come from."""
         return joined(run.origins for _, run in self.runs())
 
-    def runs(self) -> Iterator[tuple[dict[str, Any], Run]]:
+    def runs(self) -> Iterator[tuple[dict[str, Any], StoredRun]]:
         """Yield the settings and the run of every finished cell, in the cells' order."""
         for row in self.cells[self.cells["state"] == "finished"].to_dict("records"):
             yield json.loads(row["settings"]), read_run(self.path / row["folder"])

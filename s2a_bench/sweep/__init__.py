@@ -1,7 +1,7 @@
 """Sweeps: a file names a command and axes, every cell of the grid runs once, and what has run survives.
 
 A cell is one command line of ours, so that nothing about a command is written down twice: its own parser reads the
-settings, its own run folder holds the data. `Workers` is the seam where cells run: on this machine, or on Ray.
+settings, its own run folder holds the data. `CellWorkers` is the seam where cells run: on this machine, or on Ray.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ hidden."""
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class SweepCommand:
     """What a sweep must know of the command that it repeats."""
 
     name: str
@@ -38,7 +38,7 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class SweepCell:
     """One setting, one time."""
 
     number: int
@@ -75,13 +75,13 @@ class Outcome:
     """The environment that its run folder names."""
 
 
-class Workers(AbstractContextManager["Workers"], Protocol):
+class CellWorkers(AbstractContextManager["CellWorkers"], Protocol):
     """Where cells run. Use as a context manager; leaving it early ends what is under way."""
 
     width: int
     """How many virtual cells run at once."""
 
-    def submit(self, cell: Cell, folder: Path) -> Future[Any]:
+    def submit(self, cell: SweepCell, folder: Path) -> Future[Any]:
         """Start a cell, or queue it; ``folder`` does not exist yet."""
         ...
 

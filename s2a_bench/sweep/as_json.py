@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from s2a_bench.store.manifest import plain
 from s2a_bench.store.schema import SCHEMA
 from s2a_bench.store.sweep import Sweep
-from s2a_bench.sweep import Cell
+from s2a_bench.sweep import SweepCell
 from s2a_bench.sweep.run import Expected
 from s2a_bench.writers.as_json import frame
 
@@ -48,7 +48,7 @@ class SweptCell(_Setting):
     wall_s: Annotated[float, {"minimum": 0}]
 
 
-def plan_json(cells: Sequence[Cell], expected: Expected, environment: dict[str, Any]) -> dict[str, Any]:
+def plan_json(cells: Sequence[SweepCell], expected: Expected, environment: dict[str, Any]) -> dict[str, Any]:
     """Return what would run as the ``--json`` object."""
     planned = [
         PlannedCell(

@@ -97,7 +97,7 @@ def find_sweep(name: str) -> Path:
     return files[name]
 
 
-class _File(TomlTable):
+class _SweepFile(TomlTable):
     """What the file may hold."""
 
     command: str
@@ -116,7 +116,7 @@ def read_sweep_file(path: Path) -> SweepFile:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"cannot read the sweep file {path}: {error}") from error
-    file = parse(_File, text, str(path))
+    file = parse(_SweepFile, text, str(path))
     _check_keys(path, {"settings": file.settings, "grid": file.grid, "zip": file.zip})
     if len({len(values) for values in file.zip.values()}) > 1:
         lengths = ", ".join(f"{key} {len(values)}" for key, values in file.zip.items())

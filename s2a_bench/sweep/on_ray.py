@@ -21,9 +21,9 @@ from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.machine.environment import collect
 from s2a_bench.store.manifest import utc_now
-from s2a_bench.sweep import Cell, Outcome
+from s2a_bench.sweep import Outcome, SweepCell
 from s2a_bench.sweep.perform import perform
-from s2a_bench.sweep.plan import Plan
+from s2a_bench.sweep.plan import SweepPlan
 
 LOCAL: Final = "local"
 TRIES: Final = 5
@@ -40,7 +40,7 @@ Packed: TypeAlias = tuple[Outcome, bytes]
 class OnRay:
     """A cluster that runs there, or one of this machine's cores made for the sweep."""
 
-    def __init__(self, entry: str, address: str, plan: Plan, jobs: int) -> None:
+    def __init__(self, entry: str, address: str, plan: SweepPlan, jobs: int) -> None:
         """Connect; raises MissingExtra without Ray, UsageError where it does not answer or no node has a board."""
         ray = self._ray = connect(address, jobs)
         self._entry = entry
@@ -54,7 +54,7 @@ class OnRay:
         self.width = max(AHEAD * int(resources.get("CPU", 1)), 1)
         self._remote = ray.remote(max_retries=TRIES)(packed)
 
-    def submit(self, cell: Cell, folder: Path) -> Future[Packed]:  # noqa: ARG002 - it is unpacked later
+    def submit(self, cell: SweepCell, folder: Path) -> Future[Packed]:  # noqa: ARG002 - it is unpacked later
         wants = {} if cell.virtual else {"resources": {resource(cell.board): 1}}
         ref = self._remote.options(name=cell.label, **wants).remote(cell, self._entry)
         self._refs.add(ref)
@@ -100,7 +100,7 @@ def connect(address: str, jobs: int) -> Any:
     return ray
 
 
-def _check(plan: Plan, resources: Mapping[str, float]) -> None:
+def _check(plan: SweepPlan, resources: Mapping[str, float]) -> None:
     missing = [board for board in plan.boards if not resources.get(resource(board))]
     if missing:
         offered = ", ".join(name.partition(":")[2] for name in resources if name.startswith("board:"))
@@ -117,7 +117,7 @@ def resource(board: str) -> str:
     return f"board:{board}"
 
 
-def packed(cell: Cell, entry: str) -> Packed:
+def packed(cell: SweepCell, entry: str) -> Packed:
     """Carry out a cell on a node and pack its folder."""
     with TemporaryDirectory(prefix="s2a-bench-cell-") as place:
         folder = Path(place) / "cell"

@@ -20,13 +20,13 @@ from s2a_bench.machine.environment import collect
 from s2a_bench.machine.tuning import end_with_parent
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.manifest import utc_now
-from s2a_bench.sweep import Cell, Outcome
-from s2a_bench.sweep.plan import Plan
+from s2a_bench.sweep import Outcome, SweepCell
+from s2a_bench.sweep.plan import SweepPlan
 
 LOG: Final = "stderr.txt"
 
 
-def perform(cell: Cell, folder: Path, entry: str) -> Outcome:
+def perform(cell: SweepCell, folder: Path, entry: str) -> Outcome:
     """Run a cell's command with ``--output`` at a new folder; ``entry`` is "module:function" of the command line.
 
     Whatever goes wrong in the cell is the outcome's error.
@@ -98,13 +98,13 @@ DIED = "the worker process died under it (out of memory?)"
 class Here:
     """Two pools of processes, so that a cell that crashes or takes all memory does not take the sweep along."""
 
-    def __init__(self, entry: str, _address: str, _plan: Plan, jobs: int) -> None:
+    def __init__(self, entry: str, _address: str, _plan: SweepPlan, jobs: int) -> None:
         self.width = jobs
         self._entry = entry
         self._others = set(active_children())
         self._pools: dict[bool, ProcessPoolExecutor] = {}
 
-    def submit(self, cell: Cell, folder: Path) -> Future[Outcome]:
+    def submit(self, cell: SweepCell, folder: Path) -> Future[Outcome]:
         try:
             return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
         except BrokenProcessPool:  # an earlier cell broke it

@@ -11,7 +11,7 @@ from typing import Any
 
 from s2a_bench.boards.profile import find_profile
 from s2a_bench.errors import UsageError
-from s2a_bench.sweep import Cell, Command
+from s2a_bench.sweep import SweepCell, SweepCommand
 from s2a_bench.sweep.file import BOARD, OWN, Setting, SweepFile, rounds
 from s2a_bench.text import like
 
@@ -20,11 +20,11 @@ HASHED_WHOLE = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class SweepPlan:
     """The cells of a sweep in the order in which they run."""
 
     command: str
-    cells: tuple[Cell, ...]
+    cells: tuple[SweepCell, ...]
     rest_s: float
     seed: int
     repeats: int
@@ -39,7 +39,7 @@ class Plan:
         return tuple(dict.fromkeys(cell.board for cell in self.cells if cell.board))
 
 
-def plan_sweep(file: SweepFile, command: Command, boards: Collection[str] | None = None) -> Plan:
+def plan_sweep(file: SweepFile, command: SweepCommand, boards: Collection[str] | None = None) -> SweepPlan:
     """Make the cells, those for ``boards`` and those that need none; None: all.
 
     Raises UsageError, naming the file and the key, for a flag that the command does not have or a value that its
@@ -61,11 +61,11 @@ def plan_sweep(file: SweepFile, command: Command, boards: Collection[str] | None
             raise UsageError(f"{file.path}: {_words(setting)}: {error}") from error
         found = _hash([argv, setting.get(BOARD), [_content(path) for path in _files(setting)]])
         plain = {key: _text(value) if isinstance(value, list) else value for key, value in setting.items()}
-        cells.append(Cell(number, repeat, plain, tuple(argv), virtual, setting.get(BOARD, ""), found))
-    return Plan(command.name, tuple(cells), file.rest_s, file.seed, file.repeats)
+        cells.append(SweepCell(number, repeat, plain, tuple(argv), virtual, setting.get(BOARD, ""), found))
+    return SweepPlan(command.name, tuple(cells), file.rest_s, file.seed, file.repeats)
 
 
-def _check_keys(file: SweepFile, command: Command, setting: Setting) -> None:
+def _check_keys(file: SweepFile, command: SweepCommand, setting: Setting) -> None:
     for key, value in setting.items():
         if key == BOARD:
             if not isinstance(value, str) or not value:
@@ -85,7 +85,7 @@ def _check_keys(file: SweepFile, command: Command, setting: Setting) -> None:
                     raise UsageError(f"{file.path}: {key}: {each!r} should be text or a number")
 
 
-def _argv(file: SweepFile, command: Command, setting: Setting, seed: int) -> list[str]:
+def _argv(file: SweepFile, command: SweepCommand, setting: Setting, seed: int) -> list[str]:
     """Write a setting as a command line; a list becomes values with commas, as flags take several."""
     flags, arguments = [], []
     for key, value in setting.items():

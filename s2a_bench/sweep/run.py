@@ -21,15 +21,15 @@ from s2a_bench.progress import Progress
 from s2a_bench.store.manifest import SWEEP
 from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.store.sweep import CELLS, CellRow, Sweep, is_sweep, read_sweep
-from s2a_bench.sweep import COPY, Cell, Outcome, Workers
+from s2a_bench.sweep import COPY, CellWorkers, Outcome, SweepCell
 from s2a_bench.sweep.perform import run_folder
-from s2a_bench.sweep.plan import Plan
+from s2a_bench.sweep.plan import SweepPlan
 
 UNDER_WAY = ".under-way"
 """Cells that are running; what a killed sweep leaves there is the work that is lost."""
 
 
-def start_sweep(plan: Plan, source: Path, output: Path, boards: Sequence[str] | None) -> RunWriter:
+def start_sweep(plan: SweepPlan, source: Path, output: Path, boards: Sequence[str] | None) -> RunWriter:
     """Make the sweep's folder; ``boards`` are what this machine is called, None where Ray knows. Raises StoreError."""
     facts = {
         "configuration": {
@@ -51,7 +51,7 @@ def start_sweep(plan: Plan, source: Path, output: Path, boards: Sequence[str] | 
     return writer
 
 
-def check_resume(folder: Path, plan: Plan) -> None:
+def check_resume(folder: Path, plan: SweepPlan) -> None:
     """Refuse to go on with another configuration or on another machine; raises UsageError."""
     run = read_run(folder)
     if not is_sweep(run.manifest):
@@ -82,7 +82,7 @@ def latest(rows: Iterable[Mapping[Any, Any]]) -> dict[tuple[str, int], tuple[int
     return {(row["cell"], row["repeat"]): (row["attempt"], row["state"]) for row in rows}
 
 
-def pending(plan: Plan, rows: Iterable[Mapping[Any, Any]], *, retry_failed: bool) -> list[Cell]:
+def pending(plan: SweepPlan, rows: Iterable[Mapping[Any, Any]], *, retry_failed: bool) -> list[SweepCell]:
     """List the cells of a plan that have still to run, in their order."""
     over = {"finished"} if retry_failed else {"finished", "failed"}
     ended = latest(rows)
@@ -92,7 +92,7 @@ def pending(plan: Plan, rows: Iterable[Mapping[Any, Any]], *, retry_failed: bool
 class SweepRun:
     """One sitting at a sweep."""
 
-    def __init__(self, writer: RunWriter, plan: Plan, progress: Progress, clock: Clock | None = None) -> None:
+    def __init__(self, writer: RunWriter, plan: SweepPlan, progress: Progress, clock: Clock | None = None) -> None:
         """Look at what earlier sittings left; the folder must be held by `only_one`."""
         self._writer = writer
         self._plan = plan
@@ -106,13 +106,13 @@ class SweepRun:
     def failed(self) -> int:
         return sum(state == "failed" for _, state in self._latest.values())
 
-    def pending(self, *, retry_failed: bool) -> list[Cell]:
+    def pending(self, *, retry_failed: bool) -> list[SweepCell]:
         return pending(self._plan, self._rows, retry_failed=retry_failed)
 
-    def work(self, cells: Sequence[Cell], workers: Workers) -> None:
+    def work(self, cells: Sequence[SweepCell], workers: CellWorkers) -> None:
         """Run cells: measured ones first, one at a time on each board; then the virtual ones, many at once."""
         self._progress.expect(len(cells))
-        lanes: dict[str, deque[Cell]] = {}
+        lanes: dict[str, deque[SweepCell]] = {}
         for cell in cells:
             if not cell.virtual:
                 lanes.setdefault(cell.board, deque()).append(cell)
@@ -126,9 +126,11 @@ class SweepRun:
         text = f"{failed} of {len(self._plan.cells)} cells failed" if failed else None
         self._writer.finish("failed" if failed else "finished", text)
 
-    def _drain(self, lanes: dict[str, deque[Cell]], width: dict[str, int], workers: Workers, rest_ns: int) -> None:
+    def _drain(
+        self, lanes: dict[str, deque[SweepCell]], width: dict[str, int], workers: CellWorkers, rest_ns: int
+    ) -> None:
         """Keep every lane busy until its cells are done, with a rest after each."""
-        running: dict[Future[Any], tuple[str, Cell, Path]] = {}
+        running: dict[Future[Any], tuple[str, SweepCell, Path]] = {}
         ready_ns = dict.fromkeys(lanes, 0)
         while running or any(lanes.values()):
             now = self._clock.now_ns()
@@ -149,7 +151,7 @@ class SweepRun:
                 self._keep(cell, workers.collect(future, folder), folder)
                 ready_ns[lane] = self._clock.now_ns() + rest_ns
 
-    def _keep(self, cell: Cell, outcome: Outcome, folder: Path) -> None:
+    def _keep(self, cell: SweepCell, outcome: Outcome, folder: Path) -> None:
         """Move a cell's run folder to its place and write its row: from then on it is done."""
         attempt = self._latest.get(cell.key, (0, ""))[0] + 1
         host = str(outcome.machine.get("host", ""))
@@ -186,7 +188,7 @@ class SweepRun:
             self._progress.stage(f"cell {cell.name} failed: {error}")
         self._progress.advance()
 
-    def _stranger(self, cell: Cell, outcome: Outcome) -> str:
+    def _stranger(self, cell: SweepCell, outcome: Outcome) -> str:
         """Remember what machine a board is, and refuse an unlike one of that name."""
         if not cell.board or cell.virtual:
             return ""
@@ -244,7 +246,9 @@ def earlier(output: Path, command: str) -> list[Sweep]:
     return found
 
 
-def expect(cells: Sequence[Cell], rest_s: float, width: int, sweeps: Sequence[Sweep], workers: Workers) -> Expected:
+def expect(
+    cells: Sequence[SweepCell], rest_s: float, width: int, sweeps: Sequence[Sweep], workers: CellWorkers
+) -> Expected:
     """Return how long cells will take, by the times of the same cells, of the same command, or of the first."""
     for sweep in sweeps:
         done = sweep.cells[sweep.cells["state"] == "finished"]
@@ -270,7 +274,7 @@ def expect(cells: Sequence[Cell], rest_s: float, width: int, sweeps: Sequence[Sw
     return Expected(_total([(cell, turns[1]) for cell in cells], rest_s, width) + max(start_s, 0), source)
 
 
-def _total(spent: Sequence[tuple[Cell, float]], rest_s: float, width: int) -> float:
+def _total(spent: Sequence[tuple[SweepCell, float]], rest_s: float, width: int) -> float:
     """Add up: measured cells one after another on their board, boards side by side, then virtual ones."""
     boards: dict[str, float] = {}
     for cell, seconds in spent:

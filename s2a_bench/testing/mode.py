@@ -9,18 +9,18 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from s2a_bench.policy.chunks import MODES, Mode, Setting
+from s2a_bench.policy.chunks import MODES, ControlSetting, Mode
 from s2a_bench.policy.chunks.cycles import step
 
 shared = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
-Case: TypeAlias = tuple[Any, Setting]
+Case: TypeAlias = tuple[Any, ControlSetting]
 
 
 def draw(seed: int, horizon: int, requests: int, longest: float, *, floor: bool) -> Case:
     """Make latencies of up to ``longest`` chunks, now and then of whole ticks."""
     rng = np.random.default_rng(seed)
-    setting = Setting(int(rng.integers(1, 21)), horizon, "floor" if floor else "ceil")
+    setting = ControlSetting(int(rng.integers(1, 21)), horizon, "floor" if floor else "ceil")
     latency_ns = rng.integers(0, 1 + int(longest * horizon * setting.period_ns), requests)
     whole = rng.random(requests) < 0.3
     return np.where(whole, latency_ns // setting.period_ns * setting.period_ns, latency_ns), setting

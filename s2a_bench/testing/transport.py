@@ -45,7 +45,7 @@ from s2a_bench.types import Action, Frame, Piece, Request, Token
 Connect = Callable[[Handler], Client]
 
 
-class Recorder:
+class RecordingHandler:
     """A handler that remembers what it got and answers what it is told: texts, or the actions of an array (H, D)."""
 
     def __init__(self, answer: Sequence[Any]) -> None:
@@ -150,11 +150,11 @@ class TransportSuite:
     def transport(self, told: Wiring[Any]) -> Transport[Any]:
         return TRANSPORTS[told.transport]
 
-    def handler(self, told: Wiring[Any], words: Sequence[str]) -> Recorder:
+    def handler(self, told: Wiring[Any], words: Sequence[str]) -> RecordingHandler:
         """A handler that answers with words, or where those cannot travel with as many actions."""
         if TOKENS in told.capabilities.answer_kinds:
-            return Recorder(words)
-        return Recorder([[place / 8, -place] for place in range(len(words))])
+            return RecordingHandler(words)
+        return RecordingHandler([[place / 8, -place] for place in range(len(words))])
 
     def test_it_is_found_by_the_name_that_it_declares(self, transport: Transport[Any], told: Wiring[Any]) -> None:
         assert transport.name == told.transport
@@ -184,14 +184,16 @@ class TransportSuite:
     def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect, told: Wiring[Any]) -> None:
         self._needs(TOKENS, told)
         words = ["go", "_to(", "キッチン", ")\n", ""]
-        tokens, _ = ask(connect(Recorder(words)), Request("a", "plan", (yuyv_frame(),)))
+        tokens, _ = ask(connect(RecordingHandler(words)), Request("a", "plan", (yuyv_frame(),)))
         assert tokens == [Token(index, text, 7 + index) for index, text in enumerate(words)]
 
     def test_actions_arrive_in_order_with_every_bit(self, connect: Connect, told: Wiring[Any]) -> None:
         self._needs(ACTIONS, told)
         chunk = np.random.default_rng(5).normal(size=(16, 7)).astype(np.float32)
         chunk[0, :3] = 1e-42, 3.4e38, -0.0
-        actions, trace = ask(connect(Recorder(list(chunk))), Request("a", "plan", (yuyv_frame(),), max_tokens=16))
+        actions, trace = ask(
+            connect(RecordingHandler(list(chunk))), Request("a", "plan", (yuyv_frame(),), max_tokens=16)
+        )
         assert [action.index for action in actions] == list(range(16))
         got = np.stack([action.values for action in actions if isinstance(action, Action)])
         assert got.dtype == np.float32
@@ -289,7 +291,7 @@ class TransportSuite:
 
     def test_an_empty_answer_is_no_error(self, connect: Connect, told: Wiring[Any]) -> None:
         self._needs(TOKENS, told)
-        tokens, _ = ask(connect(Recorder([])), Request("a", "plan"))
+        tokens, _ = ask(connect(RecordingHandler([])), Request("a", "plan"))
         assert tokens == []
 
     def test_a_burst_of_a_thousand_tokens_is_complete(self, connect: Connect, told: Wiring[Any]) -> None:

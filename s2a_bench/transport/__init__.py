@@ -69,7 +69,7 @@ EXTERNAL: Final = "external"
 """``side`` of an option that, when set, is the address of a server that runs already and is not ours."""
 
 PROGRAM: Final = "program"
-"""``side`` of an option that, when set, names somebody else's server for the run to start: see `Options.program`."""
+"""``side`` of an option that names an external server for the run to start: see `TransportOptions.program`."""
 
 
 Payload = Annotated[str, base.one_of(lambda: ("", *PAYLOADS))]
@@ -86,7 +86,7 @@ class Program:
     port: int
 
 
-class Options(base.Options):
+class TransportOptions(base.Options):
     """What every transport can be told; a transport without options of its own uses this class.
 
     An option is the client's business unless its ``side`` says something else.
@@ -136,7 +136,7 @@ class Options(base.Options):
         return ("",)
 
 
-O = TypeVar("O", bound=Options)  # noqa: E741 - the one type variable here
+O = TypeVar("O", bound=TransportOptions)  # noqa: E741 - the one type variable here
 
 TOKENS: Final = "tokens"
 ACTIONS: Final = "actions"
@@ -367,10 +367,10 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
 """Name -> what is said about it."""
 
 
-class _Undeclared(Transport[Options]):
+class _UndeclaredTransport(Transport[TransportOptions]):
     """What is assumed of a transport of an old run whose package is not here."""
 
-    options = Options
+    options = TransportOptions
     order = inf
 
 
@@ -380,7 +380,7 @@ def declared(name: str) -> Transport[Any]:
     try:
         return TRANSPORTS[name]
     except UsageError:
-        return _Undeclared()
+        return _UndeclaredTransport()
 
 
 def paths() -> Iterator[str]:

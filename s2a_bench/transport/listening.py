@@ -21,14 +21,14 @@ from pydantic import field_validator
 from s2a_bench.errors import PortInUse, UsageError
 from s2a_bench.options import option
 from s2a_bench.secrets import is_secret, keep
-from s2a_bench.transport import EXTERNAL, SERVER, SERVING, Options
+from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
 
 ANY: Final = "127.0.0.1:0"
 """What is bound unless told."""
 VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
-class ListeningOptions(Options):
+class ListeningOptions(TransportOptions):
     """How our server is reached, or somebody else's is asked."""
 
     SCHEMES: ClassVar[tuple[str, ...]] = ()

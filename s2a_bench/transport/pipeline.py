@@ -27,12 +27,12 @@ from s2a_bench.transport import (
     TRANSPORTS,
     Capabilities,
     Choice,
-    Options,
     Transport,
+    TransportOptions,
     Wiring,
 )
 
-O = TypeVar("O", bound=Options)  # noqa: E741 - the one type variable here
+O = TypeVar("O", bound=TransportOptions)  # noqa: E741 - the one type variable here
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Pipeline:
     """What its cell is called: canonical, unless a command has a word of its own."""
     transport: Transport[Any]
     variant: str
-    options: Options
+    options: TransportOptions
     engine: tuple[tuple[str, str], ...] = ()
     """Options of the engine, with their values, that only this cell's has."""
 
@@ -70,7 +70,7 @@ class Pipeline:
         return (self.transport.name, ours, *((name, getattr(self.options, name)) for name in told), *self.engine)
 
     def risks(self) -> Iterator[tuple[str, str, str]]:
-        """Yield those of the options in its name, as `Options.risks` does."""
+        """Yield those of the options in its name, as `TransportOptions.risks` does."""
         fields = type(self.options).model_fields
         for name, value in _parse(self.name).options.items():
             if name in fields and (risk := str(extra_of(fields[name]).get("risk", ""))):
@@ -240,7 +240,11 @@ def without(name: str, option: str) -> str:
 
 
 def _canonical(
-    transport: Transport[Any], variant: str, options: Options, default: Options, own: Iterable[tuple[str, str]]
+    transport: Transport[Any],
+    variant: str,
+    options: TransportOptions,
+    default: TransportOptions,
+    own: Iterable[tuple[str, str]],
 ) -> str:
     """Write the name of a cell, the engine's ``own`` options last."""
     path = f"{transport.name}/{variant}" if variant else transport.name

@@ -350,7 +350,7 @@ class Core:
         return f"the answer under way has shown no sign of life for {silent_s:.0f} s" if silent_s > STUCK_S else ""
 
 
-class Workers:
+class SharedSourceWorkers:
     """The threads of a source that many clients share: they take turns in waiting for a request.
 
     The one that got a request answers it while another waits, so that no request changes threads. One is always left

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
     from s2a_bench.store.sweep import Sweep
 
 
@@ -35,7 +35,9 @@ class RatioJson:
     launch_sd: Annotated[float | None, {"minimum": 0}] = None
 
 
-def frame(run: Run | Sweep, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+def frame(
+    run: StoredRun | Sweep, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], **more: Any
+) -> dict[str, Any]:
     """Return what the objects of all commands share, around a command's own cells."""
     return {
         "schema": SCHEMA,

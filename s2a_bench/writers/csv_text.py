@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.provenance import Origins
     from s2a_bench.stats import Summary
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 SUMMARY = ("n", "median", "mean", "sd", "p90", "p99")
 """The columns of a summary, in the order of every table."""
@@ -76,7 +76,7 @@ def _inert(value: object) -> object:
     return value
 
 
-def write_texts(run: Run, tables: Mapping[str, TextTable], csvs: Mapping[str, CsvTable]) -> list[Path]:
+def write_texts(run: StoredRun, tables: Mapping[str, TextTable], csvs: Mapping[str, CsvTable]) -> list[Path]:
     """Write ``tables/``: each table as .md and .tex, and those for programs under their names; raises StoreError."""
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
     texts |= {f"{name}.tex": to_latex(table) for name, table in tables.items()}

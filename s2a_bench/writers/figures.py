@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 WIDE_SPREAD = 10
 """Values that spread by more than this factor get a logarithmic axis, or a panel of shares."""
@@ -172,14 +172,14 @@ def build_distribution(
 _DAY = len("2026-11-23")
 
 
-def source_line(runs: Iterable[Run]) -> str:
+def source_line(runs: Iterable[StoredRun]) -> str:
     """Return in one line who answered runs, whether anything was emulated, paced or a dummy, the hosts and the days."""
     manifests = [run.manifest for run in runs]
     facts = (str(each.get(name, ""))[:most] for name, most in (("host", None), ("started", _DAY)) for each in manifests)
     return " · ".join(dict.fromkeys((joined(run.origins for run in runs).brief, *filter(None, facts))))
 
 
-def marked(build: Callable[[], Figure], *runs: Run) -> Figure:
+def marked(build: Callable[[], Figure], *runs: StoredRun) -> Figure:
     """Build a figure of runs; where its numbers come from is drawn above it in one line, and ends its caption."""
     figure = build()
     line = figure.suptitle(source_line(runs), x=0.01, horizontalalignment="left", color="#444444", parse_math=False)

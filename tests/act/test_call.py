@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.act import SkillKind, kind, open_robot
-from s2a_bench.act.call import CallableRobot, Motion
+from s2a_bench.act.call import CallableRobot, SkillMotion
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RobotError, UsageError
 from s2a_bench.plan import load_skills
@@ -73,7 +73,7 @@ def test_the_function_gets_each_skill_on_a_thread_of_its_own(arm: ModuleType) ->
     seen: list[tuple[str, bool]] = []
     over = Event()
 
-    def act(motion: Motion) -> None:
+    def act(motion: SkillMotion) -> None:
         seen.append((str(motion.call), current_thread() is main_thread()))
 
     arm.act = act  # type: ignore[attr-defined]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from s2a_bench.act.control import SWITCH_S, Acted, ControlLoop
 from s2a_bench.clock import SystemClock, VirtualClock, now_ns
-from s2a_bench.policy.chunks import Setting, mode
+from s2a_bench.policy.chunks import ControlSetting, mode
 from s2a_bench.policy.chunks.cycles import NEVER, follow
 
 PERIOD_NS, HORIZON = 1_000_000, 6
@@ -43,7 +43,7 @@ class Late(VirtualClock):
         self._slept += 1
 
 
-def act(written: str, setting: Setting, latency_ns: list[int], clock: VirtualClock, ticks: int = 400) -> Acted:
+def act(written: str, setting: ControlSetting, latency_ns: list[int], clock: VirtualClock, ticks: int = 400) -> Acted:
     """Run a loop whose answers are told at once, for the time at which they come."""
     chosen = mode(written)
     actions = [np.full(1, place, np.float32) for place in range(setting.horizon)]
@@ -75,7 +75,7 @@ def act(written: str, setting: Setting, latency_ns: list[int], clock: VirtualClo
 def test_loop_does_what_virtual_time_says(
     written: str, rounding: str, latency_ns: list[int], late_ns: list[int]
 ) -> None:
-    setting = Setting(PERIOD_NS, HORIZON, rounding)  # type: ignore[arg-type]
+    setting = ControlSetting(PERIOD_NS, HORIZON, rounding)  # type: ignore[arg-type]
     acted = act(written, setting, latency_ns, Late(late_ns))
     arrival_ns = np.where(acted.arrival_ns < 0, NEVER, acted.arrival_ns)
     _, said = follow(mode(written), arrival_ns, setting, acted.chunk.size)
@@ -85,7 +85,7 @@ def test_loop_does_what_virtual_time_says(
 
 
 def test_lateness_is_told_and_made_up_for() -> None:
-    acted = act("queue", Setting(PERIOD_NS, HORIZON, "ceil"), [0] * 40, Late([0, 3 * PERIOD_NS]), ticks=100)
+    acted = act("queue", ControlSetting(PERIOD_NS, HORIZON, "ceil"), [0] * 40, Late([0, 3 * PERIOD_NS]), ticks=100)
     assert acted.chunk.size == 100
     assert acted.late_ns[1] == 3 * PERIOD_NS
     assert acted.late_ns[2] == 2 * PERIOD_NS  # the clock had gone that far
@@ -93,14 +93,14 @@ def test_lateness_is_told_and_made_up_for() -> None:
 
 
 def test_a_chunk_that_never_comes_ends_what_is_decided() -> None:
-    acted = act("queue?trigger=1", Setting(PERIOD_NS, HORIZON), [0, 0], VirtualClock(), ticks=50)
+    acted = act("queue?trigger=1", ControlSetting(PERIOD_NS, HORIZON), [0, 0], VirtualClock(), ticks=50)
     assert acted.whole == 2
     assert acted.chunk.size == 50
     assert (acted.chunk[int(acted.asked_tick[2]) + 1 :] < 0).all()  # one action was left
 
 
 def test_robot_is_sent_each_action_and_each_stall() -> None:
-    setting, sent = Setting(2_000_000, 3), []
+    setting, sent = ControlSetting(2_000_000, 3), []
     chunk = [np.full(2, place, np.float32) for place in range(3)]
     loop = ControlLoop(
         mode("sync"),
@@ -118,7 +118,7 @@ def test_robot_is_sent_each_action_and_each_stall() -> None:
 
 
 def test_overlapping_actions_are_blended_as_virtual_time_says() -> None:
-    setting, sent = Setting(PERIOD_NS, HORIZON), []
+    setting, sent = ControlSetting(PERIOD_NS, HORIZON), []
     chosen = mode("aggregate?trigger=3")
     rng = np.random.default_rng(0)
     chunks = rng.normal(size=(12, HORIZON, 2)).astype(np.float32)
@@ -147,7 +147,7 @@ def test_failure_of_a_robot_reaches_who_waits_and_the_interpreter_is_as_before()
         seen.append(sys.getswitchinterval())
         raise ValueError("the arm fell off")
 
-    setting = Setting(1_000_000, 3)
+    setting = ControlSetting(1_000_000, 3)
     loop = ControlLoop(mode("sync"), setting, broken, lambda *_: None, 10)
     loop.start()
     with pytest.raises(ValueError, match="fell off"):
@@ -158,7 +158,7 @@ def test_failure_of_a_robot_reaches_who_waits_and_the_interpreter_is_as_before()
 
 def test_stop_ends_it_before_its_time() -> None:
     asked = Event()
-    setting = Setting(1_000_000, 3)
+    setting = ControlSetting(1_000_000, 3)
     loop = ControlLoop(mode("sync"), setting, lambda *_: None, lambda *_: asked.set(), 10**9, SystemClock())
     loop.start()
     assert asked.wait(10)
@@ -168,7 +168,7 @@ def test_stop_ends_it_before_its_time() -> None:
 
 
 def test_what_was_told_before_is_passed_over_and_old_chunks_are_forgotten() -> None:
-    setting, sent = Setting(PERIOD_NS, 3), []
+    setting, sent = ControlSetting(PERIOD_NS, 3), []
     one, other = [[np.full(1, value, np.float32)] * 3 for value in (1, 2)]
 
     def ask(request: int, tick: int) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from s2a_bench.act import ROBOTS, events
-from s2a_bench.act.call import Motion
+from s2a_bench.act.call import SkillMotion
 from s2a_bench.act.events import ScriptedInbox
 from s2a_bench.clock import VirtualClock, now_ns
 from s2a_bench.plan import load_skills
@@ -23,9 +23,9 @@ def test_the_example_package_makes_a_robot(capsys: pytest.CaptureFixture[str]) -
     exec(ARM, names)  # noqa: S102 - our own page
     household = load_skills("household")
     names["MyArm"]().open_skills(household).hold("coast")
-    motion = Motion(household.calls[-1], now_ns())
+    motion = SkillMotion(household.calls[-1], now_ns())
     names["pick"](motion)
-    stopped = Motion(household.calls[-1], now_ns() + 10**12)
+    stopped = SkillMotion(household.calls[-1], now_ns() + 10**12)
     stopped.abort()
     names["pick"](stopped)
     assert capsys.readouterr().out.splitlines()[-1] == "stopping"

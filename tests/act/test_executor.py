@@ -25,7 +25,7 @@ from s2a_bench.act.record import Record
 from s2a_bench.act.timed import TimedRobot
 from s2a_bench.clock import VirtualClock
 from s2a_bench.policy import Plans, PlanShape, Start, Stepper, policy
-from s2a_bench.policy.naive import Naive, Queue
+from s2a_bench.policy.naive import Naive, NominalQueue
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.testing.policy import one, seeded
 from tests.act.drive import (
@@ -58,7 +58,7 @@ class Elastic:
         return ElasticQueue()
 
 
-class ElasticQueue(Queue):
+class ElasticQueue(NominalQueue):
     def decide(self, now_s: float) -> Start | float:
         answer = super().decide(now_s)
         return replace(answer, latest_s=1.5 * answer.duration_s) if isinstance(answer, Start) else answer

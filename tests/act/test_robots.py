@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from s2a_bench.act import SkillKind, SkillRobot, kind, ros
-from s2a_bench.act.call import CallableRobot, Motion, SkillFunction
+from s2a_bench.act.call import CallableRobot, SkillFunction, SkillMotion
 from s2a_bench.act.events import AbortAsked, LiveInbox, Requested, SkillCame, StreamEnded
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record
@@ -61,7 +61,7 @@ class TestFunctions:
     def test_each_call_is_made_with_its_arguments_in_order(self) -> None:
         seen: list[object] = []
 
-        def wave(motion: Motion) -> None:
+        def wave(motion: SkillMotion) -> None:
             seen.append(motion.arguments["thing"])
             assert motion.wait()
 
@@ -74,7 +74,7 @@ class TestFunctions:
             assert run.due_ns <= run.ordered_ns <= run.start_ns
 
     def test_a_function_that_raises_fails_the_plan(self) -> None:
-        def wave(motion: Motion) -> None:
+        def wave(motion: SkillMotion) -> None:
             raise RuntimeError(f"no grip on the {motion.arguments['thing']}")
 
         record = execute(CallableRobot(QUICK, {"wave": wave}), [CUP, BOX])
@@ -93,7 +93,7 @@ class TestFunctions:
     def test_a_function_that_does_not_end_is_told_to_and_given_up(self) -> None:
         told = Flag()
 
-        def wave(motion: Motion) -> None:
+        def wave(motion: SkillMotion) -> None:
             while motion.wait():
                 pass
             told.set()
@@ -105,7 +105,7 @@ class TestFunctions:
     def test_an_abort_reaches_the_function(self) -> None:
         begun, stopped = Flag(), Flag()
 
-        def wave(motion: Motion) -> None:
+        def wave(motion: SkillMotion) -> None:
             begun.set()
             motion.retime(now_ns() + 3600 * 10**9)
             assert not motion.wait()
@@ -117,7 +117,7 @@ class TestFunctions:
         assert stopped.wait(10)
 
     def test_waiting_follows_a_moved_end(self) -> None:
-        motion = Motion(CUP, now_ns() + 3600 * 10**9)
+        motion = SkillMotion(CUP, now_ns() + 3600 * 10**9)
         assert motion.remaining_s > 3000
         Thread(target=motion.retime, args=(now_ns(),)).start()
         assert motion.wait()
@@ -125,18 +125,18 @@ class TestFunctions:
 
     def test_waiting_for_longer_than_the_end_ends_with_it(self) -> None:
         end_ns = now_ns() + 20 * NS
-        assert Motion(CUP, end_ns).wait(3600)
+        assert SkillMotion(CUP, end_ns).wait(3600)
         assert now_ns() >= end_ns
 
     def test_what_remains_is_in_seconds_and_never_less_than_none(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        motion = Motion(CUP, 3_500_000_000)
+        motion = SkillMotion(CUP, 3_500_000_000)
         monkeypatch.setattr("s2a_bench.act.call.now_ns", lambda: 1_000_000_000)
         assert motion.remaining_s == 2.5
         motion.retime(999_999_999)
         assert motion.remaining_s == 0
 
     def test_waiting_a_while_does_not_wait_for_the_end(self) -> None:
-        motion = Motion(CUP, now_ns() + 3600 * 10**9)
+        motion = SkillMotion(CUP, now_ns() + 3600 * 10**9)
         assert motion.wait(0.001)
         assert not motion.aborted
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.act import ActionKind, kind, open_robot
-from s2a_bench.act.ros import TRAJECTORY, Ros
+from s2a_bench.act.ros import TRAJECTORY, RosRobot
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RobotError, UsageError
 from s2a_bench.ros import QoS, open_middleware
@@ -140,7 +140,7 @@ def test_what_makes_no_sense_is_refused_by_its_parameter(written: str, message: 
 
 def test_other_joints_than_the_action_has_are_refused() -> None:
     with pytest.raises(UsageError, match="`robot`: ros: joints = 'a:b' names 2 joints of 3"):
-        Ros(joints="a:b").open_actions(3, 1)
+        RosRobot(joints="a:b").open_actions(3, 1)
 
 
 def test_what_is_about_skills_is_refused() -> None:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from s2a_bench.testing.transport import Recorder
+from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.types import Request, Token
 from tests.cli.program import program
 from tests.servers.sockets import Received, head, serving
@@ -57,7 +57,7 @@ class Caching(Cloud):
 
 @contextmanager
 def caching(server: Caching) -> Iterator[str]:
-    chat = answering(server, Recorder(["go", "_to"]))
+    chat = answering(server, RecordingHandler(["go", "_to"]))
 
     def reply(received: Received) -> Any:
         if received.path == "/metrics":

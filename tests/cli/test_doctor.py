@@ -16,7 +16,7 @@ from s2a_bench.cli import app
 from s2a_bench.cli.doctor import all_checks
 from s2a_bench.machine.doctor import Finding, Level
 from s2a_bench.machine.resources import RESOURCES
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from tests.cli.program import program, refused
 
 ROOT = Path(__file__).parent.parent.parent
@@ -72,7 +72,7 @@ def test_the_exit_code_is_the_severitys(level: Level, plain: int, strict: int, m
     assert f"{level:8}load  busy -> wait" in shown.splitlines()
 
 
-def run_folder(tmp_path: Path) -> Run:
+def run_folder(tmp_path: Path) -> StoredRun:
     (folder,) = tmp_path.iterdir()
     return read_run(folder)
 

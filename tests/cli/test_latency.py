@@ -20,7 +20,7 @@ import pytest
 from s2a_bench.clock import now_ns
 from s2a_bench.experiments.requests import cells_of
 from s2a_bench.harness.session import INTERRUPTED
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import budget
 from tests.cli.program import program, refused
 
@@ -37,7 +37,7 @@ def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedPro
     return program("latency", *arguments, "--output", output, code=code)
 
 
-def only_run(output: Path) -> Run:
+def only_run(output: Path) -> StoredRun:
     """Return the run, all of whose facts are declared."""
     (folder,) = output.iterdir()
     kept = read_run(folder)
@@ -46,14 +46,14 @@ def only_run(output: Path) -> Run:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, str]:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[StoredRun, str]:
     """Measure all pipelines; return the run and what was printed."""
     output = tmp_path_factory.mktemp("whole")
     done = run(*DRAWN, "--transport", "http,ros,loopback", "--requests", "8", "--verbose", output=output)
     return only_run(output), done.stdout
 
 
-def test_one_run_compares_all_pipelines(whole: tuple[Run, str]) -> None:
+def test_one_run_compares_all_pipelines(whole: tuple[StoredRun, str]) -> None:
     kept, said = whole
     names = {"http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "loopback"}
     assert kept.manifest["state"] == "finished"
@@ -91,7 +91,7 @@ def test_a_server_whose_latencies_are_known_answers_after_them_and_is_emulated_i
         assert "Echo engine, EMULATED: latencies 20 ms" in path.read_text(), path
 
 
-def test_blocks_hold_every_cell_once_in_changing_order(whole: tuple[Run, str]) -> None:
+def test_blocks_hold_every_cell_once_in_changing_order(whole: tuple[StoredRun, str]) -> None:
     samples = whole[0].samples
     orders = []
     for block, rows in samples.groupby("block"):
@@ -113,7 +113,7 @@ def test_the_same_seed_gives_the_same_order_and_frames(tmp_path: Path) -> None:
     assert list(first["frame_index"]) == list(second["frame_index"])
 
 
-def test_every_sample_closes_its_budget(whole: tuple[Run, str]) -> None:
+def test_every_sample_closes_its_budget(whole: tuple[StoredRun, str]) -> None:
     samples = whole[0].samples
     assert (samples["error"] == "").all()
     for row in samples.itertuples():
@@ -121,7 +121,7 @@ def test_every_sample_closes_its_budget(whole: tuple[Run, str]) -> None:
         assert sum(spent.stages_ns.values()) + spent.residual_ns == spent.e2e_ns == row.e2e_ns
 
 
-def test_every_token_has_its_two_times(whole: tuple[Run, str]) -> None:
+def test_every_token_has_its_two_times(whole: tuple[StoredRun, str]) -> None:
     kept, _ = whole
     assert Counter(kept.tokens.groupby(["request_id"]).size()) == {3: len(kept.samples)}
     assert (kept.tokens["client_ns"] > kept.tokens["engine_ns"]).all()
@@ -205,7 +205,7 @@ def test_the_untuned_case_is_recorded_as_such(tmp_path: Path) -> None:
     assert "FragmentSize" not in manifest["servers"]["ros"]["transport"]["configuration"]
 
 
-def test_the_manifest_tells_the_machine(whole: tuple[Run, str]) -> None:
+def test_the_manifest_tells_the_machine(whole: tuple[StoredRun, str]) -> None:
     manifest = whole[0].manifest
     assert manifest["tuning"]["dds"] == "tuned"
     assert "65000B" in manifest["servers"]["ros"]["transport"]["configuration"]
@@ -233,7 +233,7 @@ def start_long(output: Path, *arguments: str) -> tuple[subprocess.Popen[str], Pa
     raise AssertionError(process.communicate()[1])
 
 
-def check_kept(folder: Path, state: str) -> Run:
+def check_kept(folder: Path, state: str) -> StoredRun:
     kept = read_run(folder)
     assert kept.manifest["state"] == state
     assert len(kept.samples) >= 29

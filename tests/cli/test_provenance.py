@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 import s2a_bench
-from s2a_bench.store.run import Run, read_run
-from s2a_bench.testing.transport import Recorder
+from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing.transport import RecordingHandler
 from tests.cli.program import called, program, refused
 from tests.servers.sockets import serving as serving_socket
 from tests.servers.speakers import Cloud, answering
@@ -35,7 +35,7 @@ def serving(*arguments: str) -> Iterator[str]:
         process.communicate()
 
 
-def measured(output: Path, *arguments: str) -> tuple[Run, str]:
+def measured(output: Path, *arguments: str) -> tuple[StoredRun, str]:
     """Measure and return the run with what was printed."""
     done = program("latency", *SMALL, *arguments, "--output", output)
     (folder,) = output.iterdir()
@@ -43,13 +43,13 @@ def measured(output: Path, *arguments: str) -> tuple[Run, str]:
 
 
 @pytest.fixture(scope="module")
-def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, str]:
+def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[StoredRun, str]:
     with serving("http", "--engine", "replay", "--profile", "rtx-4080", "--port", "0") as line:
         url = line.split()[2].rstrip(";").split("/v1")[0]
         return measured(tmp_path_factory.mktemp("replayed"), "--transport", "http/as-deployed", "--url", url)
 
 
-def test_a_replay_behind_a_url_is_emulated_in_every_place(replayed: tuple[Run, str], tmp_path: Path) -> None:
+def test_a_replay_behind_a_url_is_emulated_in_every_place(replayed: tuple[StoredRun, str], tmp_path: Path) -> None:
     run, said = replayed
     (origin,) = run.origins.every
     assert (origin.engine, origin.tokens, origin.profile) == ("replay", "emulated", "rtx-4080")
@@ -70,7 +70,7 @@ def test_a_replay_behind_a_url_is_emulated_in_every_place(replayed: tuple[Run, s
     assert shown["provenance"]["cells"]["http/as-deployed"]["tokens"] == "emulated"
 
 
-def test_it_is_not_compared_with_a_measured_run(replayed: tuple[Run, str], tmp_path: Path) -> None:
+def test_it_is_not_compared_with_a_measured_run(replayed: tuple[StoredRun, str], tmp_path: Path) -> None:
     own, _ = measured(tmp_path, "--transport", "http/as-deployed", "--engine", "echo", "--data-only")
     said = refused("compare", own.path, replayed[0].path, code=1)
     assert "provenance tokens: measured against emulated" in said
@@ -94,7 +94,7 @@ def test_a_replay_behind_an_action_is_emulated_too(tmp_path: Path) -> None:
 
 
 def test_a_server_that_does_not_tell_is_unknown_never_the_default(tmp_path: Path) -> None:
-    with serving_socket(answering(Cloud(), Recorder(["x", "y"]))) as url:
+    with serving_socket(answering(Cloud(), RecordingHandler(["x", "y"]))) as url:
         run, said = measured(
             tmp_path, "--transport", "http/as-deployed", "--url", url, "--dialect", "openai", "--data-only"
         )

@@ -15,7 +15,7 @@ from threading import Event
 import pytest
 
 from s2a_bench.store.run import read_run
-from s2a_bench.testing.transport import Recorder
+from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.types import Token
 from tests.cli.program import program, refused
 from tests.servers.sockets import Received, head, serving
@@ -32,7 +32,7 @@ def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedPro
 
 def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
     keys = []
-    reply = answering(Ollama(), Recorder(["go", "_to"]))
+    reply = answering(Ollama(), RecordingHandler(["go", "_to"]))
 
     def keyed(received: Received) -> object:
         keys.append(received.headers["authorization"])
@@ -59,7 +59,7 @@ def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
 
 
 def test_an_unknown_server_is_asked_what_it_is(tmp_path: Path) -> None:
-    chat = answering(LlamaServer(), Recorder(["go"]))
+    chat = answering(LlamaServer(), RecordingHandler(["go"]))
 
     def reply(received: Received) -> object:
         if received.path == "/v1/models":
@@ -136,7 +136,7 @@ def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: P
 
 
 def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path) -> None:
-    reply = answering(Cloud(), Recorder(["go", "_to", "x"]))
+    reply = answering(Cloud(), RecordingHandler(["go", "_to", "x"]))
     with serving(reply) as url:
         done = program("throughput", *SMALL, "--url", url, "--output", tmp_path)
     said = " ".join(done.stdout.split())

@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 
 from s2a_bench.experiments.throughput.metrics import REFERENCE
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from tests.cli.program import program
 from tests.llama_bench_stand_in import install
 
@@ -26,7 +26,7 @@ def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedPro
     return program("throughput", *arguments, "--output", output, code=code)
 
 
-def only_run(output: Path) -> Run:
+def only_run(output: Path) -> StoredRun:
     (folder,) = output.iterdir()
     return read_run(folder)
 

@@ -12,7 +12,7 @@ import pytest
 
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.store.requests import SKILLS
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from tests.cli.program import called
 from tests.policy.test_tables import CASES, shown
 
@@ -28,7 +28,7 @@ def schema() -> dict[str, Any]:
     return found
 
 
-def only_run(output: Path) -> Run:
+def only_run(output: Path) -> StoredRun:
     (folder,) = output.iterdir()
     return read_run(folder)
 

@@ -9,12 +9,12 @@ import pytest
 
 from s2a_bench.experiments.latency.view.against_bytes import against_bytes, crossings, shown
 from s2a_bench.experiments.requests import split
-from s2a_bench.store.run import Run
+from s2a_bench.store.run import StoredRun
 from s2a_bench.transport import TRANSPORTS
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import _OTHER_LOOKS
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., StoredRun]
 FIXED = {"http/binary": 1.0, "ros/topic": 0.2, "loopback": 0.1}
 A_MB = {"http/binary": 0.3, "ros/topic": 0.9, "loopback": 0.2}
 
@@ -24,7 +24,7 @@ def asked(width: int, height: int, cameras: int, **more: Any) -> dict[str, Any]:
 
 
 @pytest.fixture
-def runs(make_run: MakeRun) -> list[Run]:
+def runs(make_run: MakeRun) -> list[StoredRun]:
     made = []
     for width, height, cameras in ((224, 224, 1), (640, 480, 1), (640, 480, 3), (1920, 1080, 3)):
         pixels = width * height * 3 * cameras
@@ -38,7 +38,7 @@ def runs(make_run: MakeRun) -> list[Run]:
     return made
 
 
-def test_lines_are_what_made_the_times(runs: list[Run]) -> None:
+def test_lines_are_what_made_the_times(runs: list[StoredRun]) -> None:
     found = {each.name: each for each in against_bytes(split(runs))}
     assert list(found) == ["http/binary", "ros/topic", "loopback"]
     for name, each in found.items():
@@ -75,7 +75,7 @@ def test_runs_of_one_size_show_nothing(make_run: MakeRun) -> None:
     assert against_bytes(split([make_run(n=5)])) == []  # a folder that says no size
 
 
-def test_tables_and_figure_say_what_answered(runs: list[Run]) -> None:
+def test_tables_and_figure_say_what_answered(runs: list[StoredRun]) -> None:
     tables, figures = shown(split(runs))
     assert set(tables) == {"bytes", "crossings"}
     assert tables["bytes"].rows[0] == (

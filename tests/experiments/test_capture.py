@@ -15,7 +15,7 @@ from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import EngineError, StoreError, UsageError
 from s2a_bench.experiments.profile_capture import CaptureConfig
 from s2a_bench.experiments.profile_capture.run import (
-    Answer,
+    TimedAnswer,
     answers,
     document,
     open_model,
@@ -31,11 +31,11 @@ MODEL = {"engine": "llama", "dummy": True, "name": "tiny", "secret": "no fact of
 PAUSES = Quantiles(0.02, (0, 0.5, 0.96, 0.97, 1), (1, 1.02, 1.3, 6, 20))
 
 
-def recording(gaps: Gaps, seed: int, requests: int, tokens: int = 64) -> list[Answer]:
+def recording(gaps: Gaps, seed: int, requests: int, tokens: int = 64) -> list[TimedAnswer]:
     """Make answers up: TTFT .5 s on average, gaps of a family."""
     rng = np.random.default_rng(seed)
     rows = (gaps.sample(rng, tokens - 1, requests).T * 1e9).round().astype(int).tolist()
-    return [Answer(int(rng.normal(5e8, 2e7)), row) for row in rows]
+    return [TimedAnswer(int(rng.normal(5e8, 2e7)), row) for row in rows]
 
 
 def replayed_ns(path: Path, gaps: str, requests: int, tokens: int) -> list[list[int]]:
@@ -49,7 +49,7 @@ def replayed_ns(path: Path, gaps: str, requests: int, tokens: int) -> list[list[
     return played
 
 
-def saved(path: Path, recorded: list[Answer], **settings: Any) -> Path:
+def saved(path: Path, recorded: list[TimedAnswer], **settings: Any) -> Path:
     config = CaptureConfig(name="board", **{"requests": len(recorded) - 2, "warmup": 2, **settings})
     write_profile(document(config, recorded, MODEL, ["load: high; wait"]), path, force=False)
     return path
@@ -123,7 +123,7 @@ def test_a_folder_that_cannot_be_is_named(tmp_path: Path) -> None:
 
 
 def test_answers_too_short_to_time_say_what_to_do() -> None:
-    short = [Answer(10**8, [10**7] * 3) for _ in range(12)]
+    short = [TimedAnswer(10**8, [10**7] * 3) for _ in range(12)]
     with pytest.raises(
         EngineError, match="the answers were short: 30 gaps in 10 requests, a profile needs 40; give more"
     ):

@@ -36,23 +36,23 @@ from s2a_bench.scenario.ccrb.drive import drive
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.words import MARK, NO_SCORE
 from s2a_bench.scenario.longitudinal import Longitudinal
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from tests.made_runs import SCHEMA
 
 GRID = {"phase": True, "phase_points": (21, 13)}
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Run]:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., StoredRun]:
     @cache
-    def make(**asked: Any) -> Run:
+    def make(**asked: Any) -> StoredRun:
         with RunProgress() as progress:
             return read_run(run_ccrb(CcrbConfig(**asked), tmp_path_factory.mktemp("runs"), progress))
 
     return make
 
 
-def test_at_the_operating_point_the_papers_outcome_comes_about(made: Callable[..., Run]) -> None:
+def test_at_the_operating_point_the_papers_outcome_comes_about(made: Callable[..., StoredRun]) -> None:
     rows = made().table(ROLLOUTS).set_index("policy")
     assert rows["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "none"}
     assert rows["stalls"].to_dict() == {"naive": 4, "wait-then-act": 0, "stream-to-act": 0}
@@ -62,7 +62,7 @@ def test_at_the_operating_point_the_papers_outcome_comes_about(made: Callable[..
 
 
 def test_with_full_braking_in_gaps_the_ordering_holds_for_a_band_of_rates_and_waiting_is_never_better(
-    made: Callable[..., Run],
+    made: Callable[..., StoredRun],
 ) -> None:
     run = made(**GRID)
     low, high = rate_span_here(run, "stop") or (0.0, 0.0)
@@ -75,7 +75,7 @@ def test_with_full_braking_in_gaps_the_ordering_holds_for_a_band_of_rates_and_wa
 
 @pytest.mark.parametrize("gap", GAPS)
 def test_acting_at_once_is_better_more_often_and_the_ordering_next_to_nowhere_unless_gaps_brake(
-    made: Callable[..., Run], gap: str
+    made: Callable[..., StoredRun], gap: str
 ) -> None:
     run = made(**GRID)
     scenes = scenes_of(run, "phase", gap)
@@ -85,7 +85,7 @@ def test_acting_at_once_is_better_more_often_and_the_ordering_next_to_nowhere_un
         assert share_of(scenes, "paper").value < 0.02
 
 
-def test_with_the_hybrid_follower_the_operating_point_turns_round(made: Callable[..., Run]) -> None:
+def test_with_the_hybrid_follower_the_operating_point_turns_round(made: Callable[..., StoredRun]) -> None:
     run = made(scenario=CcrbOptions(follower="hybrid"), **GRID)
     point = run.table(ROLLOUTS)[run.table(ROLLOUTS)["study"] == "point"].set_index("policy")
     assert point["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "rear"}
@@ -96,7 +96,7 @@ def test_with_the_hybrid_follower_the_operating_point_turns_round(made: Callable
 
 @pytest.mark.parametrize(("follower", "passes"), [("careful", True), ("hdm", True), ("idm", True), ("hybrid", False)])
 def test_a_rear_outcome_behind_which_no_ego_is_safe_says_nothing(
-    made: Callable[..., Run], follower: str, passes: bool
+    made: Callable[..., StoredRun], follower: str, passes: bool
 ) -> None:
     run = made(scenario=CcrbOptions(follower=follower))
     assert all(cell["follower_survives"] is passes for cell in cells_of(run))
@@ -107,7 +107,7 @@ def test_a_rear_outcome_behind_which_no_ego_is_safe_says_nothing(
     assert NO_SCORE in table.notes
 
 
-def test_the_diagram_says_where_the_follower_passes_its_check(made: Callable[..., Run]) -> None:
+def test_the_diagram_says_where_the_follower_passes_its_check(made: Callable[..., StoredRun]) -> None:
     careful, hybrid = (
         share_of(scenes_of(made(scenario=CcrbOptions(follower=name), **GRID), "phase", "stop"), "survives").value
         for name in ("careful", "hybrid")
@@ -118,7 +118,7 @@ def test_the_diagram_says_where_the_follower_passes_its_check(made: Callable[...
     assert rows["follower survives fast tokens"] == f"{careful:.1%}"
 
 
-def test_in_random_scenarios_the_ordering_is_rare_and_waiting_is_worse(made: Callable[..., Run]) -> None:
+def test_in_random_scenarios_the_ordering_is_rare_and_waiting_is_worse(made: Callable[..., StoredRun]) -> None:
     scenes = scenes_of(made(random=150), "random", "stop")
     assert len(scenes) == 150
     paper, worse, better = (share_of(scenes, name) for name in ("paper", "wait_worse", "wait_better"))
@@ -135,7 +135,7 @@ def test_random_scenarios_repeat_by_their_seed(tmp_path: Path) -> None:
     assert again[0] == again[1] != again[2]
 
 
-def test_what_never_stalls_comes_out_alike_with_every_gap_behaviour(made: Callable[..., Run]) -> None:
+def test_what_never_stalls_comes_out_alike_with_every_gap_behaviour(made: Callable[..., StoredRun]) -> None:
     run = made(**GRID)
     columns = ["wait-then-act", "stream-to-act"]
     first = scenes_of(run, "phase", "stop")[columns]
@@ -143,13 +143,13 @@ def test_what_never_stalls_comes_out_alike_with_every_gap_behaviour(made: Callab
         assert scenes_of(run, "phase", gap)[columns].equals(first)
 
 
-def test_studies_are_driven_fast_enough_to_be_of_use(made: Callable[..., Run]) -> None:
+def test_studies_are_driven_fast_enough_to_be_of_use(made: Callable[..., StoredRun]) -> None:
     studies = made(**GRID).manifest["studies"]
     assert studies["rollouts"] == 21 * 13 * 7  # the check on the car behind included
     assert studies["rollouts_per_cpu_s"] > 0
 
 
-def test_the_findings_name_every_gap_behaviour(made: Callable[..., Run]) -> None:
+def test_the_findings_name_every_gap_behaviour(made: Callable[..., StoredRun]) -> None:
     run = made(**GRID)
     said = findings(run)
     assert [line.split(":")[0] for line in said] == list(GAPS)
@@ -158,7 +158,7 @@ def test_the_findings_name_every_gap_behaviour(made: Callable[..., Run]) -> None
     assert findings(made()) == []
 
 
-def test_the_regions_of_the_diagram_cover_it_and_the_figures_can_be_drawn(made: Callable[..., Run]) -> None:
+def test_the_regions_of_the_diagram_cover_it_and_the_figures_can_be_drawn(made: Callable[..., StoredRun]) -> None:
     run = made(**GRID)
     scenes = scenes_of(run, "phase", "stop")
     named = region_of(scenes)
@@ -172,7 +172,7 @@ def test_the_interval_is_clopper_pearsons() -> None:
     assert Share(0, 100).interval == pytest.approx((0.0, 1 - 0.025 ** (1 / 100)))
 
 
-def test_the_deadline_makes_stream_to_act_start_earlier_where_it_must(made: Callable[..., Run]) -> None:
+def test_the_deadline_makes_stream_to_act_start_earlier_where_it_must(made: Callable[..., StoredRun]) -> None:
     rows = made(ttc=True, scenario=CcrbOptions(front_gap_m=30.0)).table(ROLLOUTS).set_index("policy")
     stream, timed = rows.loc["stream-to-act"], rows.loc["s2a-ttc"]
     assert timed["deadline_ns"] < stream["start_ns"]
@@ -186,7 +186,7 @@ def test_the_deadline_makes_stream_to_act_start_earlier_where_it_must(made: Call
     assert late["start_ns"] == 1_750_000_000
 
 
-def test_the_metrics_are_keys_of_the_cells_and_columns_of_the_tables(made: Callable[..., Run]) -> None:
+def test_the_metrics_are_keys_of_the_cells_and_columns_of_the_tables(made: Callable[..., StoredRun]) -> None:
     run = made()
     keys = {key for cell in ccrb_json(run)["cells"] for key in cell}
     assert {metric.name for metric in METRICS} <= keys
@@ -196,7 +196,7 @@ def test_the_metrics_are_keys_of_the_cells_and_columns_of_the_tables(made: Calla
     assert tables["outcomes"].rows[0][:4] == ("naive", "hit from behind", "1.75", "4")
 
 
-def test_the_run_shows_what_its_options_ask_for(made: Callable[..., Run]) -> None:
+def test_the_run_shows_what_its_options_ask_for(made: Callable[..., StoredRun]) -> None:
     assert set(show(made()).tables) == {"margins", "outcomes"}
     assert set(show(made(**GRID)).figures) == {"scenario", "phase"}
     assert set(show(made(), animation=True).files) == {"figures/scenario.gif", "figures/scenario.mp4"}
@@ -227,14 +227,16 @@ def test_what_makes_no_sense_is_refused(asked: dict[str, Any], message: str) -> 
 FEW: dict[str, Any] = {"seeds": 2, "seed_points": 16}
 
 
-def json_of(run: Run) -> dict[str, Any]:
+def json_of(run: StoredRun) -> dict[str, Any]:
     """What --json prints, as its schema describes it."""
     whole: dict[str, Any] = json.loads(json.dumps(ccrb_json(run)))
     jsonschema.validate(whole, SCHEMA)
     return whole
 
 
-def test_every_follower_meets_the_four_combinations_and_says_whether_it_survives(made: Callable[..., Run]) -> None:
+def test_every_follower_meets_the_four_combinations_and_says_whether_it_survives(
+    made: Callable[..., StoredRun],
+) -> None:
     run = made(all_followers=True, **FEW)
     rows = run.table(FOLLOWER_STUDY)
     assert len(rows) == 4 * 4 * 3 * (FEW["seeds"] + 1)
@@ -255,7 +257,7 @@ def test_every_follower_meets_the_four_combinations_and_says_whether_it_survives
     assert sum(row["rear"] for row in told) == rows["rear"].sum()
 
 
-def test_who_never_stalls_is_not_hit_where_the_follower_survives(made: Callable[..., Run]) -> None:
+def test_who_never_stalls_is_not_hit_where_the_follower_survives(made: Callable[..., StoredRun]) -> None:
     rows = made(all_followers=True, **FEW).table(FOLLOWER_STUDY)
     assert rows[rows["policy"] != "naive"]["rear_survived"].sum() == 0
     assert (rows["rear_survived"] <= rows["survived"]).all()
@@ -265,7 +267,7 @@ def test_who_never_stalls_is_not_hit_where_the_follower_survives(made: Callable[
 
 
 @pytest.mark.slow
-def test_six_numbers_are_varied_over_the_same_points(made: Callable[..., Run]) -> None:
+def test_six_numbers_are_varied_over_the_same_points(made: Callable[..., StoredRun]) -> None:
     run = made(sensitivity=True, seeds=2, seed_points=64)
     rows = run.table(SENSITIVITY)
     assert list(rows["varied"].unique()) == list(VARIED)

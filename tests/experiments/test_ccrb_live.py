@@ -11,7 +11,7 @@ import pytest
 
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import TransportError
-from s2a_bench.experiments.ccrb.config import Asked, CcrbConfig
+from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.ccrb.view.figures import build_scenario
@@ -20,32 +20,32 @@ from s2a_bench.experiments.ccrb.view.tables import ccrb_json
 from s2a_bench.inference import EngineConfig
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.requests import SKILLS, TOKENS
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import Trace
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Request, Token
 from tests.made_runs import SCHEMA
 
 N, L, T_NS = 3, 6, 800_000_000
-REPLAYED = Asked(live=True, transport="loopback", engine=EngineConfig(name="replay"))
+REPLAYED = PlanRequest(live=True, transport="loopback", engine=EngineConfig(name="replay"))
 
 
-def drive(asked: Asked, folder: Path, profile: str = "jetson-agx-orin") -> Run:
+def drive(asked: PlanRequest, folder: Path, profile: str = "jetson-agx-orin") -> StoredRun:
     config = CcrbConfig(scenario=CcrbOptions(n_skills=N), tokens_per_skill=L, asked=asked, profile=profile)
     with RunProgress() as progress:
         return read_run(run_ccrb(config, folder, progress))
 
 
 @pytest.fixture(scope="module")
-def paced(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def paced(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     """The tiny dummy model, held back to 40 tokens a second."""
     return drive(
-        Asked(live=True, transport="loopback", engine=EngineConfig(threads=1, pace=40.0)),
+        PlanRequest(live=True, transport="loopback", engine=EngineConfig(threads=1, pace=40.0)),
         tmp_path_factory.mktemp("runs"),
     )
 
 
-def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: Run) -> None:
+def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: StoredRun) -> None:
     token_ns = np.rint(np.array(token_times_s(paced)) * 1e9).astype(np.int64)
     assert len(token_ns) == N * L
     arrivals_ns = token_ns[L - 1 :: L]
@@ -61,11 +61,11 @@ def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: Run
     assert by_policy["wait-then-act"]["start_ns"].iloc[0] == pytest.approx(arrivals_ns[-1], abs=2)
 
 
-def test_what_is_driven_is_the_scenarios_plan_and_not_the_models(paced: Run) -> None:
+def test_what_is_driven_is_the_scenarios_plan_and_not_the_models(paced: StoredRun) -> None:
     assert list(paced.table(SKILLS)["text"][:N]) == ["set_speed(33.3)", "set_speed(16.7)", "set_speed(0)"]
 
 
-def test_each_request_has_a_picture_of_its_own_and_the_warm_up_is_marked(paced: Run) -> None:
+def test_each_request_has_a_picture_of_its_own_and_the_warm_up_is_marked(paced: StoredRun) -> None:
     samples = paced.samples
     assert list(samples["frame_index"]) == [0, 1]
     assert list(samples["warmup"]) == [True, False]
@@ -73,7 +73,7 @@ def test_each_request_has_a_picture_of_its_own_and_the_warm_up_is_marked(paced: 
     assert paced.manifest["configuration"]["live"]["source"] == "scenario"
 
 
-def test_a_paced_dummy_is_live_and_says_what_is_set_and_what_means_nothing(paced: Run) -> None:
+def test_a_paced_dummy_is_live_and_says_what_is_set_and_what_means_nothing(paced: StoredRun) -> None:
     notes = " ".join(origin_notes(paced))
     assert "LIVE tokens over loopback, paced to 40 tokens/s (the rate is set); car simulated." in notes
     assert "Dummy weights: what the plan says means nothing" in notes
@@ -87,7 +87,7 @@ def test_a_paced_dummy_is_live_and_says_what_is_set_and_what_means_nothing(paced
     assert (printed["live"]["dummy"], printed["live"]["robot"]) == (True, "longitudinal simulator")
 
 
-def test_the_figure_marks_every_token(paced: Run) -> None:
+def test_the_figure_marks_every_token(paced: StoredRun) -> None:
     axes = build_scenario(paced).axes
     marks = [line for line in axes[0].lines if line.get_marker() == "|"]
     assert [len(line.get_xdata()) for line in marks] == [N * L]  # type: ignore[arg-type]

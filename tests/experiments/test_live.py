@@ -12,7 +12,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from s2a_bench.act.call import Motion
+from s2a_bench.act.call import SkillMotion
 from s2a_bench.errors import EngineError, ServerDied, SourceError, TransportError, UsageError
 from s2a_bench.experiments.timeline.live import run_live
 from s2a_bench.experiments.timeline.rows import TIMELINES
@@ -27,9 +27,9 @@ from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
 from s2a_bench.policy import Plans
-from s2a_bench.policy.tracking import Tracked
+from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.store.requests import SKILLS
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import Trace
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Frame, Request, Token
@@ -74,12 +74,12 @@ def config(fast_board: str) -> TimelineConfig:
     )
 
 
-def live(config: TimelineConfig, output: Path) -> tuple[Run, Watched]:
+def live(config: TimelineConfig, output: Path) -> tuple[StoredRun, Watched]:
     view = Watched()
     return read_run(run_live(config, output / "runs", view)), view
 
 
-def check(run: Run, transport: str) -> None:
+def check(run: StoredRun, transport: str) -> None:
     """Check what holds of every live run that went well."""
     assert run.manifest["state"] == "finished"
     assert [found["outcome"] for found in run.manifest["executions"].values()] == ["completed"] * 3
@@ -120,7 +120,7 @@ def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: Ti
 acted: list[str] = []
 
 
-def act(motion: Motion) -> None:
+def act(motion: SkillMotion) -> None:
     """Stand in for somebody's robot."""
     acted.append(str(motion.call))
     assert motion.wait()
@@ -366,20 +366,22 @@ def test_skills_keep_their_own_durations_unless_they_are_given(config: TimelineC
 
 
 @pytest.fixture
-def taught(monkeypatch: pytest.MonkeyPatch) -> list[Tracked]:
-    """Every `Tracked` that learned from a plan, in order."""
-    whole = Tracked.learn
-    found: list[Tracked] = []
+def taught(monkeypatch: pytest.MonkeyPatch) -> list[TrackedPolicy]:
+    """Every `TrackedPolicy` that learned from a plan, in order."""
+    whole = TrackedPolicy.learn
+    found: list[TrackedPolicy] = []
 
-    def learn(self: Tracked, plan: Plans, *, stalled: bool) -> None:
+    def learn(self: TrackedPolicy, plan: Plans, *, stalled: bool) -> None:
         whole(self, plan, stalled=stalled)
         found.append(self)
 
-    monkeypatch.setattr(Tracked, "learn", learn)
+    monkeypatch.setattr(TrackedPolicy, "learn", learn)
     return found
 
 
-def test_lambda_is_followed_live_by_each_policy(config: TimelineConfig, taught: list[Tracked], tmp_path: Path) -> None:
+def test_lambda_is_followed_live_by_each_policy(
+    config: TimelineConfig, taught: list[TrackedPolicy], tmp_path: Path
+) -> None:
     live(config.but(policies=("stream-to-act", "stream-to-act?detect=True", "naive"), track=True, requests=2), tmp_path)
     assert [each.made.detect for each in taught] == [False, True] * 2
     assert taught[:2] == taught[2:]
@@ -389,7 +391,7 @@ def test_lambda_is_followed_live_by_each_policy(config: TimelineConfig, taught: 
         assert state["level"] != state["epsilon"] == 0.01
 
 
-def test_lambda_is_followed_in_real_time(fast_board: str, taught: list[Tracked], tmp_path: Path) -> None:
+def test_lambda_is_followed_in_real_time(fast_board: str, taught: list[TrackedPolicy], tmp_path: Path) -> None:
     config = TimelineConfig(
         real_time=True,
         profiles=(fast_board,),

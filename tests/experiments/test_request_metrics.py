@@ -12,7 +12,7 @@ from s2a_bench.experiments.latency.metrics import METRICS, compared, latency_cel
 from s2a_bench.experiments.latency.view import latency_tables
 from s2a_bench.experiments.requests import RequestMetric
 from s2a_bench.store.requests import SampleRow, TokenRow
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from tests.made_runs import STAGES, known
 
 LATE = RequestMetric(
@@ -26,7 +26,7 @@ LATE = RequestMetric(
 
 
 @pytest.fixture
-def run(tmp_path: Path, make_row: Callable[..., SampleRow]) -> Run:
+def run(tmp_path: Path, make_row: Callable[..., SampleRow]) -> StoredRun:
     with RunWriter.create(tmp_path, "latency", known({"stages": STAGES})) as writer:
         for block in range(2):
             row = make_row("ros/topic", {"capture": 1, "inference": 100, "return": 0.5}, block)
@@ -38,7 +38,7 @@ def run(tmp_path: Path, make_row: Callable[..., SampleRow]) -> Run:
     return read_run(writer.path)
 
 
-def test_a_metric_is_added_in_one_place_and_is_nowhere_without_it(run: Run) -> None:
+def test_a_metric_is_added_in_one_place_and_is_nowhere_without_it(run: StoredRun) -> None:
     assert "token_late" not in compared().metrics
     assert "token_late_ms" not in latency_json(run)["cells"][0]
     assert "late median" not in latency_tables(run)["tokens"].header

@@ -22,7 +22,7 @@ from s2a_bench.experiments.timeline.run import recordings, run_timeline
 from s2a_bench.experiments.timeline.to_rows import timeline_rows
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.tables import timeline_tables
-from s2a_bench.harness.timelines.config import Setting, TimelineConfig, settings
+from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, settings
 from s2a_bench.harness.timelines.policies import draw, learn
 from s2a_bench.harness.timelines.rows import KEPT_PLANS
 from s2a_bench.policy import Plans, Schedule
@@ -30,7 +30,7 @@ from s2a_bench.policy.conformal import Calibration
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.policy.stream_to_act import StreamToAct
 from s2a_bench.store.requests import SKILLS, TokenRow
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from tests.made_runs import marks_of, row_of
 
@@ -38,7 +38,7 @@ ORIN = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
 JITTERY = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,), jitter="profile", plans=300)
 
 
-def ran(config: TimelineConfig, output: Path) -> Run:
+def ran(config: TimelineConfig, output: Path) -> StoredRun:
     return read_run(run_timeline(config, output, NullProgress()))
 
 
@@ -281,7 +281,7 @@ def test_a_plan_of_hours_has_no_sampled_motion(tmp_path: Path) -> None:
 
 def test_a_skill_that_fails_at_once_has_a_row_and_no_motion() -> None:
     second = np.ones((1, 1))
-    setting = Setting("", "live", 5.0, None, 6, 4, 1.0, mode="live", emulated=False)
+    setting = PlanSetting("", "live", 5.0, None, 6, 4, 1.0, mode="live", emulated=False)
     (row,) = timeline_rows(setting, "naive", Plans(second, second, second, second), Schedule(second, 0 * second), ["a"])
     kept = asdict(row)
     assert (kept["start_ns"], kept["end_ns"], kept["sparc"], kept["rms_jerk"]) == (10**9, 10**9, None, None)

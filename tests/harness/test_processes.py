@@ -14,7 +14,7 @@ from threading import Timer
 import pytest
 
 from s2a_bench.errors import ServerDied
-from s2a_bench.harness.processes import LlamaServer, OwnServer, ServerProcess, keep_serving
+from s2a_bench.harness.processes import LlamaServerProcess, OwnServer, ServerProcess, keep_serving
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
 from s2a_bench.sweep.perform import _outside
@@ -89,7 +89,7 @@ def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same(interrupt: 
 
 def test_only_our_own_server_is_mended_by_our_set_up() -> None:
     assert "make setup" in OwnServer._cure
-    assert "make setup" not in LlamaServer._cure
+    assert "make setup" not in LlamaServerProcess._cure
 
 
 def test_a_cell_of_a_sweep_that_met_an_illegal_instruction_says_so_too(

@@ -21,7 +21,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import STATUS_ARRAY, Status
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
-from s2a_bench.testing.transport import Recorder, ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, open_client
 from s2a_bench.transport.limits import LIMITS, Limits
@@ -191,7 +191,7 @@ def test_garbage_and_guesses_beside_the_tokens_are_skipped_and_counted(stranger:
 
 
 def test_the_name_of_a_request_on_the_topic_cannot_be_guessed(stranger: Middleware) -> None:
-    handler = Recorder(["x"])
+    handler = RecordingHandler(["x"])
     with serving(handler, "ros/topic") as address:
         heard = stranger.subscription(NAMESPACE + "/request", ros.REQUEST, READER_QOS)
         client = open_client(wiring("ros/topic", address))

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from s2a_bench.clock import VirtualClock
 from s2a_bench.machine.resources import READERS, RESOURCES, Unreadable, open_readers
-from s2a_bench.machine.resources.host import CpuTimes, Memory, Rapl
+from s2a_bench.machine.resources.host import CpuTimes, HostMemory, Rapl
 from s2a_bench.machine.resources.nvidia import Nvml, Tegrastats, parse_tegrastats
-from s2a_bench.machine.resources.sampler import Sampler
+from s2a_bench.machine.resources.sampler import ResourceSampler
 from s2a_bench.store.run import RunWriter, read_run
 
 S = 1_000_000_000
@@ -53,16 +53,16 @@ class Scripted:
         self.closed += 1
 
 
-def polled(reader: Scripted, times_s: list[float], hz: float = 10) -> Sampler:
+def polled(reader: Scripted, times_s: list[float], hz: float = 10) -> ResourceSampler:
     clock = VirtualClock()
-    sampler = Sampler({"scripted": reader}, hz, clock=clock.now_ns)
+    sampler = ResourceSampler({"scripted": reader}, hz, clock=clock.now_ns)
     for time_s in times_s:
         clock.sleep_until_ns(int(time_s * S))
         sampler.poll()
     return sampler
 
 
-def counting(name: str, rate: float, times_s: list[float]) -> Sampler:
+def counting(name: str, rate: float, times_s: list[float]) -> ResourceSampler:
     return polled(Scripted(*({name: rate * time_s} for time_s in times_s)), times_s)
 
 
@@ -245,7 +245,7 @@ def test_the_cpu_clock_of_another_process_counts_its_threads() -> None:
 
 
 def test_memory_is_that_of_the_processes() -> None:
-    values = Memory([os.getpid()]).read()
+    values = HostMemory([os.getpid()]).read()
     assert values["client_rss_bytes"] == pytest.approx(values["server_rss_bytes"], rel=0.05)
     assert values["memory_available_bytes"] > 0
 
@@ -256,7 +256,7 @@ def test_memory_and_load_are_read_from_proc(tmp_path: Path) -> None:
         (tmp_path / process / "statm").write_text(f"9000 {pages} 300 1 0 200 0\n")
     (tmp_path / "meminfo").write_text("MemTotal:  2000 kB\nMemFree:  10 kB\nMemAvailable:  1000 kB\n")
     (tmp_path / "stat").write_text("cpu  100 0 50 800 50 0 0 0 7 0\ncpu0 1 2 3\n")
-    reader = Memory([42, 43], tmp_path)
+    reader = HostMemory([42, 43], tmp_path)
     assert "cpu_busy" not in reader.read()  # no time has passed
     (tmp_path / "stat").write_text("cpu  120 5 60 850 60 1 2 2 9 0\n")
     assert reader.read() == {
@@ -266,7 +266,7 @@ def test_memory_and_load_are_read_from_proc(tmp_path: Path) -> None:
         "cpu_busy": 0.4,
     }
     with pytest.raises(Unreadable, match="no-proc"):
-        Memory([], tmp_path / "no-proc")
+        HostMemory([], tmp_path / "no-proc")
 
 
 def test_a_counters_rise_between_edges_is_exact() -> None:
@@ -309,7 +309,7 @@ def test_the_boards_input_is_not_added_to_its_parts() -> None:
     parts = Scripted({"gpu_energy_j": 0.0, "package_energy_j": 0.0}, {"gpu_energy_j": 2.0, "package_energy_j": 1.0})
     only_parts = Scripted(*parts.values)
     for readers, expected in (({"board": board, "parts": parts}, 30.0), ({"parts": only_parts}, 3.0)):
-        sampler = Sampler(readers, 1, clock=clock.now_ns)
+        sampler = ResourceSampler(readers, 1, clock=clock.now_ns)
         start_ns = clock.now_ns()
         sampler.poll()
         clock.sleep_until_ns(start_ns + S)
@@ -326,7 +326,7 @@ def test_memory_of_a_window_is_its_peak_and_falls_back_on_the_reading_before() -
 
 def test_edges_read_only_what_is_cheap() -> None:
     cheap, dear = Scripted({"client_cpu_ns": 1}, cheap=True), Scripted({"gpu_busy": 0.5})
-    sampler = Sampler({"cpu": cheap, "nvml": dear}, 10)
+    sampler = ResourceSampler({"cpu": cheap, "nvml": dear}, 10)
     sampler.edge()
     sampler.edge()
     sampler.poll()
@@ -344,7 +344,7 @@ def test_the_thread_polls_until_it_is_told_and_closes_its_readers() -> None:
             return super().read()
 
     reader = Counting({"gpu_busy": 0.25})
-    with Sampler({"nvml": reader}, 1000, {"rapl": "no package zone"}) as sampler:
+    with ResourceSampler({"nvml": reader}, 1000, {"rapl": "no package zone"}) as sampler:
         assert polled_often.wait(30)
     assert reader.closed == 1
     told = sampler.describe()
@@ -363,7 +363,7 @@ def test_a_reader_that_fails_is_left_out_from_then_on_and_ends_no_run() -> None:
             return super().read()
 
     failing = Failing({"package_energy_j": 1.0}, cheap=True)
-    sampler = Sampler({"rapl": failing}, 10)
+    sampler = ResourceSampler({"rapl": failing}, 10)
     for _ in range(4):
         sampler.edge()
     assert failing.reads == 2

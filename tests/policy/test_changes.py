@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from s2a_bench.policy.changes import Watch, learned_along
+from s2a_bench.policy.changes import ChangeWatch, learned_along
 from s2a_bench.policy.conformal import calibrate, stalled
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import measure, stalls
@@ -40,7 +40,7 @@ def test_it_is_the_plain_rule_for_plans_side_by_side(
     token_s = 1.0 + np.cumsum(np.array([gaps, gaps[::-1]]).T, axis=0)
     token_s += np.random.default_rng(seed).uniform(0, 0.01, token_s.shape).cumsum(axis=0)
     prior = GapPrior(0.2, plan_cv, token_cv)
-    watch, found = Watch(prior, 2), []
+    watch, found = ChangeWatch(prior, 2), []
     for at_s in token_s:
         watch.token(at_s)
         found.append((*watch.learned, watch.slow.copy()))
@@ -65,7 +65,7 @@ def test_a_rate_that_halves_is_learned_within_two_tokens_and_forgotten_when_it_r
 def test_plans_as_calibrated_are_hardly_ever_taken_for_slow() -> None:
     plans = WORLD.draw(generator(1, "calm"), 1000)
     assert plans.token_s is not None
-    watch = Watch(GapPrior.fit(plans.token_s), 1000)
+    watch = ChangeWatch(GapPrior.fit(plans.token_s), 1000)
     ever = np.zeros(1000, dtype=bool)
     for at_s in plans.token_s:
         watch.token(at_s)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.policy import Plans, Schedule, policy
-from s2a_bench.policy.metrics import Metrics, fluidity, measure, queue_wait, stalls
+from s2a_bench.policy.metrics import PlanMetrics, fluidity, measure, queue_wait, stalls
 from s2a_bench.testing.policy import draw
 from tests.policy import plain
 
@@ -63,7 +63,7 @@ def test_wait_then_act_by_hand() -> None:
 def test_shares_are_the_same_for_a_plan_of_a_sixteenth_of_the_time(name: str) -> None:
     short = Plans(PLANS.arrival_s / 16, PLANS.nominal_s / 16, PLANS.least_s / 16, PLANS.most_s / 16)
     found, slow = (measure(plans, policy(name).schedule(plans)) for plans in (short, PLANS))
-    for field in fields(Metrics):
+    for field in fields(PlanMetrics):
         value, long = getattr(found, field.name), getattr(slow, field.name)
         assert value == (long / 16 if field.name.endswith("_s") else long), field.name
 

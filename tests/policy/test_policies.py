@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Plans, PlanShape, Policy, Start, Stepper, Timing, policy, stepping
-from s2a_bench.policy.naive import Queue
+from s2a_bench.policy.naive import NominalQueue
 from s2a_bench.policy.schedule import work_conserving
 from s2a_bench.policy.stepping import Stream, follow
 from s2a_bench.policy.wait_then_act import WaitingStepper
@@ -99,7 +99,7 @@ def test_plans_without_a_shape_cannot_be_stepped_through() -> None:
 
 
 @dataclass
-class Wrong(Queue):
+class Wrong(NominalQueue):
     """Answers the same whatever happens."""
 
     answer: Start | float = 0.0
@@ -113,7 +113,7 @@ class AsTold(Wrong):
     """Starts whatever has arrived with the same answer."""
 
     def decide(self, now_s: float) -> Start | float:
-        return self.answer if isinstance(Queue.decide(self, now_s), Start) else math.inf
+        return self.answer if isinstance(NominalQueue.decide(self, now_s), Start) else math.inf
 
 
 @pytest.mark.parametrize(

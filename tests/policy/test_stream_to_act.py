@@ -16,7 +16,7 @@ from s2a_bench.policy import Plans, PlanShape, Start, Timing, stepping
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
-from s2a_bench.policy.stream_to_act import EarlyStart, MeanStart, OnlineStepper, Rule, StreamToAct
+from s2a_bench.policy.stream_to_act import EarlyStart, MeanStart, OnlineStepper, StartRule, StreamToAct
 from s2a_bench.testing.policy import EXACT, draw
 
 SHAPE = PlanShape(4, 2, Timing(1.0, 0.8, 1.5), expected_cv=0.2)
@@ -251,7 +251,7 @@ def test_each_plan_may_have_its_own_caution() -> None:
 
     plans = draw(7, 6, 3, 1.4, 4)
     cautions = [0.0, 1.0, 3.0, math.inf]
-    together = schedule(PRIOR, cautions, plans, Rule())
+    together = schedule(PRIOR, cautions, plans, StartRule())
     for column, caution in enumerate(cautions):
         alone = StreamToAct(PRIOR, caution).schedule(plans)
         np.testing.assert_array_equal(together.start_s[:, column], alone.start_s[:, column])

@@ -14,7 +14,7 @@ from s2a_bench.policy import Plans, tracking
 from s2a_bench.policy.conformal import stalled, take
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import EarlyStart, StreamToAct
-from s2a_bench.policy.tracking import Tracked
+from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.stats.seeds import generator
 from studies.worlds import World
 
@@ -22,9 +22,11 @@ WORLD = World(0.58, 3.0, 1, 8, 1.0)
 CALIBRATION = WORLD.draw(generator(0, "tracking"), 120)
 
 
-def begin(policy: StreamToAct | None = None) -> Tracked:
+def begin(policy: StreamToAct | None = None) -> TrackedPolicy:
     assert CALIBRATION.token_s is not None
-    return Tracked.begin(replace(policy or StreamToAct(), prior=GapPrior.fit(CALIBRATION.token_s)), CALIBRATION, 0.02)
+    return TrackedPolicy.begin(
+        replace(policy or StreamToAct(), prior=GapPrior.fit(CALIBRATION.token_s)), CALIBRATION, 0.02
+    )
 
 
 def slow(plans: int) -> Plans:
@@ -60,7 +62,7 @@ def test_it_goes_on_from_its_state() -> None:
     whole.follow(plans)
     first.follow(take(plans, np.arange(25)))
     state = json.loads(json.dumps(first.state()))
-    rest = Tracked.resume(StreamToAct(), state)
+    rest = TrackedPolicy.resume(StreamToAct(), state)
     rest.follow(take(plans, np.arange(25, 60)))
     assert rest.state() == whole.state()
     assert rest.policy == whole.policy
@@ -82,4 +84,4 @@ def test_it_goes_on_from_its_state() -> None:
 )
 def test_what_is_no_state_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
-        Tracked.resume(StreamToAct(), begin().state() | change)
+        TrackedPolicy.resume(StreamToAct(), begin().state() | change)

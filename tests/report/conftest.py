@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from s2a_bench.provenance import Origins, Provenance
-from s2a_bench.store.run import Run
+from s2a_bench.store.run import StoredRun
 from tests.made_runs import spoken_run
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., StoredRun]
 REAL = Provenance("llama", "MiniCPM-V 2.6", "ab", "Q4_K_M", "real", "measured")
 
 
@@ -30,7 +30,7 @@ def beside(make_run: MakeRun) -> MakeRun:
         origins: Mapping[str, Provenance] | None = None,
         manifest: Mapping[str, Any] | None = None,
         **facts: Any,
-    ) -> Run:
+    ) -> StoredRun:
         whole = {
             "configuration": {"pipelines": {name: {} for name in cells} | dict(options or {})},
             "provenance": Origins(REAL, dict(origins or {})).to_manifest(),

@@ -13,17 +13,17 @@ from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
 from s2a_bench.report.page.files import make_report, write_report
 from s2a_bench.report.page.lanes import panels_of_chunks
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     config = ChunksConfig(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60)
     return read_run(run_chunks(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
 
 
-def test_a_panel_is_a_source_and_a_bar_a_chunk_or_a_stall(run: Run) -> None:
+def test_a_panel_is_a_source_and_a_bar_a_chunk_or_a_stall(run: StoredRun) -> None:
     first, second = panels_of_chunks(lanes_of(run))
     assert (first.title, second.title) == ("Latency 60", "Latency 100")
     assert first.end_s == pytest.approx(60 * 0.02)
@@ -45,7 +45,7 @@ def test_a_panel_is_a_source_and_a_bar_a_chunk_or_a_stall(run: Run) -> None:
     )
 
 
-def test_the_page_draws_them_and_says_what_bars_are(run: Run, tmp_path: Path) -> None:
+def test_the_page_draws_them_and_says_what_bars_are(run: StoredRun, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     report = make_report(read_chapters([run.path], against_paper=False), against_paper=False)
     write_report(report, ReportConfig(runs=[run.path], output=page))

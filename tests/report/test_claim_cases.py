@@ -17,12 +17,12 @@ from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.report.claims import CONTRADICTED, REPRODUCED, SUPPORTED, UNDECIDED, Judged
 from s2a_bench.report.claims.table import judge_claims
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from tests.report.conftest import REAL
 
-MakeRun = Callable[..., Run]
-Made = Callable[["Kit"], Run]
+MakeRun = Callable[..., StoredRun]
+Made = Callable[["Kit"], StoredRun]
 ORIN = {"board": "NVIDIA Jetson AGX Orin Developer Kit"}
 RTX = {"cpu": "AMD Ryzen 9", "gpus": [{"name": "NVIDIA GeForce RTX 4080"}]}
 GPU = {"gpu_layers": -1, "gpu_offload_supported": True, "model": "/m/MiniCPM-V-2_6-Q4_K_M.gguf", "model_sha256": "ab"}
@@ -39,11 +39,11 @@ class Kit:
     def __init__(self, root: Path, beside: MakeRun, spoken: MakeRun) -> None:
         self.root, self.beside, self.spoken = root, beside, spoken
 
-    def timeline(self, **asked: Any) -> Run:
+    def timeline(self, **asked: Any) -> StoredRun:
         """Compute a timeline run."""
         return read_run(run_timeline(TimelineConfig(**asked), self.root, NullProgress()))
 
-    def live(self, provenance: Provenance, rate: float, **facts: Any) -> Run:
+    def live(self, provenance: Provenance, rate: float, **facts: Any) -> StoredRun:
         """Make a live run of the four L, with timings as one at that rate has them."""
         run = self.timeline(profiles=(), rates=(rate,))
         rows = run.table(TIMELINES).copy()
@@ -52,20 +52,20 @@ class Kit:
         manifest = {**run.manifest, "boards": [], "provenance": origins, "configuration": {}, **facts}
         return replace(run, manifest=manifest, tables=run.tables | {"timelines": rows})
 
-    def latency(self, *, ratio: float = 6.57, manifest: dict[str, Any] | None = None, **facts: Any) -> Run:
+    def latency(self, *, ratio: float = 6.57, manifest: dict[str, Any] | None = None, **facts: Any) -> StoredRun:
         """Make a latency run on an AGX Orin with the paper's setting, unless told otherwise."""
         sent = {"base64_encode": 9.13 * ratio, "network": 0.87 * ratio, "inference": 5, "return": 0}
         cells = {"http/as-deployed": sent, "ros/topic": {"convert": 10, "inference": 5, "return": 0}}
         return self.beside(cells, spread=0.02, manifest={"environment": ORIN, **(manifest or {})}, **facts)
 
-    def sizes(self) -> Run:
+    def sizes(self) -> StoredRun:
         """Make a latency run whose sides have frames of two sizes."""
         run = self.latency()
         samples = run.samples.copy()
         samples.loc[samples["pipeline"] == "ros", "size"] = "1280x720"
         return replace(run, tables=run.tables | {"samples": samples})
 
-    def cut(self, launch: int) -> Run:
+    def cut(self, launch: int) -> StoredRun:
         """Make a latency run without ROS in one launch."""
         run = self.latency()
         missing = (run.samples["pipeline"] == "ros") & (run.samples["launch"] == launch)
@@ -73,7 +73,7 @@ class Kit:
 
     def beside_llama_server(
         self, *, without_model_ms: float = 60, engine: Provenance = REAL, server: Provenance = LLAMA_SERVER
-    ) -> Run:
+    ) -> StoredRun:
         """Make a latency run of llama-server, 75 ms without inference, beside ROS: 20 ms, without model 35."""
         sent = {"base64_encode": 15, "ingest": 60, "inference": 55, "return": 0}
         cells = {LLAMA: sent, "ros/topic": {"convert": 20, "preprocess": 15, "inference": 80, "return": 0}}
@@ -85,12 +85,12 @@ class Kit:
             server_prompt_ms=130 - without_model_ms,
         )
 
-    def rates(self, rate: float, provenance: Provenance | None, model: dict[str, Any], **facts: Any) -> Run:
+    def rates(self, rate: float, provenance: Provenance | None, model: dict[str, Any], **facts: Any) -> StoredRun:
         """Make a throughput run on a host with an RTX 4080."""
         origins = {} if provenance is None else {"provenance": Origins(provenance).to_manifest()}
         return self.spoken(rate, environment=RTX, model=model, **origins, **facts)
 
-    def ccrb(self, **asked: Any) -> Run:
+    def ccrb(self, **asked: Any) -> StoredRun:
         """Drive a CCRB run."""
         return read_run(run_ccrb(CcrbConfig(**asked), self.root, NullProgress()))
 
@@ -100,7 +100,7 @@ def kit(tmp_path: Path, beside: MakeRun, spoken: MakeRun) -> Kit:
     return Kit(tmp_path, beside, spoken)
 
 
-def verdicts(*runs: Run) -> dict[str, Judged]:
+def verdicts(*runs: StoredRun) -> dict[str, Judged]:
     return {each.claim.text: each for each in judge_claims(runs)}
 
 
@@ -381,7 +381,7 @@ def test_evidence_decides_by_its_intervals(kit: Kit, case: str) -> None:
     assert {text: found[text].verdict for text in wanted} == wanted
 
 
-def stalling(run: Run, every: int) -> Run:
+def stalling(run: StoredRun, every: int) -> StoredRun:
     """Let every so-manieth plan of stream-to-act stall, and no other."""
     rows = run.table(TIMELINES).copy()
     ours = rows["policy"] == "stream-to-act"

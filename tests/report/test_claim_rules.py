@@ -15,24 +15,24 @@ from s2a_bench.report.claims import (
     SUPPORTED,
     UNDECIDED,
     Check,
-    Finding,
+    ClaimFinding,
     Judged,
     Met,
-    Part,
+    RunPart,
     all_of,
     within,
 )
 from s2a_bench.report.claims.requests import PAPERS_MODEL, facts_of, on_board
 from s2a_bench.report.claims.table import CLAIMS
 from s2a_bench.stats import Ratio
-from s2a_bench.store.run import Run
+from s2a_bench.store.run import StoredRun
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., StoredRun]
 ORIN = {"board": "NVIDIA Jetson AGX Orin Developer Kit"}
 RTX = {"gpus": [{"name": "NVIDIA GeForce RTX 4080"}]}
 
 
-def unmeasured(_: Part) -> tuple[list[Ratio], str]:
+def unmeasured(_: RunPart) -> tuple[list[Ratio], str]:
     return [], ""
 
 
@@ -116,8 +116,8 @@ def test_more_than_a_half_is_not_a_half() -> None:
 def test_runs_that_can_tell_have_to_agree_and_no_other_counts(
     testable: list[str], others: list[str], verdict: str
 ) -> None:
-    findings = [Finding(said, str(place), (Met("board: it", True),)) for place, said in enumerate(testable)]
-    findings += [Finding(said, "", (Met("board: another (needs it)", False),)) for said in others]
+    findings = [ClaimFinding(said, str(place), (Met("board: it", True),)) for place, said in enumerate(testable)]
+    findings += [ClaimFinding(said, "", (Met("board: another (needs it)", False),)) for said in others]
     for order in (findings, findings[::-1]):
         judged = Judged(CLAIMS[0], dict.fromkeys(order, ("run",)))
         assert judged.verdict == verdict

@@ -19,7 +19,7 @@ from s2a_bench.provenance import Origins
 from s2a_bench.report.claims import claim_table
 from s2a_bench.report.claims.table import judge_claims
 from s2a_bench.store.requests import SampleRow
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from tests.report.conftest import REAL
 from tests.report.test_claim_cases import DUMMY, GPU, ORIN, REPLAY, RTX, Kit, MakeRun, stalling
@@ -29,7 +29,7 @@ MakeRow = Callable[..., SampleRow]
 SENT = {"convert": 10, "inference": 5, "return": 0}
 
 
-def said(*runs: Run) -> list[str]:
+def said(*runs: StoredRun) -> list[str]:
     """Return what is said of all claims that these runs can judge or nearly so."""
     judged = [each for each in judge_claims(runs) if each.findings]
     texts = []
@@ -46,20 +46,20 @@ def kit(tmp_path: Path, beside: MakeRun, spoken: MakeRun) -> Kit:
 
 
 def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_row: MakeRow, tmp_path: Path) -> None:
-    def elsewhere(run: Run, **environment: object) -> Run:
+    def elsewhere(run: StoredRun, **environment: object) -> StoredRun:
         return replace(run, manifest={**run.manifest, "environment": environment})
 
-    def boundary(**asked: object) -> Run:
+    def boundary(**asked: object) -> StoredRun:
         return read_run(run_boundary(BoundaryConfig(**asked), tmp_path, NullProgress()))  # type: ignore[arg-type]
 
-    def bodies(coded: int, plain: int) -> Run:
+    def bodies(coded: int, plain: int) -> StoredRun:
         sizes = {"http/as-deployed": coded, "http/binary": plain}
         rows = [make_row(name, SENT, 1, payload_bytes=size, request_id=name) for name, size in sizes.items()]
         return make_run({}, extra=tuple(rows))
 
     orin = {"profiles": ("jetson-agx-orin",), "tokens_per_skill": (1, 2, 4, 6)}
     jitter = orin | {"jitter": "lognormal:cv=0.2", "plans": 60}
-    runs: dict[str, Callable[[], Run]] = {  # title, with the claims it is about in brackets
+    runs: dict[str, Callable[[], StoredRun]] = {  # title, with the claims it is about in brackets
         "Timelines of table II": lambda: elsewhere(kit.timeline(), **RTX),
         "Timelines with jitter, every 20th of ours stalling (Orin: |V-E: |IV-F: )": lambda: elsewhere(
             stalling(kit.timeline(**jitter), every=20)

@@ -27,7 +27,7 @@ from s2a_bench.report.claims import (
     UNDECIDED,
     Judged,
     Need,
-    Part,
+    RunPart,
     Trial,
     claim_table,
     judge,
@@ -35,10 +35,10 @@ from s2a_bench.report.claims import (
 from s2a_bench.report.claims.plans import CHOSEN
 from s2a_bench.report.claims.table import CLAIMS, judge_claims
 from s2a_bench.store.requests import SampleRow
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., StoredRun]
 MakeRow = Callable[..., SampleRow]
 ORIN = {"board": "NVIDIA Jetson AGX Orin Developer Kit"}
 RTX = {"gpus": [{"name": "NVIDIA GeForce RTX 4080"}]}
@@ -48,23 +48,23 @@ EVEN: dict[str, dict[str, float]] = {
 }
 
 
-def claim_of(text: str, *runs: Run) -> Judged:
+def claim_of(text: str, *runs: StoredRun) -> Judged:
     (found,) = [judged for judged in judge_claims(runs) if text in judged.claim.text]
     return found
 
 
-def changed(run: Run, **tables: pd.DataFrame) -> Run:
+def changed(run: StoredRun, **tables: pd.DataFrame) -> StoredRun:
     """Return a run some of whose rows are others."""
     return replace(run, tables=run.tables | tables)
 
 
 @pytest.fixture(scope="module")
-def timelines(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def timelines(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     return read_run(run_timeline(TimelineConfig(), tmp_path_factory.mktemp("timeline"), NullProgress()))
 
 
 @pytest.fixture(scope="module")
-def ccrb(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def ccrb(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     config = CcrbConfig(phase=True, phase_points=(7, 5))
     return read_run(run_ccrb(config, tmp_path_factory.mktemp("ccrb"), NullProgress()))
 
@@ -135,7 +135,7 @@ def test_ros_is_dominated_by_conversions_or_not(beside: MakeRun, convert_ms: flo
     assert f"take {10 * convert_ms}%" in judged.evidence[0]
 
 
-def bodies(make_run: MakeRun, make_row: MakeRow, plain: int, coded: int) -> Run:
+def bodies(make_run: MakeRun, make_row: MakeRow, plain: int, coded: int) -> StoredRun:
     """Make a run of one request over HTTP with Base64 and one without, by what they weigh."""
     sent = {"http/as-deployed": coded, "http/binary": plain}
     rows = [make_row(name, EVEN["ros/topic"], 1, payload_bytes=size, request_id=name) for name, size in sent.items()]
@@ -173,12 +173,12 @@ def test_a_run_whose_parts_all_lack_something_says_what_the_nearest_lacks(make_r
     names = ("board", "mode", "model")
     needs = tuple(Need(name, "right", lambda found: found.startswith("right")) for name in names)
 
-    def split(run: Run) -> list[Part]:
+    def split(run: StoredRun) -> list[RunPart]:
         facts = (
             {name: f"{'wrong' if name in lacks else 'right'}, {part}" for name in names}
             for part, lacks in parts.items()
         )
-        return [Part(run, each) for each in facts]
+        return [RunPart(run, each) for each in facts]
 
     claim = replace(CLAIMS[0], trial=Trial("s2a-bench latency", split, needs))
     (finding,) = judge(claim, [make_run({}, manifest={})]).findings
@@ -188,7 +188,7 @@ def test_a_run_whose_parts_all_lack_something_says_what_the_nearest_lacks(make_r
     )
 
 
-def test_the_timelines_of_table_ii_bear_the_papers_findings_out(timelines: Run) -> None:
+def test_the_timelines_of_table_ii_bear_the_papers_findings_out(timelines: StoredRun) -> None:
     verdicts = {judged.claim.text.split(" (")[0]: judged for judged in judge_claims([timelines])}
     for text in (
         "RTX 4080: all policies run smoothly with no noticeable stalls",
@@ -206,7 +206,7 @@ def test_the_timelines_of_table_ii_bear_the_papers_findings_out(timelines: Run) 
     assert len(verdicts["AGX Orin: stream-to-act eliminates stalls"].findings) == 1  # other boards are not its business
 
 
-def test_always_and_never_are_not_intermittent(timelines: Run) -> None:
+def test_always_and_never_are_not_intermittent(timelines: StoredRun) -> None:
     judged = claim_of("intermittent", timelines)
     assert judged.verdict == UNDECIDED
     assert "Naive stalls at 100% at L = 6, 0% at L = 4, 0% at L = 2, 0% at L = 1 of the gaps" in judged.evidence[0]
@@ -231,7 +231,7 @@ def test_half_of_the_gaps_are_not_frequent(tmp_path: Path) -> None:
         assert claim_of("frequent", naive).verdict == verdict
 
 
-def test_frequent_means_most_of_the_gaps_at_every_granularity(timelines: Run) -> None:
+def test_frequent_means_most_of_the_gaps_at_every_granularity(timelines: StoredRun) -> None:
     rows = timelines.table(TIMELINES)
     short = (rows["policy"] == "naive") & (rows["tokens_per_skill"] == 1)
     rows = rows.assign(stalls=rows["stalls"].mask(short, 3))
@@ -251,7 +251,7 @@ def test_frequent_means_most_of_the_gaps_at_every_granularity(timelines: Run) ->
     ],
 )
 def test_more_tokens_more_stalls_needs_a_strict_increase(
-    timelines: Run, stalled_s: tuple[float, ...], verdict: str
+    timelines: StoredRun, stalled_s: tuple[float, ...], verdict: str
 ) -> None:
     rows = timelines.table(TIMELINES)
     rows = rows[rows["board"] == "jetson-agx-orin"].copy()
@@ -260,7 +260,7 @@ def test_more_tokens_more_stalls_needs_a_strict_increase(
     assert claim_of("More tokens", changed(timelines, timelines=rows)).verdict == verdict
 
 
-def test_what_has_no_threshold_in_the_paper_is_stated_and_not_judged(timelines: Run) -> None:
+def test_what_has_no_threshold_in_the_paper_is_stated_and_not_judged(timelines: StoredRun) -> None:
     excessive = claim_of("excessive delays", timelines)
     assert excessive.verdict == UNDECIDED
     assert "no threshold" in excessive.evidence[0]
@@ -272,14 +272,14 @@ def test_what_has_no_threshold_in_the_paper_is_stated_and_not_judged(timelines: 
     assert "+0.00 s (+0.0%) at L = 6" in end.evidence[0]
 
 
-def test_fast_and_smooth_means_against_waiting(timelines: Run) -> None:
+def test_fast_and_smooth_means_against_waiting(timelines: StoredRun) -> None:
     fast = claim_of("preferable for fast and smooth control", timelines)
     assert fast.verdict == SUPPORTED
     assert all("no plan stalls" in text for text in fast.evidence)
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1.005, SUPPORTED), (1.02, CONTRADICTED), (0.9, SUPPORTED)])
-def test_an_end_within_one_per_cent_of_naives_is_no_penalty(timelines: Run, factor: float, verdict: str) -> None:
+def test_an_end_within_one_per_cent_of_naives_is_no_penalty(timelines: StoredRun, factor: float, verdict: str) -> None:
     rows = timelines.table(TIMELINES).copy()
     ours = rows["policy"] == "stream-to-act"
     rows.loc[ours, "end_ns"] = (rows.loc[ours, "end_ns"].astype("float64") * factor).round().astype("Int64")
@@ -296,7 +296,7 @@ def test_an_increase_that_may_be_none_decides_nothing(tmp_path: Path) -> None:
     assert claim_of("More tokens", changed(run, timelines=rows)).verdict == UNDECIDED
 
 
-def test_what_ends_with_stream_to_act_or_before_it_does_not_end_later(timelines: Run) -> None:
+def test_what_ends_with_stream_to_act_or_before_it_does_not_end_later(timelines: StoredRun) -> None:
     rows = timelines.table(TIMELINES).copy()
     rows.loc[rows["policy"] == "wait-then-act", "end_ns"] = 1_000_000_000
     early = changed(timelines, timelines=rows)
@@ -304,7 +304,7 @@ def test_what_ends_with_stream_to_act_or_before_it_does_not_end_later(timelines:
     assert claim_of("preferable for fast and smooth control", early).verdict == CONTRADICTED
 
 
-def test_s0_is_minimal_with_fixed_durations_and_not_with_elastic_ones(timelines: Run) -> None:
+def test_s0_is_minimal_with_fixed_durations_and_not_with_elastic_ones(timelines: StoredRun) -> None:
     assert claim_of("with fixed durations", timelines).verdict == SUPPORTED
     elastic = claim_of("up to T_max", timelines)
     assert elastic.verdict == CONTRADICTED
@@ -324,7 +324,7 @@ def test_timelines_at_other_rates_say_nothing_of_the_papers_boards(tmp_path: Pat
     assert claim_of("latency penalty: at the end", run).verdict == SUPPORTED
 
 
-def test_runs_that_disagree_decide_nothing(timelines: Run) -> None:
+def test_runs_that_disagree_decide_nothing(timelines: StoredRun) -> None:
     rows = timelines.table(TIMELINES).copy()
     mine = (rows["policy"] == "stream-to-act") & (rows["board"] == "jetson-orin-nano")
     rows.loc[mine, "any_stall"] = True
@@ -356,7 +356,7 @@ def test_where_skills_cannot_end_early_the_papers_line_is_not_tried(tmp_path: Pa
     assert not claim_of("Below R", told).verdicts
 
 
-def test_the_operating_point_is_reproduced_and_the_diagram_does_not_bear_all_of_it_out(ccrb: Run) -> None:
+def test_the_operating_point_is_reproduced_and_the_diagram_does_not_bear_all_of_it_out(ccrb: StoredRun) -> None:
     for text in ("hit from behind", "hits the car ahead", "hits nobody"):
         judged = claim_of(f"{text}", ccrb)
         assert judged.verdict == REPRODUCED
@@ -373,7 +373,7 @@ def test_the_chosen_point_is_the_default_of_the_command() -> None:
     assert {name: asked[name] for name in CHOSEN} == CHOSEN
 
 
-def test_another_outcome_decides_nothing_as_the_paper_gives_no_settings(ccrb: Run) -> None:
+def test_another_outcome_decides_nothing_as_the_paper_gives_no_settings(ccrb: StoredRun) -> None:
     rows = ccrb.table(ROLLOUTS).copy()
     rows.loc[(rows["study"] == "point") & (rows["policy"] == "naive"), "outcome"] = "none"
     assert claim_of("hit from behind", changed(ccrb, rollouts=rows)).verdict == UNDECIDED

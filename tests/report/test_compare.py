@@ -40,7 +40,7 @@ from s2a_bench.report.compare.shown import (
 )
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.store.requests import SampleRow
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from tests.made_runs import STAGES as GROUPS
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-compare-1.json").read_text())
@@ -51,7 +51,7 @@ MODEL = {"engine": "llama", "dummy": False, "model_sha256": "aa"}
 MANIFEST = {"environment": MACHINE, "model": MODEL, "configuration": {"runs": 60, "http": {"payload": "jpeg"}}}
 
 MakeRow = Callable[..., SampleRow]
-Launch = Callable[..., Run]
+Launch = Callable[..., StoredRun]
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def launch(tmp_path: Path, make_row: MakeRow) -> Launch:
         manifest: dict[str, Any] | None = None,
         launches: int = 1,
         **facts: Any,
-    ) -> Run:
+    ) -> StoredRun:
         rng = np.random.default_rng(seed)
         load = 0.0
         with RunWriter.create(tmp_path, "latency", {"stages": GROUPS} | (manifest or MANIFEST)) as run:
@@ -86,11 +86,11 @@ def launch(tmp_path: Path, make_row: MakeRow) -> Launch:
     return make
 
 
-def opened(first: Run, second: Run, *, unlike: bool = False, least: float = 0.05) -> ComparedRuns:
+def opened(first: StoredRun, second: StoredRun, *, unlike: bool = False, least: float = 0.05) -> ComparedRuns:
     return open_comparison([first], [second], unlike=unlike, least=least)
 
 
-def compared(first: Run, second: Run, *names: str, **settings: Any) -> ComparedRuns:
+def compared(first: StoredRun, second: StoredRun, *names: str, **settings: Any) -> ComparedRuns:
     both = opened(first, second, **settings)
     return compare(both, metrics_of(both, names) if names else shown_metrics(both))
 
@@ -198,7 +198,7 @@ def test_other_latencies_of_an_echo_are_refused_unless_told(launch: Launch) -> N
 
 
 def test_another_gpu_is_refused_and_another_driver_is_told(launch: Launch) -> None:
-    def with_gpu(name: str, driver: str) -> Run:
+    def with_gpu(name: str, driver: str) -> StoredRun:
         return launch(1, n=2, manifest=with_(MANIFEST, "environment", gpus=[{"name": name, "driver": driver}]))
 
     found = [(one.what, one.fatal) for one in differences(with_gpu("Orin", "1"), with_gpu("H200", "2"))]

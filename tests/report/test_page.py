@@ -29,7 +29,7 @@ from s2a_bench.report.page.chapters import MOST_CHAPTERS, read_chapters
 from s2a_bench.report.page.files import inline, make_report, write_report
 from s2a_bench.report.page.lanes import panels_of, ticks_of
 from s2a_bench.store.requests import SampleRow
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.store.sweep import CELLS, CellRow
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of
@@ -37,7 +37,7 @@ from s2a_bench.writers.latex import PREAMBLE, document, escape, to_siunitx
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., StoredRun]
 MakeRow = Callable[..., SampleRow]
 HOSTILE = "<script>alert('x')</script>&\"%_$#{}\\"
 VOID = {"meta", "br", "hr", "img", "input", "link"}

@@ -118,7 +118,7 @@ def test_an_id_is_written_as_recorded() -> None:
 def test_a_node_is_listed_by_name_with_its_endpoints(dds_domain: int) -> None:
     from s2a_bench.ros import QoS
     from s2a_bench.ros.cyclone import PARTICIPANT_ENTITIES
-    from s2a_bench.ros.dds import RawReader, Waiter, dds_qos
+    from s2a_bench.ros.dds import DdsWaiter, RawReader, dds_qos
 
     listening = open_middleware(domain_id=dds_domain)
     named = open_middleware(domain_id=dds_domain, node_name="/llama/llama_node")
@@ -127,7 +127,7 @@ def test_a_node_is_listed_by_name_with_its_endpoints(dds_domain: int) -> None:
         named.action_server(NAME, llama.GENERATE_RESPONSE)
         participant = listening._participant  # type: ignore[attr-defined]
         reader = RawReader(participant, DISCOVERY, PARTICIPANT_ENTITIES, dds_qos(QoS(0, latched=True), ""))
-        waiter = Waiter(participant, [reader])
+        waiter = DdsWaiter(participant, [reader])
         deadline = now_ns() + 20_000_000_000
         nodes: dict[str, Any] = {}
         while not (node := nodes.get("llama_node")) or len(node.writer_gid_seq) < 6:

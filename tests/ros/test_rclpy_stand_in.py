@@ -21,7 +21,7 @@ from s2a_bench.ros import Accepted, Feedback, QoS, Result, llama, open_middlewar
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.diagnostics import LOG, ROSOUT_QOS
 from s2a_bench.ros.parameters import SERVICE, Parameter, value_of
-from s2a_bench.testing.transport import Recorder, ask, connector, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, connector, wiring, yuyv_frame
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.ros.node import NodeApi
 from s2a_bench.types import Frame, Request
@@ -145,7 +145,7 @@ def test_topics_are_served_without_llama_msgs_and_the_log_says_what_is_not(
     without_llama_msgs(monkeypatch)
     told = wiring("ros/topic", "/s2a", middleware="rclpy", domain_id=7)
     with closing(connector(told)) as connecting:
-        client = next(connecting)(Recorder(["a ", "b"]))
+        client = next(connecting)(RecordingHandler(["a ", "b"]))
         tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),)))
     assert [token.text for token in tokens] == ["a ", "b"]
     assert "the action is not served: llama_msgs/action/GenerateResponse is not in this ROS 2 workspace" in caplog.text
@@ -156,7 +156,7 @@ def test_topics_are_served_without_llama_msgs_and_the_log_says_what_is_not(
 def test_the_action_needs_llama_msgs(monkeypatch: pytest.MonkeyPatch) -> None:
     without_llama_msgs(monkeypatch)
     told = wiring("ros/action", "/s2a", middleware="rclpy", domain_id=7)
-    for opened in (lambda: open_server(told, Recorder([])), lambda: open_client(told)):
+    for opened in (lambda: open_server(told, RecordingHandler([])), lambda: open_client(told)):
         with pytest.raises(MissingInterface, match="colcon build --packages-select llama_msgs"):
             opened()
     assert GRAPH == []

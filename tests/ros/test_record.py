@@ -15,7 +15,7 @@ from s2a_bench.errors import StoreError
 from s2a_bench.frames import open_source
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros import record
-from s2a_bench.ros.record import Recorder
+from s2a_bench.ros.record import BagRecorder
 from s2a_bench.transport.ros.wire import token_message
 from s2a_bench.types import Frame, Token
 
@@ -43,7 +43,7 @@ def texts(path: Path) -> list[str]:
 @pytest.mark.parametrize("name", ["run.mcap", "run"])
 def test_what_was_sent_reads_back_byte_for_byte(tmp_path: Path, name: str, live: bool) -> None:
     ready = ros.serialise(token(1), ros.TOKEN)
-    with Recorder(tmp_path / name, live=live) as recorder:
+    with BagRecorder(tmp_path / name, live=live) as recorder:
         recorder.write("/a", STRING, cdr("one"), 5)
         recorder.write("/b", ros.TOKEN, ready, 6)
         recorder.write("/a", STRING, memoryview(cdr("two")).toreadonly(), 7)
@@ -58,7 +58,7 @@ def test_what_was_sent_reads_back_byte_for_byte(tmp_path: Path, name: str, live:
 
 def test_the_name_says_file_or_folder(tmp_path: Path) -> None:
     for name in ("one.mcap", "two"):
-        with Recorder(tmp_path / name) as recorder:
+        with BagRecorder(tmp_path / name) as recorder:
             recorder.write("/a", STRING, cdr("x"), 1)
     assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
         "one.mcap",
@@ -69,7 +69,7 @@ def test_the_name_says_file_or_folder(tmp_path: Path) -> None:
 
 
 def test_definitions_and_hashes_travel_with_it(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "run.mcap") as recorder:
+    with BagRecorder(tmp_path / "run.mcap") as recorder:
         recorder.write("/token", ros.TOKEN, token(3), 1)
     with AnyReader([tmp_path / "run.mcap"]) as reader:  # knows no types but the file's, and checks their hashes
         ((connection, _, data),) = list(reader.messages())
@@ -81,7 +81,7 @@ def test_definitions_and_hashes_travel_with_it(tmp_path: Path) -> None:
 
 def test_a_recorded_camera_is_a_source(tmp_path: Path) -> None:
     pixels = np.random.default_rng(1).integers(0, 256, (48, 64, 3), np.uint8)
-    with Recorder(tmp_path / "run.mcap") as recorder:
+    with BagRecorder(tmp_path / "run.mcap") as recorder:
         recorder.write("/token", ros.TOKEN, token(0), 1)
         recorder.write("/camera", ros.IMAGE, ros.image_message(Frame(0, 0, 64, 48, "rgb8", pixels), 9, "camera"), 2)
     source = open_source(f"bag:{tmp_path}/run.mcap", 64, 48)
@@ -90,7 +90,7 @@ def test_a_recorded_camera_is_a_source(tmp_path: Path) -> None:
 
 
 def test_writing_waits_for_flush(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "run")
+    recorder = BagRecorder(tmp_path / "run")
     size = (tmp_path / "run" / "run.mcap").stat
     before = size().st_size
     image = ros.image_message(Frame(0, 0, 1024, 1024, "rgb8", np.zeros((1024, 1024, 3), np.uint8)), 0, "c")
@@ -103,7 +103,7 @@ def test_writing_waits_for_flush(tmp_path: Path) -> None:
 
 def test_a_full_backlog_is_written_by_the_writer_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(record, "BACKLOG_BYTES", 50)
-    recorder = Recorder(tmp_path / "run.mcap")
+    recorder = BagRecorder(tmp_path / "run.mcap")
     for i in range(9):
         recorder.write("/a", STRING, cdr(f"text {i}"), i)
         assert recorder._backlog <= 50
@@ -113,7 +113,7 @@ def test_a_full_backlog_is_written_by_the_writer_itself(tmp_path: Path, monkeypa
 
 @pytest.mark.parametrize("live", [False, True])
 def test_many_threads_write(tmp_path: Path, live: bool) -> None:
-    with Recorder(tmp_path / "run.mcap", live=live) as recorder:
+    with BagRecorder(tmp_path / "run.mcap", live=live) as recorder:
 
         def work(n: int) -> None:
             for i in range(200):
@@ -130,19 +130,19 @@ def test_many_threads_write(tmp_path: Path, live: bool) -> None:
 
 
 def test_an_empty_recording_is_valid(tmp_path: Path) -> None:
-    Recorder(tmp_path / "run.mcap").close()
+    BagRecorder(tmp_path / "run.mcap").close()
     assert read(tmp_path / "run.mcap") == []
 
 
 @pytest.mark.parametrize("name", ["run.mcap", "run"])
 def test_an_empty_recording_of_what_failed_is_removed(tmp_path: Path, name: str) -> None:
-    with pytest.raises(StoreError), Recorder(tmp_path / name):
+    with pytest.raises(StoreError), BagRecorder(tmp_path / name):
         raise StoreError("no server")
     assert not any(tmp_path.iterdir())
 
 
 def test_what_was_recorded_before_an_error_is_kept(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), Recorder(tmp_path / "run.mcap") as recorder:  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), BagRecorder(tmp_path / "run.mcap") as recorder:  # noqa: PT012
         recorder.write("/a", STRING, cdr("kept"), 1)
         raise KeyboardInterrupt
     assert texts(tmp_path / "run.mcap") == ["kept"]
@@ -152,27 +152,27 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
     with pytest.raises(StoreError, match=r"^`record`: .*run\.mcap exists already"):
-        Recorder(path)
+        BagRecorder(path)
     assert path.read_text() == "precious"
     with pytest.raises(StoreError, match=r"^`record`: \. exists already"):
-        Recorder(Path())
+        BagRecorder(Path())
 
 
 def test_remains_of_a_killed_run_are_named(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "run.mcap")
+    recorder = BagRecorder(tmp_path / "run.mcap")
     with pytest.raises(StoreError, match=r"run\.mcap\.recording.* exists already"):
-        Recorder(tmp_path / "run.mcap")
+        BagRecorder(tmp_path / "run.mcap")
     recorder.close()
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match=r"^`record`: cannot write .*run\.mcap: "):
-        Recorder(tmp_path / "file" / "run.mcap")
+        BagRecorder(tmp_path / "file" / "run.mcap")
 
 
 def test_closing_twice_is_fine_and_writing_afterwards_is_not(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "run.mcap")
+    recorder = BagRecorder(tmp_path / "run.mcap")
     recorder.close()
     recorder.close()
     with pytest.raises(StoreError, match="is closed"):
@@ -181,7 +181,7 @@ def test_closing_twice_is_fine_and_writing_afterwards_is_not(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("live", [False, True])
 def test_a_failure_is_raised_where_messages_come_from(tmp_path: Path, live: bool) -> None:
-    recorder = Recorder(tmp_path / "run.mcap", live=live)
+    recorder = BagRecorder(tmp_path / "run.mcap", live=live)
     recorder.write("/a", STRING, cdr("kept"), 1)
     recorder.write("/a", "no_msgs/msg/Such", b"\0\1\0\0", 2)
     with pytest.raises(StoreError, match=r"^`record`: writing .*run\.mcap failed: .*what was written is in "):

@@ -301,15 +301,15 @@ def test_an_inbox_is_bounded_and_says_once_that_it_is_full(
     from s2a_bench.ros import zenoh_node
 
     monkeypatch.setattr(zenoh_node, "HELD_BYTES", 10_000)
-    inbox: Any = zenoh_node.Inbox("/x", zenoh_node.Bell())
+    inbox: Any = zenoh_node.SampleQueue("/x", zenoh_node.Bell())
     took = [inbox.put(number, 1000) for number in range(9)]
     assert took == [True] * 4 + [False] * 5
     assert [*inbox.arrived()] == [0, 1, 2, 3]
     assert inbox.put(9, 1000)
     assert caplog.messages == ["/x: messages are dropped: 0 MiB wait to be taken"]
-    small: Any = zenoh_node.Inbox("/y", zenoh_node.Bell(), most_bytes=5000)
+    small: Any = zenoh_node.SampleQueue("/y", zenoh_node.Bell(), most_bytes=5000)
     assert [small.put(number, 1000) for number in range(3)] == [True, True, False]
-    last: Any = zenoh_node.Inbox("/x", zenoh_node.Bell(), depth=2)
+    last: Any = zenoh_node.SampleQueue("/x", zenoh_node.Bell(), depth=2)
     assert all(last.put(number, 1000) for number in range(9))
     assert [*last.arrived()] == [7, 8]
 

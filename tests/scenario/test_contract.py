@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from s2a_bench.scenario import EGO, LEAD, REAR, SIMULATORS, Command, Simulator, State, simulator
+from s2a_bench.scenario import EGO, LEAD, REAR, SIMULATORS, DriveCommand, Simulator, State, simulator
 from s2a_bench.scenario.carla import Carla
 from tests.scenario.carla_stand_in import World, package
 
@@ -16,11 +16,11 @@ START = np.array([[40.0], [0.0], [-14.0]])
 SPEED = np.full((3, 1), 10.0)
 
 
-def command(lead: float = 0.0, ego: float = 0.0, rear: float = 0.0, lane: int = 0) -> Command:
-    return Command(np.array([[lead], [ego], [rear]]), np.array([lane]))
+def command(lead: float = 0.0, ego: float = 0.0, rear: float = 0.0, lane: int = 0) -> DriveCommand:
+    return DriveCommand(np.array([[lead], [ego], [rear]]), np.array([lane]))
 
 
-def run(world: Simulator, seconds: float, wanted: Command) -> State:
+def run(world: Simulator, seconds: float, wanted: DriveCommand) -> State:
     state = world.step(wanted)
     for _ in range(round(seconds / world.step_s) - 1):
         state = world.step(wanted)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.signal import lfilter
 
-from s2a_bench.stats.batches import Launch, Memory, Rows
+from s2a_bench.stats.batches import LaunchValues, RowCorrelation, Rows
 from s2a_bench.stats.change import Noise, change_between, holm
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -160,7 +160,7 @@ def test_the_interval_of_superiority_is_that_of_resampled_batches_written_out() 
     below, above = rng.normal(0, 1, 30), rng.normal(0.5, 1, 25).round(1)
     change = change_between([rows_of(below.round(1))], [rows_of(above)], "median", seed=9, confidence=0.9)
     again = np.random.default_rng(9)
-    sides = [Launch(rows_of(values)) for values in (below.round(1), above)]
+    sides = [LaunchValues(rows_of(values)) for values in (below.round(1), above)]
     draws = [side.draw(again) for side in sides]
     found = []
     for counts in zip(*draws, strict=True):
@@ -182,7 +182,7 @@ def test_the_interval_of_superiority_is_that_of_resampled_batches_written_out() 
 def test_a_resample_has_the_statistic_of_its_values_written_out(
     rows: list[list[float]], statistic: str, seed: int
 ) -> None:
-    cut = Launch([np.array(row) for row in rows])
+    cut = LaunchValues([np.array(row) for row in rows])
     assert cut.levels.tolist() == [np.median(row) for row in rows]
     drawn = cut.draw(np.random.default_rng(seed))[:20]
     quick = cut.replicate(statistic, drawn)
@@ -247,19 +247,19 @@ def test_bounds_without_a_ratio_are_those_of_the_difference(
 
 @pytest.mark.parametrize(("rows", "dependent"), [(59, True), (61, False)])
 def test_rows_remember_about_one_plus_r_over_one_minus_r_rows(rows: int, dependent: bool) -> None:
-    assert Memory(r=0.5, n=rows, k=20).dependent is dependent  # 3 rows, and batches of n / k
+    assert RowCorrelation(r=0.5, n=rows, k=20).dependent is dependent  # 3 rows, and batches of n / k
 
 
 @pytest.mark.parametrize(("r", "dependent"), [(0.63, False), (0.64, True)])
 def test_neighbours_that_are_alike_by_chance_are_not_dependent(r: float, dependent: bool) -> None:
-    assert Memory(r, n=10, k=5).dependent is dependent  # 2 / sqrt(10) = .632
+    assert RowCorrelation(r, n=10, k=5).dependent is dependent  # 2 / sqrt(10) = .632
 
 
 def test_a_series_remembers_from_nothing_to_almost_all() -> None:
-    assert Memory.of(np.arange(1000.0)) == Memory(0.95, 1000, 10)
-    assert Memory.of(np.array([1.0, 9, 1, 9, 1, 9, 1])) == Memory(0.0, 7, 7)
-    assert Memory.of(np.ones(12)) == Memory(0.0, 12, 10)
-    assert Memory(0.3, 1, 1).hidden == 1.0
+    assert RowCorrelation.of(np.arange(1000.0)) == RowCorrelation(0.95, 1000, 10)
+    assert RowCorrelation.of(np.array([1.0, 9, 1, 9, 1, 9, 1])) == RowCorrelation(0.0, 7, 7)
+    assert RowCorrelation.of(np.ones(12)) == RowCorrelation(0.0, 12, 10)
+    assert RowCorrelation(0.3, 1, 1).hidden == 1.0
 
 
 def test_one_launch_beside_several_tells_a_superiority_without_an_interval() -> None:
@@ -273,7 +273,7 @@ def test_one_launch_beside_several_tells_a_superiority_without_an_interval() -> 
 
 @pytest.mark.parametrize("last", [6, 600])
 def test_memory_is_the_correlation_of_neighbouring_ranks(last: float) -> None:
-    assert Memory.of(np.array([1.0, 2, 3, 4, 5, last])).r == pytest.approx(8.75 / 17.5)  # ranks less 3.5
+    assert RowCorrelation.of(np.array([1.0, 2, 3, 4, 5, last])).r == pytest.approx(8.75 / 17.5)  # ranks less 3.5
 
 
 @pytest.mark.parametrize("k", [2, 20])
@@ -283,7 +283,7 @@ def test_what_batches_hide_of_the_variance_is_that_of_the_means_of_a_series_of_o
         return float(np.mean(r ** np.abs(np.subtract.outer(np.arange(m), np.arange(m)))))
 
     between = (variance(120 // k) - variance(120)) / (k - 1)  # of the means of k batches, around the whole mean
-    assert Memory(r, 120, k).hidden == pytest.approx(variance(120) / between)
+    assert RowCorrelation(r, 120, k).hidden == pytest.approx(variance(120) / between)
 
 
 def test_a_launch_that_remembers_longer_than_a_batch_is_told() -> None:

@@ -12,7 +12,7 @@ from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.boards.latency import read_latency, sequence_ns
 from s2a_bench.boards.profile import load_profile
 from s2a_bench.frames.synthetic import render_scene
-from s2a_bench.harness.timelines.config import Setting
+from s2a_bench.harness.timelines.config import PlanSetting
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
 from s2a_bench.policy import PlanShape, Timing
@@ -24,7 +24,7 @@ from s2a_bench.sweep.file import rounds
 from s2a_bench.testing.engine import ask
 from studies.worlds import World
 
-SETTING = Setting("rtx-4080", "RTX 4080", 34.2, 0.3, 6, 8, 1.0)
+SETTING = PlanSetting("rtx-4080", "RTX 4080", 34.2, 0.3, 6, 8, 1.0)
 SHAPE = PlanShape(8, 6, Timing(1.0, 0.8, 1.5), 0.2)
 WORLD = World(10.0, 0.5, 6, 8, 1.0)
 

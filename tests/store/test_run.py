@@ -24,7 +24,7 @@ from s2a_bench.errors import MissingExtra, StoreError
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.files import RESERVE, RESERVE_BYTES, read_csv, read_parquet, why
 from s2a_bench.store.requests import TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
-from s2a_bench.store.run import Run, RunWriter, fits, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, fits, read_run
 from tests.made_runs import STAGES
 
 CHAIN = [
@@ -67,7 +67,7 @@ def token(index: int, text: str, engine_ns: int | None = 5) -> TokenRow:
     return TokenRow("r1", "ros/topic", index, 100 + index, text, engine_ns, 9_007_199_254_740_993)
 
 
-def kept(folder: Path, *samples: SampleRow) -> Run:
+def kept(folder: Path, *samples: SampleRow) -> StoredRun:
     """Keep samples in a run that finishes, and read it."""
     with RunWriter.create(folder, "latency", {"stages": STAGES}) as run:
         for each in samples:
@@ -319,7 +319,7 @@ def test_a_disk_without_room_for_the_reserve_ends_the_run_before_it_begins(
 
 @pytest.mark.parametrize("wrong", [ZeroDivisionError, AttributeError, KeyError, TypeError, ValueError])
 def test_rows_that_do_not_fit_their_manifest_are_told_with_their_folders(wrong: type[Exception]) -> None:
-    runs = [Run(Path(name), {}) for name in ("one", "two")]
+    runs = [StoredRun(Path(name), {}) for name in ("one", "two")]
     said = rf"^one, two: rows and manifest do not fit: {wrong.__name__}\('x'\)$"
     with pytest.raises(StoreError, match=said), fits(*runs):
         raise wrong("x")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.writers.style import paper_column
 from studies.figures import (
     build_drift,
@@ -52,7 +52,7 @@ def row(**facts: Any) -> StudyRow:
     return StudyRow(**whole, p_any_stall=whole["stalled"] / PLANS)
 
 
-def run_of(path: Path, study: str, rows: Iterable[StudyRow], epsilon: float = 0.01) -> Run:
+def run_of(path: Path, study: str, rows: Iterable[StudyRow], epsilon: float = 0.01) -> StoredRun:
     manifest = {"configuration": {"study": study, "epsilon": epsilon}}
     with RunWriter.create(path, f"study-{study}", manifest, (STUDY_CELLS,)) as writer:
         writer.append(STUDY_CELLS, rows)

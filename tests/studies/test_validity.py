@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import binomtest
 
 from s2a_bench.plan import load_skills, paper_format
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from studies.validity import VALIDITY, Score, Share, ValidityRow, arms_of, score, validity_tables
 
 PAPER = {
@@ -27,7 +27,7 @@ def row(*, grammar: bool, lines: int, skills: int, cut: bool = False, **problems
     return ValidityRow("paper", "numbered calls", "arm", 2, grammar, 0, 9, cut, lines, skills, named, exact, "1. x\n")
 
 
-def run_of(path: Path, *rows: ValidityRow, dummy: bool = False) -> Run:
+def run_of(path: Path, *rows: ValidityRow, dummy: bool = False) -> StoredRun:
     manifest: dict[str, Any] = {
         "configuration": {"n_skills": 2, "answers": 2},
         "formats": [PAPER],

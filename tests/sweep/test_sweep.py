@@ -18,9 +18,9 @@ from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.sweep import CELLS, read_sweep
-from s2a_bench.sweep import Cell, Command, Outcome
+from s2a_bench.sweep import Outcome, SweepCell, SweepCommand
 from s2a_bench.sweep.file import SweepFile, expand, read_sweep_file, rounds
-from s2a_bench.sweep.plan import Plan, plan_sweep
+from s2a_bench.sweep.plan import SweepPlan, plan_sweep
 from s2a_bench.sweep.run import SweepRun, check_resume, difference, expect, only_one, start_sweep
 from s2a_bench.testing import NullProgress
 
@@ -139,10 +139,10 @@ FLAGS = {
     "seed": "value",
     "data-only": "switch",
 }
-COMMAND = Command("fly", FLAGS, lambda argv: "--live" not in argv)  # type: ignore[arg-type]
+COMMAND = SweepCommand("fly", FLAGS, lambda argv: "--live" not in argv)  # type: ignore[arg-type]
 
 
-def plan_of(*settings: dict[str, Any], repeats: int = 1, rest_s: float = 0.0, seed: int = 0, **of: Any) -> Plan:
+def plan_of(*settings: dict[str, Any], repeats: int = 1, rest_s: float = 0.0, seed: int = 0, **of: Any) -> SweepPlan:
     return plan_sweep(SweepFile(Path("s.toml"), "fly", repeats, rest_s, seed, settings), COMMAND, **of)
 
 
@@ -235,12 +235,12 @@ class Fake:
 
     width = 3
 
-    def __init__(self, go: Callable[[Cell], str] = lambda _: "", machine: dict[str, Any] | None = None) -> None:
+    def __init__(self, go: Callable[[SweepCell], str] = lambda _: "", machine: dict[str, Any] | None = None) -> None:
         self.go = go
         self.machine = machine or {"host": "h", "cpu": "c"}
-        self.ran: list[Cell] = []
+        self.ran: list[SweepCell] = []
 
-    def submit(self, cell: Cell, folder: Path) -> Future[Outcome]:
+    def submit(self, cell: SweepCell, folder: Path) -> Future[Outcome]:
         future: Future[Outcome] = Future()
         self.ran.append(cell)
         error = self.go(cell)
@@ -272,7 +272,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 
 
 def sit(
-    folder: Path, workers: Fake, *, plan: Plan = PLAN, retry: bool = False, clock: VirtualClock | None = None
+    folder: Path, workers: Fake, *, plan: SweepPlan = PLAN, retry: bool = False, clock: VirtualClock | None = None
 ) -> NullProgress:
     progress = NullProgress()
     with RunWriter.reopen(folder, [CELLS]) as writer:
@@ -301,7 +301,7 @@ def test_every_cell_is_kept_once_with_its_settings_and_its_run(folder: Path) -> 
 
 
 def test_a_sweep_that_breaks_off_goes_on_with_the_cells_it_has_not_kept(folder: Path) -> None:
-    def stop(_: Cell) -> str:
+    def stop(_: SweepCell) -> str:
         if len(first.ran) == 4:
             raise KeyboardInterrupt
         return ""
@@ -370,7 +370,7 @@ def test_boards_have_lanes_of_their_own_and_one_cell_at_a_time(folder: Path) -> 
     under_way: list[list[str]] = []
 
     class Slow(Fake):
-        def submit(self, cell: Cell, folder: Path) -> Future[Outcome]:
+        def submit(self, cell: SweepCell, folder: Path) -> Future[Outcome]:
             under_way.append([cell.board])
             return super().submit(cell, folder)
 
@@ -385,7 +385,7 @@ def test_a_board_that_is_another_machine_later_is_not_mixed_in(folder: Path) -> 
     twins = iter(({"host": "a", "cpu": "x"}, {"host": "b", "cpu": "y"}))
 
     class Changing(Fake):
-        def submit(self, cell: Cell, folder: Path) -> Future[Outcome]:
+        def submit(self, cell: SweepCell, folder: Path) -> Future[Outcome]:
             self.machine = next(twins)
             return super().submit(cell, folder)
 

@@ -24,7 +24,7 @@ def test_a_page_has_its_tables_as_they_are(page: Path) -> None:
 
 
 def test_a_table_can_be_of_one_group_or_of_the_others() -> None:
-    live, others = docs_flags.table("timeline", group="Live"), docs_flags.table("timeline", "-", "Live")
+    live, others = docs_flags.table("timeline", group="LiveOptions"), docs_flags.table("timeline", "-", "LiveOptions")
     assert "| `--warmup` | 1 | answers before, which policies learn the rate from |" in live.splitlines()
     assert "`--pace`" in live
     assert "`--jitter`" not in live
@@ -40,7 +40,7 @@ def test_a_table_can_be_of_what_another_command_has_otherwise() -> None:
 
 
 def test_a_group_within_a_configuration_is_left_out_or_alone() -> None:
-    live, others = docs_flags.table("ccrb", "", "Asked"), docs_flags.table("ccrb", "-", "Asked")
+    live, others = docs_flags.table("ccrb", "", "PlanRequest"), docs_flags.table("ccrb", "-", "Asked")
     assert "| `--pace` | the model's own | hold the answer back to so many tokens/s |" in live.splitlines()
     assert "`--rear-gap`" in others
     assert "`--rear-gap`" not in live

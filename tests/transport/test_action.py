@@ -20,7 +20,7 @@ from s2a_bench.ros import ActionClient, ActionServer, Rejected, Result, ServerGo
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import ServedAction, Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
-from s2a_bench.testing.transport import Recorder, ask, connector, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, connector, served, wiring, yuyv_frame
 from s2a_bench.trace import budget
 from s2a_bench.transport import Handler, Wiring, open_client, open_server
 from s2a_bench.transport.serving import Queued
@@ -184,7 +184,7 @@ def test_no_node_is_said_so(foreign: Wiring[Any]) -> None:
 
 
 def test_our_server_stops_at_a_stop_word_and_borrows_no_seed(stranger: Stranger) -> None:
-    handler = Recorder(["one ", "two ", "three ", "four "])
+    handler = RecordingHandler(["one ", "two ", "three ", "four "])
     client = stranger("/test_stop", handler)
     client.send(client.pack(generate_goal("count", stop=["three"])))
     events = [client.next_event(20) for _ in range(5)]
@@ -196,7 +196,7 @@ def test_our_server_stops_at_a_stop_word_and_borrows_no_seed(stranger: Stranger)
 
 
 def test_what_a_goal_wants_of_sampling_reaches_the_engine_or_fails_it(stranger: Stranger) -> None:
-    recorder = Recorder(["x"])
+    recorder = RecordingHandler(["x"])
     handler = Queued.around(recorder)
     handler.honours = ("temp",)
     client = stranger("/test_sampling", handler)
@@ -209,7 +209,7 @@ def test_tokens_faster_than_the_interval_share_a_feedback_and_none_is_lost(dds_d
     words = [f"t{number} " for number in range(200)]
     told = wiring("ros/action", "/test_pace", domain_id=dds_domain, max_tokens=200, feedback_interval=0.02)
     with closing(connector(told)) as connecting:
-        tokens, _ = ask(next(connecting)(Recorder(words)), Request("a", "plan", max_tokens=200))
+        tokens, _ = ask(next(connecting)(RecordingHandler(words)), Request("a", "plan", max_tokens=200))
     assert "".join(token.text for token in tokens) == "".join(words)
     assert len(tokens) < 100
 
@@ -217,7 +217,7 @@ def test_tokens_faster_than_the_interval_share_a_feedback_and_none_is_lost(dds_d
 @pytest.mark.slow
 def test_ten_thousand_goals_with_random_cancels_leak_nothing(stranger: Stranger) -> None:
     random, before = Random(1), threading.active_count()  # other tests of this process may have left some
-    client = stranger("/test_soak", Recorder(["a", "b", "c", "d"]), max_tokens=4, result_timeout=0.5)
+    client = stranger("/test_soak", RecordingHandler(["a", "b", "c", "d"]), max_tokens=4, result_timeout=0.5)
     resident: list[int] = []
     ended = {Status.SUCCEEDED: 0, Status.CANCELED: 0}
     for number in range(10_000):
@@ -235,7 +235,7 @@ def test_ten_thousand_goals_with_random_cancels_leak_nothing(stranger: Stranger)
 
 
 def test_impossible_goals_end_and_the_node_stays_up(stranger: Stranger) -> None:
-    client, frame = stranger("/test_bad", Recorder(["fine"])), yuyv_frame()
+    client, frame = stranger("/test_bad", RecordingHandler(["fine"])), yuyv_frame()
     empty = ros.image_message(replace(frame, encoding="mono8", data=frame.data[:1, :1, 0]), 0, "c")
     empty.width, empty.height, empty.step = 0, 5, 0
     odd = ros.image_message(frame, 0, "c")
@@ -259,7 +259,7 @@ def test_a_goal_that_cannot_start_ends_and_says_why(dds_domain: int, monkeypatch
     monkeypatch.setattr(ServedAction, "execute", executing)
     told = wiring("ros/action", "/test_start", domain_id=dds_domain)
     with closing(connector(told)) as connecting:
-        client = next(connecting)(Recorder(["fine"]))
+        client = next(connecting)(RecordingHandler(["fine"]))
         with pytest.raises(RequestFailed, match="no status can be sent"):
             ask(client, Request("a", "plan"))
         assert len(ask(client, Request("a", "plan"))[0]) == 1
@@ -268,7 +268,7 @@ def test_a_goal_that_cannot_start_ends_and_says_why(dds_domain: int, monkeypatch
 def test_our_server_does_not_join_a_node_that_answers_already(node: Node, dds_domain: int) -> None:
     node()
     with pytest.raises(TransportError, match="another server answers under /llama_ros"):
-        open_server(wiring("ros/action", "/llama_ros", domain_id=dds_domain), Recorder(["x"]))
+        open_server(wiring("ros/action", "/llama_ros", domain_id=dds_domain), RecordingHandler(["x"]))
 
 
 @pytest.mark.parametrize(("served", "other"), [("4.4", "6.0"), ("6.0", "4.4")])
@@ -277,7 +277,7 @@ def test_our_server_speaks_the_version_it_is_told_and_logs_who_speaks_another(
 ) -> None:
     told = wiring("ros/action", "/s2a", domain_id=dds_domain, llama_msgs=served)
     with closing(connector(told)) as connecting:
-        recorder = Recorder(["a ", "b"])
+        recorder = RecordingHandler(["a ", "b"])
         client = next(connecting)(recorder)
         tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),), grammar='root ::= "x"'))
         assert [token.text for token in tokens] == ["a ", "b"]

@@ -11,7 +11,7 @@ import pytest
 
 from s2a_bench.errors import UsageError
 from s2a_bench.machine.doctor import Finding
-from s2a_bench.testing.transport import Recorder, served, wiring
+from s2a_bench.testing.transport import RecordingHandler, served, wiring
 from s2a_bench.transport import dangers
 from s2a_bench.transport.dangers import PREFACE, examine, shown
 
@@ -55,7 +55,7 @@ def test_what_speaks_no_grpc_is_an_error(reply: bytes) -> None:
 
 
 def test_a_server_of_models_without_a_key_is_told_of() -> None:
-    with served(wiring("http"), Recorder(["x"])) as (server, _):
+    with served(wiring("http"), RecordingHandler(["x"])) as (server, _):
         findings = found(server.address)
     assert findings["plain-text"].level == "state"
     assert findings["no-key"].level == "advice"

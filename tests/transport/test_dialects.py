@@ -14,7 +14,7 @@ import pytest
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.frames.convert import decode_image, encode_png, to_bgr
-from s2a_bench.testing.transport import Connect, Recorder, TransportSuite, ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import Connect, RecordingHandler, TransportSuite, ask, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client
 from s2a_bench.transport.http import HTTP
@@ -82,23 +82,25 @@ class TestContract(TransportSuite):
             yield connect
 
     def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect) -> None:
-        tokens, _ = ask(connect(Recorder(["go", "", "_to(", "キッチン", ")\n"])), Request("a", "plan", (yuyv_frame(),)))
+        tokens, _ = ask(
+            connect(RecordingHandler(["go", "", "_to(", "キッチン", ")\n"])), Request("a", "plan", (yuyv_frame(),))
+        )
         assert [(token.index, token.text) for token in tokens] == [(0, "go"), (1, "_to("), (2, "キッチン"), (3, ")\n")]
 
     def test_every_field_of_a_request_reaches_the_handler(self, connect: Connect) -> None:
-        handler = Recorder(["x"])
+        handler = RecordingHandler(["x"])
         ask(connect(handler), Request("id-7", 'Grüße,\n"robot"\t机器人', (), max_tokens=9, seed=42))
         (got,) = handler.requests
         assert got == Request("", 'Grüße,\n"robot"\t机器人', (), max_tokens=9, seed=42)
 
     def test_the_picture_arrives_as_rgb(self, connect: Connect) -> None:
-        handler, frame = Recorder(["x"]), yuyv_frame(seed=3)
+        handler, frame = RecordingHandler(["x"]), yuyv_frame(seed=3)
         ask(connect(handler), Request("a", "", (frame,)))
         (image,) = handler.requests[0].images
         np.testing.assert_array_equal(image.data, decode_image(encode_png(to_bgr(frame))))
 
     def test_stages_and_residual_sum_to_the_whole(self, connect: Connect) -> None:
-        _, trace = ask(connect(Recorder(["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
+        _, trace = ask(connect(RecordingHandler(["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
         spent = budget(trace.chain())
         assert sum(spent.stages_ns.values()) + spent.residual_ns == spent.e2e_ns
         assert all(duration >= 0 for duration in spent.stages_ns.values())
@@ -106,7 +108,7 @@ class TestContract(TransportSuite):
 
     def test_the_servers_marks_come_back(self, connect: Connect) -> None:
         """It has none; nothing is made up."""
-        _, trace = ask(connect(Recorder(["x"])), Request("a", "plan"))
+        _, trace = ask(connect(RecordingHandler(["x"])), Request("a", "plan"))
         assert trace.remote is None
 
 
@@ -442,7 +444,7 @@ def test_an_openai_server_is_told_by_whom_its_model_is_owned(owner: str | None, 
 
 
 def test_a_grammar_reaches_the_servers_that_know_it_and_is_refused_elsewhere(speaker: Speaker) -> None:
-    handler = Recorder(["x"])
+    handler = RecordingHandler(["x"])
     request = Request("a", "plan", grammar='root ::= "x"')
     with client_of(speaker, answering(speaker, handler)) as client:
         if speaker.dialect in {"llama-server", "vllm"}:
@@ -483,7 +485,7 @@ def test_an_answer_that_a_filter_cut_is_a_failure(reason: str) -> None:
 def test_both_variants_say_the_same(speaker: Speaker) -> None:
     handlers = []
     for variant in ("as-deployed", "best-effort"):
-        handler = Recorder(["x"])
+        handler = RecordingHandler(["x"])
         handlers.append(handler)
         with serving(answering(speaker, handler)) as url:
             client = open_client(replace(route(speaker, url), variant=variant))

@@ -12,7 +12,7 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import PortInUse, RequestFailed, TransportError, UsageError
-from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, open_client, open_server
 from s2a_bench.transport.limits import Limits
@@ -54,8 +54,8 @@ class Gate:
             self.ended.append(request.prompt)
 
 
-def recorder(name: str, pieces: int = 3) -> Recorder:
-    return Recorder([[place / 8] for place in range(pieces)] if name in POLICIES else ["go "] * pieces)
+def recorder(name: str, pieces: int = 3) -> RecordingHandler:
+    return RecordingHandler([[place / 8] for place in range(pieces)] if name in POLICIES else ["go "] * pieces)
 
 
 Connect = Callable[[], Client]
@@ -174,7 +174,7 @@ def test_an_answer_whose_client_has_gone_ends(name: str) -> None:
 @pytest.mark.parametrize("name", ["http/as-deployed", "http/best-effort", "shm"])
 def test_a_client_that_does_not_read_does_not_keep_the_engine(name: str) -> None:
     many = 20_000
-    with serving(name, Recorder(["long " * 100] * many)) as connect:
+    with serving(name, RecordingHandler(["long " * 100] * many)) as connect:
         slow = connect().request(Request("slow", "go", max_tokens=many), Trace())
         next(iter(slow))
         assert len(ask(connect(), Request("b", "go", max_tokens=many))[0]) == many

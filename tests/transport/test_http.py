@@ -15,7 +15,7 @@ import httpx
 import numpy as np
 import pytest
 
-from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Remote, Trace, budget
 from s2a_bench.transport import Handler, open_client, open_server
 from s2a_bench.transport.http import own as dialect
@@ -24,8 +24,8 @@ from s2a_bench.types import Request, Token
 
 
 @pytest.fixture
-def handler() -> Recorder:
-    return Recorder(["go", "_to"])
+def handler() -> RecordingHandler:
+    return RecordingHandler(["go", "_to"])
 
 
 @contextmanager
@@ -36,13 +36,13 @@ def serving(handler: Handler, name: str = "http") -> Iterator[str]:
 
 
 @pytest.fixture
-def url(handler: Recorder) -> Iterator[str]:
+def url(handler: RecordingHandler) -> Iterator[str]:
     with serving(handler) as address:
         yield address
 
 
 @pytest.fixture
-def urls(url: str, handler: Recorder) -> Iterator[dict[str, str]]:
+def urls(url: str, handler: RecordingHandler) -> Iterator[dict[str, str]]:
     """Our servers, by the variants that they answer."""
     with serving(handler, "http/best-effort") as fast:
         yield {"as-deployed": url, "best-effort": fast, "binary": fast}
@@ -95,7 +95,7 @@ def test_marks_of_another_hosts_clock_are_not_mixed_with_ours(url: str, monkeypa
 
 @pytest.mark.parametrize(("connection", "connections"), [("keep-alive", 1), ("per-request", 3)])
 def test_connections_are_kept_or_not(
-    handler: Recorder, connection: str, connections: int, monkeypatch: pytest.MonkeyPatch
+    handler: RecordingHandler, connection: str, connections: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import socket
 
@@ -133,7 +133,7 @@ def test_the_stream_is_what_openai_clients_expect(url: str) -> None:
     assert [stage for stage, _ in events[-1]["s2a"]["marks"]] == ["network", "json_parse", "", "inference"]
 
 
-def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: Recorder) -> None:
+def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: RecordingHandler) -> None:
     picture = np.full((8, 8, 3), (255, 0, 0), np.uint8)  # blue in OpenCV's order
     uri = "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", picture)[1]).decode()
     part = {"type": "image_url", "image_url": {"url": uri}}

@@ -14,7 +14,7 @@ from threading import Event
 
 import pytest
 
-from s2a_bench.testing.transport import Recorder, served, wiring
+from s2a_bench.testing.transport import RecordingHandler, served, wiring
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler
 from s2a_bench.transport.http.own import PATHS
@@ -31,7 +31,7 @@ def connected(
     """Serve, and connect, for as long as the context lasts."""
     with ExitStack() as stack:
         told = replace(wiring(f"http/{variant}"), limits=limits)
-        server, _ = stack.enter_context(served(told, handler or Recorder(["go", "_to"])))
+        server, _ = stack.enter_context(served(told, handler or RecordingHandler(["go", "_to"])))
         host, port = server.address.removeprefix("http://").split(":")
         yield stack.enter_context(socket.create_connection((host, int(port)), timeout=20))
 

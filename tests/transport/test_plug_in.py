@@ -19,16 +19,26 @@ from s2a_bench.experiments.requests import cells_of
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import option
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import TransportSuite
 from s2a_bench.trace import Trace
-from s2a_bench.transport import SERVER, TRANSPORTS, Client, Handler, Options, Server, Transport, Wiring, declared
+from s2a_bench.transport import (
+    SERVER,
+    TRANSPORTS,
+    Client,
+    Handler,
+    Server,
+    Transport,
+    TransportOptions,
+    Wiring,
+    declared,
+)
 from s2a_bench.transport.loopback.in_process import LoopbackClient, LoopbackServer
 from s2a_bench.types import Request, Token
 
 
-class ToyOptions(Options):
+class ToyOptions(TransportOptions):
     number: int = option(1, "a number", ge=1, side=SERVER)
     greeting: str = option("hello", "a word")
 
@@ -84,14 +94,14 @@ class TestToy(TransportSuite):
 
 
 @pytest.fixture
-def run(toy: None, tmp_path: Path) -> Run:  # noqa: ARG001 - what is measured
+def run(toy: None, tmp_path: Path) -> StoredRun:  # noqa: ARG001 - what is measured
     names = ("loopback", "toy", "toy?greeting=servus", "toy?number=2")
     few: dict[str, Any] = {"requests": 3, "warmup": 1, "max_tokens": 3, "sample_resources_hz": 0}
     config = RequestsConfig(transports=names, engine=EngineConfig(name="echo"), size=(64, 48), **few)
     return read_run(run_latency(config, tmp_path, NullProgress()))
 
 
-def test_a_run_measures_it_and_everything_shows_it(run: Run) -> None:
+def test_a_run_measures_it_and_everything_shows_it(run: StoredRun) -> None:
     names = ["toy", "toy?greeting=servus", "toy?number=2", "loopback"]
     assert (run.samples["error"] == "").all()
     assert run.samples["greet_ns"].notna().sum() == 12
@@ -106,7 +116,7 @@ def test_a_run_measures_it_and_everything_shows_it(run: Run) -> None:
     assert [draw() for draw in latency_figures(run).values()]
 
 
-def test_its_folder_reads_where_the_package_is_not(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_folder_reads_where_the_package_is_not(run: StoredRun, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     forget()
     assert "toy" not in TRANSPORTS

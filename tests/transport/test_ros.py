@@ -16,7 +16,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, TransportError
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client, open_server
 from s2a_bench.transport.ros.camera import CAMERA
@@ -40,7 +40,7 @@ def told(dds_domain: int) -> Wiring[Any]:
     return wiring("ros/topic", "/test_ros", domain_id=dds_domain)
 
 
-def ask_until_seen(client: Client, handler: Recorder, stamp_ns: int) -> Trace:
+def ask_until_seen(client: Client, handler: RecordingHandler, stamp_ns: int) -> Trace:
     """Ask without a picture until the server has the frame of a stamp."""
     deadline = now_ns() + 20_000_000_000
     while now_ns() < deadline:
@@ -58,7 +58,7 @@ def test_a_request_without_a_picture_is_about_the_newest_frame(
 ) -> None:
     import cv2
 
-    handler = Recorder(["x"])
+    handler = RecordingHandler(["x"])
     serve(stack, told, handler)
     client = connect(stack, wiring("ros/topic", told.address, domain_id=dds_domain, payload=payload))
     assert client.camera is not None
@@ -78,7 +78,7 @@ def test_a_request_without_a_picture_is_about_the_newest_frame(
 
 
 def test_a_client_is_a_camera_from_when_it_is_used_as_one(stack: ExitStack, told: Wiring[Any]) -> None:
-    server = serve(stack, told, Recorder(["x"]))
+    server = serve(stack, told, RecordingHandler(["x"]))
     clients = [connect(stack, replace(told, variant=variant)) for variant in ("topic", "action")]
     publishers = server._cache._cameras[0].publishers
     assert publishers() == 0
@@ -88,7 +88,7 @@ def test_a_client_is_a_camera_from_when_it_is_used_as_one(stack: ExitStack, told
 
 
 def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, told: Wiring[Any], dds_domain: int) -> None:
-    handler = Recorder(["x"])
+    handler = RecordingHandler(["x"])
     serve(stack, told, handler)
     client = connect(stack, told)
     middleware = open_middleware(domain_id=dds_domain)
@@ -112,7 +112,7 @@ def test_a_frame_that_came_too_long_ago_fails_the_request_and_its_age_is_told(
     stack: ExitStack, dds_domain: int, variant: str
 ) -> None:
     told = wiring(f"ros/{variant}", "/test_age", domain_id=dds_domain, max_frame_age=0.3)
-    serve(stack, told, Recorder(["x"]))
+    serve(stack, told, RecordingHandler(["x"]))
     client = connect(stack, told)
     assert client.camera is not None
     frame = replace(yuyv_frame(), stamp_ns=now_ns() - 5_000_000_000)
@@ -184,6 +184,6 @@ def test_tokens_out_of_order_are_messages_lost(
 
 
 def test_a_second_server_of_a_namespace_is_refused(stack: ExitStack, told: Wiring[Any]) -> None:
-    serve(stack, told, Recorder(["x"]))
+    serve(stack, told, RecordingHandler(["x"]))
     with pytest.raises(TransportError, match="another server answers under /test_ros"):
-        open_server(told, Recorder(["y"]))
+        open_server(told, RecordingHandler(["y"]))

@@ -19,7 +19,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.diagnostics import ARRAY, Level
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
-from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.ros import camera as camera_module
 from s2a_bench.transport.ros.camera import CAMERA, CAMERA_QOS
@@ -43,7 +43,7 @@ class Robot:
     """A server, and a peer in its domain."""
 
     def __init__(self, stack: ExitStack, told: Wiring[Any]) -> None:
-        self.handler = Recorder(["x"])
+        self.handler = RecordingHandler(["x"])
         self.server: Any = stack.enter_context(served(told, self.handler))[0]
         self._stack, self._told = stack, replace(told, address=self.server.address)
         self.peer = self.join()

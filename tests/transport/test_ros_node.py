@@ -15,9 +15,9 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.inference import EngineConfig
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.diagnostics import ARRAY, LOG, LONGEST, Finding, Level, diagnostic_array, log_message
+from s2a_bench.ros.diagnostics import ARRAY, LOG, LONGEST, Level, PartHealth, diagnostic_array, log_message
 from s2a_bench.ros.parameters import PARAMETER, SERVICE, value_message, value_of
-from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring, open_client
 from s2a_bench.transport.ros.joining import join
@@ -47,7 +47,7 @@ def peer(stack: ExitStack, told: Wiring[Any], server: RosServer) -> Middleware:
 @pytest.fixture
 def server(stack: ExitStack, told: Wiring[Any]) -> RosServer:
     """A server as `serve ros` starts it."""
-    handler = Queued.around(Recorder(["a", "b"]))
+    handler = Queued.around(RecordingHandler(["a", "b"]))
     handler.settings = EngineConfig(name="echo")
     server, _ = stack.enter_context(served(told, handler))
     assert isinstance(server, RosServer)
@@ -189,7 +189,7 @@ def test_a_log_is_cut_and_cleaned() -> None:
 
 
 def test_diagnostics_survive_the_wire() -> None:
-    sent = diagnostic_array("/a/b", [Finding("c", Level.ERROR, "d", {"e": 0.5})], 5_000_000_007)
+    sent = diagnostic_array("/a/b", [PartHealth("c", Level.ERROR, "d", {"e": 0.5})], 5_000_000_007)
     array = ros.deserialise(memoryview(bytes(ros.serialise(sent, ARRAY))), ARRAY)
     (status,) = array.status
     assert ros.stamp_of(array.header) == 5_000_000_007

@@ -12,9 +12,9 @@ import zmq
 from s2a_bench.errors import EngineError, RequestFailed, S2AError
 from s2a_bench.trace import Trace
 from s2a_bench.transport.limits import Limits
-from s2a_bench.transport.serving import Core, Disconnected, Exchange, Workers
+from s2a_bench.transport.serving import Core, Disconnected, Exchange, SharedSourceWorkers
 from s2a_bench.transport.zmq.server import Marks
-from s2a_bench.transport.zmq.watch import Watch
+from s2a_bench.transport.zmq.watch import ConnectionWatch
 from s2a_bench.types import Piece, Request, Token
 
 
@@ -121,7 +121,7 @@ def test_a_worker_without_another_thread_answers_all_the_same(
         stopped.wait(0.01)
         return pending.pop() if pending else None
 
-    workers = Workers(take, stopped)
+    workers = SharedSourceWorkers(take, stopped)
     start = Thread.start
     started: list[Thread] = []
 
@@ -152,7 +152,7 @@ def test_marks_that_are_not_known_keep_nothing_of_who_asks() -> None:
 
 def test_a_message_of_a_client_that_has_gone_counts_as_no_connection() -> None:
     context = zmq.Context()
-    watch = Watch(context.socket(zmq.ROUTER))
+    watch = ConnectionWatch(context.socket(zmq.ROUTER))
     assert not watch.of(12345).gone
     assert watch.connections == {}
     watch.close()

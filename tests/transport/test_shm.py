@@ -25,13 +25,13 @@ from s2a_bench.errors import PortInUse, RequestFailed, ServerDied, TransportErro
 from s2a_bench.frames.convert import to_bgr, to_rgb
 from s2a_bench.machine.doctor import Machine
 from s2a_bench.testing.hostile.asker import usage
-from s2a_bench.testing.transport import Connect, Recorder, TransportSuite, ask, connector, wiring, yuyv_frame
+from s2a_bench.testing.transport import Connect, RecordingHandler, TransportSuite, ask, connector, wiring, yuyv_frame
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.connections import Wire
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.shm import door, shared_memory
-from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PLACE, STEP_BYTES, Memory, accept, offer
+from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PLACE, STEP_BYTES, SharedMemory, accept, offer
 from s2a_bench.transport.shm.pieces import packed, unpacked
 from s2a_bench.transport.shm.reading import HEADER_BYTES, request_at, size_of
 from s2a_bench.transport.shm.server import Writer
@@ -83,7 +83,7 @@ def named_memory(*pids: int) -> list[str]:
 
 @pytest.mark.parametrize("payload", ["raw", "png"])
 def test_several_pictures_of_unlike_sizes_arrive_with_their_very_pixels(payload: str) -> None:
-    handler = Recorder(["x"])
+    handler = RecordingHandler(["x"])
     frames = tuple(yuyv_frame(width, height, seed) for seed, (width, height) in enumerate([(64, 48), (2, 2), (98, 30)]))
     for connect in connector(wiring(f"shm?payload={payload}")):
         ask(connect(handler), Request("a", "plan", frames))
@@ -95,7 +95,7 @@ def test_several_pictures_of_unlike_sizes_arrive_with_their_very_pixels(payload:
 
 @pytest.mark.parametrize("encoding", ["bgr8", "rgb8"])
 def test_a_camera_of_rgb_or_bgr_is_written_once(connect: Connect, encoding: Any) -> None:
-    handler = Recorder(["x"])
+    handler = RecordingHandler(["x"])
     pixels = to_bgr(yuyv_frame())
     frame = Frame(0, now_ns(), 64, 48, encoding, pixels)
     ask(connect(handler), Request("a", "plan", (frame,)))
@@ -103,7 +103,7 @@ def test_a_camera_of_rgb_or_bgr_is_written_once(connect: Connect, encoding: Any)
 
 
 def test_a_larger_picture_opens_a_link_with_more_memory_and_says_so(connect: Connect) -> None:
-    handler = Recorder(["x"] * 40)
+    handler = RecordingHandler(["x"] * 40)
     client = connect(handler)
     stages = []
     for width in (64, 1280, 1280, 64):
@@ -182,7 +182,7 @@ def test_a_client_that_is_killed_in_mid_answer_leaves_nothing() -> None:
 
 
 def test_nothing_of_the_memory_has_a_name_while_it_is_used(connect: Connect) -> None:
-    client = connect(Recorder(["x"]))
+    client = connect(RecordingHandler(["x"]))
     ask(client, Request("a", "plan", (yuyv_frame(),)))
     assert sum("memfd:s2a_bench" in name for name in memory_of(os.getpid())) >= 4  # two, seen from both sides
     assert named_memory(os.getpid()) == []
@@ -220,14 +220,14 @@ def test_the_socket_is_its_users_alone(own_folder: Path) -> None:
 def test_a_folder_that_others_may_enter_is_refused_in_one_line(own_folder: Path) -> None:
     own_folder.mkdir(mode=0o755)
     with pytest.raises(TransportError, match=r"is not a folder of ours alone: remove it, or name a `socket`"):
-        open_server(wiring("shm"), Recorder([]))
+        open_server(wiring("shm"), RecordingHandler([]))
 
 
 def test_a_link_in_place_of_the_folder_is_refused(own_folder: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     own_folder.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(TransportError, match="is not a folder of ours alone"):
-        open_server(wiring("shm"), Recorder([]))
+        open_server(wiring("shm"), RecordingHandler([]))
 
 
 def test_a_socket_of_ones_own_is_used_once_and_never_takes_the_place_of_a_file(tmp_path: Path) -> None:
@@ -235,18 +235,18 @@ def test_a_socket_of_ones_own_is_used_once_and_never_takes_the_place_of_a_file(t
     told = wiring("shm", str(path))
     listener, _ = door.listen(str(path))
     with listener, pytest.raises(PortInUse, match=r"`socket`: .*robot.sock cannot be had"):
-        open_server(told, Recorder([]))
+        open_server(told, RecordingHandler([]))
     assert path.is_socket()  # as of a server that was killed
-    server = open_server(told, Recorder([]))
+    server = open_server(told, RecordingHandler([]))
     server.stop()
     server.stop()
     assert not path.exists()
     path.write_text("mine")
     with pytest.raises(PortInUse):
-        open_server(told, Recorder([]))
+        open_server(told, RecordingHandler([]))
     assert path.read_text() == "mine"
     with pytest.raises(PortInUse, match="nowhere"):
-        open_server(wiring("shm", str(tmp_path / "nowhere" / "a.sock")), Recorder([]))
+        open_server(wiring("shm", str(tmp_path / "nowhere" / "a.sock")), RecordingHandler([]))
 
 
 def test_the_name_of_a_socket_may_be_nearly_as_long_as_the_kernel_takes(tmp_path: Path) -> None:
@@ -268,7 +268,7 @@ def test_another_version_of_us_is_told_as_such() -> None:
 
 def test_a_limit_that_is_no_whole_step_is_kept_all_the_same() -> None:
     for connect in connector(replace(wiring("shm"), limits=Limits(body_mib=0.5))):
-        client = connect(Recorder(["x"]))
+        client = connect(RecordingHandler(["x"]))
         assert len(ask(client, Request("a", "plan"))[0]) == 1
         with pytest.raises(RequestFailed):
             ask(client, Request("b", "p" * (1 << 19)))
@@ -287,7 +287,7 @@ def test_the_memory_of_a_long_answer_is_given_back() -> None:
 def test_a_client_of_another_user_hears_why_it_is_refused(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("s2a_bench.transport.shm.server.may_ask", lambda _: False)
     with pytest.raises(RequestFailed, match="the link was refused: this server answers its own user only"):
-        ask(connect(Recorder(["x"])), Request("a", "plan"))
+        ask(connect(RecordingHandler(["x"])), Request("a", "plan"))
 
 
 def test_who_may_ask_is_the_user_or_root(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,7 +317,7 @@ def test_another_user_of_the_machine_gets_no_memory(tmp_path: Path, mode: int) -
         if folder.name.startswith(("pytest", "popen", "test")):
             folder.chmod(0o755)
     for connect in connector(wiring("shm", str(path))):
-        connect(Recorder(["x"]))
+        connect(RecordingHandler(["x"]))
         path.chmod(mode)
         child = os.fork()
         if not child:
@@ -344,7 +344,7 @@ def test_a_header_of_many_values_is_refused_before_it_takes_memory(unit: bytes) 
     text = b"[" + b",".join([unit] * (HEADER_BYTES // (len(unit) + 1) - 1)) + b"]"
     file = os.memfd_create("header")
     os.ftruncate(file, len(text))
-    memory = Memory(file, len(text), writes=True)
+    memory = SharedMemory(file, len(text), writes=True)
     os.close(file)
     memory.map[:] = text
     tracemalloc.start()
@@ -359,7 +359,7 @@ def test_a_header_of_many_values_is_refused_before_it_takes_memory(unit: bytes) 
 
 def test_memory_above_the_limit_is_refused() -> None:
     for connect in connector(replace(wiring("shm"), limits=Limits(body_mib=2))):
-        client = connect(Recorder(["x"]))
+        client = connect(RecordingHandler(["x"]))
         with pytest.raises(RequestFailed, match=r"refused: shared memory of \d+ bytes was offered; at most"):
             ask(client, Request("a", "plan", (yuyv_frame(1280, 960),)))
         assert len(ask(client, Request("a", "plan"))[0]) == 1
@@ -373,7 +373,7 @@ def test_nobody_there_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("gone", ["os.memfd_create", "socket.SO_PEERCRED"])
 def test_a_system_without_such_memory_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch, gone: str) -> None:
     monkeypatch.delattr(gone)
-    for opens in (lambda: open_client(wiring("shm", "x")), lambda: open_server(wiring("shm"), Recorder([]))):
+    for opens in (lambda: open_client(wiring("shm", "x")), lambda: open_server(wiring("shm"), RecordingHandler([]))):
         with pytest.raises(UsageError, match=r"`transport` shm: it needs Linux \(memfd_create, SO_PEERCRED\); this is"):
             opens()
     found = shared_memory(Machine())
@@ -391,7 +391,7 @@ def test_a_sandbox_that_forbids_such_memory_is_named(connect: Connect, monkeypat
     assert found
     assert "memfd_create: Operation not permitted" in found.message
     with pytest.raises(TransportError, match=r"shared memory of \d+ bytes cannot be had: Operation not permitted"):
-        connect(Recorder(["x"]))
+        connect(RecordingHandler(["x"]))
 
 
 SAID = st.one_of(
@@ -422,7 +422,7 @@ def test_pieces_of_any_sizes_come_in_order_however_late_they_are_read(pieces: li
     told, heard = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     file = os.memfd_create("test")
     os.ftruncate(file, ANSWER_BYTES)
-    answers = Memory(file, ANSWER_BYTES, writes=True)
+    answers = SharedMemory(file, ANSWER_BYTES, writes=True)
     os.close(file)
     with told, heard:
         heard.setblocking(False)
@@ -452,7 +452,7 @@ def test_pieces_of_any_sizes_come_in_order_however_late_they_are_read(pieces: li
 
 
 def test_an_answer_that_its_memory_has_no_room_for_ends_with_the_reason(connect: Connect) -> None:
-    handler = Recorder(["long" * (1 << 20)] * (ANSWER_BYTES >> 22))
+    handler = RecordingHandler(["long" * (1 << 20)] * (ANSWER_BYTES >> 22))
     with pytest.raises(RequestFailed, match="this wire carries no more"):
         ask(connect(handler), Request("a", "plan", max_tokens=10_000))
-    assert len(ask(connect(Recorder(["x"])), Request("b", "plan"))[0]) == 1
+    assert len(ask(connect(RecordingHandler(["x"])), Request("b", "plan"))[0]) == 1

@@ -27,7 +27,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.provenance import Provenance
-from s2a_bench.testing.transport import Connect, Recorder, ask, connector, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import Connect, RecordingHandler, ask, connector, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.dangers import examine
@@ -98,7 +98,7 @@ def openpi(address: str, **more: Any) -> Any:
 
 
 def test_openpi_client_gets_actions_from_our_server() -> None:
-    handler = Recorder(list(CHUNK))
+    handler = RecordingHandler(list(CHUNK))
     queued = Queued.around(handler)
     queued.settings, queued.provenance = EngineConfig(name="echo", answer="actions", horizon=4), {"engine": "echo"}
     with serving(queued) as server:
@@ -121,7 +121,7 @@ def test_openpi_client_gets_actions_from_our_server() -> None:
 
 @pytest.mark.parametrize("dtype", ["bool", "int8", "uint16", ">i4", "int64", "float16", "float32", ">f8", "S3", "U3"])
 def test_openpi_client_sends_arrays_of_every_type(dtype: str) -> None:
-    handler = Recorder(list(CHUNK))
+    handler = RecordingHandler(list(CHUNK))
     sent = np.ones((2, 3)).astype(dtype)
     with serving(handler) as server:
         policy = openpi(server.address)
@@ -131,7 +131,7 @@ def test_openpi_client_sends_arrays_of_every_type(dtype: str) -> None:
 
 
 def test_openpi_client_gets_an_error_as_text_and_the_connection_closes_with_1011() -> None:
-    handler = Recorder(list(CHUNK))
+    handler = RecordingHandler(list(CHUNK))
     handler.fail_at = 0
     with serving(handler) as server:
         policy = openpi(server.address)
@@ -147,7 +147,7 @@ def test_openpi_client_gets_an_error_as_text_and_the_connection_closes_with_1011
 
 def test_openpi_client_with_its_key(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROBOT_KEY", "open sesame")
-    with serving(Recorder(list(CHUNK)), api_key_env="ROBOT_KEY") as server:
+    with serving(RecordingHandler(list(CHUNK)), api_key_env="ROBOT_KEY") as server:
         policy = openpi(server.address, api_key="open sesame")
         assert policy.infer({"prompt": "go"})["actions"].shape == (4, 3)
         policy._ws.close()
@@ -160,14 +160,14 @@ def test_openpi_client_with_its_key(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_policy_websocket_client_gets_actions_from_our_server() -> None:
     peer = pytest.importorskip("policy_websocket")
-    with serving(Recorder(list(CHUNK))) as server:
+    with serving(RecordingHandler(list(CHUNK))) as server:
         policy = peer.WebsocketClientPolicy(server.address)
         np.testing.assert_array_equal(policy.infer({"state": np.zeros(7), "prompt": "go"})["actions"], CHUNK)
         policy.close()
 
 
 def test_a_stranger_asks_for_the_stream() -> None:
-    with serving(Recorder(list(CHUNK))) as server, robot(server.address, "/stream") as (socket, _):
+    with serving(RecordingHandler(list(CHUNK))) as server, robot(server.address, "/stream") as (socket, _):
         socket.send(packb({"prompt": "go"}))
         messages = [unpackb(socket.recv()) for _ in range(5)]
     assert [message["type"] for message in messages] == ["partial"] * 4 + ["final"]
@@ -200,7 +200,7 @@ def test_a_request_that_comes_early_waits_for_the_one_before() -> None:
 
 
 def test_messages_in_fragments_are_joined() -> None:
-    handler = Recorder(list(CHUNK))
+    handler = RecordingHandler(list(CHUNK))
     with serving(handler) as server, robot(server.address) as (socket, _):
         body = packb({"prompt": "go on"})
         socket.send([body[:3], body[3:9], b"", body[9:]])
@@ -227,7 +227,7 @@ def closed_with(socket: Any) -> tuple[str, int]:
     ],
 )
 def test_what_is_no_observation_is_refused_in_a_line(message: Any, says: str, code: int) -> None:
-    with serving(Recorder(list(CHUNK))) as server, robot(server.address) as (socket, _):
+    with serving(RecordingHandler(list(CHUNK))) as server, robot(server.address) as (socket, _):
         socket.send(message)
         said, got = closed_with(socket)
     assert says in said
@@ -235,7 +235,10 @@ def test_what_is_no_observation_is_refused_in_a_line(message: Any, says: str, co
 
 
 def test_a_message_that_is_too_large_is_refused_before_it_comes() -> None:
-    with serving(Recorder(list(CHUNK)), limits=Limits(body_mib=0.1)) as server, robot(server.address) as (socket, _):
+    with (
+        serving(RecordingHandler(list(CHUNK)), limits=Limits(body_mib=0.1)) as server,
+        robot(server.address) as (socket, _),
+    ):
         socket.socket.sendall(b"\x82\xff" + (1 << 30).to_bytes(8, "big"))
         with pytest.raises(ConnectionClosed) as closed:
             socket.recv(timeout=20)
@@ -262,7 +265,7 @@ def test_small_requests_that_are_too_much_together_are_refused() -> None:
 
 
 def test_what_half_a_message_held_is_given_back() -> None:
-    with serving(Recorder(list(CHUNK)), limits=Limits(in_flight_mib=1.0)) as server:
+    with serving(RecordingHandler(list(CHUNK)), limits=Limits(in_flight_mib=1.0)) as server:
         for _ in range(3):
             with robot(server.address) as (socket, _):
                 socket.socket.sendall(b"\x82\xff" + (900_000).to_bytes(8, "big") + bytes(600_000))
@@ -276,7 +279,7 @@ def test_what_half_a_message_held_is_given_back() -> None:
 def test_what_a_refused_message_held_is_given_back_though_its_client_stays() -> None:
     handshake = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: "
     handshake = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n" + handshake + b"AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-    with serving(Recorder(list(CHUNK)), limits=Limits(in_flight_mib=1.0)) as server:
+    with serving(RecordingHandler(list(CHUNK)), limits=Limits(in_flight_mib=1.0)) as server:
         host, _, port = server.address.removeprefix("ws://").partition(":")
         with create_connection((host, int(port)), 20) as stays:
             stays.sendall(handshake + b"\x82\xff" + (1_200_000).to_bytes(8, "big") + bytes(1_100_000))
@@ -288,7 +291,10 @@ def test_what_a_refused_message_held_is_given_back_though_its_client_stays() -> 
 
 
 def test_a_message_that_does_not_end_is_given_up() -> None:
-    with serving(Recorder(list(CHUNK)), limits=Limits(body_s=0.2)) as server, robot(server.address) as (socket, _):
+    with (
+        serving(RecordingHandler(list(CHUNK)), limits=Limits(body_s=0.2)) as server,
+        robot(server.address) as (socket, _),
+    ):
         socket.socket.sendall(b"\x82\xff" + (1 << 20).to_bytes(8, "big") + b"abcdefg")
         said, code = closed_with(socket)
     assert "a message took more than 0.2 s" in said
@@ -333,7 +339,7 @@ def test_keepalive_pings_and_more_than_a_thousand_of_them_over_time_pass(monkeyp
     began = now_ns()
     pings = iter(range(10**6))
     monkeypatch.setattr(connection, "now_ns", lambda: began + next(pings) * 100_000_000)
-    with serving(Recorder(list(CHUNK))) as server, robot(server.address) as (socket, _):
+    with serving(RecordingHandler(list(CHUNK))) as server, robot(server.address) as (socket, _):
         for _ in range(3000):
             assert socket.ping().wait(20)
         socket.send(packb({"prompt": "go"}))
@@ -342,9 +348,9 @@ def test_keepalive_pings_and_more_than_a_thousand_of_them_over_time_pass(monkeyp
 
 def test_a_name_of_somebody_else_is_refused_unless_it_is_allowed() -> None:
     headers = {"Host": "robot.example"}
-    with serving(Recorder(list(CHUNK)), allow_host="robot.example") as server:
+    with serving(RecordingHandler(list(CHUNK)), allow_host="robot.example") as server:
         assert get(server.address, "/healthz", **headers) == (200, "OK\n")
-    with serving(Recorder(list(CHUNK))) as server:
+    with serving(RecordingHandler(list(CHUNK))) as server:
         assert get(server.address, "/healthz") == (200, "OK\n")
         status, said = get(server.address, "/healthz", **headers)
     assert status == 403
@@ -353,7 +359,7 @@ def test_a_name_of_somebody_else_is_refused_unless_it_is_allowed() -> None:
 
 def test_no_page_of_a_browser_may_ask() -> None:
     with (
-        serving(Recorder(list(CHUNK))) as server,
+        serving(RecordingHandler(list(CHUNK))) as server,
         pytest.raises(InvalidStatus, match="403"),
         robot(server.address, origin="https://example.org"),
     ):
@@ -361,21 +367,21 @@ def test_no_page_of_a_browser_may_ask() -> None:
 
 
 def test_what_is_no_websocket_is_told_so() -> None:
-    with serving(Recorder(list(CHUNK))) as server:
+    with serving(RecordingHandler(list(CHUNK))) as server:
         status, said = get(server.address, "/")
     assert status == 426
     assert "WebSocket" in said
 
 
 def test_tokens_do_not_travel() -> None:
-    with serving(Recorder(["x"])) as server, robot(server.address) as (socket, _):
+    with serving(RecordingHandler(["x"])) as server, robot(server.address) as (socket, _):
         socket.send(packb({"prompt": "go"}))
         said, _ = closed_with(socket)
     assert "choose `answer` actions" in said
 
 
 def test_the_doctor_tells_of_a_server_without_a_key_that_refuses_pages() -> None:
-    with serving(Recorder(list(CHUNK))) as server:
+    with serving(RecordingHandler(list(CHUNK))) as server:
         found = {finding.code: finding for finding in examine(server.address)}
     assert "it greets everybody (server, provenance)" in found["no-key"].message
     assert "any-page" not in found
@@ -389,7 +395,7 @@ def test_the_doctor_tells_of_a_server_that_any_page_may_ask() -> None:
 
 def test_the_doctor_tells_of_a_server_with_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROBOT_KEY", "open sesame")
-    with serving(Recorder(list(CHUNK)), api_key_env="ROBOT_KEY") as server:
+    with serving(RecordingHandler(list(CHUNK)), api_key_env="ROBOT_KEY") as server:
         found = {finding.code: finding for finding in examine(server.address)}
     assert "greets nobody without a key" in found["server"].message
     assert {finding.level for finding in examine("ws://127.0.0.1:9")} == {"state", "error"}
@@ -399,7 +405,7 @@ def test_the_doctor_tells_of_a_server_with_a_key(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_parts_of_a_picture_are_marked(connect: Connect) -> None:
-    _, trace = ask(connect(Recorder(list(CHUNK))), Request("a", "go", (yuyv_frame(),)))
+    _, trace = ask(connect(RecordingHandler(list(CHUNK))), Request("a", "go", (yuyv_frame(),)))
     spent = budget(trace.chain()).stages_ns
     own = {"msgpack_pack", "connect", "network", "msgpack_parse", "inference", "return"}
     assert set(spent) == own | {"convert"}
@@ -419,7 +425,7 @@ def test_the_first_action_of_a_stream_comes_before_the_last_is_there() -> None:
 
 
 def test_a_server_that_came_back_is_connected_to_again() -> None:
-    handler = Recorder(list(CHUNK))
+    handler = RecordingHandler(list(CHUNK))
     with serving(handler) as server:
         client = open_client(replace(wiring("websocket"), address=server.address))
         ask(client, Request("a", "go"))
@@ -495,7 +501,7 @@ def foreign(address: str, name: str = "websocket/openpi", **options: Any) -> Ite
 
 
 def test_a_server_of_ours_behind_a_url_says_who_answers() -> None:
-    queued = Queued.around(Recorder(list(CHUNK)))
+    queued = Queued.around(RecordingHandler(list(CHUNK)))
     queued.provenance = Provenance("echo", weights="none", tokens="emulated", profile="latencies 80 ms").to_dict()
     with serving(queued) as server, foreign(server.address) as client:
         _, trace = ask(client, Request("a", "go", (yuyv_frame(64, 48),)))
@@ -697,7 +703,7 @@ def test_policy_websocket_killed_in_mid_request_is_one_line(policy_server: tuple
 
 def test_an_answer_that_no_socket_takes_at_once_comes_whole() -> None:
     chunk = np.random.default_rng(1).normal(size=(4096, 200)).astype(np.float32)
-    handler = Recorder(list(chunk))
+    handler = RecordingHandler(list(chunk))
     with serving(handler) as server, robot(server.address) as (socket, _):
         for _ in "ab":
             socket.send(packb({"prompt": "go"}))
@@ -706,7 +712,7 @@ def test_an_answer_that_no_socket_takes_at_once_comes_whole() -> None:
 
 
 def test_a_client_that_does_not_read_its_stream_does_not_keep_the_engine() -> None:
-    handler = Recorder(list(np.zeros((1000, 5000), np.float32)))
+    handler = RecordingHandler(list(np.zeros((1000, 5000), np.float32)))
     with (
         serving(handler) as server,
         robot(server.address, "/stream", max_queue=1) as (slow, _),

@@ -26,13 +26,13 @@ from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
-from s2a_bench.testing.transport import Recorder, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.dangers import examine
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
-from s2a_bench.transport.zmq.watch import Watch
+from s2a_bench.transport.zmq.watch import ConnectionWatch
 from s2a_bench.types import Action, Piece, Request
 from tests.waiting import until
 
@@ -179,7 +179,7 @@ def strands() -> Any:
 
 class TestClientsOfOthers:
     def test_the_client_of_strands_robots_is_answered(self, strands: Any) -> None:
-        handler = Recorder(list(CHUNK))
+        handler = RecordingHandler(list(CHUNK))
         with serving(handler) as server:
             client = strands.GR00TClient("127.0.0.1", int(server.address.rpartition(":")[2]))
             assert client.ping()
@@ -194,7 +194,7 @@ class TestClientsOfOthers:
 
     def test_its_policy_moves_a_robot_by_our_answers(self, strands: Any) -> None:
         joints = [f"joint_{number}" for number in range(6)]
-        handler = Recorder(list(np.arange(12, dtype=np.float32).reshape(2, 6)))
+        handler = RecordingHandler(list(np.arange(12, dtype=np.float32).reshape(2, 6)))
         with serving(handler) as server:
             theirs = strands.Gr00tPolicy("so100", "127.0.0.1", int(server.address.rpartition(":")[2]))
             theirs.set_robot_state_keys(joints)
@@ -206,14 +206,14 @@ class TestClientsOfOthers:
         assert handler.requests[0].prompt == "go home"
 
     def test_n1_5_is_answered_flat_with_a_batch_where_it_has_one(self) -> None:
-        with serving(Recorder(list(CHUNK))) as server, plain(server.address) as call:
+        with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address) as call:
             for frames, batched in ((1, False), (2, True)):
                 answer = call("get_action", flat(frames, batched))
                 assert list(answer) == ["action.robot"]
                 assert answer["action.robot"].shape == ((1, 4, 3) if batched else (4, 3))
 
     def test_n1_6_is_answered_with_a_list(self) -> None:
-        handler = Recorder(list(CHUNK))
+        handler = RecordingHandler(list(CHUNK))
         with serving(handler) as server, plain(server.address) as call:
             actions, info = call("get_action", {"observation": nested(), "options": {"words": "not the prompt"}})
         assert info == {}
@@ -223,7 +223,7 @@ class TestClientsOfOthers:
         assert [image.data.shape for image in got.images] == [(48, 64, 3), (48, 64, 3), (32, 32, 3)]
 
     def test_n1_7_is_answered_in_its_own_codec(self, peer: Any) -> None:
-        handler = Recorder(list(CHUNK))
+        handler = RecordingHandler(list(CHUNK))
         with serving(handler) as server, plain(server.address, **mapped(peer)) as call:
             actions, info = call("get_action", {"observation": nested(), "options": None})
             with plain(server.address) as older:
@@ -235,12 +235,12 @@ class TestClientsOfOthers:
         assert [image.data.shape for image in handler.requests[0].images] == [(48, 64, 3), (48, 64, 3), (32, 32, 3)]
 
     def test_objects_of_msgpack_numpy_are_refused_in_a_line(self, peer: Any) -> None:
-        with serving(Recorder(list(CHUNK))) as server, plain(server.address, **mapped(peer)) as call:
+        with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address, **mapped(peer)) as call:
             error = call("get_action", {"observation": {"state": {"arm": np.array([{}], object)}}})["error"]
         assert "nothing is unpickled" in error
 
     def test_other_endpoints_answer_as_gr00ts(self) -> None:
-        with serving(Recorder([])) as server, plain(server.address) as call:
+        with serving(RecordingHandler([])) as server, plain(server.address) as call:
             assert call("ping") == {"status": "ok", "message": "Server is running"}
             assert call("reset", {"options": None}) == {}
             assert "Unknown endpoint: 'dance'" in call("dance")["error"]
@@ -249,27 +249,27 @@ class TestClientsOfOthers:
         assert configs["language"]["as_json"]["modality_keys"] == [TASK]
 
     def test_n1_5s_modalities_are_json(self) -> None:
-        with serving(Recorder([]), layout="n1.5") as server, plain(server.address) as call:
+        with serving(RecordingHandler([]), layout="n1.5") as server, plain(server.address) as call:
             video = call("get_modality_config")["video"]
         assert json.loads(video["as_json"]) == {"delta_indices": [0], "modality_keys": ["video.ego_view"]}
 
     def test_n1_7s_modalities_have_a_mark_of_their_own(self) -> None:
-        with serving(Recorder([]), layout="n1.7") as server, plain(server.address) as call:
+        with serving(RecordingHandler([]), layout="n1.7") as server, plain(server.address) as call:
             configs = call("get_modality_config")
         assert [list(config) for config in configs.values()] == [["__ModalityConfig__", "as_json"]] * 4
         assert configs["video"]["as_json"]["modality_keys"] == ["ego_view"]
 
     def test_nobody_ends_the_server_over_the_network(self) -> None:
-        with serving(Recorder([])) as server, plain(server.address) as call:
+        with serving(RecordingHandler([])) as server, plain(server.address) as call:
             assert "stop its process" in call("kill")["error"]
             assert call("ping")["status"] == "ok"
 
     def test_an_engine_of_tokens_is_refused_in_a_line(self) -> None:
-        with serving(Recorder(["go"])) as server, plain(server.address) as call:
+        with serving(RecordingHandler(["go"])) as server, plain(server.address) as call:
             assert "choose `answer` actions" in call("get_action", flat())["error"]
 
     def test_marks_are_for_who_said_an_id_and_once(self) -> None:
-        with serving(Recorder(list(CHUNK))) as server, plain(server.address) as call:
+        with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address) as call:
             call("get_action", flat())
             assert "not known" in call("s2a_marks", s2a={"id": "observation-0"})["error"]
             call("get_action", flat(), s2a={"id": "mine"})
@@ -317,7 +317,7 @@ class TestServer:
 
     def test_without_its_key_nothing_is_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("ROBOT_KEY", KEY)
-        handler = Recorder(list(CHUNK))
+        handler = RecordingHandler(list(CHUNK))
         with serving(handler, api_key_env="ROBOT_KEY") as server, plain(server.address) as call:
             for wrong in ({}, {"api_token": "wrong"}, {"api_token": None}, {"api_token": [KEY]}):
                 for endpoint in ("ping", "get_action", "get_modality_config", "kill", "s2a_marks"):
@@ -330,7 +330,7 @@ class TestWatch:
     def test_a_message_is_of_the_connection_that_has_the_descriptor_now(self) -> None:
         context = zmq.Context()
         router = context.socket(zmq.ROUTER)
-        watch = Watch(router)
+        watch = ConnectionWatch(router)
         port = router.bind_to_random_port("tcp://127.0.0.1")
         descriptors = []
         for _ in range(3):
@@ -555,7 +555,7 @@ class TestLayoutOfAServer:
 
     @pytest.mark.parametrize(("layout", "found"), [("auto", "n1.6"), ("n1.6", "n1.6"), ("n1.7", "n1.7")])
     def test_our_own_server_tells_its_layout(self, layout: str, found: str) -> None:
-        handler = Recorder(list(CHUNK))
+        handler = RecordingHandler(list(CHUNK))
         with serving(handler, layout=layout) as server, robot("", url=server.address) as client:
             assert client.describe()["layout"] == found
             ask(client, Request("a", "go", (yuyv_frame(),)))
@@ -565,7 +565,7 @@ class TestLayoutOfAServer:
         assert [request.images[0].data.shape for request in handler.requests] == [(48, 64, 3)] * 2
 
     def test_unless_told_it_has_the_marks_of_all_who_nest(self) -> None:
-        with serving(Recorder([])) as server, plain(server.address) as call:
+        with serving(RecordingHandler([])) as server, plain(server.address) as call:
             video = call("get_modality_config")["video"]
         assert (video.pop("__ModalityConfig_class__"), video.pop("__ModalityConfig__")) == (True, True)
         assert video["as_json"]["modality_keys"] == ["ego_view"]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 DURATIONS = ("t_nom", "t_min")
 """As skills are executed, and as the paper draws the line."""
@@ -35,7 +35,7 @@ _TRIALS: Final[dict[str, dict[str, Any]]] = {
 }
 
 
-def show(run: Run, **_: Any) -> Shown:
+def show(run: StoredRun, **_: Any) -> Shown:
     """Return what a boundary run shows."""
     return Shown(
         sentences=boundary_sentences(run),
@@ -62,25 +62,25 @@ BoundaryCell = cell_of_row(
 )
 
 
-def grid_of(run: Run, duration: str) -> pd.DataFrame:
+def grid_of(run: StoredRun, duration: str) -> pd.DataFrame:
     """Return the points of the grid for one duration."""
     rows = run.table(BOUNDARY)
     return rows[(rows["duration"] == duration) & (rows["board"] == "")]
 
 
-def marks_of(run: Run) -> list[tuple[str, float, pd.DataFrame]]:
+def marks_of(run: StoredRun) -> list[tuple[str, float, pd.DataFrame]]:
     """Return title and rate of each board with its points, in the order asked for."""
     rows = run.table(BOUNDARY)
     boards = run.manifest["boards"]
     return [(board["title"], board["tokens_per_s"], rows[rows["board"] == board["name"]]) for board in boards]
 
 
-def is_random(run: Run) -> bool:
+def is_random(run: StoredRun) -> bool:
     """Return whether plans differ at a point."""
     return bool((run.table(BOUNDARY)["plans"] > 1).any())
 
 
-def board_table(run: Run) -> TextTable:
+def board_table(run: StoredRun) -> TextTable:
     """Lay out the boards: gap between skills, and whether naive is stall-free there."""
     groups = []
     for title, rate, points in marks_of(run):
@@ -96,7 +96,7 @@ def board_table(run: Run) -> TextTable:
     return TextTable.grouped("Boards: is naive stall-free?", header, groups, 1, _notes(run), once=1)
 
 
-def line_table(run: Run) -> TextTable:
+def line_table(run: StoredRun) -> TextTable:
     """Lay out the slowest stall-free rate: L / T, and the slowest of the grid's rates that passed the trial."""
     rows = []
     for tokens in sorted(grid_of(run, "t_nom")["tokens_per_skill"].unique()):
@@ -111,13 +111,13 @@ def line_table(run: Run) -> TextTable:
     return TextTable("Slowest rate without stalls under naive, in tokens/s", header, rows, 1)
 
 
-def boundary_csv(run: Run) -> dict[str, CsvTable]:
+def boundary_csv(run: StoredRun) -> dict[str, CsvTable]:
     """Return file name -> CSV table: every point of the plane and of the boards."""
     names = ("duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall")
     return {"boundary.csv": CsvTable.of(names, run.table(BOUNDARY)[list(names)].itertuples(index=False, name=None))}
 
 
-def boundary_sentences(run: Run) -> list[str]:
+def boundary_sentences(run: StoredRun) -> list[str]:
     """Return whether the formula holds, and what the paper's line leaves out."""
     points = len(run.table(BOUNDARY))
     said = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
@@ -130,13 +130,13 @@ def boundary_sentences(run: Run) -> list[str]:
     return said
 
 
-def disagreements(run: Run) -> int:
+def disagreements(run: StoredRun) -> int:
     """Count the points where formula and trial differ; with jitter they must, so that only even tokens tell."""
     rows = run.table(BOUNDARY)
     return int(((rows["p_stall"] == 0) != rows["stall_free"]).sum())
 
 
-def _cells(run: Run) -> Iterator[dict[str, Any]]:
+def _cells(run: StoredRun) -> Iterator[dict[str, Any]]:
     for row in run.table(BOUNDARY).drop(columns=PROVENANCE).to_dict("records"):
         rate, board = row.pop("tokens_per_s"), row.pop("board")
         rho = row["tokens_per_skill"] / rate / row["duration_s"]
@@ -149,7 +149,7 @@ def _verdict(point: dict[Any, Any], *, random: bool) -> str:
     return f"{said}, P = {point['p_stall']:.1%}" if random else said
 
 
-def _notes(run: Run) -> tuple[str, ...]:
+def _notes(run: StoredRun) -> tuple[str, ...]:
     points = len(run.table(BOUNDARY))
     notes = [
         "Naive runs every skill for T_nom. The paper draws the line for T_min, which holds if skills may end early."
@@ -166,7 +166,7 @@ def _notes(run: Run) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def build_boundary(run: Run) -> Figure:
+def build_boundary(run: StoredRun) -> Figure:
     """Draw the lines R = L / T_nom and R = L / T_min, what trials found, and the boards.
 
     Without jitter regions are shaded by the formula and every trial is a mark; with jitter P(a plan stalls) is shaded.
@@ -213,14 +213,14 @@ def _shade_regions(axes: Axes, tokens: np.ndarray, lines: dict[str, float], low:
         axes.fill_between(tokens, below, above, color=colour, alpha=_SHADE, linewidth=0, label=label)
 
 
-def _mark_trials(axes: Axes, run: Run) -> None:
+def _mark_trials(axes: Axes, run: StoredRun) -> None:
     points = grid_of(run, "t_nom")
     free = points["p_stall"] == 0
     for chosen, (label, look) in zip((points[free], points[~free]), _TRIALS.items(), strict=True):
         axes.scatter(chosen["tokens_per_skill"], chosen["tokens_per_s"], 7, linewidths=0.5, label=label, **look)
 
 
-def _shade_shares(figure: Figure, axes: Axes, run: Run) -> None:
+def _shade_shares(figure: Figure, axes: Axes, run: StoredRun) -> None:
     """Shade the share of plans that stall, as executed at T_nom."""
     table = grid_of(run, "t_nom").pivot_table(index="tokens_per_s", columns="tokens_per_skill", values="p_stall")
     mesh = axes.pcolormesh(
@@ -236,7 +236,7 @@ def _shade_shares(figure: Figure, axes: Axes, run: Run) -> None:
     figure.colorbar(mesh, ax=axes, location="top", label="P(a plan stalls), naive at $T_\\mathrm{nom}$", pad=0.02)
 
 
-def _mark_boards(axes: Axes, run: Run) -> None:
+def _mark_boards(axes: Axes, run: StoredRun) -> None:
     """Draw a line a board, named beside it, with its granularities: filled where naive is stall-free at T_nom."""
     for title, rate, points in marks_of(run):
         nominal = points[points["duration"] == "t_nom"]
@@ -255,7 +255,7 @@ def _mark_boards(axes: Axes, run: Run) -> None:
             )
 
 
-def _caption(run: Run) -> tuple[str, ...]:
+def _caption(run: StoredRun) -> tuple[str, ...]:
     asked = run.manifest["configuration"]
     t_nom_s = asked["t_nom_s"]
     facts = [f"N = {asked['n_skills']}", f"T_nom = {t_nom_s:g} s", f"T_min = {asked['t_min'] * t_nom_s:g} s"]

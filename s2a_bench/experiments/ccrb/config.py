@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from s2a_bench.harness.timelines.config import TimelineConfig
 
 
-class Asked(Options):
+class PlanRequest(Options):
     """Which model answers, over which transport."""
 
     PANEL: ClassVar[str] = "A model that answers"
@@ -88,7 +88,7 @@ class CcrbConfig(Options):
     seeds: int = option(10, "draws of --all-followers and --sensitivity", ge=1, le=1000)
     seed_points: int = option(128, "points that each of them draws", ge=1, le=65_536, hidden=True)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
-    asked: Asked = Field(default_factory=Asked)
+    asked: PlanRequest = Field(default_factory=PlanRequest)
 
     @property
     def virtual(self) -> bool:

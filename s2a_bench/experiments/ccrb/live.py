@@ -22,8 +22,8 @@ from s2a_bench.experiments.ccrb.run import Prepared, complete, drive_point
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.plan import FeedPlan
-from s2a_bench.harness.rounds import Launch, Task, run_requests
-from s2a_bench.harness.timelines.link import Ask, Link, word
+from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
+from s2a_bench.harness.timelines.link import Ask, ModelLink, word
 from s2a_bench.harness.timelines.policies import prepare as prepare_policies
 from s2a_bench.plan import Parser
 from s2a_bench.policy import Plans, PlanShape, Timing
@@ -59,10 +59,10 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
         return run_requests(task, plan, output, progress)
 
 
-def _drive(config: CcrbConfig, ask: Ask, world: Simulator, launch: Launch) -> None:
+def _drive(config: CcrbConfig, ask: Ask, world: Simulator, launch: RunningLaunch) -> None:
     progress = launch.progress
     progress.expect(launch.plan.blocks.warmup + 1)
-    link = Link(config.request, launch, f"{world.name} simulator")
+    link = ModelLink(config.request, launch, f"{world.name} simulator")
     prior = link.warm_up(ask)
     progress.stage(f"one plan over {link.cell.name}")
     ready = _hear(config, ask, link, prior)
@@ -71,7 +71,7 @@ def _drive(config: CcrbConfig, ask: Ask, world: Simulator, launch: Launch) -> No
     drive_point(config, ready, world, launch.writer)
 
 
-def _hear(config: CcrbConfig, ask: Ask, link: Link, prior: GapPrior | None) -> Prepared:
+def _hear(config: CcrbConfig, ask: Ask, link: ModelLink, prior: GapPrior | None) -> Prepared:
     """Make the request, and let the policies have its arrivals; raises TransportError where the plan is not whole."""
     events: list[Event] = []
     feed = PlanFeed(Parser(ask.format), events.append)

@@ -24,7 +24,7 @@ from s2a_bench.experiments.ccrb.studies import (
     study_rows,
     trajectory_rows,
 )
-from s2a_bench.harness.timelines.config import Setting, settings
+from s2a_bench.harness.timelines.config import PlanSetting, settings
 from s2a_bench.harness.timelines.policies import draw, learn
 from s2a_bench.harness.timelines.rows import skill_rows, to_ns, token_rows
 from s2a_bench.machine import environment
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 class Prepared:
     """One plan, ready to be driven by every policy."""
 
-    setting: Setting
+    setting: PlanSetting
     request_id: str
     plans: Plans
     schedules: dict[str, Schedule]
@@ -67,7 +67,7 @@ def prepare(config: CcrbConfig) -> Prepared:
 
 
 def complete(
-    config: CcrbConfig, setting: Setting, request_id: str, plans: Plans, policies: Mapping[str, Policy]
+    config: CcrbConfig, setting: PlanSetting, request_id: str, plans: Plans, policies: Mapping[str, Policy]
 ) -> Prepared:
     """Ask the policies about a plan, drawn or heard."""
     asked = config.scenario

@@ -12,7 +12,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from s2a_bench.errors import RequestFailed, UsageError
-from s2a_bench.harness.session import Asked, Measured, Place, Session
+from s2a_bench.harness.session import Measured, Place, RequestContext, Session
 from s2a_bench.types import Action
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class Asking:
 
             place = Place(next(self.blocks), attempt, warmup=False)
             request = replace(session.request, seed=(self.seed + job.tick) % SEEDS)
-            measured = session.measure(place, Asked(job.state or None, heard, request=request))
+            measured = session.measure(place, RequestContext(job.state or None, heard, request=request))
             self.names[job.request] = measured.sample.request_id
             self.sent_bytes += measured.sample.payload_bytes or 0
             self.done.put((session, measured))
@@ -124,7 +124,7 @@ def warm_up(session: Session, place: Place, horizon: int) -> tuple[Measured, int
         if isinstance(piece, Action):
             actions.append(piece.values)
 
-    measured = session.measure(place, Asked(heard=heard))
+    measured = session.measure(place, RequestContext(heard=heard))
     if not measured.sample.error:
         check(session, len(actions), horizon)
     return measured, actions[0].size if actions else 0

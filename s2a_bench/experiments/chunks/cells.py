@@ -7,7 +7,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from s2a_bench.policy.chunks.trigger import Learning, Maximum, Mean, Rule, Tracked, calibrate, follow, trigger
+from s2a_bench.policy.chunks.trigger import (
+    Learning,
+    Maximum,
+    Mean,
+    TrackedLatency,
+    TriggerRule,
+    calibrate,
+    follow,
+    trigger,
+)
 from s2a_bench.policy.parameters import canonical
 from s2a_bench.stats.seeds import generator
 
@@ -24,7 +33,7 @@ _ORACLE_DRAWS: Final = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
+class LatencyDraw:
     """The latencies of one source, in ns: those that are judged, and others that rules learn from."""
 
     source: Source
@@ -33,18 +42,18 @@ class Drawn:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cell:
+class ChunkCell:
     """One mode under one source; ``triggers`` are those that a rule chose request by request."""
 
     mode: Mode
     name: str
     """The mode with its parameters; of one with a rule without the trigger."""
     rule: str
-    drawn: Drawn
+    drawn: LatencyDraw
     triggers: tuple[int, ...] = ()
     slower: float = 1.0
     """So many times slower than the others it executes its actions (time-scaling)."""
-    begin: Callable[[], Rule] | None = None
+    begin: Callable[[], TriggerRule] | None = None
     """Makes the rule that chooses triggers while it acts."""
 
     @property
@@ -60,22 +69,22 @@ class Cell:
         return f"{self.name}{rule} @ {self.drawn.source.name}"
 
 
-def draw(config: ChunksConfig, source: Source) -> Drawn:
+def draw(config: ChunksConfig, source: Source) -> LatencyDraw:
     """Draw the latencies of a source; a recording is played in its order, its first half for the rules if any."""
     count = config.learnt(source)
     if source.recorded_ns is not None:
         judged = source.recorded_ns[count:]
-        return Drawn(source, judged[: config.cycles], source.recorded_ns[:count])
+        return LatencyDraw(source, judged[: config.cycles], source.recorded_ns[:count])
     from s2a_bench.experiments.chunks.config import CYCLES
 
     judged = source.draw(generator(config.seed, "chunks", source.name), config.cycles or CYCLES)
-    return Drawn(source, judged, source.draw(generator(config.seed, "chunks rules", source.name), count))
+    return LatencyDraw(source, judged, source.draw(generator(config.seed, "chunks rules", source.name), count))
 
 
-def cells(config: ChunksConfig, drawn: Drawn) -> Iterator[Cell]:
+def cells(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[ChunkCell]:
     """Yield the cells of one source; live, nothing has been judged yet."""
     for name, given in config.made.items():
-        yield Cell(given, name, GIVEN, drawn)
+        yield ChunkCell(given, name, GIVEN, drawn)
     mode = config.triggered
     if mode is None:
         return
@@ -88,12 +97,12 @@ def cells(config: ChunksConfig, drawn: Drawn) -> Iterator[Cell]:
             )
             chosen = trigger(ready_ns, config.setting, most)
             triggers = (chosen.ticks,)
-            yield Cell(mode, name, rule, drawn, triggers, min(chosen.beta, config.slowest))
+            yield ChunkCell(mode, name, rule, drawn, triggers, min(chosen.beta, config.slowest))
         elif config.live:
-            yield Cell(mode, name, rule, drawn, begin=partial(_made, config, rule, drawn))
+            yield ChunkCell(mode, name, rule, drawn, begin=partial(_made, config, rule, drawn))
         else:
             triggers = tuple(follow(_made(config, rule, drawn), drawn.judged, config.setting, most).tolist())
-            yield Cell(mode, name, rule, drawn, triggers)
+            yield ChunkCell(mode, name, rule, drawn, triggers)
 
 
 def without_trigger(mode: Mode) -> str:
@@ -101,17 +110,17 @@ def without_trigger(mode: Mode) -> str:
     return canonical(mode.name, mode.varied((0,)))
 
 
-def _made(config: ChunksConfig, rule: str, drawn: Drawn) -> Rule:
+def _made(config: ChunksConfig, rule: str, drawn: LatencyDraw) -> TriggerRule:
     """Return a rule that has seen what the calibration has."""
     if rule == "tracked":
-        return Tracked.begin(drawn.learnt.tolist(), config.epsilon)
-    made: Rule = Maximum() if rule == "maximum" else Mean()
+        return TrackedLatency.begin(drawn.learnt.tolist(), config.epsilon)
+    made: TriggerRule = Maximum() if rule == "maximum" else Mean()
     for latency_ns in drawn.learnt.tolist():
         made.learn(latency_ns, stalled=False)
     return made
 
 
-def _oracle_ns(config: ChunksConfig, drawn: Drawn) -> int:
+def _oracle_ns(config: ChunksConfig, drawn: LatencyDraw) -> int:
     """Return the latency that a share epsilon of the distribution itself exceeds at most.
 
     The distribution is a million other draws; of a recording all that was recorded.

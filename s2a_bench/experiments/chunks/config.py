@@ -27,7 +27,7 @@ from s2a_bench.transport.defaults import ACTING
 if TYPE_CHECKING:
     from s2a_bench.act import ActionKind
     from s2a_bench.experiments.chunks.latencies import Source
-    from s2a_bench.policy.chunks import Mode, Setting
+    from s2a_bench.policy.chunks import ControlSetting, Mode
 
 SHOWN: Final = (
     *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
@@ -157,10 +157,10 @@ class ChunksConfig(Options):
         return f"{pipeline}, {self.known}" if self.known else pipeline
 
     @property
-    def setting(self) -> Setting:
-        from s2a_bench.policy.chunks import Setting
+    def setting(self) -> ControlSetting:
+        from s2a_bench.policy.chunks import ControlSetting
 
-        return Setting(round(1e9 / self.control_hz), self.horizon, self.rounding).slowed(self.slow_down)
+        return ControlSetting(round(1e9 / self.control_hz), self.horizon, self.rounding).slowed(self.slow_down)
 
     @cached_property
     def made(self) -> dict[str, Mode]:

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     import numpy as np
     import pandas as pd
 
-    from s2a_bench.experiments.chunks.cells import Drawn
-    from s2a_bench.policy.chunks import Ints, Mode, Setting
-    from s2a_bench.store.run import Run
+    from s2a_bench.experiments.chunks.cells import LatencyDraw
+    from s2a_bench.policy.chunks import ControlSetting, Ints, Mode
+    from s2a_bench.store.run import StoredRun
 
 _PARAMETER: Final = re.compile(r"\s*\w+\s*=")
 
@@ -122,7 +122,7 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
             )
 
 
-def _request(row: Mapping[Any, Any], run: Run, pieces: Mapping[str, tuple[int, int | None]]) -> dict[str, Any]:
+def _request(row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[int, int | None]]) -> dict[str, Any]:
     """Return what is known of a request: its marks by the group of stages that ends there, null where there is none."""
     marks = json.loads(row["marks"])
     ends = {run.stages.get(stage, ""): at_ns for stage, at_ns in marks}
@@ -139,7 +139,7 @@ def _request(row: Mapping[Any, Any], run: Run, pieces: Mapping[str, tuple[int, i
     }
 
 
-def _pieces(run: Run) -> dict[str, tuple[int, int | None]]:
+def _pieces(run: StoredRun) -> dict[str, tuple[int, int | None]]:
     """Return by request how long after the first piece the last one came, and when that left the engine."""
     found: pd.DataFrame = run.tokens.groupby("request_id").agg(
         first=("client_ns", "min"), last=("client_ns", "max"), left=("engine_ns", "max")
@@ -183,7 +183,7 @@ All times are whole ns of one clock. What a reader needs of it says `boards.late
 """
 
 
-def delay_rows(drawn: Drawn, mode: Mode, setting: Setting) -> Iterator[dict[str, object]]:
+def delay_rows(drawn: LatencyDraw, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:
     """Yield a row a request: of measured latencies when each really was made, else as ``mode`` makes them.
 
     Of a measured run all requests that count are there, also those that rules learn from.
@@ -201,13 +201,13 @@ def delay_rows(drawn: Drawn, mode: Mode, setting: Setting) -> Iterator[dict[str,
         }
 
 
-def _simulated(drawn: Drawn, mode: Mode, setting: Setting) -> Iterator[dict[str, object]]:
+def _simulated(drawn: LatencyDraw, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:
     asked_ns = mode.cycles(drawn.judged, setting).request_tick * setting.period_ns
     for at_ns, latency_ns in zip(asked_ns.tolist(), drawn.judged.tolist(), strict=True):
         yield {"observation_ns": at_ns, "received_ns": at_ns + latency_ns, "latency_ns": latency_ns}
 
 
-def _delay(latency_ns: object, setting: Setting) -> int:
+def _delay(latency_ns: object, setting: ControlSetting) -> int:
     import numpy as np
 
     return int(setting.delay_ticks(np.array([latency_ns], np.int64))[0])

@@ -20,12 +20,12 @@ from s2a_bench.act import open_robot
 from s2a_bench.act.control import ControlLoop
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.chunks.asking import Asking, Job, warm_up
-from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells
+from s2a_bench.experiments.chunks.cells import ChunkCell, LatencyDraw, cells
 from s2a_bench.experiments.chunks.latencies import Source, delay_rows, measured, write_delays
 from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
 from s2a_bench.experiments.chunks.to_rows import stall_metrics, stalls_of, write_cell
 from s2a_bench.harness.plan import resolve
-from s2a_bench.harness.rounds import Launch, Task, keep_origin, run_requests
+from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Place, Session
 from s2a_bench.policy.chunks.cycles import NEVER, follow, gather
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from s2a_bench.act import ActionRobot
     from s2a_bench.act.control import Acted
     from s2a_bench.experiments.chunks.config import ChunksConfig
-    from s2a_bench.policy.chunks import Cycles, Ints, Setting, Ticks
+    from s2a_bench.policy.chunks import ControlSetting, Cycles, Ints, Ticks
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import RunWriter
     from s2a_bench.types import Vector
@@ -44,11 +44,11 @@ LOOK_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Live:
+class LiveResult:
     """What a mode did over a pipeline; ``triggers`` are those that a rule chose as it went."""
 
-    cell: Cell
-    setting: Setting
+    cell: ChunkCell
+    setting: ControlSetting
     session: Session
     acted: Acted
     asking: Asking
@@ -56,7 +56,7 @@ class Live:
     triggers: tuple[int, ...] = ()
 
     @property
-    def judged(self) -> Cell:
+    def judged(self) -> ChunkCell:
         """Return the cell with the latencies that it had, of whole answers, and the triggers."""
         latency_ns = self.acted.arrival_ns[: self.acted.whole, 0 if self.cell.mode.streams else -1]
         cell = replace(self.cell, drawn=replace(self.cell.drawn, judged=latency_ns))
@@ -103,7 +103,7 @@ class Live:
         }
 
 
-def write(config: ChunksConfig, writer: RunWriter, live: Live) -> None:
+def write(config: ChunksConfig, writer: RunWriter, live: LiveResult) -> None:
     """Write the rows of one mode over one pipeline; raises TransportError where too little was answered."""
     if live.acted.whole < 2:  # noqa: PLR2004 - a boundary lies between two chunks
         raise TransportError(f"{live.cell.cell}: {live.acted.whole} chunks in {config.seconds:g} s; act for longer")
@@ -132,21 +132,21 @@ def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
     if config.export_delays is not None:
         source = next(measured(folder))
         none = np.empty(0, np.int64)
-        rows = delay_rows(Drawn(source, none, none), next(iter(config.made.values())), config.setting)
+        rows = delay_rows(LatencyDraw(source, none, none), next(iter(config.made.values())), config.setting)
         write_delays(config.export_delays, rows)
     return folder
 
 
-def _drive(config: ChunksConfig, launch: Launch) -> None:
+def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
     """Let every mode act over every pipeline, in random order."""
     blocks = count()
-    tried: list[tuple[Cell, list[Session], int]] = []
+    tried: list[tuple[ChunkCell, list[Session], int]] = []
     launch.progress.stage("warming up")
     for _, of_cell in groupby(launch.sessions, lambda session: session.cell.name):
         sessions = list(of_cell)
         learnt, dims = _warm_up(config, launch, sessions, blocks)
         source = Source(config.named(sessions[0].cell.name))
-        tried += [(cell, sessions, dims) for cell in cells(config, Drawn(source, learnt[:0], learnt))]
+        tried += [(cell, sessions, dims) for cell in cells(config, LatencyDraw(source, learnt[:0], learnt))]
     launch.progress.expect(len(tried))
     for cell, sessions, dims in Random(config.seed).sample(tried, len(tried)):  # noqa: S311 - an order, not a secret
         launch.progress.stage(f"acting for {config.seconds:g} s: {cell.cell}")
@@ -157,7 +157,7 @@ def _drive(config: ChunksConfig, launch: Launch) -> None:
 
 
 def _warm_up(
-    config: ChunksConfig, launch: Launch, sessions: Sequence[Session], blocks: Iterator[int]
+    config: ChunksConfig, launch: RunningLaunch, sessions: Sequence[Session], blocks: Iterator[int]
 ) -> tuple[Ints, int]:
     """Return the latencies of requests before any loop starts, in ns, and of how many numbers an action is."""
     latency_ns: list[int] = []
@@ -175,7 +175,7 @@ def _warm_up(
 
 
 @contextmanager
-def robot_of(config: ChunksConfig, cell: Cell, dims: int) -> Iterator[ActionRobot | None]:
+def robot_of(config: ChunksConfig, cell: ChunkCell, dims: int) -> Iterator[ActionRobot | None]:
     """Open the robot for a cell, if there is one; raises S2AError."""
     if not config.robot:
         yield None
@@ -189,12 +189,12 @@ def robot_of(config: ChunksConfig, cell: Cell, dims: int) -> Iterator[ActionRobo
 
 def _act(
     config: ChunksConfig,
-    cell: Cell,
+    cell: ChunkCell,
     sessions: Sequence[Session],
-    launch: Launch,
+    launch: RunningLaunch,
     blocks: Iterator[int],
     robot: ActionRobot | None,
-) -> Live:
+) -> LiveResult:
     """Act in one mode, and write down every request as it is measured."""
     setting = config.setting.slowed(cell.slower)
     told = robot is not None and _takes_state(config, sessions[0], robot)
@@ -219,7 +219,7 @@ def _act(
         finally:
             loop.stop()
     _keep(asking, launch)
-    return Live(cell, setting, sessions[0], loop.acted(), asking, robot, tuple(loop.stepper.triggers))
+    return LiveResult(cell, setting, sessions[0], loop.acted(), asking, robot, tuple(loop.stepper.triggers))
 
 
 def _nowhere(action: Vector | None, at_ns: int) -> None:
@@ -234,7 +234,7 @@ def _takes_state(config: ChunksConfig, session: Session, robot: ActionRobot) -> 
     return bool(numbers) and cell.capabilities.accepts_state
 
 
-def _keep(asking: Asking, launch: Launch) -> None:
+def _keep(asking: Asking, launch: RunningLaunch) -> None:
     while not asking.done.empty():
         launch.keep(*asking.done.get())
     if asking.failure is not None:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.cells import Cell, Drawn, cells, draw, without_trigger
+from s2a_bench.experiments.chunks.cells import ChunkCell, LatencyDraw, cells, draw, without_trigger
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.latencies import delay_rows, write_delays
 from s2a_bench.experiments.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS, MeanRow, TriggerRow
-from s2a_bench.experiments.chunks.smooth import Follower, follower
+from s2a_bench.experiments.chunks.smooth import TrackingPlant, follower
 from s2a_bench.experiments.chunks.to_rows import stalls_of, write_cell
 from s2a_bench.machine import environment
 from s2a_bench.policy.chunks.closed import closed
@@ -35,7 +35,7 @@ SMOOTH: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ide
 """What is kept of a follower's motion at each."""
 
 
-def trigger_rows(config: ChunksConfig, drawn: Drawn) -> Iterator[TriggerRow]:
+def trigger_rows(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[TriggerRow]:
     """Try every trigger of the first mode that has one to choose."""
     if config.triggered is None:
         return
@@ -58,7 +58,7 @@ def trigger_rows(config: ChunksConfig, drawn: Drawn) -> Iterator[TriggerRow]:
             )
 
 
-def mean_rows(config: ChunksConfig, drawn: Drawn, follows: Follower | None) -> Iterator[MeanRow]:
+def mean_rows(config: ChunksConfig, drawn: LatencyDraw, follows: TrackingPlant | None) -> Iterator[MeanRow]:
     """Try each mode as given with a source's latencies made longer or shorter: means from 0 to H ticks."""
     setting, judged = config.setting, drawn.judged[:REQUESTS_TRIED]
     shape = judged / max(float(judged.mean()), 1.0)
@@ -133,14 +133,14 @@ def _warnings(config: ChunksConfig) -> Iterator[RunWarning]:
         )
 
 
-def _simulate(config: ChunksConfig, cell: Cell, follows: Follower | None, writer: RunWriter) -> None:
+def _simulate(config: ChunksConfig, cell: ChunkCell, follows: TrackingPlant | None, writer: RunWriter) -> None:
     setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
     cycles, ticks = cell.acting.cycles(latency_ns, setting), cell.acting.ticks(latency_ns, setting)
     smooth = follows.measure(cell.mode, cycles, ticks) if follows and cell.slower == 1 else {}
     write_cell(config, writer, cell, cycles, ticks, config.shown_ticks, more=smooth)
 
 
-def _check(config: ChunksConfig, drawn: Drawn) -> None:
+def _check(config: ChunksConfig, drawn: LatencyDraw) -> None:
     """Refuse what would not fit into memory."""
     ticks = int(drawn.judged.size) * config.horizon + int(config.setting.known_ticks(drawn.judged).sum())
     if ticks > MOST_TICKS:

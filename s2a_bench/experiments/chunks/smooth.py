@@ -31,7 +31,7 @@ MOST_TICKS: Final = 50_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Target:
+class TargetPath:
     """A target at control ticks, in units of its standard deviation; arrays of shape (K,).
 
     Position x and drift y = x' + r x follow dy = -r y dt + noise, dx = (y - r x) dt: a stationary Gaussian process with
@@ -49,7 +49,7 @@ class Target:
         return expected
 
 
-def draw_target(rng: np.random.Generator, ticks: int, period_s: float) -> Target:
+def draw_target(rng: np.random.Generator, ticks: int, period_s: float) -> TargetPath:
     """Draw a target, exact at its ticks; the first ones are the same however many there are."""
     from scipy.signal import lfilter
     from scipy.special import gammainc
@@ -64,15 +64,15 @@ def draw_target(rng: np.random.Generator, ticks: int, period_s: float) -> Target
     noise[:1] = drawn[:1] @ first.T
     drift = lfilter([1.0], [1.0, -keep], noise[:, 0])
     noise[1:, 1] += keep * step * drift[:-1]
-    return Target(lfilter([1.0], [1.0, -keep], noise[:, 1]), RATE * drift, period_s)
+    return TargetPath(lfilter([1.0], [1.0, -keep], noise[:, 1]), RATE * drift, period_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Follower:
+class TrackingPlant:
     """A plant that is to follow a target."""
 
     plant: ActionKind
-    target: Target
+    target: TargetPath
 
     def measure(self, mode: Mode, cycles: Cycles, ticks: Ticks) -> Mapping[str, float]:
         """Return the metrics of smoothness by their names; none where nothing was executed.
@@ -91,7 +91,7 @@ class Follower:
         return {**found, **{f"{name}_ideal": ideal[name] for name in ("tracking_rms", "jerk_rms")}}
 
 
-def follower(config: ChunksConfig) -> Follower | None:
+def follower(config: ChunksConfig) -> TrackingPlant | None:
     """Return what follows, the same target for all cells of a seed; None where no robot is asked for.
 
     Nor where all actions are slowed down: no target waits for them.
@@ -99,10 +99,10 @@ def follower(config: ChunksConfig) -> Follower | None:
     if config.plant is None or config.slow_down > 1:
         return None
     rng = generator(config.seed, "chunks target")
-    return Follower(config.plant, draw_target(rng, MOST_TICKS, config.setting.period_ns / 1e9))
+    return TrackingPlant(config.plant, draw_target(rng, MOST_TICKS, config.setting.period_ns / 1e9))
 
 
-def executed(mode: Mode, cycles: Cycles, ticks: Ticks, target: Target) -> Floats:
+def executed(mode: Mode, cycles: Cycles, ticks: Ticks, target: TargetPath) -> Floats:
     """Return the action of each tick, as long as the target goes; NaN for no action."""
     length = min(ticks.chunk.size, target.position.size)
     found = np.full(length, np.nan)

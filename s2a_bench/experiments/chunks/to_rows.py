@@ -27,10 +27,10 @@ from s2a_bench.policy.conformal import upper_bound
 from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
-    from s2a_bench.experiments.chunks.cells import Cell
+    from s2a_bench.experiments.chunks.cells import ChunkCell
     from s2a_bench.experiments.chunks.config import ChunksConfig
     from s2a_bench.policy import Floats
-    from s2a_bench.policy.chunks import Cycles, Ints, Setting, Ticks
+    from s2a_bench.policy.chunks import ControlSetting, Cycles, Ints, Ticks
     from s2a_bench.store.run import RunWriter
 
 EVENTS: Final = 100_000
@@ -45,7 +45,7 @@ _SIDE: Final = 0.975
 def write_cell(
     config: ChunksConfig,
     writer: RunWriter,
-    cell: Cell,
+    cell: ChunkCell,
     cycles: Cycles,
     ticks: Ticks,
     most: int,
@@ -85,7 +85,7 @@ def write_cell(
 
 
 def metrics_of(
-    cell: Cell, setting: Setting, cycles: Cycles, ticks: Ticks, reaction_s: Floats
+    cell: ChunkCell, setting: ControlSetting, cycles: Cycles, ticks: Ticks, reaction_s: Floats
 ) -> dict[str, float | None]:
     """Return the value of every metric of what was simulated; NaN or None where there is none."""
     period_s, latency_ns = setting.period_ns / 1e9, cell.drawn.judged
@@ -130,7 +130,7 @@ def stall_metrics(stalled: int, boundaries: int) -> dict[str, Any]:
     return found
 
 
-def reactions_s(cycles: Cycles, ticks: Ticks, setting: Setting, rng: np.random.Generator) -> Floats:
+def reactions_s(cycles: Cycles, ticks: Ticks, setting: ControlSetting, rng: np.random.Generator) -> Floats:
     """Return the reaction times to events at uniform moments from the first action to the last request, in s."""
     acted = ticks.chunk >= 0
     if not acted.any():
@@ -140,7 +140,9 @@ def reactions_s(cycles: Cycles, ticks: Ticks, setting: Setting, rng: np.random.G
     return found[~np.isnan(found)]
 
 
-def reaction_rows(cell: Cell, latency_ns: Ints, setting: Setting, reaction_s: Floats) -> Iterator[ReactionRow]:
+def reaction_rows(
+    cell: ChunkCell, latency_ns: Ints, setting: ControlSetting, reaction_s: Floats
+) -> Iterator[ReactionRow]:
     """Yield the quantiles of a cell's reaction times, none where there are none."""
     if not reaction_s.size:
         return
@@ -194,7 +196,7 @@ def _mean(triggers: tuple[int, ...], given: int | None) -> float | None:
     return float(np.mean(triggers)) if triggers else None if given is None else float(given)
 
 
-def _blended(cell: Cell, cycles: Cycles) -> float | None:
+def _blended(cell: ChunkCell, cycles: Cycles) -> float | None:
     age = cell.mode.blended_age(cycles)
     return None if age is None or not np.isfinite(age).any() else float(np.nanmean(age))
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.experiments.requests import (
     TOKEN_METRICS,
-    Cell,
+    RequestCell,
     RequestMetric,
     cell_class,
     cell_json,
@@ -27,9 +27,9 @@ from s2a_bench.writers.as_json import frame, ratio_entry, summaries
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 
 if TYPE_CHECKING:
-    from s2a_bench.experiments import Compared
+    from s2a_bench.experiments import Comparable
     from s2a_bench.stats import Ratio
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 METRICS: Final = (
     RequestMetric(
@@ -55,9 +55,9 @@ METRICS: Final = (
 """A metric is a row here: JSON and its schema, CSV, comparison and the tables have it from its row."""
 
 
-def compared(metrics: Sequence[RequestMetric] = METRICS) -> Compared:
+def compared(metrics: Sequence[RequestMetric] = METRICS) -> Comparable:
     """Return what latency runs are compared by: metrics, groups of stages, and the stages of a run."""
-    groups = [RequestMetric(f"group.{name}", "ms", of=partial(Cell.sums_ms, group=name)) for name in GROUPS]
+    groups = [RequestMetric(f"group.{name}", "ms", of=partial(RequestCell.sums_ms, group=name)) for name in GROUPS]
     shown = ("e2e_without_inference", "e2e", "itl")
     return compared_by((*metrics, *groups), shown, own=lambda run: [RequestMetric(stage, "ms") for stage in run.stages])
 
@@ -78,7 +78,7 @@ COMPARED: Final = compared()
 LatencyCell: Final = latency_cell()
 
 
-def latency_json(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, Any]:
+def latency_json(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, Any]:
     """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
     cells = cells_of(run)
     found = [
@@ -96,7 +96,7 @@ def latency_json(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> dict[s
     return frame(run, found, [ratio_entry(*ratio) for ratio in _ratios(cells, run)])
 
 
-def latency_csv(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, CsvTable]:
+def latency_csv(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, CsvTable]:
     """Return file name -> CSV table in long form, one row a value, every digit kept; what is absent has no row."""
     cells = cells_of(run)
     return {
@@ -108,12 +108,12 @@ def latency_csv(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> dict[st
     }
 
 
-def _ratios(cells: list[Cell], run: Run) -> Iterator[tuple[str, str, str, Ratio]]:
+def _ratios(cells: list[RequestCell], run: StoredRun) -> Iterator[tuple[str, str, str, Ratio]]:
     for metric, cell, base, ratio in ratios(cells, run.bootstrap_seed):
         yield f"{metric}_ms", cell.name, base.name, ratio
 
 
-def _stage_rows(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
+def _stage_rows(cells: list[RequestCell]) -> Iterator[tuple[object, ...]]:
     """Yield a row a cell and stage, the residual last."""
     for cell in cells:
         for stage in (*stages_present([cell]), "residual"):
@@ -121,7 +121,7 @@ def _stage_rows(cells: list[Cell]) -> Iterator[tuple[object, ...]]:
                 yield cell.name, cell.stages.get(stage, ""), stage, *summary_values(summary), cell.emulated
 
 
-def _rows(cells: list[Cell], metrics: Sequence[RequestMetric]) -> Iterator[tuple[object, ...]]:
+def _rows(cells: list[RequestCell], metrics: Sequence[RequestMetric]) -> Iterator[tuple[object, ...]]:
     """Yield a row a cell and metric; a cell in which everything failed has one row, without numbers."""
     for cell in cells:
         found = [(key, summary_values(summary)) for _, key, summary in summarised([cell], metrics)]

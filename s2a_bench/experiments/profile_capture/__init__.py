@@ -44,7 +44,7 @@ class CaptureConfig(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Board:
+class BoardFacts:
     """This board; what cannot be read is absent."""
 
     model: Annotated[str | None, about("From the device tree.")] = None

@@ -51,14 +51,14 @@ _MODEL_FACTS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class TimedAnswer:
     """One request as timed: to its first token, and from each token to the next."""
 
     ttft_ns: int
     gaps_ns: list[int]
 
 
-def answers(engine: Engine, config: CaptureConfig) -> Iterator[Answer]:
+def answers(engine: Engine, config: CaptureConfig) -> Iterator[TimedAnswer]:
     """Ask again and again, each time about a new picture and with a new seed, and yield the times."""
     with ExitStack() as stack:
         source = Stamped(open_source(config.source, *config.size, seed=config.seed), "capture")
@@ -76,13 +76,13 @@ def _rgb(frame: Frame) -> Frame:
     return replace(frame, encoding="rgb8", data=bgr_to_rgb(to_bgr(frame)))
 
 
-def _timed(engine: Engine, request: Request) -> Answer:
+def _timed(engine: Engine, request: Request) -> TimedAnswer:
     """Answer one request; raises EngineError for an empty answer."""
     started = now_ns()
     times = [now_ns() for _ in engine.generate(request)]
     if not times:
         raise EngineError(f"request {request.id}: the answer was empty; give another `prompt`")
-    return Answer(times[0] - started, [after - before for before, after in pairwise(times)])
+    return TimedAnswer(times[0] - started, [after - before for before, after in pairwise(times)])
 
 
 def open_model(config: EngineConfig) -> Engine:
@@ -122,7 +122,7 @@ def capture(config: CaptureConfig, progress: Progress) -> dict[str, Any]:
 
 
 def document(
-    config: CaptureConfig, recorded: list[Answer], model: dict[str, Any], warnings: list[str]
+    config: CaptureConfig, recorded: list[TimedAnswer], model: dict[str, Any], warnings: list[str]
 ) -> dict[str, Any]:
     """Turn timed answers, warm-ups first, into the tables of a profile's file."""
     import numpy as np

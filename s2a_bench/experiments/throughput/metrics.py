@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from s2a_bench.experiments.requests import (
     ANSWER_METRICS,
     TOKEN_METRICS,
-    Cell,
+    RequestCell,
     by_launch,
     cell_class,
     cell_json,
@@ -29,7 +29,7 @@ from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 if TYPE_CHECKING:
     from s2a_bench.experiments.requests import Floats
     from s2a_bench.stats import Ratio
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,17 +99,17 @@ class Reference:
     decode_tokens_per_s: Summary
 
 
-def throughput_cells(run: Run) -> list[Cell]:
+def throughput_cells(run: StoredRun) -> list[RequestCell]:
     """Split a run into its cells: in-process first, then HTTP and ROS."""
     return sorted(cells_of(run), key=lambda cell: not declared(cell.pipeline).in_process)
 
 
-def joined(cell: Cell) -> int:
+def joined(cell: RequestCell) -> int:
     """Count tokens that came together with another, as where a server holds back half a character."""
     return int((cell.n_tokens - cell.fact("events")).clip(lower=0).sum())
 
 
-def rates_by_position(cell: Cell) -> dict[tuple[int, int], Floats]:
+def rates_by_position(cell: RequestCell) -> dict[tuple[int, int], Floats]:
     """Return (first, last token of a bin, from 0) -> decode rates there, one a request that got so far.
 
     The gap before token i belongs to the bin of i; token 0 has none.
@@ -123,26 +123,26 @@ def rates_by_position(cell: Cell) -> dict[tuple[int, int], Floats]:
     return {(place * BIN, place * BIN + BIN - 1): rates[places == place] for place in sorted(set(places.tolist()))}
 
 
-def reference_by_launch(run: Run) -> dict[int, dict[int, list[float]]]:
+def reference_by_launch(run: StoredRun) -> dict[int, dict[int, list[float]]]:
     """Return llama-bench's tokens/s by launch and block, its warm-ups left out."""
     rows = run.table(REFERENCE)
     counted = rows[~rows["warmup"]]
     return by_launch(counted, counted["n_gen"] / counted["decode_ns"] * 1e9)
 
 
-def reference_values(run: Run) -> list[float]:
+def reference_values(run: StoredRun) -> list[float]:
     """Return llama-bench's tokens/s in the order of the blocks."""
     launches = sorted(reference_by_launch(run).items())
     return [value for _, blocks in launches for _, values in sorted(blocks.items()) for value in values]
 
 
-def reference_depths(run: Run) -> list[int]:
+def reference_depths(run: StoredRun) -> list[int]:
     """Return how many tokens lay before those that llama-bench timed: one number where all prompts are alike."""
     rows = run.table(REFERENCE)
     return sorted({int(depth) for depth in rows[~rows["warmup"]]["depth"]})
 
 
-def ratios_of(run: Run, cells: Sequence[Cell]) -> Iterator[tuple[str, str, str, Ratio]]:
+def ratios_of(run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[str, str, str, Ratio]]:
     """Yield metric, cell, base and ratio: every cell to llama-bench where it ran, and every other cell to in-process.
 
     Cells that another engine answered are compared by the engines' own figures too.
@@ -162,7 +162,7 @@ def ratios_of(run: Run, cells: Sequence[Cell]) -> Iterator[tuple[str, str, str, 
             yield ENGINE_METRIC, cell.name, base.name, ratio
 
 
-def throughput_json(run: Run) -> dict[str, Any]:
+def throughput_json(run: StoredRun) -> dict[str, Any]:
     """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
     cells = throughput_cells(run)
     found = [
@@ -183,7 +183,7 @@ def throughput_json(run: Run) -> dict[str, Any]:
     return frame(run, found, [ratio_entry(*ratio) for ratio in ratios_of(run, cells)], **more)
 
 
-def throughput_csv(run: Run) -> dict[str, CsvTable]:
+def throughput_csv(run: StoredRun) -> dict[str, CsvTable]:
     """Return file name -> CSV table, every digit kept; what is absent has no row."""
     cells = throughput_cells(run)
     rows = [
@@ -203,7 +203,7 @@ def throughput_csv(run: Run) -> dict[str, CsvTable]:
     }
 
 
-def _base(cell: Cell, cells: Sequence[Cell]) -> Cell | None:
+def _base(cell: RequestCell, cells: Sequence[RequestCell]) -> RequestCell | None:
     """Return the cell in this process whose engine is set alike, as its name ends, or the first; None for itself."""
     here = [each for each in cells if declared(each.pipeline).in_process]
     alike = [each for each in here if each is not cell and cell.name.endswith(each.name.partition("?")[2])]

@@ -18,9 +18,9 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import COMPILE_AGAIN, EngineError, how_it_ended
 from s2a_bench.experiments.throughput.config import IN_PROCESS, ThroughputConfig
 from s2a_bench.experiments.throughput.metrics import REFERENCE, ReferenceRow
-from s2a_bench.harness.plan import Plan, resolve
+from s2a_bench.harness.plan import RunPlan, resolve
 from s2a_bench.harness.processes import llama_flags
-from s2a_bench.harness.rounds import Launch, Task, in_blocks, run_requests
+from s2a_bench.harness.rounds import RunningLaunch, Task, in_blocks, run_requests
 from s2a_bench.harness.session import Place
 from s2a_bench.progress import Progress
 from s2a_bench.store.run import RunWriter
@@ -35,7 +35,7 @@ def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -
     Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
     """
 
-    def drive(launch: Launch) -> None:
+    def drive(launch: RunningLaunch) -> None:
         def longest_prompt() -> int:
             return max(session.prompt_n for session in launch.sessions)
 
@@ -54,7 +54,7 @@ def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -
 class LlamaBench:
     """One turn of llama-bench a block; called with its place."""
 
-    def __init__(self, program: Path, plan: Plan, writer: RunWriter, depth: Callable[[], int]) -> None:
+    def __init__(self, program: Path, plan: RunPlan, writer: RunWriter, depth: Callable[[], int]) -> None:
         """Prepare the command; ``depth`` tells how many tokens lie in the context before those that are timed."""
         self._program = program
         self._writer = writer

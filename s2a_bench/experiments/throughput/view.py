@@ -39,14 +39,14 @@ from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interv
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.requests import Cell, Floats
-    from s2a_bench.store.run import Run
+    from s2a_bench.experiments.requests import Floats, RequestCell
+    from s2a_bench.store.run import StoredRun
 
 PAPER_LABEL: Final = "the paper's claim (table II), other machines"
 _REFERENCE_FILL: Final = "#FFFFFF"
 
 
-def show(run: Run, *, against: str = "", **_: Any) -> Shown:
+def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
     """Return what a throughput run shows."""
     return Shown(
         sentences=throughput_sentences(run),
@@ -58,7 +58,7 @@ def show(run: Run, *, against: str = "", **_: Any) -> Shown:
     )
 
 
-def throughput_sentences(run: Run) -> list[str]:
+def throughput_sentences(run: StoredRun) -> list[str]:
     """Return how many tokens a second each cell generates."""
     said, cells = [], throughput_cells(run)
     for cell in cells:
@@ -74,7 +74,7 @@ def throughput_sentences(run: Run) -> list[str]:
     return said or ["No request was answered; samples.csv says why."]
 
 
-def throughput_tables(run: Run) -> dict[str, TextTable]:
+def throughput_tables(run: StoredRun) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
     tables = {"throughput": speed_table(run), "prompt": prompt_table(run), "gaps": gap_table(run)}
     if positions := position_table(run):
@@ -82,7 +82,7 @@ def throughput_tables(run: Run) -> dict[str, TextTable]:
     return tables
 
 
-def speed_table(run: Run) -> TextTable:
+def speed_table(run: StoredRun) -> TextTable:
     """Lay out the rates: the paper's, what the client saw, and the ratios."""
     cells = throughput_cells(run)
     reference = reference_values(run)
@@ -117,7 +117,7 @@ def _median_mean(values: Floats) -> str:
     return f"{median} ({mean})" if values.size else median
 
 
-def prompt_table(run: Run) -> TextTable:
+def prompt_table(run: StoredRun) -> TextTable:
     """Lay out what happens before the first token, part by part, and the step after it: medians."""
     columns = (
         *("prompt_tokens", "preprocess_ms", "vision_encode_ms", "prompt_eval_ms", "prompt_ms"),
@@ -135,7 +135,7 @@ def prompt_table(run: Run) -> TextTable:
     return TextTable("The prompt and the first step after it: medians, in ms", header, rows, 1)
 
 
-def gap_table(run: Run) -> TextTable:
+def gap_table(run: StoredRun) -> TextTable:
     """Lay out the gaps between tokens, each gap of each request."""
     rows = []
     for cell in throughput_cells(run):
@@ -146,7 +146,7 @@ def gap_table(run: Run) -> TextTable:
     return TextTable("Between two tokens, as the client saw them, in ms", header, rows, 1)
 
 
-def position_table(run: Run) -> TextTable | None:
+def position_table(run: StoredRun) -> TextTable | None:
     """Lay out the decode rate by the place in the answer; None where all answers end in the first bin."""
     found = {cell.name: rates_by_position(cell) for cell in throughput_cells(run)}
     bins = sorted({place for rates in found.values() for place in rates})
@@ -162,7 +162,7 @@ def position_table(run: Run) -> TextTable | None:
     return TextTable(f"Decode tokens a second by position, bins of {BIN}: medians", ("token", *found), rows, 1)
 
 
-def _notes(run: Run, cells: list[Cell], launches: tuple[str, ...]) -> list[str]:
+def _notes(run: StoredRun, cells: list[RequestCell], launches: tuple[str, ...]) -> list[str]:
     untold = [cell.name for cell in cells if not cell.told]
     notes = ["N / T_eval is the engine's own figure, as in the paper."] if len(untold) < len(cells) else []
     notes.append("decode is (n - 1) / (t_last - t_first) at the client.")
@@ -182,7 +182,7 @@ def _notes(run: Run, cells: list[Cell], launches: tuple[str, ...]) -> list[str]:
     return notes
 
 
-def throughput_figures(run: Run, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
+def throughput_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
     """Return every figure by its file's name; the paper's values only when asked for. No rates, no figures."""
     if not any(cell.values(RATIO_METRIC).size for cell in throughput_cells(run)):
         return {}
@@ -193,7 +193,7 @@ def throughput_figures(run: Run, *, against_paper: bool = False) -> dict[str, Ca
     }
 
 
-def build_throughput_bars(run: Run, *, against_paper: bool = False) -> Figure:
+def build_throughput_bars(run: StoredRun, *, against_paper: bool = False) -> Figure:
     """Draw medians of N / T_eval, a row a cell (the paper's table II), and llama-bench's decode rate where it ran.
 
     Bars from zero; points on a logarithmic axis where the rates are too far apart for one scale.
@@ -212,7 +212,7 @@ def build_throughput_bars(run: Run, *, against_paper: bool = False) -> Figure:
     return build_bars(caption, bars, "tokens/s", PAPER_LABEL if against_paper else "", scaled=True)
 
 
-def build_gap_distribution(run: Run) -> Figure:
+def build_gap_distribution(run: StoredRun) -> Figure:
     """Draw the empirical distribution of the gaps between tokens, a line a cell."""
     cells = [cell for cell in throughput_cells(run) if cell.values("itl").size]
     looks = cell_looks({cell.name: cell.path for cell in cells})
@@ -225,7 +225,7 @@ def build_gap_distribution(run: Run) -> Figure:
     return build_distribution(caption, lines, "gaps", "gap (ms)", columns=1)
 
 
-def build_rate_by_position(run: Run) -> Figure:
+def build_rate_by_position(run: StoredRun) -> Figure:
     """Draw the decode rate over the place in the answer, median and a band from the lower to the upper quartile.
 
     Not means: tokens that arrive together after a pause have any rate at all.
@@ -253,7 +253,7 @@ def build_rate_by_position(run: Run) -> Figure:
     return figure
 
 
-def _caption(run: Run, cells: list[Cell], what: str, *notes: str) -> tuple[str, ...]:
+def _caption(run: StoredRun, cells: list[RequestCell], what: str, *notes: str) -> tuple[str, ...]:
     tokens = summary_of(cells[0].n_tokens.to_numpy(dtype="float64"))
     facts = [f"{tokens.median:.0f} tokens an answer"] if tokens else []
     return caption_for(run, cells, what, [*facts, *sorted({cell.about["size"] for cell in cells})], notes)

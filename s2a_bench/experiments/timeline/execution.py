@@ -17,7 +17,7 @@ from s2a_bench.act.record import Record, SkillRun
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.to_rows import timeline_rows
-from s2a_bench.harness.timelines.config import Setting
+from s2a_bench.harness.timelines.config import PlanSetting
 from s2a_bench.harness.timelines.policies import finite
 from s2a_bench.harness.timelines.rows import skill_rows
 from s2a_bench.plan import Gap
@@ -82,7 +82,7 @@ def quick_switching() -> Iterator[None]:
 
 def keep(
     writer: RunWriter,
-    setting: Setting,
+    setting: PlanSetting,
     plan: int,
     request_id: str,
     policies: Mapping[str, Policy],
@@ -161,7 +161,7 @@ def _facts(record: Record) -> dict[str, Any]:
     }
 
 
-def _warnings(setting: Setting, plan: int, records: Sequence[Record]) -> Iterator[RunWarning]:
+def _warnings(setting: PlanSetting, plan: int, records: Sequence[Record]) -> Iterator[RunWarning]:
     """Tell of a plan that was not completed; once where all policies met the same."""
     ends: dict[tuple[str, str], list[Record]] = {}
     for record in records:

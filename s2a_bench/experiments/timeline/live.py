@@ -20,9 +20,9 @@ from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, k
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.frames.stamp import Stamped
-from s2a_bench.harness.rounds import Launch, Task, run_requests
+from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
 from s2a_bench.harness.timelines.config import TimelineConfig
-from s2a_bench.harness.timelines.link import Ask, Link, word
+from s2a_bench.harness.timelines.link import Ask, ModelLink, word
 from s2a_bench.harness.timelines.policies import Following, prepare
 from s2a_bench.plan import Parser
 from s2a_bench.progress import Progress, watching
@@ -49,9 +49,9 @@ def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
         return run_requests(task, plan, output, progress)
 
 
-def _drive(config: TimelineConfig, asks: Sequence[Ask], robots: Sequence[SkillRobot], launch: Launch) -> None:
+def _drive(config: TimelineConfig, asks: Sequence[Ask], robots: Sequence[SkillRobot], launch: RunningLaunch) -> None:
     """Let every policy execute every plan that is asked for."""
-    link, records, progress = Link(config, launch, config.robot), list[Record](), launch.progress
+    link, records, progress = ModelLink(config, launch, config.robot), list[Record](), launch.progress
     progress.expect(config.warmup + len(asks) * config.plans_a_cell)
     try:
         prior = link.warm_up(asks[0])
@@ -66,7 +66,7 @@ def _drive(config: TimelineConfig, asks: Sequence[Ask], robots: Sequence[SkillRo
 
 
 def _execute(
-    link: Link, ask: Ask, plan: int, following: Following, robots: Sequence[SkillRobot], records: list[Record]
+    link: ModelLink, ask: Ask, plan: int, following: Following, robots: Sequence[SkillRobot], records: list[Record]
 ) -> None:
     """Ask for one plan, let every policy execute it as it arrives, and add what they did to ``records``."""
     policies, progress = following.policies(), link.launch.progress
@@ -93,7 +93,7 @@ def _execute(
     following.learn(side_by_side.records)
 
 
-def _remarks(link: Link) -> str:
+def _remarks(link: ModelLink) -> str:
     paced = f", paced to {link.pace:g} tokens/s" if link.pace else ""
     dummy = ", dummy weights" if link.writer.manifest["model"].get("dummy") else ""
     return f"{paced}{dummy}{' (EMULATED)' if link.origin.emulated else ''}"

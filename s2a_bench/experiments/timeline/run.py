@@ -19,7 +19,7 @@ from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, k
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.to_rows import timeline_rows
 from s2a_bench.experiments.timeline.watch import Scene
-from s2a_bench.harness.timelines.config import Setting, TimelineConfig, settings
+from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, settings
 from s2a_bench.harness.timelines.policies import Following, Knowledge, draw, finite, learn, plans_of
 from s2a_bench.harness.timelines.rows import KEPT_PLANS, skill_rows, token_rows
 from s2a_bench.machine import environment
@@ -65,7 +65,7 @@ def run_timeline(config: TimelineConfig, output: Path, progress: Progress) -> Pa
 
 
 def _compute(
-    config: TimelineConfig, board: Board, setting: Setting, answers: Sequence[Floats], writer: RunWriter
+    config: TimelineConfig, board: Board, setting: PlanSetting, answers: Sequence[Floats], writer: RunWriter
 ) -> dict[str, Any]:
     """Draw one setting's plans, let every policy decide them, keep the rows and return the calibrations."""
     known = learn(config, board, setting, answers)
@@ -92,7 +92,7 @@ def _decide(
     return finite(policy.caution), policy.schedule(plans)
 
 
-def manifest_of(config: TimelineConfig, work: Sequence[tuple[Board, Setting]]) -> dict[str, Any]:
+def manifest_of(config: TimelineConfig, work: Sequence[tuple[Board, PlanSetting]]) -> dict[str, Any]:
     """Return what is known before a run that no model answers."""
     return {
         "configuration": config.to_manifest(),
@@ -103,7 +103,7 @@ def manifest_of(config: TimelineConfig, work: Sequence[tuple[Board, Setting]]) -
     }
 
 
-def _origins(config: TimelineConfig, work: Sequence[tuple[Board, Setting]]) -> Origins:
+def _origins(config: TimelineConfig, work: Sequence[tuple[Board, PlanSetting]]) -> Origins:
     """Return where the numbers of each timeline come from: its board's tokens."""
     clock = {setting.mode: "virtual" if setting.mode == "virtual" else "monotonic" for _, setting in work}
     cells = {
@@ -210,7 +210,7 @@ class _RealTime:
     warnings: list[RunWarning] = field(default_factory=list)
     calibrations: dict[str, Any] = field(default_factory=dict)
 
-    def play(self, board: Board, setting: Setting) -> None:
+    def play(self, board: Board, setting: PlanSetting) -> None:
         """Play the plans of one setting."""
         config = self.config
         self.progress.stage(f"learning {setting.title}")
@@ -227,7 +227,7 @@ class _RealTime:
             self._execute(setting, plan, _Play(token_s[:, plan], one), following)
             self.progress.advance()
 
-    def _execute(self, setting: Setting, plan: int, play: _Play, following: Following) -> None:
+    def _execute(self, setting: PlanSetting, plan: int, play: _Play, following: Following) -> None:
         """Let every policy execute one plan."""
         self.progress.stage(f"{setting.title}, L = {setting.tokens_per_skill}: about {play.span_s:.0f} s")
         safe_s = float(safe_start(play.plans.arrival_s, play.plans.nominal_s)[0])
@@ -273,7 +273,7 @@ def _play(play: _Play, tokens_per_skill: int, executors: SideBySide) -> None:
     executors.finish()
 
 
-def _token_rows(setting: Setting, request_id: str, record: Record) -> list[TokenRow]:
+def _token_rows(setting: PlanSetting, request_id: str, record: Record) -> list[TokenRow]:
     return [
         TokenRow(request_id, setting.name, index, -1, "", None, at_ns) for index, at_ns in enumerate(record.token_ns)
     ]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.experiments.timeline.rows import METRICS, PlanRow, TimelineRow
-from s2a_bench.harness.timelines.config import Setting
+from s2a_bench.harness.timelines.config import PlanSetting
 from s2a_bench.harness.timelines.rows import KEPT_PLANS
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.conformal import TOLERANCE_S
@@ -34,7 +34,7 @@ LONGEST_MOTION_S: Final = 1000.0
 
 
 def timeline_rows(
-    setting: Setting,
+    setting: PlanSetting,
     policy: str,
     plans: Plans,
     schedule: Schedule,

@@ -50,7 +50,7 @@ Seconds = Annotated[tuple[Annotated[float, Field(ge=LEAST_T_NOM_S, allow_inf_nan
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class PlanSetting:
     """What plans have in common, whatever the policy."""
 
     board: str
@@ -81,7 +81,7 @@ class Setting:
         return f"{self.name}/{policy}/{plan}" if policy else f"{self.name}/{plan}"
 
 
-class Compared(Options):
+class ComparedOptions(Options):
     """Options about what is compared, wherever the tokens are from."""
 
     PANEL: ClassVar[str] = "Plans"
@@ -145,7 +145,7 @@ class Modelled(Options):
     )
 
 
-class Live(Options):
+class LiveOptions(Options):
     """Options about a model that answers."""
 
     PANEL: ClassVar[str] = "A model that answers"
@@ -174,7 +174,7 @@ class Live(Options):
     )
 
 
-class TimelineConfig(Live, Modelled, Compared):
+class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
     """What is compared with what: computed, played in real time, or live."""
 
     @property
@@ -223,7 +223,7 @@ class TimelineConfig(Live, Modelled, Compared):
         if self.live:
             if self.real_time:
                 raise UsageError("`live` and `real_time` are two things: a model answers, or a profile is played")
-            if "epsilon" in self.given(Compared) and not self.track:
+            if "epsilon" in self.given(ComparedOptions) and not self.track:
                 raise UsageError("`epsilon`: nothing is calibrated with `live`; it needs `track`")
             if self.plans is not None:
                 raise UsageError(f"`plans` are computed; with `live` write `requests` {self.plans}")
@@ -231,7 +231,7 @@ class TimelineConfig(Live, Modelled, Compared):
                 raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")
             check_live(self)
             return
-        for name in self.given(Live):
+        for name in self.given(LiveOptions):
             raise UsageError(f"`{name}` is about a model that answers; it needs `live`")
         self._check_modelled()
 
@@ -252,7 +252,7 @@ class TimelineConfig(Live, Modelled, Compared):
                 f"`n_skills`, `tokens_per_skill`: {tokens} tokens a plan, {drawn} a cell: {MOST_TOKENS} is the most"
             )
 
-    def shape(self, setting: Setting) -> PlanShape:
+    def shape(self, setting: PlanSetting) -> PlanShape:
         """Return what is known of a plan before its first token."""
         t_nom_s = setting.t_nom_s
         timing = Timing(t_nom_s, self.t_min * t_nom_s, self.t_max * t_nom_s)
@@ -266,7 +266,7 @@ class TimelineConfig(Live, Modelled, Compared):
 
     def to_manifest(self) -> dict[str, Any]:
         """Return the options that hold in this kind of run, with the values that follow from others."""
-        own = self.model_dump(include=set(Compared.model_fields) - {"profiles", "real_time", "live"})
+        own = self.model_dump(include=set(ComparedOptions.model_fields) - {"profiles", "real_time", "live"})
         own |= {"tokens_per_skill": self.lengths, "plans": self.plans_a_cell}
         if self.live:
             asked = {"skills": self.skills, "task": self.task, "robot": self.robot, "constrained": not self.no_grammar}
@@ -284,12 +284,12 @@ def check_tracking(config: TimelineConfig) -> None:
         raise UsageError("`track`: without `jitter` or `t_nom_cv` all plans are the same; nothing can be learned")
 
 
-def settings(config: TimelineConfig) -> Iterator[tuple[Board, Setting]]:
+def settings(config: TimelineConfig) -> Iterator[tuple[Board, PlanSetting]]:
     """List what is compared, board by board."""
     for n_skills, t_nom_s, board, tokens in product(
         config.n_skills, config.t_nom_s or (1.0,), config.boards, config.lengths
     ):
-        yield board, Setting(board.name, board.title, board.tokens_per_s, board.prompt_s, tokens, n_skills, t_nom_s)
+        yield board, PlanSetting(board.name, board.title, board.tokens_per_s, board.prompt_s, tokens, n_skills, t_nom_s)
 
 
 def requests_of(config: TimelineConfig) -> RequestsConfig:

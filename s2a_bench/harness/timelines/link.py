@@ -12,11 +12,11 @@ import numpy as np
 
 from s2a_bench.act.events import PlanFeed
 from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.harness.plan import Plan, resolve
-from s2a_bench.harness.rounds import Launch
+from s2a_bench.harness.plan import RunPlan, resolve
+from s2a_bench.harness.rounds import RunningLaunch
 from s2a_bench.harness.servers import on_files
-from s2a_bench.harness.session import Asked, Measured, Place
-from s2a_bench.harness.timelines.config import Setting, TimelineConfig, requests_of
+from s2a_bench.harness.session import Measured, Place, RequestContext
+from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, requests_of
 from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.inference import need_engine
 from s2a_bench.machine.tuning import limit_threads
@@ -104,7 +104,7 @@ def skills_lasting(config: TimelineConfig, t_nom_s: float | None) -> SkillSet:
     return replace(config.skill_set, skills=skills)
 
 
-def word(config: TimelineConfig, progress: Progress) -> tuple[Plan, list[Ask]]:
+def word(config: TimelineConfig, progress: Progress) -> tuple[RunPlan, list[Ask]]:
     """Find the model's files, word what it is asked, and plan requests with the room that it needs; raises S2AError."""
     limit_threads()
     requests = requests_of(config)
@@ -117,11 +117,11 @@ def word(config: TimelineConfig, progress: Progress) -> tuple[Plan, list[Ask]]:
 
 
 @dataclass
-class Link:
+class ModelLink:
     """The way to one model, for one run."""
 
     config: TimelineConfig
-    launch: Launch
+    launch: RunningLaunch
     robot: str
     """What will act, for the record."""
     blocks: Iterator[int] = field(default_factory=count)
@@ -174,7 +174,7 @@ class Link:
         run = self.session.request
         asked = replace(run, prompt=ask.prompt, grammar=ask.grammar, max_pieces=ask.max_tokens, seed=run.seed + plan)
         place = Place(next(self.blocks), 0, warmup=feed is None)
-        measured = self.session.measure(place, Asked(plan=feed, request=asked))
+        measured = self.session.measure(place, RequestContext(plan=feed, request=asked))
         if self.session.origin != self.origin:
             self._tell_origin()
         self.answers += feed is not None and not measured.sample.error
@@ -186,9 +186,9 @@ class Link:
             raise UsageError(f"{error} (here: `no_grammar`)") from error
         return measured
 
-    def setting(self, ask: Ask) -> Setting:
+    def setting(self, ask: Ask) -> PlanSetting:
         """Return the setting of what was asked, at the rate that was seen."""
-        return Setting(
+        return PlanSetting(
             board="",
             title=f"live {self.cell.name}",
             tokens_per_s=float(f"{self.rate or 0.0:.4g}"),

@@ -12,14 +12,14 @@ import numpy as np
 from s2a_bench.act.record import Record, observed
 from s2a_bench.boards.tokens import Board
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.timelines.config import MOST_CV, Setting, TimelineConfig
+from s2a_bench.harness.timelines.config import MOST_CV, PlanSetting, TimelineConfig
 from s2a_bench.policy import CAUTION, ONLINE, Floats, Plans, PlanShape, Policy
 from s2a_bench.policy.arrivals import recorded_plans, with_skills
 from s2a_bench.policy.conformal import PLANS, Calibration, Guarantee, Tracker, choose, scores
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
 from s2a_bench.policy.evaluate import TOLERANCE_S
 from s2a_bench.policy.parameters import canonical
-from s2a_bench.policy.tracking import Tracked
+from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.stats.seeds import generator
 
 
@@ -40,12 +40,12 @@ class Knowledge:
         """Tell online rules what they were not told yet, the prior and lambda."""
         return policy.informed(self.prior, self._caution(policy) if _open(policy) else None)
 
-    def tracked(self, policy: Policy) -> Tracked | None:
+    def tracked(self, policy: Policy) -> TrackedPolicy | None:
         """Return what follows the lambda of a policy from plan to plan; None where it has none, or was told it."""
         if not _open(policy) or self.plans is None:
             return None
         self._caution(policy)
-        return Tracked(policy.informed(self.prior), Tracker(self.scores[policy], self.epsilon))
+        return TrackedPolicy(policy.informed(self.prior), Tracker(self.scores[policy], self.epsilon))
 
     def _caution(self, policy: Policy) -> float:
         if self.plans is None:
@@ -55,7 +55,7 @@ class Knowledge:
             self.calibrations[policy] = choose(self.scores[policy], self.epsilon, self.guarantee)
         return self.calibrations[policy].caution
 
-    def facts(self, setting: Setting) -> dict[str, Any]:
+    def facts(self, setting: PlanSetting) -> dict[str, Any]:
         """Return the calibrations as plain data, stream-to-act's by the setting's name, others by their cell's."""
         named = {canonical(policy.name, policy): found for policy, found in self.calibrations.items()}
         return {
@@ -75,7 +75,7 @@ def finite(caution: float | None) -> float | None:
     return None if caution is None or caution == float("inf") else caution
 
 
-def learn(config: TimelineConfig, board: Board, setting: Setting, answers: Sequence[Floats] = ()) -> Knowledge:
+def learn(config: TimelineConfig, board: Board, setting: PlanSetting, answers: Sequence[Floats] = ()) -> Knowledge:
     """Learn a prior, and what to calibrate on, from other plans of the same kind: drawn ones, or recorded ``answers``.
 
     Where nothing is random the prior is as certain as the arrivals, and the online rule starts at S0.
@@ -94,7 +94,7 @@ def learn(config: TimelineConfig, board: Board, setting: Setting, answers: Seque
     return Knowledge(prior, plans, config.epsilon, config.guarantee)
 
 
-def plans_of(config: TimelineConfig, setting: Setting, answers: Sequence[Floats]) -> Plans:
+def plans_of(config: TimelineConfig, setting: PlanSetting, answers: Sequence[Floats]) -> Plans:
     """Make plans of recorded answers; raises UsageError where too few are long enough."""
     rng = generator(config.seed, "timeline", "calibration", setting.key)
     plans = recorded_plans(answers, config.shape(setting), rng)
@@ -107,7 +107,7 @@ def plans_of(config: TimelineConfig, setting: Setting, answers: Sequence[Floats]
     return plans
 
 
-def draw(config: TimelineConfig, board: Board, setting: Setting, plans: int, purpose: str) -> tuple[Floats, Plans]:
+def draw(config: TimelineConfig, board: Board, setting: PlanSetting, plans: int, purpose: str) -> tuple[Floats, Plans]:
     """Draw plans and the tokens that they come in; each purpose has random numbers of its own."""
     rng = generator(config.seed, "timeline", purpose, setting.key)
     shape = config.shape(setting)
@@ -121,7 +121,7 @@ class Following:
 
     shape: PlanShape
     made: Mapping[str, Policy]
-    tracked: dict[str, Tracked] = field(default_factory=dict)
+    tracked: dict[str, TrackedPolicy] = field(default_factory=dict)
 
     def policies(self) -> dict[str, Policy]:
         return {name: self.tracked[name].policy if name in self.tracked else each for name, each in self.made.items()}
@@ -142,7 +142,7 @@ def prepare(config: TimelineConfig, shape: PlanShape, prior: GapPrior | None) ->
         made[name] = policy.informed(prior)
         if _open(policy) and config.track:
             plans = drawn(made[name].prior, shape, generator(config.seed, "tracking", shape.key), PLANS)
-            tracked[name] = Tracked.begin(made[name], plans, config.epsilon)
+            tracked[name] = TrackedPolicy.begin(made[name], plans, config.epsilon)
         elif _open(policy):
             made[name] = policy.informed(prior, CAUTION)
     return Following(shape, made, tracked)

@@ -93,7 +93,7 @@ class Reader(Protocol):
 
 READERS: dict[str, str] = {
     "cpu": "s2a_bench.machine.resources.host:CpuTimes",
-    "memory": "s2a_bench.machine.resources.host:Memory",
+    "memory": "s2a_bench.machine.resources.host:HostMemory",
     "rapl": "s2a_bench.machine.resources.host:Rapl",
     "nvml": "s2a_bench.machine.resources.nvidia:Nvml",
     "tegrastats": "s2a_bench.machine.resources.nvidia:Tegrastats",

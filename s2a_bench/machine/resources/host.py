@@ -50,7 +50,7 @@ class CpuTimes:
         """Nothing is held."""
 
 
-class Memory:
+class HostMemory:
     """Resident memory, and how busy all CPUs are, as /proc says."""
 
     cheap = False

@@ -1,8 +1,8 @@
 """The thread that polls the readers, and the answer to what happened between two moments.
 
 A counter's rise is exact between two readings of it, so the cheap readers are read before and after every request
-(`Sampler.edge`), by the thread that makes the request and outside of its time; the others at the poll rate only. A
-window too short for a reader's rate gets no rise from it: absent, rather than a share of somebody else's work.
+(`ResourceSampler.edge`), by the thread that makes the request and outside of its time; the others at the poll rate
+only. A window too short for a reader's rate gets no rise from it: absent, rather than a share of other work.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ class _Source:
     broken: bool = False
 
 
-def open_sampler(hz: float, pids: Sequence[int]) -> Sampler:
+def open_sampler(hz: float, pids: Sequence[int]) -> ResourceSampler:
     """Make the sampler of a run whose servers have ``pids``; one that reads nothing for ``hz`` 0."""
     readers, left_out = open_readers(pids) if hz else ({}, {})
-    return Sampler(readers, hz or 1, left_out)
+    return ResourceSampler(readers, hz or 1, left_out)
 
 
-class Sampler:
+class ResourceSampler:
     """Polls readers ``hz`` times a second on a thread of its own. Use as a context manager."""
 
     def __init__(
@@ -86,7 +86,7 @@ class Sampler:
         self._started_ns = self._seen_ns = 0
         self._thread_cpu_ns = 0
 
-    def __enter__(self) -> Sampler:  # noqa: PYI034 - Self is typing's since 3.11
+    def __enter__(self) -> ResourceSampler:  # noqa: PYI034 - Self is typing's since 3.11
         if self._sources:
             self._thread.start()
         return self

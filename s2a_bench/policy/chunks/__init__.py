@@ -47,7 +47,7 @@ is a multiple of Delta t."""
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class ControlSetting:
     """What all modes are told: the control period Delta t, the prediction horizon H, and how L becomes d."""
 
     period_ns: int
@@ -74,13 +74,13 @@ class Setting:
             raise ValueError(f"execute = {execute} of a chunk of {self.horizon} actions")
         return execute or self.horizon
 
-    def slowed(self, beta: float) -> Setting:
+    def slowed(self, beta: float) -> ControlSetting:
         """Return the setting with all actions executed ``beta`` times slower (time-scaling), up to whole ns."""
-        return Setting(math.ceil(self.period_ns * beta), self.horizon, self.rounding)
+        return ControlSetting(math.ceil(self.period_ns * beta), self.horizon, self.rounding)
 
 
 @dataclass(frozen=True, slots=True)
-class Action:
+class ChunkAction:
     """One action: which request's chunk it is from, and its place in that chunk, from 0."""
 
     request: int
@@ -103,7 +103,7 @@ class ChunkStepper(Protocol):
     def ask(self, tick: int) -> bool:
         """Return whether to observe and to ask now."""
 
-    def act(self, tick: int) -> Action | None:
+    def act(self, tick: int) -> ChunkAction | None:
         """Return what to execute in this tick, None where there is nothing."""
 
 
@@ -205,7 +205,7 @@ class Mode(Protocol):
         """Return the share of a new action where it meets one that is due at the same time; 1: it takes its place."""
         return 1.0
 
-    def stepper(self, setting: Setting) -> ChunkStepper:
+    def stepper(self, setting: ControlSetting) -> ChunkStepper:
         """Follow one robot."""
 
     def varied(self, triggers: tuple[int, ...]) -> Mode:
@@ -214,15 +214,15 @@ class Mode(Protocol):
 
         return Varied(self, triggers)
 
-    def execution_horizon(self, setting: Setting) -> int:
+    def execution_horizon(self, setting: ControlSetting) -> int:
         """Return s, for how many ticks a chunk is to be executed; raises ValueError where it has fewer actions."""
         return setting.horizon
 
-    def slack(self, setting: Setting) -> int | None:
+    def slack(self, setting: ControlSetting) -> int | None:
         """Return the greatest d that its best trigger would not stall with; None where slower actions do not help."""
         return self.execution_horizon(setting) - 1 if self.triggered else None
 
-    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:  # noqa: ARG002 - for subclasses
+    def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:  # noqa: ARG002 - for subclasses
         """Say what follows without a simulation from latencies of shape (R,), in ns, R > 0, of the steady state."""
         from s2a_bench.policy.chunks.closed import Closed
 
@@ -246,13 +246,13 @@ class Mode(Protocol):
         """
         return None
 
-    def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
+    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
         """Say what becomes of requests with latencies of shape (R,), in ns; the first leaves at tick 0."""
         from s2a_bench.policy.chunks.cycles import step
 
         return step(self, latency_ns, setting)[0]
 
-    def ticks(self, latency_ns: Ints, setting: Setting) -> Ticks:
+    def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
         """Say what each tick does, for the same requests."""
         from s2a_bench.policy.chunks.cycles import step
 

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from s2a_bench.policy import Floats
-from s2a_bench.policy.chunks import Action, ChunkStepper, Cycles, Ints, Setting, Ticks
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Ticks
 from s2a_bench.policy.chunks.closed import Closed, stall_share
 from s2a_bench.policy.chunks.cycles import Laid, assemble, lay
 
@@ -42,20 +42,20 @@ class Aggregate(Laid):
     def weight(self) -> float:
         return WEIGHTS[self.kind]
 
-    def stepper(self, setting: Setting) -> ChunkStepper:
+    def stepper(self, setting: ControlSetting) -> ChunkStepper:
         return AggregateStepper(setting.horizon, self.trigger)
 
-    def execution_horizon(self, setting: Setting) -> int:
+    def execution_horizon(self, setting: ControlSetting) -> int:
         return max(0, setting.horizon - self.trigger)
 
-    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:
+    def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
         if 2 * self.trigger >= setting.horizon:
             return Closed()
         delay = setting.delay_ticks(latency_ns)
         cycle = delay + setting.horizon - np.minimum(delay, self.trigger) - self.trigger
         return Closed(stall_share(delay, self.trigger), delay, cycle)
 
-    def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
+    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
         """Say what becomes of requests with latencies of shape (R,), in ns.
 
         With q actions left at the request, min(d, q) of the new chunk are past when it arrives.
@@ -128,9 +128,9 @@ class AggregateStepper(ChunkStepper):
         self.under_way, self.since_asked = True, 0
         return True
 
-    def act(self, tick: int) -> Action | None:  # noqa: ARG002 - whatever is next
+    def act(self, tick: int) -> ChunkAction | None:  # noqa: ARG002 - whatever is next
         if self.newest < 0 or self.past == self.horizon:
             return None
         self.past += 1
         self.since_asked += 1
-        return Action(self.newest, self.past - 1)
+        return ChunkAction(self.newest, self.past - 1)

@@ -13,7 +13,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from s2a_bench.policy.chunks import Action, ChunkStepper, Cycles, Ints, Mode, Setting, Ticks
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Ticks
 from s2a_bench.policy.chunks.closed import Closed, appended
 from s2a_bench.policy.chunks.cycles import Laid, assemble, lay, step
 from s2a_bench.policy.chunks.trigger import Varied
@@ -26,7 +26,7 @@ class Appending(Laid):
 
     execute: int
 
-    def execution_horizon(self, setting: Setting) -> int:
+    def execution_horizon(self, setting: ControlSetting) -> int:
         return setting.length(self.execute)
 
 
@@ -40,17 +40,17 @@ class Queue(Appending):
     trigger: Annotated[int, Field(ge=0)] = 0
     execute: Execute = 0
 
-    def stepper(self, setting: Setting) -> ChunkStepper:
+    def stepper(self, setting: ControlSetting) -> ChunkStepper:
         return QueueStepper(self.execution_horizon(setting), self.trigger)
 
     def varied(self, triggers: tuple[int, ...]) -> Mode:
         return VariedQueue(self, triggers) if len(triggers) > 1 else replace(self, trigger=triggers[0])
 
-    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:
+    def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
         delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
         return appended(delay, known, self.trigger, self.execution_horizon(setting))
 
-    def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
+    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
         delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
         return _append(delay, known, delay, self.trigger, self.execution_horizon(setting), setting.horizon)
 
@@ -58,7 +58,7 @@ class Queue(Appending):
 class VariedQueue(Varied):
     """The same with a trigger for each request."""
 
-    def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
+    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
         """Say what becomes of requests with latencies of shape (R,), in ns, one request at a time."""
         delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
         length, last = self.mode.execution_horizon(setting), len(self.triggers) - 1
@@ -73,7 +73,7 @@ class VariedQueue(Varied):
         first, until = np.zeros_like(start), start + length
         return assemble(asked, asked + delay, start, first, until, ticks=leaves[-1], horizon=setting.horizon)
 
-    def ticks(self, latency_ns: Ints, setting: Setting) -> Ticks:
+    def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
         return lay(self.cycles(latency_ns, setting))
 
 
@@ -87,13 +87,13 @@ class Sync(Appending):
 
     execute: Execute = 0
 
-    def stepper(self, setting: Setting) -> ChunkStepper:
+    def stepper(self, setting: ControlSetting) -> ChunkStepper:
         return Queue(0, self.execute).stepper(setting)
 
-    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:
+    def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
         return Queue(0, self.execute).closed_form(latency_ns, setting)
 
-    def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
+    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
         return Queue(0, self.execute).cycles(latency_ns, setting)
 
 
@@ -120,26 +120,26 @@ class Streamed(Appending):
     def gap_ns(self) -> int:
         return round(self.gap_s * 1e9)
 
-    def hold_ticks(self, setting: Setting) -> int:
+    def hold_ticks(self, setting: ControlSetting) -> int:
         """Return for how many ticks the first action is held back, S0 - L rounded up."""
         slower_ns = max(0, self.gap_ns - setting.period_ns) if self.start == "safe" else 0
         return -(-(self.execution_horizon(setting) - 1) * slower_ns // setting.period_ns)
 
-    def waits_within(self, setting: Setting) -> bool:
+    def waits_within(self, setting: ControlSetting) -> bool:
         """Whether it may stall within a chunk: then neither arrays nor a closed form tell."""
         return self.start == "naive" and self.gap_ns > setting.period_ns
 
-    def stepper(self, setting: Setting) -> ChunkStepper:
+    def stepper(self, setting: ControlSetting) -> ChunkStepper:
         return QueueStepper(self.execution_horizon(setting), self.trigger, self.hold_ticks(setting))
 
-    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:
+    def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
         if self.waits_within(setting):
             return Closed()
         length = self.execution_horizon(setting)
         known = setting.known_ticks(latency_ns + (length - 1) * self.gap_ns)
         return appended(setting.delay_ticks(latency_ns) + self.hold_ticks(setting), known, self.trigger, length)
 
-    def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
+    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
         if self.waits_within(setting):
             return step(self, latency_ns, setting)[0]
         length = self.execution_horizon(setting)
@@ -148,7 +148,7 @@ class Streamed(Appending):
         ready = setting.delay_ticks(latency_ns) + self.hold_ticks(setting)
         return _append(ready, known, whole, self.trigger, length, setting.horizon)
 
-    def ticks(self, latency_ns: Ints, setting: Setting) -> Ticks:
+    def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
         if self.waits_within(setting):
             return step(self, latency_ns, setting)[1]
         return Laid.ticks(self, latency_ns, setting)
@@ -161,7 +161,7 @@ class QueueStepper(ChunkStepper):
     length: int
     trigger: int = 0
     hold: int = 0
-    waiting: deque[tuple[Action, int]] = field(default_factory=deque)
+    waiting: deque[tuple[ChunkAction, int]] = field(default_factory=deque)
     """Actions, and from which tick on they may be executed."""
     asked: int = 0
     missing: int = 0
@@ -173,7 +173,7 @@ class QueueStepper(ChunkStepper):
             return
         have = self.length - self.missing
         for index in range(have, min(actions, self.length)):
-            self.waiting.append((Action(request, index), tick + (0 if index else self.hold)))
+            self.waiting.append((ChunkAction(request, index), tick + (0 if index else self.hold)))
         self.missing = self.length - max(have, min(actions, self.length))
 
     def ask(self, tick: int) -> bool:  # noqa: ARG002 - whenever few are left
@@ -184,7 +184,7 @@ class QueueStepper(ChunkStepper):
         self.missing = self.length
         return True
 
-    def act(self, tick: int) -> Action | None:
+    def act(self, tick: int) -> ChunkAction | None:
         if not self.waiting or self.waiting[0][1] > tick:
             return None
         return self.waiting.popleft()[0]

@@ -2,7 +2,8 @@
 
 They are about the steady state, from the second request on, and of requests that do not overlap: one is
 under way at a time, and L <= s Delta t unless said otherwise. Ticks are whole; d and ceil(L / Delta t), "known", are
-what `Setting` makes of a latency. In continuous time, on a robot whose ticks are shifted by a stall, d Delta t is L.
+what `ControlSetting` makes of a latency. In continuous time, on a robot whose ticks are shifted by a stall, d Delta t
+is L.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from s2a_bench.policy import Floats
 from s2a_bench.policy.chunks import Ints
 
 if TYPE_CHECKING:
-    from s2a_bench.policy.chunks import Mode, Setting
+    from s2a_bench.policy.chunks import ControlSetting, Mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +61,7 @@ class Closed:
         return found
 
 
-def closed(mode: Mode, latency_ns: Ints, setting: Setting) -> Closed:
+def closed(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> Closed:
     """Return what the closed forms say of a mode at latencies of shape (R,), in ns, the first one's left out."""
     return mode.closed_form(latency_ns[1:], setting) if latency_ns.size > 1 else Closed()
 
@@ -72,7 +73,7 @@ def appended(ready: Ints, known: Ints, trigger: int, length: int) -> Closed:
     return Closed() if (cycle < np.maximum(known, 1)).any() else Closed(stall_share(ready, trigger), wait, cycle)
 
 
-def beta(mode: Mode, latency_ns: Ints, setting: Setting, epsilon: float) -> float | None:
+def beta(mode: Mode, latency_ns: Ints, setting: ControlSetting, epsilon: float) -> float | None:
     """Return by how much actions would have to be slower for P(stall) <= epsilon; None for a mode without slack."""
     slack = mode.slack(setting)
     if slack is None or slack < 1:

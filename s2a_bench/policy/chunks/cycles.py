@@ -10,7 +10,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from s2a_bench.policy.chunks import ChunkStepper, Cycles, Ints, Mode, Setting, Ticks
+from s2a_bench.policy.chunks import ChunkStepper, ControlSetting, Cycles, Ints, Mode, Ticks
 
 _Arrival: TypeAlias = tuple[int, int, int, int]
 """When actions are usable, from when on asking knows of them, the request, and how many of its actions that are."""
@@ -22,7 +22,7 @@ NEVER: Final = 2**61
 class Laid(Mode):
     """A mode with arrays for `cycles`, in which every chunk is one run: its ticks follow from that."""
 
-    def ticks(self, latency_ns: Ints, setting: Setting) -> Ticks:
+    def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
         return lay(self.cycles(latency_ns, setting))
 
 
@@ -107,13 +107,13 @@ def _stalled(chunk: Ints) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     return np.asarray(begun & (chunk < 0))
 
 
-def step(mode: Mode, latency_ns: Ints, setting: Setting) -> tuple[Cycles, Ticks]:
+def step(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> tuple[Cycles, Ticks]:
     """Run a mode's stepper until it asks once more than there are latencies, shape (R,) in ns."""
     shifts = np.arange(setting.horizon) * mode.gap_ns
     return follow(mode, latency_ns[:, np.newaxis] + shifts, setting)
 
 
-def follow(mode: Mode, arrival_ns: Ints, setting: Setting, most: int = NEVER) -> tuple[Cycles, Ticks]:
+def follow(mode: Mode, arrival_ns: Ints, setting: ControlSetting, most: int = NEVER) -> tuple[Cycles, Ticks]:
     """Do the same with the arrival of every action after the request's tick began: shape (R, H), in ns.
 
     It ends after ``most`` ticks, if there have been as many.

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.policy import Floats
-from s2a_bench.policy.chunks import Cycles, Ints, Mode, Setting, Ticks
+from s2a_bench.policy.chunks import ControlSetting, Cycles, Ints, Mode, Ticks
 
 
 @dataclass(frozen=True, slots=True)
-class Metrics:
+class ChunkMetrics:
     """One robot's run; NaN where there is nothing to count."""
 
     first_action_tick: int
@@ -43,14 +43,14 @@ class Metrics:
     """Ticks in which the control loop waits for an answer, the first included; 0 unless the mode blocks."""
 
 
-def measure(mode: Mode, cycles: Cycles, ticks: Ticks) -> Metrics:
+def measure(mode: Mode, cycles: Cycles, ticks: Ticks) -> ChunkMetrics:
     """Count a mode's run."""
     settled, age = cycles.settled, ticks.age[ticks.age >= 0]
     first = int(np.argmax(ticks.chunk >= 0)) if age.size else cycles.ticks
     stall_ticks, length = int(ticks.stalled.sum()), cycles.ticks - first
     last = int(np.flatnonzero(cycles.executed)[-1]) if age.size else 0
     jump = np.abs(cycles.jump[settled])
-    return Metrics(
+    return ChunkMetrics(
         first_action_tick=first,
         ticks=length,
         stall_ticks=stall_ticks,
@@ -80,7 +80,7 @@ def reaction_ticks(cycles: Cycles, moment_ticks: Floats) -> Floats:
     return start[place] - moment_ticks
 
 
-def margin_ticks(mode: Mode, latency_ns: Ints, setting: Setting) -> int:
+def margin_ticks(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> int:
     """Return the stability margin, in ticks: by how much all latencies, shape (R,), may grow without a stall.
 
     -1 for a run that stalls as it is. All of it counts, so that a longer run has a smaller margin.

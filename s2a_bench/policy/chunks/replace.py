@@ -13,7 +13,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from s2a_bench.policy.chunks import Action, ChunkStepper, Cycles, Ints, Setting
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints
 from s2a_bench.policy.chunks.closed import Closed, replace_stall_share, slack_ticks, stall_share
 from s2a_bench.policy.chunks.cycles import Laid, assemble
 
@@ -41,16 +41,16 @@ class Replace(Laid):
     def assumed_ticks(self) -> int | None:
         return None if self.assumed < 0 else self.assumed
 
-    def stepper(self, setting: Setting) -> ChunkStepper:
+    def stepper(self, setting: ControlSetting) -> ChunkStepper:
         return ReplaceStepper(self, setting.horizon)
 
-    def execution_horizon(self, setting: Setting) -> int:
+    def execution_horizon(self, setting: ControlSetting) -> int:
         return setting.length(self.execute)
 
-    def slack(self, setting: Setting) -> int:
+    def slack(self, setting: ControlSetting) -> int:
         return slack_ticks(setting.horizon, self.execute, self.under_way)
 
-    def closed_form(self, latency_ns: Ints, setting: Setting) -> Closed:
+    def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
         if self.assumed >= 0:
             return Closed()
         delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
@@ -64,7 +64,7 @@ class Replace(Laid):
             cycle = np.full_like(delay, self.execute)
         return Closed(share, delay, cycle) if delay.max() < setting.horizon else Closed(share)
 
-    def cycles(self, latency_ns: Ints, setting: Setting) -> Cycles:
+    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
         delay = setting.delay_ticks(latency_ns)
         step = np.full(delay.size, self.execute)
         if not self.several:
@@ -115,6 +115,6 @@ class ReplaceStepper(ChunkStepper):
         self.next_ask = tick + self.rule.execute
         return True
 
-    def act(self, tick: int) -> Action | None:
+    def act(self, tick: int) -> ChunkAction | None:
         index = tick - self.due_from
-        return Action(self.newest, index) if self.newest >= 0 and index < self.horizon else None
+        return ChunkAction(self.newest, index) if self.newest >= 0 and index < self.horizon else None

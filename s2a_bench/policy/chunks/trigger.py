@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from s2a_bench.policy.chunks import Action, ChunkStepper, Ints, Mode, Setting
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Ints, Mode
 from s2a_bench.policy.chunks.closed import slow_down
 from s2a_bench.policy.conformal import EPSILON, Calibration, Guarantee, Tracker, choose
 
@@ -31,7 +31,7 @@ class Trigger:
     beta: float = 1.0
 
 
-class Rule(Protocol):
+class TriggerRule(Protocol):
     """A rule that learns each latency and says from which one on cycles may stall."""
 
     @property
@@ -42,7 +42,7 @@ class Rule(Protocol):
         """Learn how long the answer took, and whether the robot stalled."""
 
 
-def trigger(latency_ns: float, setting: Setting, most: int) -> Trigger:
+def trigger(latency_ns: float, setting: ControlSetting, most: int) -> Trigger:
     """Return the least trigger that a latency does not stall with, and the slow-down where that is above ``most``.
 
     An infinite latency has the greatest trigger, and no slow-down. Raises ValueError for a ``most`` below 1 that a
@@ -95,7 +95,7 @@ class Mean:
 
 
 @dataclass(slots=True)
-class Tracked:
+class TrackedLatency:
     """The calibrated latency, tracked from cycle to cycle while the latencies drift: `conformal.Tracker`.
 
     Its bound on stalls, whatever the machine does, is about cycles that an infinite caution saves; here that is the
@@ -105,8 +105,8 @@ class Tracked:
     tracker: Tracker = field(repr=False)
 
     @staticmethod
-    def begin(latency_ns: Iterable[float], epsilon: float = EPSILON, **options: Any) -> Tracked:
-        return Tracked(Tracker(map(float, latency_ns), epsilon, **options))
+    def begin(latency_ns: Iterable[float], epsilon: float = EPSILON, **options: Any) -> TrackedLatency:
+        return TrackedLatency(Tracker(map(float, latency_ns), epsilon, **options))
 
     @property
     def latency_ns(self) -> float:
@@ -116,7 +116,7 @@ class Tracked:
         self.tracker.learn(float(latency_ns), stalled=stalled)
 
 
-def follow(rule: Rule, latency_ns: Ints, setting: Setting, most: int) -> Ints:
+def follow(rule: TriggerRule, latency_ns: Ints, setting: ControlSetting, most: int) -> Ints:
     """Return the trigger of each request where a rule learns every latency, shape (R,), after the cycle it decided.
 
     A trigger is at most ``most``, below s; the robot stalls for max(0, d - m) ticks.
@@ -128,7 +128,7 @@ def follow(rule: Rule, latency_ns: Ints, setting: Setting, most: int) -> Ints:
     return triggers
 
 
-def _ticks(latency_ns: float, setting: Setting) -> int:
+def _ticks(latency_ns: float, setting: ControlSetting) -> int:
     """Return d of a latency that need not be whole."""
     whole = math.ceil(latency_ns)
     return whole // setting.period_ns if setting.rounding == "floor" else -(-whole // setting.period_ns)
@@ -174,7 +174,7 @@ class ChosenStepper(ChunkStepper):
             self.triggers.append(self.stepper.trigger)
         return asks
 
-    def act(self, tick: int) -> Action | None:
+    def act(self, tick: int) -> ChunkAction | None:
         return self.stepper.act(tick)
 
 
@@ -184,7 +184,7 @@ class Varied(Chosen):
 
     triggers: tuple[int, ...]
 
-    def stepper(self, setting: Setting) -> ChunkStepper:
+    def stepper(self, setting: ControlSetting) -> ChunkStepper:
         def choose() -> int:
             return self.triggers[min(len(stepper.triggers), len(self.triggers) - 1)]
 
@@ -200,9 +200,9 @@ class Learning(Chosen):
     of what a delay of d ticks can have been: no matter to a quantile or a maximum, and right for a mean.
     """
 
-    begin: Callable[[], Rule]
+    begin: Callable[[], TriggerRule]
 
-    def stepper(self, setting: Setting) -> LearningStepper:
+    def stepper(self, setting: ControlSetting) -> LearningStepper:
         rule, length = self.begin(), self.mode.execution_horizon(setting)
 
         def choose() -> int:
@@ -215,8 +215,8 @@ class Learning(Chosen):
 class LearningStepper(ChosenStepper):
     """A stepper whose rule learns the delay of every answer."""
 
-    rule: Rule
-    setting: Setting
+    rule: TriggerRule
+    setting: ControlSetting
     length: int
     """Actions of a chunk that are to be executed: when the last one is there the delay is known."""
     learnt: int = 0

@@ -15,7 +15,7 @@ from s2a_bench.stats import Ratio
 from s2a_bench.writers.tables import TextTable
 
 if TYPE_CHECKING:
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 SUPPORTED: Final = "supported"
 REPRODUCED: Final = "reproduced at the chosen point"
@@ -25,13 +25,13 @@ UNDECIDED: Final = "undecided or not testable"
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class RunPart:
     """What of a run is judged at once: cells that belong together, its facts by the names that needs give them.
 
     ``about`` is said of it behind the evidence.
     """
 
-    run: Run
+    run: StoredRun
     facts: Mapping[str, Any]
     cells: Any = None
     about: str = ""
@@ -63,7 +63,7 @@ class Trial:
     """The command that tests a claim, how its runs split into parts, and what a part must be to count."""
 
     run: str
-    parts: Callable[[Run], Iterable[Part]]
+    parts: Callable[[StoredRun], Iterable[RunPart]]
     needs: tuple[Need, ...]
 
     @property
@@ -71,7 +71,7 @@ class Trial:
         return self.run.split()[1]
 
 
-Measure: TypeAlias = "Callable[[Part], tuple[Sequence[Ratio], str]]"
+Measure: TypeAlias = "Callable[[RunPart], tuple[Sequence[Ratio], str]]"
 """Measures a part: values with their intervals, and how they read."""
 
 
@@ -127,7 +127,7 @@ class Claim:
     checks: tuple[Check, ...]
     reads: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
-    def judge(self, part: Part) -> tuple[str, str]:
+    def judge(self, part: RunPart) -> tuple[str, str]:
         """Return the verdict of a part that meets all needs, and the evidence in words."""
         shown = [(check, *check.measure(part)) for check in self.checks]
         found = all_of(check.verdict(values) for check, values, _ in shown)
@@ -139,7 +139,7 @@ class Claim:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ClaimFinding:
     """What one part of a run says about a claim, and which needs it meets."""
 
     verdict: str
@@ -156,7 +156,7 @@ class Judged:
     """A claim with what runs say about it, those that can tell first, by the names of those that say the same."""
 
     claim: Claim
-    findings: dict[Finding, tuple[str, ...]]
+    findings: dict[ClaimFinding, tuple[str, ...]]
 
     @property
     def verdicts(self) -> frozenset[str]:
@@ -196,9 +196,9 @@ class Judged:
         return " | ".join(dict.fromkeys("; ".join(need.text for need in finding.needs) for finding in self.findings))
 
 
-def judge(claim: Claim, runs: Iterable[Run]) -> Judged:
+def judge(claim: Claim, runs: Iterable[StoredRun]) -> Judged:
     """Judge one claim by each run; the order of the runs changes the order of the evidence and nothing else."""
-    found: dict[Finding, tuple[str, ...]] = {}
+    found: dict[ClaimFinding, tuple[str, ...]] = {}
     for run in runs:
         if run.manifest.get("command") == claim.trial.command:
             for finding in _findings(claim, run):
@@ -206,15 +206,15 @@ def judge(claim: Claim, runs: Iterable[Run]) -> Judged:
     return Judged(claim, dict(sorted(found.items(), key=lambda item: not item[0].testable)))
 
 
-def _findings(claim: Claim, run: Run) -> Iterator[Finding]:
+def _findings(claim: Claim, run: StoredRun) -> Iterator[ClaimFinding]:
     """Judge the parts of a run that meet all needs; if none does, yield what the nearest one lacks."""
     looked = [(part, tuple(need.of(part.facts) for need in claim.trial.needs)) for part in claim.trial.parts(run)]
     fit = [(part, needs) for part, needs in looked if all(need.met for need in needs)]
     for part, needs in fit:
-        yield Finding(*claim.judge(part), needs)
+        yield ClaimFinding(*claim.judge(part), needs)
     if looked and not fit:
         nearest = min((needs for _, needs in looked), key=lambda needs: sum(not need.met for need in needs))
-        yield Finding(UNDECIDED, "Not testable with this run.", nearest)
+        yield ClaimFinding(UNDECIDED, "Not testable with this run.", nearest)
 
 
 def claim_table(judged: Sequence[Judged]) -> TextTable:

@@ -28,13 +28,13 @@ from s2a_bench.plan.skillset import GAPS
 from s2a_bench.policy import Floats, Plans
 from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
 from s2a_bench.provenance import UNKNOWN
-from s2a_bench.report.claims import Check, Met, Need, Part, Trial
+from s2a_bench.report.claims import Check, Met, Need, RunPart, Trial
 from s2a_bench.report.claims.requests import LIKE, PAPERS_MODEL, change, emulated, exact, facts_of, on_board, one_of
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.words import PAPER, SAID, law
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import Change
-from s2a_bench.store.run import Run
+from s2a_bench.store.run import StoredRun
 
 NAIVE, WAIT, OURS = "naive", "wait-then-act", "stream-to-act"
 RTX, ORIN, NANO = paper_throughput()
@@ -67,7 +67,7 @@ class _Or(Need):
         return Met(", ".join(missing or [row.text for row in rows]), not missing)
 
 
-def timelines(run: Run) -> Iterator[Part]:
+def timelines(run: StoredRun) -> Iterator[RunPart]:
     """Yield the timelines of one source of tokens, N and T_nom: L -> policy -> cell, from long to short skills."""
 
     def setting(cell: Timelines) -> tuple[str, int, float]:
@@ -102,7 +102,7 @@ def timelines(run: Run) -> Iterator[Part]:
         lines = "; ".join(dict.fromkeys(origin.line for origin in origins))
         gaps = "" if jitter == "none" else f", jitter {jitter}, {every[0].n} plans a cell"
         assumed = "an assumption: the paper gives neither N nor T_nom"
-        yield Part(run, facts, cells, f"{title}, N = {n_skills}, T_nom = {t_nom_s:g} s ({assumed}){gaps}; {lines}.")
+        yield RunPart(run, facts, cells, f"{title}, N = {n_skills}, T_nom = {t_nom_s:g} s ({assumed}){gaps}; {lines}.")
 
 
 def _shown(cells: Mapping[int, Mapping[str, Timelines]]) -> list[tuple[Floats, ...]]:
@@ -140,7 +140,7 @@ def figure_5(board: PaperThroughput, *policies: str) -> Trial:
 def no_stalls(*policies: str) -> Check:
     """Check that no more plans stall at any L than is promised: epsilon, but no promise of more than 1 % counts."""
 
-    def measure(part: Part) -> tuple[list[Ratio], str]:
+    def measure(part: RunPart) -> tuple[list[Ratio], str]:
         promised, even = part.facts["promised"], part.facts["exact"]
         cells = [of_length[policy] for of_length in part.cells.values() for policy in policies]
         found, stalled = [], []
@@ -164,7 +164,7 @@ def no_stalls(*policies: str) -> Check:
 def after(policy: str, than: str, metric: str, least: float = -inf, most: float = inf) -> Check:
     """Check how much later a policy's mean start or end is than that of another at every L, as a ratio."""
 
-    def measure(part: Part) -> tuple[list[Ratio], str]:
+    def measure(part: RunPart) -> tuple[list[Ratio], str]:
         found = [_compared(part, cells[policy], cells[than], metric) for cells in part.cells.values()]
         shares = ["" if each.ratio.value is None else f" ({_signed(each.ratio.value - 1)})" for each in found]
         shifts = [round(each.difference.value or 0.0, 2) + 0.0 for each in found]
@@ -174,14 +174,14 @@ def after(policy: str, than: str, metric: str, least: float = -inf, most: float 
     return Check(f"{policy}'s {metric.removesuffix('_s')} after {than}'s: {{}}.", measure, least, most)
 
 
-def stalled_gaps(part: Part) -> tuple[list[Ratio], str]:
+def stalled_gaps(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the share of the gaps between skills that are stalls under naive, at every L."""
     cells = [of_length[NAIVE] for of_length in part.cells.values()]
     shares = [(cell.mean("stalls") or 0.0) / (cell.setting[2] - 1) for cell in cells]
     return list(map(exact, shares)), _at(part, [f"{share:.0%}" for share in shares])
 
 
-def growth(part: Part) -> tuple[list[Ratio], str]:
+def growth(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure by how much longer naive stalls at each larger L, from the first that stalls on."""
     cells = [of_length[NAIVE] for _, of_length in sorted(part.cells.items())]
     steps = [pair for pair in pairwise(cells) if max(map(_stall_s, pair)) > VISIBLE_S]
@@ -189,7 +189,7 @@ def growth(part: Part) -> tuple[list[Ratio], str]:
     return [_compared(part, more, less, "stall_s").difference for less, more in steps], said
 
 
-def early_stalls(part: Part) -> tuple[list[Ratio], str]:
+def early_stalls(part: RunPart) -> tuple[list[Ratio], str]:
     """Start at five times before S0, T_nom being kept: how far stalls are from what is missing to S0 (theorem T1)."""
     off_s = []
     for arrival, nominal, *_ in _shown(part.cells):
@@ -200,7 +200,7 @@ def early_stalls(part: Part) -> tuple[list[Ratio], str]:
     return [exact(float(max(off_s)))], f"{len(off_s)} earlier starts tried, off by {max(off_s):.1e} s"
 
 
-def stretched(part: Part) -> tuple[list[Ratio], str]:
+def stretched(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure how much before S0 a plan may start without a stall, with the extension that the paper allows."""
     found = []
     for arrival, nominal, least, most in _shown(part.cells):
@@ -211,7 +211,7 @@ def stretched(part: Part) -> tuple[list[Ratio], str]:
     return [exact(early_s)], said
 
 
-def _at(part: Part, texts: Sequence[str]) -> str:
+def _at(part: RunPart, texts: Sequence[str]) -> str:
     return ", ".join(f"{text} at L = {length}" for text, length in zip(texts, part.cells, strict=True))
 
 
@@ -220,25 +220,25 @@ def _signed(share: float) -> str:
     return f"{round(share, 3) + 0.0:+.1%}"
 
 
-def _compared(part: Part, above: Timelines, below: Timelines, metric: str) -> Change:
+def _compared(part: RunPart, above: Timelines, below: Timelines, metric: str) -> Change:
     """Compare a metric's mean; plan by plan where both ran the same plans."""
     one, other = above.values(metric), below.values(metric)
     same = above.setting == below.setting and len(one) == len(other)
     return change(one, other, part.run.bootstrap_seed, paired=same, exact=part.facts["exact"])
 
 
-def plane(run: Run) -> Iterator[Part]:
+def plane(run: StoredRun) -> Iterator[RunPart]:
     """Yield a run of points of rate and tokens a skill."""
     if not run.table(BOUNDARY).empty:
         least = float(run.manifest.get("configuration", {}).get("t_min", 1.0))
-        yield Part(run, {"tokens": "with jitter" if is_random(run) else "evenly", "T_min / T_nom": least})
+        yield RunPart(run, {"tokens": "with jitter" if is_random(run) else "evenly", "T_min / T_nom": least})
 
 
 EVENLY: Final = Need("tokens", "evenly: with jitter no line separates the regions", lambda found: found == "evenly")
 SHORTER: Final = Need("T_min / T_nom", "less than 1, else both have the same line", lambda found: found < 1)
 
 
-def stalls_at(side: str, part: Part) -> tuple[list[Ratio], str]:
+def stalls_at(side: str, part: RunPart) -> tuple[list[Ratio], str]:
     """Measure at which share of the points above or below R = L / T_min skills that run for T_nom stall, as naive's."""
     least_s = float(grid_of(part.run, "t_min")["duration_s"].iloc[0])
     points = grid_of(part.run, "t_nom")
@@ -263,7 +263,7 @@ _VARIED: Final = ("rear_gap_m", "gap")
 """What the diagram varies itself; its c is the board's."""
 
 
-def drives(run: Run) -> Iterator[Part]:
+def drives(run: StoredRun) -> Iterator[RunPart]:
     """Yield a run of drives, with the settings that are not those of the chosen point or diagram."""
     asked, scenario, rows = run.manifest.get("configuration", {}), CcrbOptions(), run.table(ROLLOUTS)
     wanted = {**scenario.to_manifest(), "t_nom_s": scenario.durations.nominal_s, **CHOSEN}
@@ -271,13 +271,13 @@ def drives(run: Run) -> Iterator[Part]:
     facts = {name: ", ".join(dict.fromkeys(rows[name])) for name in ("study", "policy")}
     for name, free in (("point", _SPANS), ("diagram", _VARIED)):
         facts[name] = ", ".join(f"{key} {found}" for key, found in other.items() if key not in free) or "as chosen"
-    yield Part(run, facts_of(run, run.origins.every) | facts)
+    yield RunPart(run, facts_of(run, run.origins.every) | facts)
 
 
 BOARD: Final = one_of("source", emulated("jetson-agx-orin", ORIN.tokens_per_s))
 
 
-def outcome(policy: str, part: Part) -> tuple[list[Ratio], str]:
+def outcome(policy: str, part: RunPart) -> tuple[list[Ratio], str]:
     """Say what becomes of the cars under one policy at the chosen point, and how far that carries."""
     rows, asked = rollouts_of(part.run, "point"), configuration(part.run)
     row = rows[rows["policy"] == policy].iloc[0]
@@ -291,7 +291,7 @@ def outcome(policy: str, part: Part) -> tuple[list[Ratio], str]:
     return [exact(float(row["outcome"] == PAPER[policy]))], f"{said}; {law(asked)}"
 
 
-def worse(policy: str, part: Part) -> tuple[list[Ratio], str]:
+def worse(policy: str, part: RunPart) -> tuple[list[Ratio], str]:
     """Measure at how much more of the phase diagram a policy is worse than stream-to-act than it is better."""
     found, said = [], []
     for gap in GAPS:

@@ -10,14 +10,14 @@ from typing import Any, Final
 import numpy as np
 
 from s2a_bench.experiments.paper import PaperThroughput
-from s2a_bench.experiments.requests import Cell, cells_of
+from s2a_bench.experiments.requests import RequestCell, cells_of
 from s2a_bench.experiments.throughput.metrics import throughput_cells
 from s2a_bench.policy import Floats
 from s2a_bench.provenance import NONE, UNKNOWN, Provenance
-from s2a_bench.report.claims import Need, Part
+from s2a_bench.report.claims import Need, RunPart
 from s2a_bench.stats import Ratio, summarise, summary_of
 from s2a_bench.stats.change import Blocks, Change, change_between, ratio_of_launches
-from s2a_bench.store.run import Run
+from s2a_bench.store.run import StoredRun
 from s2a_bench.transport import EXTERNAL, PROGRAM, declared
 from s2a_bench.writers.tables import interval, mean_sd
 
@@ -57,7 +57,7 @@ PAPERS_MODEL: Final = (
 """What a claim about a model needs; an unknown provenance meets none of it."""
 
 
-def facts_of(run: Run, origins: Sequence[Provenance]) -> dict[str, Any]:
+def facts_of(run: StoredRun, origins: Sequence[Provenance]) -> dict[str, Any]:
     """Return machine, model and where its numbers come from; what nobody told is unknown."""
     facts, model = run.manifest.get("environment", {}), run.manifest.get("model") or {}
     gpus = " + ".join(str(gpu.get("name")) for gpu in facts.get("gpus", []))
@@ -82,7 +82,7 @@ def _processor(model: Mapping[str, Any], answered: set[str]) -> str:
     return f"{'all' if layers < 0 or layers >= _LAYERS else layers} layers on the GPU" if offload and layers else "CPU"
 
 
-def _source(run: Run, origins: Sequence[Provenance]) -> str:
+def _source(run: StoredRun, origins: Sequence[Provenance]) -> str:
     """Return which of the paper's boards is emulated, with its rate; else where tokens come from."""
     profiles = {origin.profile if origin.emulated else "" for origin in origins}
     for board in run.manifest.get("boards", []):
@@ -106,7 +106,7 @@ def change(over: Floats, base: Floats, seed: int, *, paired: bool = False, exact
     return change_between([[*base[:, None]]], [[*over[:, None]]], "mean", seed=seed, paired=paired, exact=exact)
 
 
-def pairs(run: Run) -> Iterator[Part]:
+def pairs(run: StoredRun) -> Iterator[RunPart]:
     """Yield HTTP as usually deployed, or llama-server, with ROS: every cell of one with every cell of the other."""
     cells = cells_of(run)
     https = [cell for cell in cells if "/".join(cell.path) in {_HTTP, _LLAMA_SERVER}]
@@ -122,7 +122,7 @@ def pairs(run: Run) -> Iterator[Part]:
         yield _pair(run, pair, facts, f"{times} (mean ± sd, n = {pair[0].n}).")
 
 
-def bodies(run: Run) -> Iterator[Part]:
+def bodies(run: StoredRun) -> Iterator[RunPart]:
     """Yield HTTP with Base64 and without, of the same payload and size."""
     cells = [cell for cell in cells_of(run) if cell.good["payload_bytes"].notna().any()]
     coded, plain = ([cell for cell in cells if "/".join(cell.path) == path] for path in (_HTTP, _BINARY))
@@ -132,12 +132,12 @@ def bodies(run: Run) -> Iterator[Part]:
             yield _pair(run, pair, {"bytes a picture": round(_bytes(pair[1]))}, f"{texts}.")
 
 
-def _pair(run: Run, pair: tuple[Cell, Cell], facts: dict[str, Any], about: str) -> Part:
+def _pair(run: StoredRun, pair: tuple[RequestCell, RequestCell], facts: dict[str, Any], about: str) -> RunPart:
     told = {name: " and ".join(dict.fromkeys(cell.about[name] for cell in pair)) for name in ("mode", "payload")}
-    return Part(run, facts_of(run, [run.origins.of(cell.name) for cell in pair]) | told | facts, pair, about)
+    return RunPart(run, facts_of(run, [run.origins.of(cell.name) for cell in pair]) | told | facts, pair, about)
 
 
-def _unlike(run: Run, pair: tuple[Cell, Cell]) -> str:
+def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
     """Return in what frames and engines differ; llama-server on the file of our engine counts as that engine."""
     http, ros = (run.origins.of(cell.name).to_dict() | {"size": cell.about["size"]} for cell in pair)
     engines = http["engine"], ros["engine"]
@@ -150,7 +150,7 @@ def _unlike(run: Run, pair: tuple[Cell, Cell]) -> str:
     )
 
 
-def _others(run: Run, pair: tuple[Cell, Cell]) -> str:
+def _others(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
     """Return which servers the run did not start, and what names them."""
     pipelines = run.manifest.get("configuration", {}).get("pipelines", {})
     found = [f"{cell.name} {UNKNOWN}" for cell in pair if cell.name not in pipelines]
@@ -174,21 +174,21 @@ COMPARED: Final = (
 LARGE: Final = Need("bytes a picture", f"{_SMALL} or more, by a larger --size", lambda found: found >= _SMALL)
 
 
-def times_as_long(part: Part) -> tuple[list[Ratio], str]:
+def times_as_long(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure how much longer HTTP takes in the mean, launch by launch and block by block."""
     ratio = ratio_of_launches(*_blocks(part.cells), part.run.bootstrap_seed, "mean") or Ratio(None, None, None)
     return [ratio], interval(ratio)
 
 
-def times_as_large(part: Part) -> tuple[list[Ratio], str]:
+def times_as_large(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure how much larger bodies are with Base64, in the mean."""
     ratio = _bytes(part.cells[0]) / _bytes(part.cells[1])
     return [exact(ratio)], f"{ratio:.4f}"
 
 
-def shares(side: int, groups: Mapping[str, Sequence[str]], part: Part) -> tuple[list[Ratio], str]:
+def shares(side: int, groups: Mapping[str, Sequence[str]], part: RunPart) -> tuple[list[Ratio], str]:
     """Measure what share of the time of one side, inference left out, groups of stages take."""
-    cell: Cell = part.cells[side]
+    cell: RequestCell = part.cells[side]
     whole, seed = cell.values_ms(_METRIC), part.run.bootstrap_seed
     spent = {stage: _spent(cell, [stage]).sum() for stage, of in cell.stages.items() if of != "inference"}
     parts = [_spent(cell, stages) for stages in groups.values()]
@@ -198,7 +198,7 @@ def shares(side: int, groups: Mapping[str, Sequence[str]], part: Part) -> tuple[
     return found, f"{', '.join(texts)} of {cell.name}; the longest stage is {max(spent, key=spent.__getitem__)}"
 
 
-def _spent(cell: Cell, stages: Sequence[str]) -> Floats:
+def _spent(cell: RequestCell, stages: Sequence[str]) -> Floats:
     """Return what stages took together, one value a sample that has the metric, in ms."""
     good = cell.good[cell.good[f"{_METRIC}_ns"].notna()]
     names = [f"{stage}_ns" for stage in stages if f"{stage}_ns" in good]
@@ -206,16 +206,16 @@ def _spent(cell: Cell, stages: Sequence[str]) -> Floats:
     return spent
 
 
-def _bytes(cell: Cell) -> float:
+def _bytes(cell: RequestCell) -> float:
     return float(cell.good["payload_bytes"].dropna().mean())
 
 
-def _metric(pair: Sequence[Cell]) -> str:
+def _metric(pair: Sequence[RequestCell]) -> str:
     """Return what is compared: the `ingest` of a llama-server has work in it that our engine counts as inference."""
     return "e2e_without_model" if any(cell.has_ingest for cell in pair) else _METRIC
 
 
-def _blocks(pair: Sequence[Cell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
+def _blocks(pair: Sequence[RequestCell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
     """Return the values of both sides by launch and block, without the blocks that one side lacks."""
     sides = [cell.by_launch(_metric(pair)) for cell in pair]
     both = {launch: sides[0][launch].keys() & sides[1][launch].keys() for launch in sides[0].keys() & sides[1].keys()}
@@ -223,18 +223,18 @@ def _blocks(pair: Sequence[Cell]) -> tuple[Mapping[int, Blocks], Mapping[int, Bl
     return http, ros
 
 
-def speeds(run: Run) -> Iterator[Part]:
+def speeds(run: StoredRun) -> Iterator[RunPart]:
     """Yield every cell that has a rate."""
     for speed in throughput_cells(run):
         if speed.values("tokens_per_s").size:
             told = {"T_eval": "the engine's" if speed.told else "the client's"}
-            yield Part(run, facts_of(run, [run.origins.of(speed.name)]) | told, speed)
+            yield RunPart(run, facts_of(run, [run.origins.of(speed.name)]) | told, speed)
 
 
 KNOWN: Final = Need("quantisation", "known (the paper does not say which it used)", lambda found: found != UNKNOWN)
 
 
-def speed_over(board: PaperThroughput, part: Part) -> tuple[list[Ratio], str]:
+def speed_over(board: PaperThroughput, part: RunPart) -> tuple[list[Ratio], str]:
     """Measure tokens a second over those of the paper's board."""
     values = part.cells.values("tokens_per_s")
     found = change(values, np.full(len(values), board.tokens_per_s), part.run.bootstrap_seed)

@@ -13,7 +13,7 @@ from s2a_bench.report.claims import plans as of
 from s2a_bench.report.claims import requests as timed
 from s2a_bench.report.claims.plans import NAIVE, NANO, ORIN, OURS, RTX, WAIT, figure_5, listed
 from s2a_bench.report.claims.requests import COMPARED, LIKE, on_board, one_of
-from s2a_bench.store.run import Run
+from s2a_bench.store.run import StoredRun
 
 _HTTP, _ROS = paper_latency()
 _RATIO: Final = _HTTP.mean_ms / _ROS.mean_ms
@@ -247,6 +247,6 @@ CLAIMS: Final[tuple[Claim, ...]] = (
 )
 
 
-def judge_claims(runs: Sequence[Run]) -> list[Judged]:
+def judge_claims(runs: Sequence[StoredRun]) -> list[Judged]:
     """Judge every claim of the paper by the runs that there are."""
     return [judge(claim, runs) for claim in CLAIMS]

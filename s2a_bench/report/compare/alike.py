@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from s2a_bench.provenance import Origins
 
 if TYPE_CHECKING:
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 _KIND: Final = ("cpu", "machine", "board", "cores")
 _MACHINE: Final = (*_KIND, "affinity", "governor", "power_mode")
@@ -46,7 +46,7 @@ class Difference:
         return f"{self.what}: {self.baseline} against {self.other}"
 
 
-def differences(baseline: Run, other: Run) -> list[Difference]:
+def differences(baseline: StoredRun, other: StoredRun) -> list[Difference]:
     """List what differs, the fatal first. A fact that one run does not know is told, never fatal."""
     sides = baseline.manifest, other.manifest
     machines = [manifest.get("environment", {}) for manifest in sides]

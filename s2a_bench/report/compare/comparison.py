@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UnlikeRuns, UsageError
-from s2a_bench.experiments import EXPERIMENTS, Compared, Metric, Subject, by_name, experiment_of
+from s2a_bench.experiments import EXPERIMENTS, Comparable, Metric, Subject, by_name, experiment_of
 from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.compare.alike import Difference, differences, in_words
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.stats.change import Change, change_between, holm
 from s2a_bench.store.manifest import RunWarning
-from s2a_bench.store.run import Run, fits, read_run
+from s2a_bench.store.run import StoredRun, fits, read_run
 
 if TYPE_CHECKING:
     from s2a_bench.experiments import Rows
@@ -27,7 +27,7 @@ SAME, UNCLEAR, TOO_FEW = "same", "unclear", "too few"
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class CellPair:
     """One cell as the launches of both sides have it; never empty."""
 
     baseline: tuple[Subject, ...]
@@ -39,13 +39,13 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class CellComparison:
     """One statistic of one cell: what changed, the p-value corrected for all comparisons, and the verdict.
 
     ``detectable`` is the smallest rise, as a share, that the test would have found in `POWER` of repeats.
     """
 
-    pair: Pair
+    pair: CellPair
     metric: Metric
     statistic: str
     n: tuple[int, int]
@@ -66,15 +66,15 @@ class ComparedRuns:
     ``only`` lists the cells that have no partner, a side each.
     """
 
-    baseline: tuple[Run, ...]
-    other: tuple[Run, ...]
-    by: Compared
+    baseline: tuple[StoredRun, ...]
+    other: tuple[StoredRun, ...]
+    by: Comparable
     metrics: Mapping[str, Metric]
     differences: tuple[Difference, ...]
-    pairs: tuple[Pair, ...]
+    pairs: tuple[CellPair, ...]
     only: tuple[tuple[str, ...], tuple[str, ...]]
     least: float
-    comparisons: tuple[Comparison, ...] = ()
+    comparisons: tuple[CellComparison, ...] = ()
 
     @property
     def launches(self) -> bool:
@@ -95,7 +95,9 @@ class ComparedRuns:
         return str(self.baseline[0].manifest["command"])
 
 
-def open_comparison(baseline: Sequence[Run], other: Sequence[Run], *, unlike: bool, least: float) -> ComparedRuns:
+def open_comparison(
+    baseline: Sequence[StoredRun], other: Sequence[StoredRun], *, unlike: bool, least: float
+) -> ComparedRuns:
     """Find what belongs together. ``least`` is the smallest share that is called a change.
 
     Raises UnlikeRuns where machine, model or setting differ and ``unlike`` does not allow it, UsageError where the
@@ -135,7 +137,7 @@ def _launches(subjects: Iterable[Subject]) -> list[dict[str, Subject]]:
     return list(found.values()) or [{}]
 
 
-def _declared(command: str) -> Compared:
+def _declared(command: str) -> Comparable:
     """Return what runs of a command are compared by; raises UsageError where nothing is declared."""
     if (experiment := experiment_of(command)) and (by := experiment.compared_by()):
         return by
@@ -145,10 +147,10 @@ def _declared(command: str) -> Compared:
 
 def _match(
     baseline: list[dict[str, Subject]], other: list[dict[str, Subject]]
-) -> tuple[list[Pair], tuple[tuple[str, ...], tuple[str, ...]], list[Difference]]:
+) -> tuple[list[CellPair], tuple[tuple[str, ...], tuple[str, ...]], list[Difference]]:
     """Pair the cells that every launch has; also return the others, and how settings differ under one name."""
     everywhere = [name for name in baseline[0] if all(name in run for run in (*baseline, *other))]
-    pairs = [Pair(tuple(run[name] for run in baseline), tuple(run[name] for run in other)) for name in everywhere]
+    pairs = [CellPair(tuple(run[name] for run in baseline), tuple(run[name] for run in other)) for name in everywhere]
     left = [
         tuple(dict.fromkeys(name for run in side for name in run if name not in everywhere))
         for side in (baseline, other)
@@ -222,17 +224,17 @@ def detectable(change: Change, tests: int, *, falls: bool = False) -> float | No
     return None if change.noise is None else change.noise.detectable(LEVEL / tests, falls=falls)
 
 
-def changes(compared: ComparedRuns, metric: Metric, statistic: str) -> Iterator[Comparison]:
+def changes(compared: ComparedRuns, metric: Metric, statistic: str) -> Iterator[CellComparison]:
     """Yield what changed in each cell that has the metric on both sides; not corrected, not judged."""
     for pair in compared.pairs:
         if rows := _rows(pair, metric.name):
             exact = all(subject.exact for subject in (*pair.baseline, *pair.other))
             change = change_between(*rows, statistic, seed=compared.baseline[0].bootstrap_seed, exact=exact)
             n = [sum(len(launch) for launch in side) for side in rows]
-            yield Comparison(pair, metric, statistic, (n[0], n[1]), change)
+            yield CellComparison(pair, metric, statistic, (n[0], n[1]), change)
 
 
-def _rows(pair: Pair, metric: str) -> tuple[list[Rows], list[Rows]] | None:
+def _rows(pair: CellPair, metric: str) -> tuple[list[Rows], list[Rows]] | None:
     """Return the rows of every launch; None where one has none."""
     sides = [[subject.rows(metric) for subject in side] for side in (pair.baseline, pair.other)]
     return (sides[0], sides[1]) if all(all(side) for side in sides) else None
@@ -255,7 +257,7 @@ def verdict(change: Change, p_holm: float | None, metric: Metric, least: float) 
     return SAME if bounds and max(map(abs, bounds)) <= least else UNCLEAR
 
 
-def read_side(text: str, flag: str) -> list[Run]:
+def read_side(text: str, flag: str) -> list[StoredRun]:
     """Read a run folder, or several with commas between them; raises UsageError, StoreError."""
     folders = [part.strip() for part in text.split(",") if part.strip()]
     if not folders:

@@ -16,8 +16,8 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments import Metric
 from s2a_bench.report.compare.comparison import (
     LEVEL,
+    CellComparison,
     ComparedRuns,
-    Comparison,
     detectable,
     metric_of,
 )
@@ -50,7 +50,7 @@ class Judgement:
     """What a gate said of one cell."""
 
     gate: Gate
-    comparison: Comparison
+    comparison: CellComparison
     outcome: str
     detectable: float | None
     """The smallest change towards the limit that the test would have found, as a share."""
@@ -91,7 +91,7 @@ def judge(compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool) -> lis
     return judged
 
 
-def _outcome(gate: Gate, one: Comparison, seen: float | None, *, strict: bool) -> str:
+def _outcome(gate: Gate, one: CellComparison, seen: float | None, *, strict: bool) -> str:
     """Say in a word what a gate finds; ``seen`` is the smallest change that there was a fair chance to find."""
     change, p_holm = one.change, one.p_holm
     rises = change.other > change.baseline

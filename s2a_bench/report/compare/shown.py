@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.report.compare.comparison import ComparedRuns, Comparison
+    from s2a_bench.report.compare.comparison import CellComparison, ComparedRuns
     from s2a_bench.report.compare.gates import Judgement
 
 _HEADER = ("cell", "n", "A", "B", "change [95 %]", "P(B > A)", "p", "sees", "verdict")
@@ -85,7 +85,7 @@ def percent(share: float) -> str:
     return text.replace("-0.0", "0.0").replace("+0.0", "0.0")
 
 
-def change_text(one: Comparison) -> str:
+def change_text(one: CellComparison) -> str:
     """Write a change in per cent with its interval."""
     relative, bounds = one.change.relative, one.change.bounds
     if relative is None:
@@ -101,11 +101,11 @@ def seen_text(share: float | None) -> str:
     return "> 1000 %" if share > _MOST_SEEN else f"{percent(share).lstrip('+')} %"
 
 
-def _title(one: Comparison) -> str:
+def _title(one: CellComparison) -> str:
     return f"{one.metric.name}: {one.statistic}" + (f", {one.metric.unit}" if one.metric.unit else "")
 
 
-def _row(one: Comparison) -> tuple[str, ...]:
+def _row(one: CellComparison) -> tuple[str, ...]:
     n = str(one.n[0]) if one.n[0] == one.n[1] else f"{one.n[0]}/{one.n[1]}"
     change = one.change
     superiority = ABSENT if change.superiority.value is None else f"{change.superiority.value:.2f}"
@@ -182,7 +182,7 @@ class Row:
     verdict: Literal["better", "worse", "lower", "higher", "same", "unclear", "too few"]
 
     @classmethod
-    def of(cls, one: Comparison) -> Row:
+    def of(cls, one: CellComparison) -> Row:
         change, metric = one.change, one.metric
         return cls(
             cell=one.pair.name,
@@ -291,7 +291,7 @@ def build_forest(compared: ComparedRuns) -> Figure | None:
     Every metric has its own axis. Cells that are alike to the last digit are counted, not drawn; None where no row is
     left.
     """
-    panels: dict[str, list[Comparison]] = {}
+    panels: dict[str, list[CellComparison]] = {}
     alike: dict[str, int] = {}
     for one in compared.comparisons:
         if one.change.bounds and not any(one.change.bounds):
@@ -323,7 +323,7 @@ def build_forest(compared: ComparedRuns) -> Figure | None:
     return figure
 
 
-def _panel(axes: Axes, rows: list[Comparison], least: float) -> None:
+def _panel(axes: Axes, rows: list[CellComparison], least: float) -> None:
     axes.axvspan(-100 * least, 100 * least, color="#EEEEEE", linewidth=0)
     axes.axvline(0, color="black", linewidth=0.6)
     for place, one in enumerate(rows):

@@ -13,7 +13,7 @@ from s2a_bench.errors import StoreError
 from s2a_bench.experiments import Shown, experiment_of
 from s2a_bench.report.compare.alike import SETTING, Difference, differences, names_of, of_machine
 from s2a_bench.report.page.sweeps import overview, pooled, words_of
-from s2a_bench.store.run import Run, fits, read_run
+from s2a_bench.store.run import StoredRun, fits, read_run
 from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep
 from s2a_bench.writers.tables import Note, TextTable
 
@@ -30,7 +30,7 @@ class Chapter:
 
     name: str
     title: str
-    run: Run
+    run: StoredRun
     content: Shown
     command: str
     caveats: Sequence[str] = ()
@@ -72,7 +72,7 @@ def told_apart(chapters: Sequence[Chapter]) -> list[str]:
     """Return which runs come from another machine than the first, and in one line what else is not the same."""
     said: list[str] = []
     others: list[Difference] = []
-    of_command: dict[str, Run] = {}
+    of_command: dict[str, StoredRun] = {}
     for chapter in chapters:
         same = of_command.setdefault(str(chapter.manifest["command"]), chapter.run)
         found = differences(chapters[0].run, chapter.run)
@@ -87,7 +87,7 @@ def told_apart(chapters: Sequence[Chapter]) -> list[str]:
     return [*said, f"The runs are not alike in {names}."] if names else said
 
 
-def _chapter(run: Run, title: str, against_paper: bool, **more: Any) -> Chapter:
+def _chapter(run: StoredRun, title: str, against_paper: bool, **more: Any) -> Chapter:
     """Make a run's chapter; one that did not end may lack what its command's tables need."""
     manifest = run.manifest
     caveats = list(_unfinished(manifest))
@@ -118,7 +118,7 @@ def _unfinished(manifest: Mapping[str, Any]) -> Iterator[str]:
 def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
     """Yield the overview, runs that are computed as one, and the others one by one."""
     manifest, runs = sweep.manifest, list(sweep.runs())
-    head = Run(sweep.path, {**manifest, "provenance": sweep.origins.to_manifest()})
+    head = StoredRun(sweep.path, {**manifest, "provenance": sweep.origins.to_manifest()})
     copy = sweep.path / "sweep.toml"
     attached = {copy.name: copy.read_text(encoding="utf-8")} if copy.is_file() else {}
     caveats = list(_unfinished(manifest))
@@ -146,7 +146,7 @@ def _named(chapter: Chapter, place: int, chapters: Sequence[Chapter]) -> Chapter
     return chapter if len(same) == 1 or number == 1 else replace(chapter, name=f"{chapter.name}-{number}")
 
 
-def content_of(run: Run, *, against_paper: bool) -> Shown:
+def content_of(run: StoredRun, *, against_paper: bool) -> Shown:
     """Return what a run shows; of a run without rows nothing, of an unknown command the names of its tables."""
     if not run.row_counts():
         return Shown(("The run has no rows: it ended before anything was measured.",))

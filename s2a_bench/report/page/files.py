@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class DrawnFigure:
     """One figure: SVG to be put into HTML, and PDF where it was asked for.
 
     ``title`` and ``notes`` are its caption; a ``wide`` one takes both columns of a paper.
@@ -42,7 +42,7 @@ class Drawn:
     pdf: bytes | None
 
 
-def draw(name: str, builders: Mapping[str, Callable[[], Figure]], *, pdf: bool) -> dict[str, Drawn]:
+def draw(name: str, builders: Mapping[str, Callable[[], Figure]], *, pdf: bool) -> dict[str, DrawnFigure]:
     """Build each figure once; ``name`` makes the ids of its parts differ from those of all other figures."""
     import matplotlib as mpl
 
@@ -53,7 +53,7 @@ def draw(name: str, builders: Mapping[str, Callable[[], Figure]], *, pdf: bool) 
             figure = build()
             title, *notes = caption_of(figure)
             svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
-            found[figure_name] = Drawn(
+            found[figure_name] = DrawnFigure(
                 inline(svg[svg.index("<svg") :], prefix),
                 title,
                 notes,
@@ -129,7 +129,7 @@ def write_report(report: Report, config: ReportConfig) -> list[Path]:
     return list(texts)
 
 
-def _latex(report: Report, drawn: dict[str, dict[str, Drawn]]) -> Iterator[tuple[str, str | bytes]]:
+def _latex(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> Iterator[tuple[str, str | bytes]]:
     r"""Yield every table as .tex and figure as .pdf by its path, and a report.tex that shows all of them."""
     parts = []
     if report.judged:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from s2a_bench.experiments.chunks.view.figures import COLOURS, runs_of
-from s2a_bench.experiments.chunks.view.figures import Lane as ChunkLane
+from s2a_bench.experiments.chunks.view.figures import CellTicks as ChunkLane
 from s2a_bench.experiments.timeline.view.cells import Timelines, panels
 from s2a_bench.experiments.timeline.view.figures import policy_colours
 from s2a_bench.experiments.timeline.view.tables import seconds
@@ -19,7 +19,7 @@ TICKS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Bar:
+class Segment:
     """One skill, chunk or stall; ``text`` says all about it, ``colour`` is its own where lanes have several."""
 
     kind: str
@@ -30,12 +30,12 @@ class Bar:
 
 
 @dataclass(frozen=True, slots=True)
-class Lane:
+class PolicyRow:
     """One policy's plan: where it waits, acts and stalls; S0 if it has one, and the tokens if they are its own."""
 
     name: str
     colour: str
-    bars: tuple[Bar, ...]
+    bars: tuple[Segment, ...]
     start_s: float
     safe_start_s: float | None
     tokens_s: tuple[float, ...]
@@ -44,31 +44,31 @@ class Lane:
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class BoardPanel:
     """One board and granularity; ``tokens`` and ``complete`` are those that all lanes share, empty where none do."""
 
     title: str
     end_s: float
     ticks: tuple[float, ...]
-    lanes: tuple[Lane, ...]
+    lanes: tuple[PolicyRow, ...]
     tokens_s: tuple[float, ...]
     complete_s: tuple[float, ...]
 
 
-def panels_of(cells: Sequence[Timelines]) -> list[Panel]:
+def panels_of(cells: Sequence[Timelines]) -> list[BoardPanel]:
     """Lay out the shown plan of every cell, a panel a setting."""
     colours = policy_colours(list(dict.fromkeys(cell.policy for cell in cells)))
     return [_panel(setting, group, colours) for setting, group in list(panels(cells))[:MOST_PANELS]]
 
 
-def _panel(setting: tuple[str, int, int, float], cells: Sequence[Timelines], colours: dict[str, str]) -> Panel:
+def _panel(setting: tuple[str, int, int, float], cells: Sequence[Timelines], colours: dict[str, str]) -> BoardPanel:
     title, tokens, n_skills, t_nom_s = setting
     shared = len({cell.about("request_id") for cell in cells}) == 1
     end_s = max(cell.moment_s("end_s") for cell in cells) * 1.02
     rate = f"{cells[0].about('tokens_per_s'):g} tokens/s"
     board = title if rate in title else f"{title}, {rate}"
     plans = f"; plan 1 of {cells[0].n}" if cells[0].n > 1 else ""
-    return Panel(
+    return BoardPanel(
         f"{board}: L = {tokens}, N = {n_skills}, T_nom = {t_nom_s:g} s{plans}",
         end_s,
         ticks_of(end_s),
@@ -89,7 +89,7 @@ def ticks_of(end_s: float) -> tuple[float, ...]:
     return tuple(place * step for place in range(int(end_s / step) + 1))
 
 
-def _lane(cell: Timelines, colour: str, *, own_tokens: bool) -> Lane:
+def _lane(cell: Timelines, colour: str, *, own_tokens: bool) -> PolicyRow:
     bars = []
     for skill in cell.skills.to_dict("records"):
         start, end, stall, arrival = (skill[f"{name}_ns"] / 1e9 for name in ("start", "end", "stall", "arrival"))
@@ -97,16 +97,16 @@ def _lane(cell: Timelines, colour: str, *, own_tokens: bool) -> Lane:
         if stall > 0:
             span = f"{seconds(start - stall)} to {seconds(start)} s"
             text = f"{cell.policy}: stall of {seconds(stall)} s before {name}, {span}"
-            bars.append(Bar("stall", start - stall, stall, text))
+            bars.append(Segment("stall", start - stall, stall, text))
         stalled = f", after a stall of {seconds(stall)} s" if stall > 0 else ", no stall before it"
         text = (
             f"{cell.policy}: {name} arrives at {seconds(arrival)} s, runs {seconds(start)} to {seconds(end)} s{stalled}"
         )
-        bars.append(Bar("skill", start, end - start, text))
+        bars.append(Segment("skill", start, end - start, text))
     stalls, stall_s = int(cell.rows["stalls"].iloc[0]), cell.moment_s("stall_s")
     words = f"starts {seconds(cell.moment_s('start_s'))} s, ends {seconds(cell.moment_s('end_s'))} s, "
     words += f"{stalls} stalls, {seconds(stall_s)} s" if stall_s else "no stalls"
-    return Lane(
+    return PolicyRow(
         cell.policy,
         colour,
         tuple(bars),
@@ -122,7 +122,7 @@ def _complete_s(cell: Timelines) -> tuple[float, ...]:
     return tuple(cell.skills["arrival_ns"].to_numpy(dtype="float64") / 1e9)
 
 
-def panels_of_chunks(lanes: Sequence[ChunkLane]) -> list[Panel]:
+def panels_of_chunks(lanes: Sequence[ChunkLane]) -> list[BoardPanel]:
     """Lay out the first ticks of every mode, in seconds from the first request."""
     groups: dict[str, list[ChunkLane]] = {}
     for lane in lanes:
@@ -130,20 +130,20 @@ def panels_of_chunks(lanes: Sequence[ChunkLane]) -> list[Panel]:
     return [_chunk_panel(source, group) for source, group in groups.items()]
 
 
-def _chunk_panel(source: str, lanes: Sequence[ChunkLane]) -> Panel:
+def _chunk_panel(source: str, lanes: Sequence[ChunkLane]) -> BoardPanel:
     end_s = max(len(lane.ticks) * lane.period_s for lane in lanes)
-    return Panel(f"Latency {source}", end_s, ticks_of(end_s), tuple(map(_chunk_lane, lanes)), (), ())
+    return BoardPanel(f"Latency {source}", end_s, ticks_of(end_s), tuple(map(_chunk_lane, lanes)), (), ())
 
 
-def _chunk_lane(lane: ChunkLane) -> Lane:
+def _chunk_lane(lane: ChunkLane) -> PolicyRow:
     bars = tuple(_chunk_bars(lane))
     stalled = int(lane.ticks["stalled"].sum())
     begin = next((bar.start_s for bar in bars), 0.0)
     words = f"{stalled} of the first {len(lane.ticks)} ticks stall" if stalled else "no stall"
-    return Lane(lane.title, COLOURS[0], bars, begin, None, (), (), words)
+    return PolicyRow(lane.title, COLOURS[0], bars, begin, None, (), (), words)
 
 
-def _chunk_bars(lane: ChunkLane) -> Iterator[Bar]:
+def _chunk_bars(lane: ChunkLane) -> Iterator[Segment]:
     """Yield a bar for every stretch of actions of one chunk, and for every stall."""
     chunk = lane.ticks["chunk"].fillna(-1).to_numpy(dtype="int64")
     index = lane.ticks["index"].fillna(-1).to_numpy(dtype="int64")
@@ -154,11 +154,11 @@ def _chunk_bars(lane: ChunkLane) -> Iterator[Bar]:
         span = f"ticks {first} to {last - 1}"
         start_s, width_s = first * lane.period_s, (last - first) * lane.period_s
         if stalled[first]:
-            yield Bar("stall", start_s, width_s, f"{lane.title}: stall of {last - first} ticks, {span}")
+            yield Segment("stall", start_s, width_s, f"{lane.title}: stall of {last - first} ticks, {span}")
         elif chunk[first] >= 0:
             text = (
                 f"{lane.title}: chunk {chunk[first]}, actions {index[first]} to {index[last - 1]}, {span}, "
                 f"observation {age[first]} to {age[last - 1]} ticks old"
             )
             away = f", {unused[chunk[first]]} actions thrown away" if unused.get(chunk[first]) else ""
-            yield Bar("skill", start_s, width_s, text + away, COLOURS[chunk[first] % len(COLOURS)])
+            yield Segment("skill", start_s, width_s, text + away, COLOURS[chunk[first] % len(COLOURS)])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench import __version__
-from s2a_bench.experiments.chunks.view.figures import Lane as ChunkLane
+from s2a_bench.experiments.chunks.view.figures import CellTicks as ChunkLane
 from s2a_bench.report.claims import Judged
 from s2a_bench.report.page import GENERATOR
 from s2a_bench.report.page.chapters import labels_of, when
@@ -18,12 +18,12 @@ from s2a_bench.text import visible
 
 if TYPE_CHECKING:
     from s2a_bench.report.page.chapters import Chapter
-    from s2a_bench.report.page.files import Drawn
+    from s2a_bench.report.page.files import DrawnFigure
 
 
 def render(
     chapters: Sequence[Chapter],
-    figures: dict[str, dict[str, Drawn]],
+    figures: dict[str, dict[str, DrawnFigure]],
     judged: Sequence[Judged],
     caveats: Sequence[str],
 ) -> str:
@@ -72,7 +72,7 @@ def tally(judged: Sequence[Judged]) -> str:
     return ", ".join(f"{verdicts.count(each)} {each}" for each in dict.fromkeys(verdicts))
 
 
-def _view(chapter: Chapter, figures: dict[str, Drawn]) -> dict[str, Any]:
+def _view(chapter: Chapter, figures: dict[str, DrawnFigure]) -> dict[str, Any]:
     content, manifest = chapter.content, chapter.manifest
     main = [content.tables[name] for name in content.main]
     return {

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.latency.view import against_bytes
-from s2a_bench.experiments.requests import Cell, spelled, split, stand_ins
+from s2a_bench.experiments.requests import RequestCell, spelled, split, stand_ins
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.policy import Floats
 from s2a_bench.provenance import Origins
 from s2a_bench.store.requests import SKILLS, TOKENS
-from s2a_bench.store.run import Run
+from s2a_bench.store.run import StoredRun
 from s2a_bench.store.sweep import Sweep
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import marked
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from s2a_bench.experiments.requests import Split
 
 
-Runs = Sequence[tuple[dict[str, Any], Run]]
+Runs = Sequence[tuple[dict[str, Any], StoredRun]]
 
 _AXES: Final = ("policies", "profiles", "rates", "tokens_per_skill", "n_skills", "t_nom_s")
 """What may differ between timelines that belong together: the name of a timeline's cell tells these apart."""
@@ -88,9 +88,9 @@ def words_of(settings: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {value}" for name, value in settings.items()) or "as the command has it"
 
 
-def pooled(sweep: Sweep, runs: Runs) -> tuple[list[Run], Runs]:
+def pooled(sweep: Sweep, runs: Runs) -> tuple[list[StoredRun], Runs]:
     """Put computed timelines of like configuration together; return them and the runs that stay alone."""
-    groups: dict[str, list[list[Run]]] = {}
+    groups: dict[str, list[list[StoredRun]]] = {}
     single = []
     for settings, run in runs:
         if not _is_virtual(run):
@@ -106,15 +106,15 @@ def pooled(sweep: Sweep, runs: Runs) -> tuple[list[Run], Runs]:
     return [_joined(sweep, part) for parts in groups.values() for part in parts], single
 
 
-def _is_virtual(run: Run) -> bool:
+def _is_virtual(run: StoredRun) -> bool:
     return run.manifest["command"] == "timeline" and set(run.table(TIMELINES)["mode"]) == {"virtual"}
 
 
-def _overlap(one: Run, other: Run) -> bool:
+def _overlap(one: StoredRun, other: StoredRun) -> bool:
     return not set(one.table(TIMELINES)["cell"]).isdisjoint(other.table(TIMELINES)["cell"])
 
 
-def _joined(sweep: Sweep, runs: Sequence[Run]) -> Run:
+def _joined(sweep: Sweep, runs: Sequence[StoredRun]) -> StoredRun:
     """Make one run of several: rows one below the other in the order of board, L, N, T; shared tokens once."""
     import pandas as pd
 
@@ -132,10 +132,10 @@ def _joined(sweep: Sweep, runs: Sequence[Run]) -> Run:
     }
     cells = {name: origin for run in runs for name, origin in run.origins.cells.items()}
     manifest["provenance"] = Origins(runs[0].origins.run, cells).to_manifest()
-    return Run(sweep.path, manifest, tables)
+    return StoredRun(sweep.path, manifest, tables)
 
 
-def _measured(words: str, run: Run, cells: Sequence[Cell]) -> Iterator[tuple[str, ...]]:
+def _measured(words: str, run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[str, ...]]:
     if run.samples.empty:
         return
     for cell in cells:
@@ -145,7 +145,7 @@ def _measured(words: str, run: Run, cells: Sequence[Cell]) -> Iterator[tuple[str
         yield words, cell.name, what, host, str(cell.n), str(cell.errors), *numbers
 
 
-def _quantity(cell: Cell, run: Run) -> tuple[str, Floats]:
+def _quantity(cell: RequestCell, run: StoredRun) -> tuple[str, Floats]:
     """Return what a cell is judged by: tokens/s of a throughput run, else e2e without inference where it is known."""
     if run.manifest["command"] == "throughput":
         return "tokens/s", cell.values("tokens_per_s")

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Floats, Schedule
-from s2a_bench.scenario import EGO, LEAD, REAR, Command, Simulator, State
+from s2a_bench.scenario import EGO, LEAD, REAR, DriveCommand, Simulator, State
 from s2a_bench.scenario.ccrb.cars import LEAD_JERK_MPS3, LEAST_IMPACT_MPS, Cars, DrivingPlan
 from s2a_bench.scenario.ccrb.ego import DONE, Ego
-from s2a_bench.scenario.ccrb.follower import Motion, Seen, follower
-from s2a_bench.scenario.ccrb.outcome import Outcomes, Watch
+from s2a_bench.scenario.ccrb.follower import CarMotion, DriverView, follower
+from s2a_bench.scenario.ccrb.outcome import CollisionWatch, Outcomes
 from s2a_bench.scenario.longitudinal import LockStep, Longitudinal, each
 
 NOBODY_M: Final = 1e6
@@ -109,7 +109,7 @@ class _Drive(LockStep):
         self._delay = Delay(position, speed, np.asarray(cars.reaction_s, float), simulator.step_s)
         self._state = simulator.place(position, speed)
         self._acceleration = np.zeros((3, rollouts))
-        self._watch = Watch(self._state)
+        self._watch = CollisionWatch(self._state)
         self._outcomes = self._watch.outcomes()
         self._left = np.arange(rollouts)
         self._seen_at_rest = np.zeros(rollouts, bool)
@@ -124,7 +124,7 @@ class _Drive(LockStep):
             if record and step % every == 0:
                 now = (self._state, self._acceleration.copy(), self._ego.phase, self._ego.index.copy())
                 self._records.append(now)
-            self._state = self._simulator.step(Command(self._acceleration, self._ego.lane))
+            self._state = self._simulator.step(DriveCommand(self._acceleration, self._ego.lane))
             self._ego.stopped(self._state.speed_mps[EGO])
             self._watch.see(self._state)
             if step % LOOK_STEPS == 0 and not self._go_on(self._decided(resting_mps), record=record):
@@ -205,12 +205,12 @@ class Delay(LockStep):
         self._steps = self._steps[columns]
         self._columns = np.arange(len(columns))
 
-    def see(self, state: State, ego_acceleration: Floats, rear_acceleration: Floats) -> Seen:
+    def see(self, state: State, ego_acceleration: Floats, rear_acceleration: Floats) -> DriverView:
         """Remember the present, and return it beside what was a reaction time ago."""
         # A brake that holds a car at rest does not slow it down.
         own_acceleration = np.where(state.speed_mps[REAR] > 0, rear_acceleration, np.maximum(rear_acceleration, 0.0))
-        ego = Motion(state.position_m[EGO], state.speed_mps[EGO], ego_acceleration)
-        own = Motion(state.position_m[REAR], state.speed_mps[REAR], own_acceleration)
+        ego = CarMotion(state.position_m[EGO], state.speed_mps[EGO], ego_acceleration)
+        own = CarMotion(state.position_m[REAR], state.speed_mps[REAR], own_acceleration)
         self._head = (self._head + 1) % self._size
         now = self._past[self._head]
         for first, car in ((0, ego), (3, own)):
@@ -220,4 +220,4 @@ class Delay(LockStep):
         else:
             then = self._past[(self._head - self._steps) % self._size, self._columns]
         then = np.ascontiguousarray(then.T)
-        return Seen(ego, own, Motion(*then[:3]), Motion(*then[3:]))
+        return DriverView(ego, own, CarMotion(*then[:3]), CarMotion(*then[3:]))

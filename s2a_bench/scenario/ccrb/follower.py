@@ -56,7 +56,7 @@ BRAKE: Final = "at most 7 m/s\N{SUPERSCRIPT TWO}, built up in 0.6 s"
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class CarMotion:
     """How a car moves, arrays of shape (M,)."""
 
     position_m: Floats
@@ -65,13 +65,13 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class DriverView:
     """What a driver can act on: ego and own car as they are, and as they were a reaction time ago."""
 
-    ego: Motion
-    own: Motion
-    ego_then: Motion
-    own_then: Motion
+    ego: CarMotion
+    own: CarMotion
+    ego_then: CarMotion
+    own_then: CarMotion
 
 
 class Follower(LockStep):
@@ -80,7 +80,7 @@ class Follower(LockStep):
     law: ClassVar[str]
     """The law in words; ``{reaction:g}`` stands for the reaction time in s."""
 
-    def acceleration(self, seen: Seen, step_s: float) -> Floats:
+    def acceleration(self, seen: DriverView, step_s: float) -> Floats:
         """Return the acceleration in m/s^2 for the next step, shape (M,)."""
         raise NotImplementedError
 
@@ -113,7 +113,7 @@ class Careful(Follower):
         self._braking = np.zeros(rollouts, bool)
         self._brake = Brake(cars, rollouts)
 
-    def acceleration(self, seen: Seen, step_s: float) -> Floats:
+    def acceleration(self, seen: DriverView, step_s: float) -> Floats:
         ego, own = seen.ego_then, seen.own
         decel = np.maximum(-ego.acceleration_mps2, 0.0)
         until_rest = np.divide(ego.speed_mps, decel, out=np.full(decel.shape, np.inf), where=decel > LEAST_MPS2)
@@ -144,7 +144,7 @@ class Idm(Follower):
         self._headway_s = np.maximum((at_ease_m - IDM_STANDSTILL_M) / speed, IDM_LEAST_HEADWAY_S)
         self._brake = Brake(cars, rollouts)
 
-    def acceleration(self, seen: Seen, step_s: float) -> Floats:
+    def acceleration(self, seen: DriverView, step_s: float) -> Floats:
         gap_m, speed, closing, ahead = self._perceived(seen)
         wish = idm_acceleration(gap_m, speed, closing, self._desired_mps, self._headway_s)
         force = self._brake.press(np.maximum(-wish, 0.0), step_s)
@@ -152,7 +152,7 @@ class Idm(Follower):
         going = np.where(standing, 0.0, np.maximum(wish, 0.0))
         return np.where(force > 0, -force, going)
 
-    def _perceived(self, seen: Seen) -> tuple[Floats, Floats, Floats, Motion]:
+    def _perceived(self, seen: DriverView) -> tuple[Floats, Floats, Floats, CarMotion]:
         """Return gap, own speed, closing speed, and the ego, as the law is given them."""
         ego, own = seen.ego, seen.own
         return ego.position_m - own.position_m, own.speed_mps, own.speed_mps - ego.speed_mps, ego
@@ -166,7 +166,7 @@ class Hdm(Idm):
         f"estimation errors; {AT_EASE}; {BRAKE}"
     )
 
-    def _perceived(self, seen: Seen) -> tuple[Floats, Floats, Floats, Motion]:
+    def _perceived(self, seen: DriverView) -> tuple[Floats, Floats, Floats, CarMotion]:
         ego, own, ago_s = seen.ego_then, seen.own_then, self._reaction_s
         closing = own.speed_mps - ego.speed_mps
         gap_m = ego.position_m - own.position_m - ago_s * closing
@@ -181,7 +181,7 @@ class Hybrid(Idm):
         f"speed; {AT_EASE}; {BRAKE}"
     )
 
-    def _perceived(self, seen: Seen) -> tuple[Floats, Floats, Floats, Motion]:
+    def _perceived(self, seen: DriverView) -> tuple[Floats, Floats, Floats, CarMotion]:
         ego, own = seen.ego_then, seen.own
         gap_m = ego.position_m + ego.speed_mps * self._reaction_s - own.position_m
         return gap_m, own.speed_mps, own.speed_mps - ego.speed_mps, ego

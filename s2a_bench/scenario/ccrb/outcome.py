@@ -44,7 +44,7 @@ class Outcomes:
         return np.fmax(self.front_impact_mps, self.rear_impact_mps)
 
 
-class Pair(LockStep):
+class CarPair(LockStep):
     """Watches one car behind another until they crash."""
 
     def __init__(self, ahead: int, behind: int, state: State) -> None:
@@ -79,7 +79,7 @@ class Pair(LockStep):
         return state.position_m[ahead] - state.position_m[behind], state.speed_mps[behind] - state.speed_mps[ahead]
 
 
-class Watch(LockStep):
+class CollisionWatch(LockStep):
     """Watches both pairs.
 
     A front impact ends a roll-out: what follows a crash is not modelled. After a rear impact the trailing car is out,
@@ -87,7 +87,7 @@ class Watch(LockStep):
     """
 
     def __init__(self, state: State) -> None:
-        self.front, self.rear = Pair(LEAD, EGO, state), Pair(EGO, REAR, state)
+        self.front, self.rear = CarPair(LEAD, EGO, state), CarPair(EGO, REAR, state)
 
     def see(self, state: State) -> None:
         live = ~self.front.crashed
@@ -107,6 +107,6 @@ class Watch(LockStep):
         )
 
 
-def _ttc(pair: Pair) -> Floats:
+def _ttc(pair: CarPair) -> Floats:
     least = np.where(np.isfinite(pair.least_ttc_s), pair.least_ttc_s, np.nan)
     return np.where(pair.crashed, 0.0, least)

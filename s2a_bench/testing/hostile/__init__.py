@@ -70,7 +70,7 @@ class Case(Generic[Does]):
     mib: float = 1024.0
 
 
-class Asker:
+class ClientProcess:
     """The process that asks hostile servers; one that hangs is ended, and the next question starts another."""
 
     def __init__(self) -> None:
@@ -118,7 +118,7 @@ class Attacked:
     """Whether no descriptors are left."""
 
 
-class Target:
+class HostileTarget:
     """Our server in a process of its own, and a client that means well, connected all the while."""
 
     def __init__(self, told: Wiring[Any], server: OwnServer, honest: Client) -> None:
@@ -167,25 +167,25 @@ class HostileSuite:
         """What comes of the hostile clients of all tests that were chosen."""
         told, folder = cls.told(), tmp_path_factory.mktemp("servers")
         with ExitStack() as stack:
-            targets: list[Target] = []
+            targets: list[HostileTarget] = []
             for number in range(cls.targets):
                 server = stack.enter_context(own_server(told, folder / f"log-{number}"))
                 here = replace(told, address=server.address)
                 honest = stack.enter_context(closing(open_client(replace(here, timeout_s=60.0))))
-                targets.append(Target(here, server, honest))
-            yield stack.enter_context(_at_once(targets, Target.attacked, _chosen(request, "hostile_client")))
+                targets.append(HostileTarget(here, server, honest))
+            yield stack.enter_context(_at_once(targets, HostileTarget.attacked, _chosen(request, "hostile_client")))
 
     @pytest.fixture(scope="class")
     @classmethod
     def asked(cls, request: pytest.FixtureRequest) -> Iterator[dict[Case[Trap], Future[dict[str, Any]]]]:
         """What comes of asking the hostile servers of all tests that were chosen."""
 
-        def ask_it(asker: Asker, case: Case[Trap]) -> dict[str, Any]:
+        def ask_it(asker: ClientProcess, case: Case[Trap]) -> dict[str, Any]:
             with case.does(told := cls.told()) as address:
                 return asker.ask(replace(told, address=address), case.seconds)
 
         with ExitStack() as stack:
-            askers = [stack.enter_context(closing(Asker())) for _ in range(AT_ONCE)]
+            askers = [stack.enter_context(closing(ClientProcess())) for _ in range(AT_ONCE)]
             yield stack.enter_context(_at_once(askers, ask_it, _chosen(request, "hostile_server")))
 
     def test_the_server_outlives_a_hostile_client(

@@ -23,7 +23,7 @@ from s2a_bench.transport import Wiring
 from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, blocks, own
 from s2a_bench.transport.http.clients import BoundedClient, HttpResponse, LeanClient
 from s2a_bench.transport.http.detect import body_of, met
-from s2a_bench.transport.http.dialects import OWN, Event, Picture, open_dialect
+from s2a_bench.transport.http.dialects import OWN, EncodedPicture, Event, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
 from s2a_bench.transport.http.dialects.decoder import Decoder
 from s2a_bench.transport.http.merge import merged, read_patch
@@ -143,7 +143,7 @@ class HttpClient:
                 media_type, data = self._dialect.encode(frame, self._options.payload, trace)
                 text = self._codec.to_base64(data.reshape(-1))
                 trace.mark("base64_encode")
-                pictures.append(Picture(media_type, text, data.shape))
+                pictures.append(EncodedPicture(media_type, text, data.shape))
             fields = merged(self._dialect.body(request, pictures, self._model), self._extra)
             body, headers = self._codec.dumps(fields), self._headers
         trace.mark("json_pack")

@@ -66,10 +66,10 @@ class _Network(httpcore.NetworkBackend):
     ) -> httpcore.NetworkStream:
         with _in_time(self._client.bounds, timeout) as left_s:
             stream = self._backend.connect_tcp(host, port, left_s, local_address, socket_options)
-        return _Stream(stream, self._client)
+        return _BoundedStream(stream, self._client)
 
 
-class _Stream(httpcore.NetworkStream):
+class _BoundedStream(httpcore.NetworkStream):
     """A connection whose reads and writes end with the bounds."""
 
     def __init__(self, stream: httpcore.NetworkStream, client: BoundedClient) -> None:
@@ -89,7 +89,7 @@ class _Stream(httpcore.NetworkStream):
         self, ssl_context: Any, server_hostname: str | None = None, timeout: float | None = None
     ) -> httpcore.NetworkStream:
         with _in_time(self._client.bounds, timeout) as left_s:
-            return _Stream(self._stream.start_tls(ssl_context, server_hostname, left_s), self._client)
+            return _BoundedStream(self._stream.start_tls(ssl_context, server_hostname, left_s), self._client)
 
     def get_extra_info(self, info: str) -> Any:
         return self._stream.get_extra_info(info)

@@ -39,7 +39,7 @@ class ImageUrl(BaseModel):
     url: str
 
 
-class Part(BaseModel):
+class MessagePart(BaseModel):
     """One part of a message: text or a picture."""
 
     type: Literal["text", "image_url"]
@@ -51,7 +51,7 @@ class Message(BaseModel):
     """One message of the conversation."""
 
     role: str
-    content: str | Annotated[list[Part], Field(fail_fast=True)]
+    content: str | Annotated[list[MessagePart], Field(fail_fast=True)]
 
 
 class ChatRequest(BaseModel):
@@ -103,7 +103,7 @@ class DeployedExchange(ChatExchange):
             raise Disconnected from error
 
 
-class Answer(Response):
+class ExchangeResponse(Response):
     """What a thread of the pool computes for an exchange."""
 
     def __init__(self, exchange: DeployedExchange, most_s: float) -> None:
@@ -147,7 +147,7 @@ def application(core: Core, *, documented: bool = False) -> FastAPI:
         exchange = DeployedExchange(body, request.scope["state"]["protocol"], core.limits)
         answering = asyncio.get_running_loop().run_in_executor(threads, core.answer, exchange)
         answering.add_done_callback(lambda _: exchange.messages.put_nowait(None))
-        return Answer(exchange, core.limits.answer_s + LINGER_S)
+        return ExchangeResponse(exchange, core.limits.answer_s + LINGER_S)
 
     return app
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, Options, Server, Transport, Wiring
+from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, Server, Transport, TransportOptions, Wiring
 
 
-class Loopback(Transport[Options]):
+class Loopback(Transport[TransportOptions]):
     """A call within the process; no picture travels, whatever the payload is."""
 
     name = "loopback"
-    options = Options
+    options = TransportOptions
     answer_kinds = (TOKENS, ACTIONS)
     accepts_state = True
     stages = {"hand_over": "parse"}  # making of the request what the handler takes
@@ -20,13 +20,13 @@ class Loopback(Transport[Options]):
     compared_with = ()
     in_process = True
 
-    def client(self, wiring: Wiring[Options], alive: Callable[[], bool]) -> Client:
+    def client(self, wiring: Wiring[TransportOptions], alive: Callable[[], bool]) -> Client:
         """Find the handler that is registered under ``wiring.address``."""
         from s2a_bench.transport.loopback.in_process import LoopbackClient
 
         return LoopbackClient(wiring, alive)
 
-    def server(self, wiring: Wiring[Options], handler: Handler) -> Server:
+    def server(self, wiring: Wiring[TransportOptions], handler: Handler) -> Server:
         """Register the handler under ``wiring.address``, or a new name without one."""
         from s2a_bench.transport.loopback.in_process import LoopbackServer
 

@@ -12,7 +12,7 @@ from threading import Event
 
 from s2a_bench.errors import EngineError, RequestFailed, ServerDied
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler, Options, Wiring
+from s2a_bench.transport import Handler, TransportOptions, Wiring
 from s2a_bench.transport.pictures import bgr_of, rgb_of
 from s2a_bench.types import Piece, Request
 
@@ -23,7 +23,7 @@ _numbers = count()
 class LoopbackServer:
     """A handler that clients of this process find by its address."""
 
-    def __init__(self, wiring: Wiring[Options], handler: Handler) -> None:
+    def __init__(self, wiring: Wiring[TransportOptions], handler: Handler) -> None:
         """Register under ``wiring.address``, or a new name without one."""
         self.address = wiring.address or f"loopback-{next(_numbers)}"
         self.handler = handler
@@ -47,7 +47,7 @@ class LoopbackServer:
 class LoopbackClient:
     """Calls the handler directly."""
 
-    def __init__(self, wiring: Wiring[Options], alive: Callable[[], bool]) -> None:
+    def __init__(self, wiring: Wiring[TransportOptions], alive: Callable[[], bool]) -> None:
         """Remember the address; the server is looked up for each request."""
         del alive  # a server in this process lives as long as it is registered
         self.camera = None

@@ -14,7 +14,7 @@ from s2a_bench.errors import TransportError
 from s2a_bench.options import Options
 from s2a_bench.ros import Middleware, QoS
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.diagnostics import ARRAY, DIAGNOSTICS_QOS, Finding, Level, Rosout, diagnostic_array
+from s2a_bench.ros.diagnostics import ARRAY, DIAGNOSTICS_QOS, Level, PartHealth, Rosout, diagnostic_array
 from s2a_bench.ros.diagnostics import TOPIC as DIAGNOSTICS
 from s2a_bench.ros.parameters import SERVICE, Parameter, Parameters, of_options
 from s2a_bench.transport import SERVER, SERVING, Wiring
@@ -56,7 +56,7 @@ class Activity:
 
     def findings(
         self, frames: int, frame_ns: int | None, silence: Callable[[], str], oldest_s: float
-    ) -> Iterator[Finding]:
+    ) -> Iterator[PartHealth]:
         """Yield how requests and camera have been since the last call.
 
         ``frames`` have come from the camera, the last at ``frame_ns``; none, where there is a publisher, and one older
@@ -76,7 +76,7 @@ class Activity:
             level, said = Level.WARN, "the queue is full: goals are rejected"
         elif failures:
             level, said = Level.WARN, f"{failures} requests failed"
-        yield Finding(
+        yield PartHealth(
             "requests",
             level,
             said,
@@ -91,13 +91,13 @@ class Activity:
         if frame_ns is None:
             why = silence()
             level = Level.WARN if why else Level.OK
-            yield Finding("camera", level, why or "no camera: no publisher on its topics", {"frames": frames})
+            yield PartHealth("camera", level, why or "no camera: no publisher on its topics", {"frames": frames})
             return
         age_s = (now[0] - frame_ns) / 1e9
         old = age_s > oldest_s
         said = ": ".join(filter(None, (f"the newest frame is {age_s:.1f} s old", silence()))) if old else "frames come"
         values = {"frames_per_s": came / seconds, "frame_age_s": age_s, "frames": frames}
-        yield Finding("camera", Level.WARN if old else Level.OK, said, values)
+        yield PartHealth("camera", Level.WARN if old else Level.OK, said, values)
 
 
 class NodeApi:
@@ -109,7 +109,7 @@ class NodeApi:
         name: str,
         parameters: Sequence[Parameter],
         change: Callable[[Mapping[str, Any]], None],
-        findings: Callable[[], Iterator[Finding]],
+        findings: Callable[[], Iterator[PartHealth]],
         log_level: str,
     ) -> None:
         """Create services and topics of the node ``/namespace/name``; ``change`` as for `Parameters`."""

@@ -14,7 +14,7 @@ from pydantic import field_validator
 from s2a_bench.options import Names, one_of, option
 from s2a_bench.ros import MIDDLEWARES
 from s2a_bench.ros.router import ROUTER, endpoint_of
-from s2a_bench.transport import EXTERNAL, SERVER, SERVING, Options
+from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
 
 NAMESPACE = "/s2a_bench"
 """Where topics are unless told; servers of a run get this and something of their own."""
@@ -25,7 +25,7 @@ BASE_NAME = r"^[A-Za-z_][A-Za-z0-9_]*$"
 """ROS 2's rules for the name of a node."""
 
 
-class RosOptions(Options):
+class RosOptions(TransportOptions):
     """Where topics and actions are, and what carries them."""
 
     PANEL: ClassVar[str] = "ROS 2"

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 from s2a_bench.errors import MissingInterface, TransportError
 from s2a_bench.ros import QoS
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.diagnostics import Finding
+from s2a_bench.ros.diagnostics import PartHealth
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros import ACTION
@@ -29,7 +29,7 @@ from s2a_bench.transport.ros.node import Activity, NodeApi, declared
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.topic import TopicFront
 from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, provenance_message
-from s2a_bench.transport.serving import Core, Workers
+from s2a_bench.transport.serving import Core, SharedSourceWorkers
 
 _log = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ class RosServer:
             self._node = NodeApi(self.middleware, name, told, self._change, self._findings, level)
 
     def serve(self) -> None:
-        fronts = [Workers(partial(self._take, front), self._shared.stopped) for front in self._fronts]
+        fronts = [SharedSourceWorkers(partial(self._take, front), self._shared.stopped) for front in self._fronts]
         self._cache.start()
         for workers in fronts:
             workers.start()
@@ -107,7 +107,7 @@ class RosServer:
         if self._action is not None:
             self._action.tune(self._options)
 
-    def _findings(self) -> Iterator[Finding]:
+    def _findings(self) -> Iterator[PartHealth]:
         return self._shared.activity.findings(*self._cache.seen(), self._cache.silence, self._options.max_frame_age)
 
     def _take(self, front: Front) -> Callable[[], None] | None:

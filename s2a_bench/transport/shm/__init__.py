@@ -12,10 +12,21 @@ from s2a_bench.errors import UsageError
 from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.options import option
-from s2a_bench.transport import ACTIONS, SERVER, TOKENS, Choice, Client, Handler, Options, Server, Transport, Wiring
+from s2a_bench.transport import (
+    ACTIONS,
+    SERVER,
+    TOKENS,
+    Choice,
+    Client,
+    Handler,
+    Server,
+    Transport,
+    TransportOptions,
+    Wiring,
+)
 
 
-class ShmOptions(Options):
+class ShmOptions(TransportOptions):
     """The options of `shm`."""
 
     socket: str = option(

@@ -18,7 +18,7 @@ from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.pictures import bgr_of, encoded
 from s2a_bench.transport.shm import ShmOptions
 from s2a_bench.transport.shm.door import connect
-from s2a_bench.transport.shm.memory import ANSWER_BYTES, PLACE, STEP_BYTES, Memory, accept, in_steps, offer
+from s2a_bench.transport.shm.memory import ANSWER_BYTES, PLACE, STEP_BYTES, SharedMemory, accept, in_steps, offer
 from s2a_bench.transport.shm.pieces import Said, unpacked
 from s2a_bench.types import Action, Frame, Piece, Request, Token
 
@@ -36,7 +36,7 @@ class ShmClient:
         """Connect; raises ServerDied where nobody listens."""
         self._wiring, self._alive, self._path = wiring, alive, wiring.address
         self._payload = wiring.options.payload
-        self._link: Link | None = None
+        self._link: ShmConnection | None = None
         self._connect(STEP_BYTES)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
@@ -71,15 +71,15 @@ class ShmClient:
             self._link.close()
         self._link = None
 
-    def _connect(self, size: int) -> Link:
+    def _connect(self, size: int) -> ShmConnection:
         self.close()
         try:
-            self._link = Link(self._path, size, self._wiring.timeout_s)
+            self._link = ShmConnection(self._path, size, self._wiring.timeout_s)
         except OSError as error:
             raise ServerDied(f"nobody takes a link at {self._path}: {error.strerror or error}") from error
         return self._link
 
-    def _lay_out(self, request: Request, trace: Trace) -> tuple[Link, int, int]:
+    def _lay_out(self, request: Request, trace: Trace) -> tuple[ShmConnection, int, int]:
         """Write pictures and header into memory; return the link, and where the header lies."""
         pictures = [self._picture(frame, trace) for frame in request.images]
         size = sum(about["bytes"] for about, _ in pictures)
@@ -116,13 +116,13 @@ class ShmClient:
         made = Frame(frame.index, frame.stamp_ns, frame.width, frame.height, "jpeg", data)
         return {**about, "encoding": media_type, "bytes": data.size}, made
 
-    def _ask(self, link: Link, at: int, length: int) -> None:
+    def _ask(self, link: ShmConnection, at: int, length: int) -> None:
         try:
             link.ask(at, length)
         except OSError as error:
             raise self._gone(error) from error
 
-    def _said(self, link: Link, bounds: Bounds) -> Iterator[Said]:
+    def _said(self, link: ShmConnection, bounds: Bounds) -> Iterator[Said]:
         """Yield the pieces of the answer, and its end."""
         try:
             while True:
@@ -158,14 +158,14 @@ def _header(request: Request, pictures: list[dict[str, Any]]) -> bytes:
     )
 
 
-class Link:
+class ShmConnection:
     """A connection with memory for requests of ``size`` bytes."""
 
     def __init__(self, path: str, size: int, patience_s: float) -> None:
         """Connect and offer memory; raises OSError, TransportError."""
         self._socket = connect(path, patience_s)
         self._waits_s = patience_s
-        self._answers: Memory | None = None
+        self._answers: SharedMemory | None = None
         try:
             self.requests = offer(self._socket, size)
         except BaseException as error:

@@ -44,7 +44,7 @@ _PACKET_BYTES: Final = 256
 _FILES: Final = struct.calcsize("i")
 
 
-class Memory:
+class SharedMemory:
     """Memory of a file, ours to write or the other side's to read."""
 
     __slots__ = ("map", "pixels", "size")
@@ -61,14 +61,14 @@ def in_steps(size: int) -> int:
     return -(-size // STEP_BYTES) * STEP_BYTES
 
 
-def offer(link: socket.socket, size: int) -> Memory:
+def offer(link: socket.socket, size: int) -> SharedMemory:
     """Make memory of so many bytes and hand it over; raises TransportError where there is none, OSError."""
     try:
         file = os.memfd_create("s2a_bench", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             os.ftruncate(file, size)
             fcntl.fcntl(file, fcntl.F_ADD_SEALS, _SEALS | fcntl.F_SEAL_SEAL)
-            memory = Memory(file, size, writes=True)
+            memory = SharedMemory(file, size, writes=True)
         except OSError:
             os.close(file)
             raise
@@ -81,7 +81,7 @@ def offer(link: socket.socket, size: int) -> Memory:
     return memory
 
 
-def accept(link: socket.socket, most: int) -> Memory:
+def accept(link: socket.socket, most: int) -> SharedMemory:
     """Map what the other side hands over; raises EOFError, OSError, and TransportError for what is not trusted."""
     data, files = _receive(link)
     try:
@@ -102,7 +102,7 @@ def accept(link: socket.socket, most: int) -> Memory:
             raise TransportError(f"shared memory of {size} bytes was offered; at most {most} are taken")
         if not _is_sealed(files[0], size):
             raise TransportError("what was offered is no memory, or its size may change")
-        return Memory(files[0], size, writes=False)
+        return SharedMemory(files[0], size, writes=False)
     finally:
         for file in files:
             os.close(file)

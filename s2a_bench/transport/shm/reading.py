@@ -11,7 +11,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.limits import SEEDS, Limits, check_pixels, check_values, text, whole_number
 from s2a_bench.transport.pictures import decoded, rgb_of
-from s2a_bench.transport.shm.memory import Memory
+from s2a_bench.transport.shm.memory import SharedMemory
 from s2a_bench.types import Frame, Request
 
 HEADER_BYTES: Final = 1 << 20
@@ -20,14 +20,14 @@ that Python does not give back."""
 BYTES_A_PIXEL: Final = {"bgr8": 3, "yuv422_yuy2": 2}
 
 
-def size_of(memory: Memory, at: int, length: int) -> int:
+def size_of(memory: SharedMemory, at: int, length: int) -> int:
     """Return the bytes of a request whose header lies there; raises RequestFailed where it cannot."""
     if not (0 < length <= HEADER_BYTES and 0 <= at <= memory.size - length):
         raise RequestFailed(f"a header of {length} bytes at {at} cannot be; at most {HEADER_BYTES} are taken")
     return at + length
 
 
-def request_at(memory: Memory, at: int, length: int, limits: Limits, trace: Trace) -> Request:
+def request_at(memory: SharedMemory, at: int, length: int, limits: Limits, trace: Trace) -> Request:
     """Copy and parse a header, and read its pictures as the engine takes them; raises RequestFailed."""
     header = memory.map[at : at + length]
     check_values(header)
@@ -58,7 +58,7 @@ def request_at(memory: Memory, at: int, length: int, limits: Limits, trace: Trac
     )
 
 
-def _picture(memory: Memory, about: dict[str, Any], begin: int, trace: Trace, limits: Limits) -> Frame:
+def _picture(memory: SharedMemory, about: dict[str, Any], begin: int, trace: Trace, limits: Limits) -> Frame:
     """Convert a picture; raw pixels are read where they lie, a file that has a size of its own is copied first."""
     encoding = text("encoding", about.get("encoding"))
     end = begin + about["bytes"]

@@ -23,7 +23,7 @@ from s2a_bench.transport.shm.memory import (
     ANSWER_BYTES,
     PLACE,
     STEP_BYTES,
-    Memory,
+    SharedMemory,
     accept,
     in_steps,
     offer,
@@ -90,7 +90,7 @@ class ShmServer:
 class Writer:
     """An answer in memory: it lies there whole, so that a client which is slow to read never holds the engine."""
 
-    def __init__(self, wire: Wire, answers: Memory) -> None:
+    def __init__(self, wire: Wire, answers: SharedMemory) -> None:
         """Write into ``answers``, and tell of it over the wire."""
         self._wire, self._answers = wire, answers
         self._told = self._end = 0
@@ -145,7 +145,7 @@ class ShmExchange(Exchange):
     def __init__(
         self,
         wire: Wire,
-        requests: Memory,
+        requests: SharedMemory,
         writer: Writer,
         place: tuple[int, int],
         core: Core,

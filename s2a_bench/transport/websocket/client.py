@@ -27,7 +27,7 @@ from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pictures import told
 from s2a_bench.transport.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
 from s2a_bench.transport.websocket.codec import packb, unpackb
-from s2a_bench.transport.websocket.link import Broken, Link
+from s2a_bench.transport.websocket.link import BoundedConnection, Broken
 from s2a_bench.types import Action, Piece, Request
 
 QUOTED = 500
@@ -49,7 +49,7 @@ class WebsocketClient:
         self._headers = {"Authorization": f"{codec.SCHEME} {key}"} if key else {}
         if self._ours:
             self._headers[codec.MARKS_HEADER] = "1"
-        self._link: Link | None = None
+        self._link: BoundedConnection | None = None
         self._metadata: dict[str, str] = {}
         self._provenance: dict[str, str] = {}
 
@@ -97,18 +97,18 @@ class WebsocketClient:
         trace.mark("connect")
         return self._exchanged(link, body, trace)
 
-    def _connected(self, bounds: Bounds) -> Link:
+    def _connected(self, bounds: Bounds) -> BoundedConnection:
         self._link = None
-        self._link = Link(self._url, self._headers, bounds, self._wiring.timeout_s)
+        self._link = BoundedConnection(self._url, self._headers, bounds, self._wiring.timeout_s)
         self._greeted(self._link)
         return self._link
 
-    def _exchanged(self, link: Link, body: bytes, trace: Trace) -> tuple[bytes, int]:
+    def _exchanged(self, link: BoundedConnection, body: bytes, trace: Trace) -> tuple[bytes, int]:
         packed_ns = trace.marks[-1][1]
         link.send(body)
         return self._message(link), packed_ns
 
-    def _greeted(self, link: Link) -> None:
+    def _greeted(self, link: BoundedConnection) -> None:
         """Read what a server says of itself when it is connected to."""
         metadata = unpackb(self._message(link))
         if not isinstance(metadata, dict):
@@ -118,7 +118,7 @@ class WebsocketClient:
         plain = {name: value for name, value in metadata.items() if isinstance(value, (str, int, float, bool))}
         self._metadata = {str(name)[:64]: struck(str(value))[:64] for name, value in list(plain.items())[:32]}
 
-    def _message(self, link: Link) -> bytes:
+    def _message(self, link: BoundedConnection) -> bytes:
         """Return the next binary message; a text is an error."""
         message = link.receive()
         if isinstance(message, str):

@@ -47,9 +47,9 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
 def _greeting(url: str, headers: Mapping[str, str]) -> str:
     """Return what a server says of itself, in a few words."""
     from s2a_bench.transport.websocket.codec import unpackb
-    from s2a_bench.transport.websocket.link import Link
+    from s2a_bench.transport.websocket.link import BoundedConnection
 
-    with closing(Link(url, headers, Bounds(url, PATIENCE_S, 0), PATIENCE_S)) as link:
+    with closing(BoundedConnection(url, headers, Bounds(url, PATIENCE_S, 0), PATIENCE_S)) as link:
         message = link.receive()
     if isinstance(message, str):
         return shown(message)

@@ -45,7 +45,7 @@ class _Counted(ClientConnection):
         super().process_event(event)
 
 
-class Link:
+class BoundedConnection:
     """One connection to one server."""
 
     def __init__(self, url: str, headers: Mapping[str, str], bounds: Bounds, timeout_s: float) -> None:

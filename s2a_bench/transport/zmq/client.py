@@ -26,7 +26,7 @@ from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pictures import told
 from s2a_bench.transport.zmq import ZmqOptions, layouts
 from s2a_bench.transport.zmq.npy import Room
-from s2a_bench.transport.zmq.watch import Watch
+from s2a_bench.transport.zmq.watch import ConnectionWatch
 from s2a_bench.transport.zmq.wire import pack, read
 from s2a_bench.types import Frame, Piece, Pixels, Request
 
@@ -55,7 +55,7 @@ class ZmqClient:
         self._template = template_of(wiring.options.template_name)
         self._key = read_key(wiring.options.api_key_env)
         self._rooms: dict[tuple[int, int, int], Room] = {}
-        self._link: Link | None = None
+        self._link: ReqSocket | None = None
         self._connected = False
         self._layout: str = wiring.options.layout
         if self._layout == layouts.AUTO:
@@ -64,7 +64,7 @@ class ZmqClient:
     def _met(self) -> str:
         """Return the layout of a foreign server, by the marks of its modality configurations."""
         bounds = self._bounds(1)
-        with closing(Link(self._wiring.address, self._wiring.timeout_s, self._alive)) as link:
+        with closing(ReqSocket(self._wiring.address, self._wiring.timeout_s, self._alive)) as link:
             link.greet(bounds)
             _, marks = self._read(link.asked(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))
         return layouts.marked(marks)
@@ -98,14 +98,14 @@ class ZmqClient:
             if not whole:
                 self.close()
 
-    def _open(self, bounds: Bounds, trace: Trace) -> Link:
+    def _open(self, bounds: Bounds, trace: Trace) -> ReqSocket:
         """Return the kept connection, or a new one that both sides have greeted over, marking `connect`."""
         if self._link is not None and not self._link.stands():
             self.close()
         if self._link is None:
             if self._connected:
                 trace.facts[RECONNECTS] = 1.0
-            self._link = Link(self._wiring.address, self._wiring.timeout_s, self._alive)
+            self._link = ReqSocket(self._wiring.address, self._wiring.timeout_s, self._alive)
             self._link.greet(bounds)
             self._connected = True
             trace.mark("connect")
@@ -167,7 +167,7 @@ class ZmqClient:
             self._link = None
 
 
-class Link:
+class ReqSocket:
     """One REQ socket and its connection, bounded in time and bytes."""
 
     def __init__(self, url: str, timeout_s: float, alive: Callable[[], bool]) -> None:
@@ -179,7 +179,7 @@ class Link:
         self._socket.maxmsgsize = ANSWER_BYTES
         self._socket.rcvtimeo = self._socket.sndtimeo = max(1, round(timeout_s * 1e3))
         self._socket.ipv6 = "[" in url
-        self._watch = Watch(self._socket)
+        self._watch = ConnectionWatch(self._socket)
         self._poller = zmq.Poller()
         self._poller.register(self._watch.monitor, zmq.POLLIN)
         try:

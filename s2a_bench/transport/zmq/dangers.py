@@ -22,12 +22,12 @@ N1 = b"ERROR", b"PK\x03\x04", *(bytes((0x80, protocol)) for protocol in range(2,
 def examine(parts: SplitResult) -> Iterator[Finding]:
     """Ping it without a key; if it answers, read how its configurations are marked."""
     extras.need("zmq", *PACKAGES)
-    from s2a_bench.transport.zmq.client import Link
+    from s2a_bench.transport.zmq.client import ReqSocket
     from s2a_bench.transport.zmq.wire import pack, read
 
     url = urlunsplit((parts.scheme, f"{parts.hostname}:{parts.port or PORT}", "", "", ""))
     bounds = Bounds(url, 3 * PATIENCE_S, 0)
-    with closing(Link(url, PATIENCE_S, lambda: True)) as link:
+    with closing(ReqSocket(url, PATIENCE_S, lambda: True)) as link:
         link.greet(bounds)
         pong = link.asked(pack({layouts.ENDPOINT: layouts.PING}), bounds)
         if pong.startswith(N1):

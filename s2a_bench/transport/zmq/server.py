@@ -25,9 +25,9 @@ from s2a_bench.errors import Busy, RequestFailed, S2AError, TransportError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring, observed
 from s2a_bench.transport.listening import cannot_bind, key_for, split
-from s2a_bench.transport.serving import RETRY_AFTER_S, Core, Exchange, Workers, told_of
+from s2a_bench.transport.serving import RETRY_AFTER_S, Core, Exchange, SharedSourceWorkers, told_of
 from s2a_bench.transport.zmq import ZmqOptions, layouts
-from s2a_bench.transport.zmq.watch import Connection, Watch
+from s2a_bench.transport.zmq.watch import Connection, ConnectionWatch
 from s2a_bench.transport.zmq.wire import pack, read
 from s2a_bench.types import Piece, Request
 
@@ -72,7 +72,7 @@ class ZmqServer:
         self._router.rcvhwm = self._router.sndhwm = QUEUED
         self._router.maxmsgsize = limits.body_bytes
         self._router.handshake_ivl = round(limits.head_s * 1e3)
-        self._watch = Watch(self._router)
+        self._watch = ConnectionWatch(self._router)
         try:
             self._router.bind(f"tcp://{host}:{'*' if port == '0' else port}")
         except zmq.ZMQError as error:
@@ -87,7 +87,7 @@ class ZmqServer:
         return {"server": "pyzmq", "version": zmq.pyzmq_version(), "libzmq": zmq.zmq_version()}
 
     def serve(self) -> None:
-        workers = Workers(self._next, self._stopped)
+        workers = SharedSourceWorkers(self._next, self._stopped)
         workers.start()
         self._stopped.wait()
         self._close()
@@ -137,7 +137,7 @@ class ZmqServer:
             error = RequestFailed("a request is one frame behind an empty one")
             self._send([frames[0].bytes, b"", _error(error)])
             return None
-        client = Client([frame.bytes for frame in frames[:-1]], connection, self._send)
+        client = ReplyAddress([frame.bytes for frame in frames[:-1]], connection, self._send)
         with ExitStack() as held:
             try:
                 held.enter_context(self._core.in_flight.counted())(len(frames[-1]))
@@ -155,7 +155,7 @@ class ZmqServer:
         with self._lock:
             self._under_way -= 1
 
-    def _serve(self, client: Client, frame: Any, trace: Trace, held: ExitStack) -> None:
+    def _serve(self, client: ReplyAddress, frame: Any, trace: Trace, held: ExitStack) -> None:
         """Read a message and answer it."""
         with held:
             try:
@@ -220,7 +220,7 @@ class ZmqServer:
             self._context.destroy(0)
 
 
-class Client:
+class ReplyAddress:
     """Where an answer goes."""
 
     def __init__(self, envelope: list[bytes], connection: Connection, send: Callable[[list[Any]], None]) -> None:
@@ -238,7 +238,7 @@ class ActionExchange(Exchange):
 
     def __init__(
         self,
-        client: Client,
+        client: ReplyAddress,
         message: dict[Any, Any],
         marks: set[str],
         told: dict[Any, Any] | None,

@@ -28,7 +28,7 @@ class Connection:
         """Whether both sides have greeted."""
 
 
-class Watch:
+class ConnectionWatch:
     """The connections of one socket; for the thread that has the socket."""
 
     def __init__(self, watched: Any) -> None:

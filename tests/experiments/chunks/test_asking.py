@@ -15,7 +15,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.asking import Asking, Job
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.plan import RequestPlan, resolve
-from s2a_bench.harness.session import Asked, Measured, Place, Session
+from s2a_bench.harness.session import Measured, Place, RequestContext, Session
 from s2a_bench.types import Action, Vector
 
 
@@ -29,7 +29,7 @@ class Server:
     cell: Any = field(default_factory=lambda: SimpleNamespace(name="fake"))
     request: RequestPlan = field(default_factory=lambda: resolve(RequestsConfig(transports="loopback")).request)
 
-    def measure(self, place: Place, asked: Asked) -> Measured:
+    def measure(self, place: Place, asked: RequestContext) -> Measured:
         self.places.append(place)
         actions, error = self.answers[len(self.places) - 1]
         for index in range(actions):

@@ -14,22 +14,22 @@ from s2a_bench.experiments.chunks.cells import cells, draw
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.rows import CHUNKS, METRICS, REQUESTS, TICKS
 from s2a_bench.experiments.chunks.run import run_chunks
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 
 LATENCIES = "40,lognormal:mean_ms=80,cv=.5"
 
 
-def ran(folder: Path, **asked: Any) -> Run:
+def ran(folder: Path, **asked: Any) -> StoredRun:
     return read_run(run_chunks(ChunksConfig(**asked), folder, NullProgress()))
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     return ran(tmp_path_factory.mktemp("chunks"), latency=LATENCIES, cycles=4000)
 
 
-def row(run: Run, mode: str, latency: str, rule: str = "given") -> dict[str, Any]:
+def row(run: StoredRun, mode: str, latency: str, rule: str = "given") -> dict[str, Any]:
     table = run.table(CHUNKS)
     (found,) = table[(table["mode"] == mode) & (table["latency"] == latency) & (table["rule"] == rule)].to_dict(
         "records"
@@ -37,7 +37,7 @@ def row(run: Run, mode: str, latency: str, rule: str = "given") -> dict[str, Any
     return {str(name): value for name, value in found.items()}
 
 
-def test_every_mode_and_rule_has_a_row_under_every_latency_with_every_metric(run: Run) -> None:
+def test_every_mode_and_rule_has_a_row_under_every_latency_with_every_metric(run: StoredRun) -> None:
     table = run.table(CHUNKS)
     assert len(table) == 2 * (4 + 5)
     assert table["cell"].is_unique
@@ -72,7 +72,7 @@ def test_at_a_constant_latency_rows_are_what_the_closed_forms_say(rounding: str,
         assert found["delay_ticks_mean"] == found["delay_ticks_max"] == delay
 
 
-def test_with_random_latencies_closed_forms_lie_within_the_interval(run: Run) -> None:
+def test_with_random_latencies_closed_forms_lie_within_the_interval(run: StoredRun) -> None:
     table = run.table(CHUNKS)
     told = table[table["p_stall_closed"].notna()]
     assert {"sync", "queue", "queue?trigger=6", "replace", "aggregate?trigger=6"} <= set(told["mode"])
@@ -90,7 +90,7 @@ def test_blended_actions_are_older_than_the_newest_observation_in_them(tmp_path:
     assert table["age_ticks_blended"].is_unique
 
 
-def test_rules_choose_between_the_mean_that_stalls_and_the_maximum_that_is_old(run: Run) -> None:
+def test_rules_choose_between_the_mean_that_stalls_and_the_maximum_that_is_old(run: StoredRun) -> None:
     found = {rule: row(run, "queue", "lognormal:mean_ms=80,cv=.5", rule) for rule in ChunksConfig().rules}
     assert found["mean"]["p_stall_cycle"] > 0.2
     assert found["calibrated"]["p_stall_cycle"] <= 0.015
@@ -106,7 +106,7 @@ def test_where_no_trigger_is_enough_beta_says_how_much_slower(tmp_path: Path) ->
     assert pd.isna(row(run, "sync", "600")["slow_down"])
 
 
-def test_the_first_ticks_and_requests_are_kept(run: Run) -> None:
+def test_the_first_ticks_and_requests_are_kept(run: StoredRun) -> None:
     ticks, requests = run.table(TICKS), run.table(REQUESTS)
     assert set(ticks.groupby("cell").size()) == {120}
     mine = ticks[ticks["cell"] == "queue?trigger=6 @ 40"]

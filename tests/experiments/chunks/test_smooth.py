@@ -15,32 +15,40 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.rows import CHUNKS, MEANS, METRICS
 from s2a_bench.experiments.chunks.run import run_chunks
-from s2a_bench.experiments.chunks.smooth import RATE, Follower, Target, draw_target, executed, follower, smoothness
-from s2a_bench.policy.chunks import Setting, Ticks, mode
+from s2a_bench.experiments.chunks.smooth import (
+    RATE,
+    TargetPath,
+    TrackingPlant,
+    draw_target,
+    executed,
+    follower,
+    smoothness,
+)
+from s2a_bench.policy.chunks import ControlSetting, Ticks, mode
 from s2a_bench.policy.chunks.aggregate import WEIGHTS, Aggregate
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 
 MS = 1_000_000
-SETTING = Setting(20 * MS, 16)
+SETTING = ControlSetting(20 * MS, 16)
 PERIOD_S = 0.02
 NAMES = [name for name in METRICS if name.startswith(("tracking", "jerk", "boundary_jump", "action_step"))]
 
 
-def ran(folder: Path, **asked: Any) -> Run:
+def ran(folder: Path, **asked: Any) -> StoredRun:
     return read_run(run_chunks(ChunksConfig(**asked), folder, NullProgress()))
 
 
 @pytest.fixture(scope="module")
-def target() -> Target:
+def target() -> TargetPath:
     return draw_target(np.random.default_rng(1), 400_000, PERIOD_S)
 
 
-def foreseen(ticks: int) -> Target:
+def foreseen(ticks: int) -> TargetPath:
     """A target that keeps to what is expected of it."""
     time_s = np.arange(ticks) * PERIOD_S
     decay = np.exp(-RATE * time_s)
-    return Target(decay * (1 + 4 * time_s), 4 * decay, PERIOD_S)
+    return TargetPath(decay * (1 + 4 * time_s), 4 * decay, PERIOD_S)
 
 
 def latencies(ticks: int, count: int = 60) -> np.ndarray:
@@ -48,14 +56,14 @@ def latencies(ticks: int, count: int = 60) -> np.ndarray:
 
 
 class TestTarget:
-    def test_it_has_the_covariance_of_its_docstring(self, target: Target) -> None:
+    def test_it_has_the_covariance_of_its_docstring(self, target: TargetPath) -> None:
         for lag in (0, 1, 5, 16, 40):
             time_s = lag * PERIOD_S
             found = np.mean(target.position[lag:] * target.position[: target.position.size - lag])
             assert found == pytest.approx((1 + RATE * time_s) * math.exp(-RATE * time_s), abs=0.05)
 
     @pytest.mark.parametrize("ahead", [0, 1, 4, 15])
-    def test_the_forecast_is_the_conditional_mean(self, target: Target, ahead: int) -> None:
+    def test_the_forecast_is_the_conditional_mean(self, target: TargetPath, ahead: int) -> None:
         now = np.arange(target.position.size - ahead)
         error = target.position[now + ahead] - target.forecast(now, np.full(now.size, ahead))
         expected = float(gammainc(3, 2 * RATE * ahead * PERIOD_S)) if ahead else 0.0
@@ -69,7 +77,7 @@ class TestTarget:
         last = [draw_target(np.random.default_rng(seed), 5, period_s).position[-1] for seed in seeds]
         assert np.std(last) == pytest.approx(1, rel=0.15)
 
-    def test_the_first_ticks_are_the_same_however_many_there_are(self, target: Target) -> None:
+    def test_the_first_ticks_are_the_same_however_many_there_are(self, target: TargetPath) -> None:
         short = draw_target(np.random.default_rng(1), 10, PERIOD_S)
         np.testing.assert_allclose(short.position, target.position[:10])
 
@@ -96,7 +104,7 @@ class TestWhatIsExecuted:
         assert np.isnan(actions).sum() == (done.chunk[: actions.size] < 0).sum()
 
     @pytest.mark.parametrize("kind", WEIGHTS)
-    def test_blended_actions_are_those_of_a_queue_that_is_overwritten(self, kind: str, target: Target) -> None:
+    def test_blended_actions_are_those_of_a_queue_that_is_overwritten(self, kind: str, target: TargetPath) -> None:
         latency_ns = np.random.default_rng(3).integers(0, 250 * MS, 80)
         made = Aggregate(6, kind)  # type: ignore[arg-type]
         cycles, done = made.cycles(latency_ns, SETTING), made.ticks(latency_ns, SETTING)
@@ -125,51 +133,54 @@ class TestWhatIsExecuted:
         np.testing.assert_allclose(total, made.ticks(latency_ns, SETTING).chunk >= 0)
 
 
-def measured(written: str, latency_ns: np.ndarray, target: Target) -> dict[str, float]:
+def measured(written: str, latency_ns: np.ndarray, target: TargetPath) -> dict[str, float]:
     made = mode(written)
-    follows = Follower(Plant(), target)
+    follows = TrackingPlant(Plant(), target)
     return {**follows.measure(made, made.cycles(latency_ns, SETTING), made.ticks(latency_ns, SETTING))}
 
 
 class TestNumbers:
-    def test_with_replace_longer_delays_do_not_track_better(self, target: Target) -> None:
+    def test_with_replace_longer_delays_do_not_track_better(self, target: TargetPath) -> None:
         found = [measured("replace", latencies(ticks, 4000), target) for ticks in range(9)]
         error, jump = ([each[name] for each in found] for name in ("tracking_rms", "boundary_jump_mean"))
         assert (np.diff(error) > 0).all()
         assert (np.diff(jump) > 0).all()
         assert error[0] > found[0]["tracking_rms_ideal"] > 0
 
-    def test_asked_in_every_tick_and_answered_at_once_it_is_the_ideal(self, target: Target) -> None:
+    def test_asked_in_every_tick_and_answered_at_once_it_is_the_ideal(self, target: TargetPath) -> None:
         found = measured("replace?execute=1", latencies(0, 4000), target)
         assert found["tracking_rms"] == found["tracking_rms_ideal"]
         assert found["jerk_rms"] == found["jerk_rms_ideal"]
 
     @pytest.mark.parametrize("written", ["sync", "queue?trigger=6", "replace", "aggregate?trigger=6", "streamed"])
     def test_a_target_that_rests_leaves_no_jumps_and_no_jerk(self, written: str) -> None:
-        rests = Target(np.zeros(3000), np.zeros(3000), PERIOD_S)
+        rests = TargetPath(np.zeros(3000), np.zeros(3000), PERIOD_S)
         latency_ns = np.random.default_rng(5).integers(0, 250 * MS, 200)
         assert set(measured(written, latency_ns, rests).values()) == {0}
 
-    def test_a_run_without_an_action_has_none(self, target: Target) -> None:
+    def test_a_run_without_an_action_has_none(self, target: TargetPath) -> None:
         never = np.full(9, -1)
         ticks = Ticks(never, never, never, np.zeros(9, np.bool_))
-        assert Follower(Plant(), target).measure(mode("sync"), mode("sync").cycles(latencies(9), SETTING), ticks) == {}
+        assert (
+            TrackingPlant(Plant(), target).measure(mode("sync"), mode("sync").cycles(latencies(9), SETTING), ticks)
+            == {}
+        )
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     return ran(tmp_path_factory.mktemp("smooth"), cycles=400)
 
 
 class TestRuns:
-    def test_every_row_has_every_number_beside_the_ideal(self, run: Run) -> None:
+    def test_every_row_has_every_number_beside_the_ideal(self, run: StoredRun) -> None:
         table = run.table(CHUNKS)
         assert table[NAMES].notna().all().all()
         assert (table["tracking_rms"] > table["tracking_rms_ideal"]).all()
         assert (table["boundary_jump_p99"] > table["boundary_jump_mean"]).all()
         assert (table["boundary_jump_mean"] > table["action_step_mean"]).all()
 
-    def test_at_the_sources_own_mean_a_mode_does_what_its_cell_does(self, run: Run) -> None:
+    def test_at_the_sources_own_mean_a_mode_does_what_its_cell_does(self, run: StoredRun) -> None:
         table = run.table(MEANS)
         assert len(table) == 4 * 33
         assert sorted(table["latency_s"].unique()) == pytest.approx(np.linspace(0, 0.32, 33))

@@ -11,7 +11,7 @@ from s2a_bench.experiments.chunks.cells import draw
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import mean_age, mean_rows, trigger_rows
 from s2a_bench.experiments.chunks.to_rows import reactions_s
-from s2a_bench.policy.chunks import Setting, mode
+from s2a_bench.policy.chunks import ControlSetting, mode
 from s2a_bench.policy.chunks.closed import Closed, closed, mean_reaction_s
 from tests.policy.chunks.forms import replace_stall_ticks
 
@@ -47,7 +47,7 @@ def test_hundreds_of_thousands_of_ticks_take_no_minutes() -> None:
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
 def test_simulated_reactions_have_the_quantiles_of_the_closed_form(written: str, rounding: str) -> None:
     rng = np.random.default_rng(3)
-    setting = Setting(20 * MS, 16, "floor" if rounding == "floor" else "ceil")
+    setting = ControlSetting(20 * MS, 16, "floor" if rounding == "floor" else "ceil")
     latency_ns = rng.integers(10 * MS, 150 * MS, 20_000)
     made = mode(written)
     simulated = reactions_s(made.cycles(latency_ns, setting), made.ticks(latency_ns, setting), setting, rng)
@@ -60,7 +60,7 @@ def test_simulated_reactions_have_the_quantiles_of_the_closed_form(written: str,
 @pytest.mark.parametrize("written", ["sync", "queue?trigger=3", "replace?execute=5", "aggregate?trigger=5"])
 def test_the_mean_age_of_cycles_is_that_of_ticks(written: str) -> None:
     latency_ns = np.random.default_rng(4).integers(0, 400 * MS, 300)
-    made, setting = mode(written), Setting(20 * MS, 16)
+    made, setting = mode(written), ControlSetting(20 * MS, 16)
     age = made.ticks(latency_ns, setting).age
     assert mean_age(made.cycles(latency_ns, setting)) == pytest.approx(age[age >= 0].mean())
 

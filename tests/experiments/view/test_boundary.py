@@ -13,24 +13,24 @@ from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.run import rows, run_boundary
 from s2a_bench.experiments.boundary.view import board_table, boundary_csv, build_boundary, disagreements, line_table
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 
 
 @pytest.fixture(scope="module")
-def even(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def even(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     return read_run(run_boundary(BoundaryConfig(), tmp_path_factory.mktemp("even"), NullProgress()))
 
 
 @pytest.fixture(scope="module")
-def jittery(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def jittery(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     config = BoundaryConfig(jitter="lognormal:cv=0.2", plans=200, points=30)
     return read_run(run_boundary(config, tmp_path_factory.mktemp("jittery"), NullProgress()))
 
 
-def drawn(run: Run) -> Figure:
+def drawn(run: StoredRun) -> Figure:
     with paper_column():
         return build_boundary(run)
 
@@ -70,7 +70,7 @@ def test_the_line_itself_is_stall_free() -> None:
     assert free[2, 1.0].p_stall == 1
 
 
-def test_with_jitter_the_line_is_a_slope(jittery: Run) -> None:
+def test_with_jitter_the_line_is_a_slope(jittery: StoredRun) -> None:
     points = jittery.table(BOUNDARY)
     mine = points[(points["duration"] == "t_nom") & (points["board"] == "") & (points["tokens_per_skill"] == 4)]
     share = mine.sort_values("tokens_per_s")["p_stall"].to_numpy()
@@ -81,7 +81,7 @@ def test_with_jitter_the_line_is_a_slope(jittery: Run) -> None:
     assert disagreements(jittery) > 0
 
 
-def test_the_figure_draws_both_lines_every_trial_and_every_board(even: Run) -> None:
+def test_the_figure_draws_both_lines_every_trial_and_every_board(even: StoredRun) -> None:
     figure = drawn(even)
     assert "the paper's rates (not measured here)" in " ".join(caption_of(figure))
     axes = figure.axes[0]
@@ -104,7 +104,7 @@ def test_the_figure_draws_both_lines_every_trial_and_every_board(even: Run) -> N
     assert all(text.get_window_extent().x0 > axes.bbox.x1 for text in axes.texts)  # none lies on a marker
 
 
-def test_with_jitter_the_share_is_shaded_and_has_a_scale(jittery: Run) -> None:
+def test_with_jitter_the_share_is_shaded_and_has_a_scale(jittery: StoredRun) -> None:
     figure = drawn(jittery)
     (mesh,) = [found for found in figure.axes[0].collections if isinstance(found, QuadMesh)]
     assert mesh.get_array().size == 8 * 30
@@ -113,7 +113,7 @@ def test_with_jitter_the_share_is_shaded_and_has_a_scale(jittery: Run) -> None:
     assert "200 plans a point" in " ".join(caption_of(figure))
 
 
-def test_tables_give_the_formula_and_the_first_rate_that_passed(even: Run) -> None:
+def test_tables_give_the_formula_and_the_first_rate_that_passed(even: StoredRun) -> None:
     table = line_table(even)
     assert [row[1] for row in table.rows][:4] == ["1.00", "2.00", "3.00", "4.00"]
     for row in table.rows:
@@ -124,7 +124,7 @@ def test_tables_give_the_formula_and_the_first_rate_that_passed(even: Run) -> No
     assert any("agree at 424 of 424 points" in note for note in board_table(even).notes)
 
 
-def test_the_csv_holds_every_point(even: Run) -> None:
+def test_the_csv_holds_every_point(even: StoredRun) -> None:
     lines = boundary_csv(even)["boundary.csv"].text(even.origins).splitlines()
     assert lines[0] == "duration,duration_s,tokens_per_skill,tokens_per_s,board,stall_free,plans,p_stall,provenance"
     assert len(lines) == 1 + 424

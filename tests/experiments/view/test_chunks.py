@@ -27,24 +27,24 @@ from s2a_bench.experiments.chunks.view.tables import (
     smoothness_table,
     stall_table,
 )
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.style import paper_column
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     config = ChunksConfig(latency="60,lognormal:mean_ms=80,cv=.5", cycles=1500)
     return read_run(run_chunks(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
 
 
-def drawn(run: Run, build: object) -> Figure:
+def drawn(run: StoredRun, build: object) -> Figure:
     with paper_column():
         figure: Figure = build(run)  # type: ignore[operator]
         return figure
 
 
-def test_tables_number_the_sources_and_name_the_convention(run: Run) -> None:
+def test_tables_number_the_sources_and_name_the_convention(run: StoredRun) -> None:
     stalls, actions, delays = stall_table(run), action_table(run), delay_table(run)
     assert stalls.header[:3] == ("L", "mode", "rule")
     assert [row[0] for row in stalls.rows] == ["1"] * 9 + ["2"] * 9
@@ -63,19 +63,19 @@ def test_tables_number_the_sources_and_name_the_convention(run: Run) -> None:
     )
 
 
-def test_sentences_say_what_each_rule_costs(run: Run) -> None:
+def test_sentences_say_what_each_rule_costs(run: StoredRun) -> None:
     constant, random = chunk_sentences(run)
     assert constant.startswith("Stalled cycles of queue @ 60, for at most 1.00%: calibrated 0.00% at age 10.5")
     assert "mean 3" in random
 
 
-def test_csv_has_every_row_with_its_provenance(run: Run) -> None:
+def test_csv_has_every_row_with_its_provenance(run: StoredRun) -> None:
     lines = EXPERIMENT.show(run).csvs["chunks.csv"].text(run.origins).splitlines()
     assert len(lines) == 1 + 18
     assert all(line.endswith("none/none/emulated/clock-virtual") for line in lines[1:])
 
 
-def test_lanes_show_the_modes_and_the_calibrated_trigger(run: Run) -> None:
+def test_lanes_show_the_modes_and_the_calibrated_trigger(run: StoredRun) -> None:
     assert [(lane.name, lane.rule) for lane in lanes_of(run)[:5]] == [
         ("sync", "given"),
         ("queue?trigger=6", "given"),
@@ -94,7 +94,7 @@ def test_lanes_show_the_modes_and_the_calibrated_trigger(run: Run) -> None:
     assert at[0] <= np.nanmin(curve.get_ydata()) <= np.nanmax(curve.get_ydata()) <= at[1]
 
 
-def test_stalls_are_a_line_a_mode_over_mean_latency(run: Run) -> None:
+def test_stalls_are_a_line_a_mode_over_mean_latency(run: StoredRun) -> None:
     (axes,) = drawn(run, build_stability).axes
     assert [line.get_label() for line in axes.lines] == ["sync", "queue?trigger=6", "replace", "aggregate?trigger=6"]
     share = {line.get_label(): np.asarray(line.get_ydata()) for line in axes.lines}
@@ -104,7 +104,7 @@ def test_stalls_are_a_line_a_mode_over_mean_latency(run: Run) -> None:
     assert (share["queue?trigger=6"] > 0).tolist() == (ms >= 140).tolist()  # d above the trigger
 
 
-def test_triggers_are_a_line_a_source_with_a_mark_a_rule(run: Run) -> None:
+def test_triggers_are_a_line_a_source_with_a_mark_a_rule(run: StoredRun) -> None:
     axes = drawn(run, build_triggers).axes[0]
     assert axes.get_yscale() == "log"
     labels = {str(line.get_label()) for line in axes.lines}
@@ -112,7 +112,7 @@ def test_triggers_are_a_line_a_source_with_a_mark_a_rule(run: Run) -> None:
     assert [text.get_text() for text in axes.texts] == ["epsilon = 0.01"]
 
 
-def test_reactions_have_the_closed_form_drawn_over_them(run: Run) -> None:
+def test_reactions_have_the_closed_form_drawn_over_them(run: StoredRun) -> None:
     upper, lower = drawn(run, build_reactions).axes
     dotted = [line for line in upper.lines if line.get_linestyle() == ":"]
     assert len(dotted) == 5
@@ -123,7 +123,7 @@ def test_reactions_have_the_closed_form_drawn_over_them(run: Run) -> None:
     assert lower.get_title(loc="left") == "lognormal:mean_ms=80,cv=.5"
 
 
-def test_smoothness_stands_beside_the_ideal(run: Run) -> None:
+def test_smoothness_stands_beside_the_ideal(run: StoredRun) -> None:
     table = smoothness_table(run)
     assert table.header[3:] == ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
     tracking, ideal = (float(text) for text in table.rows[0][3:5])
@@ -133,7 +133,7 @@ def test_smoothness_stands_beside_the_ideal(run: Run) -> None:
     assert any(note.startswith("EMULATED") for note in table.notes)
 
 
-def test_smoothness_is_a_line_a_mode_and_the_ideal_dashed(run: Run) -> None:
+def test_smoothness_is_a_line_a_mode_and_the_ideal_dashed(run: StoredRun) -> None:
     panels = drawn(run, build_smoothness).axes
     for axes in panels:
         *modes, ideal = axes.lines
@@ -149,7 +149,7 @@ def test_a_long_name_is_cut_and_a_short_one_is_not() -> None:
     assert short("bimodal:mean_ms=80", 10) == "bimodal..."
 
 
-def test_what_a_run_has_no_rows_for_is_not_drawn(run: Run, tmp_path: Path) -> None:
+def test_what_a_run_has_no_rows_for_is_not_drawn(run: StoredRun, tmp_path: Path) -> None:
     assert list(EXPERIMENT.show(run).figures) == ["lanes", "stability", "triggers", "reactions", "smoothness"]
     config = ChunksConfig(modes="sync", cycles=20, shown_ticks=0, robot="")
     run = read_run(run_chunks(config, tmp_path, NullProgress()))

@@ -14,12 +14,12 @@ from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.provenance import Origins, Provenance
-from s2a_bench.store.run import Run, read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of, source_line
 from s2a_bench.writers.style import paper_column
 
-Make = Callable[[Path, Any], Run]
+Make = Callable[[Path, Any], StoredRun]
 FIGURES = {
     "boundary": ("boundary",),
     "ccrb": ("scenario", "phase"),
@@ -30,17 +30,17 @@ FIGURES = {
 }
 
 
-def computed(name: str, config: Any, root: Path, _: Any) -> Run:
+def computed(name: str, config: Any, root: Path, _: Any) -> StoredRun:
     return read_run(EXPERIMENTS[name].run_with(config, root, NullProgress()))
 
 
-def measured(name: str, _: Path, make_run: Any) -> Run:
+def measured(name: str, _: Path, make_run: Any) -> StoredRun:
     llama = {"engine": "llama", "model": "tiny.gguf", "dummy": True}
     paced = Provenance.of_engine({**llama, "paced_tokens_per_s": 4.8})
     origins = Origins(Provenance.of_engine(llama), {"loopback": paced})
     cells = {"loopback": {"capture": 0.2, "inference": 100, "return": 0.2}}
-    run: Run = make_run(cells, n=3, engine="llama", manifest={"provenance": origins.to_manifest()})
-    return Run(run.path, {**run.manifest, "command": name}, run.tables)
+    run: StoredRun = make_run(cells, n=3, engine="llama", manifest={"provenance": origins.to_manifest()})
+    return StoredRun(run.path, {**run.manifest, "command": name}, run.tables)
 
 
 RUNS: dict[str, Make] = {
@@ -77,7 +77,7 @@ def test_the_line_stays_one_line_and_fits_whatever_answered(make_run: Any) -> No
     cells = {name: Provenance(name, weights="dummy", tokens="paced", link="emulated") for name in names}
     told = {"provenance": Origins(Provenance(), cells).to_manifest(), "host": "a$b$c"}
     run = make_run(n=3)
-    run = Run(run.path, {**run.manifest, **told}, run.tables)
+    run = StoredRun(run.path, {**run.manifest, **told}, run.tables)
     with paper_column():
         figure = EXPERIMENTS["latency"].show(run).figures["latency_bars"]()
     assert all(name in figure.get_suptitle() for name in (*names, "a$b$c", "DUMMY WEIGHTS", "PACED", "link EMULATED"))
@@ -86,4 +86,4 @@ def test_the_line_stays_one_line_and_fits_whatever_answered(make_run: Any) -> No
 
 
 def test_what_a_manifest_does_not_say_is_left_out() -> None:
-    assert source_line([Run(Path(), {})]) == "engine UNKNOWN (the server does not tell)"
+    assert source_line([StoredRun(Path(), {})]) == "engine UNKNOWN (the server does not tell)"

@@ -9,7 +9,7 @@ import pytest
 
 from s2a_bench.experiments.latency.view import latency_tables
 from s2a_bench.store.requests import FrameRow
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.trace import Mark
 from tests.made_runs import STAGES, row_of
 
@@ -20,7 +20,7 @@ FRAME: list[Mark] = [("", 10 * MS), ("capture", 11 * MS), ("convert", 13 * MS), 
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Run:
+def run(tmp_path: Path) -> StoredRun:
     with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as writer:
         writer.sample(SAMPLE)
         writer.sample(replace(SAMPLE, request_id="r1", warmup=True))
@@ -30,7 +30,7 @@ def run(tmp_path: Path) -> Run:
     return read_run(writer.path)
 
 
-def test_only_frames_of_counted_samples_count(run: Run) -> None:
+def test_only_frames_of_counted_samples_count(run: StoredRun) -> None:
     assert latency_tables(run)["frames"].rows == [
         ("capture", "capture", "1.00"),
         ("encode", "convert", "2.00"),

@@ -17,12 +17,12 @@ from s2a_bench.experiments.latency.view.figures import (
     build_stage_breakdown,
 )
 from s2a_bench.experiments.paper import LABEL
-from s2a_bench.store.run import Run
+from s2a_bench.store.run import StoredRun
 from s2a_bench.trace import GROUPS
 from s2a_bench.writers.figures import Bar, caption_of
 from s2a_bench.writers.style import GREY, GROUP_FILLS, cell_looks, paper_column
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., StoredRun]
 HAND = {
     "http/as-deployed": {"capture": 1, "image_encode": 3, "network": 2, "inference": 100, "": 1.5, "return": 0.5},
     "ros/topic": {"capture": 1, "cdr_pack": 0.5, "network": 2, "inference": 100, "return": 0.5},

@@ -17,13 +17,13 @@ from s2a_bench.experiments.latency.metrics import latency_csv
 from s2a_bench.experiments.latency.view import group_table, show, stage_table, summary_table
 from s2a_bench.stats import Ratio, Summary
 from s2a_bench.store.requests import SampleRow
-from s2a_bench.store.run import Run
+from s2a_bench.store.run import StoredRun
 from s2a_bench.trace import path_of
 from s2a_bench.writers.latex import to_latex
 from s2a_bench.writers.tables import interval, mean_sd, number, to_markdown
 from tests.made_runs import STAGES
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., StoredRun]
 NONE = "\N{EN DASH}"
 HAND = {
     "http/as-deployed": {"capture": 1, "image_encode": 3, "base64_encode": 2, "network": 18, "inference": 100, "": 1.5},
@@ -32,7 +32,7 @@ HAND = {
 HAND = {name: {**stages, "return": 0.5} for name, stages in HAND.items()}
 
 
-def printed(run: Run, width: int = 100) -> str:
+def printed(run: StoredRun, width: int = 100) -> str:
     out = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out):
         patch.setenv("COLUMNS", str(width))

@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 from rich.console import Console
 
 from s2a_bench.experiments.paper import paper_throughput
-from s2a_bench.experiments.requests import Cell
+from s2a_bench.experiments.requests import RequestCell
 from s2a_bench.experiments.throughput.metrics import (
     BIN,
     REFERENCE,
@@ -42,14 +42,14 @@ from s2a_bench.experiments.throughput.view import (
     throughput_tables,
 )
 from s2a_bench.store.requests import SampleRow, TokenRow
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import lay_out
 from tests.made_runs import SCHEMA, known
 
 MakeRow = Callable[..., SampleRow]
-Make = Callable[..., Run]
+Make = Callable[..., StoredRun]
 
 PATHS: Mapping[str, Mapping[str, float]] = {
     "in-process": {"capture": 1, "inference": 100, "return": 0},
@@ -68,7 +68,7 @@ def make(tmp_path: Path, make_row: MakeRow) -> Make:
         facts: Mapping[str, Mapping[str, float]] | None = None,
         reference: Sequence[float] = (),
         **manifest: Any,
-    ) -> Run:
+    ) -> StoredRun:
         with RunWriter.create(tmp_path, "throughput", known(manifest)) as run:
             for block in range(-1, n):
                 for name, ms in gaps.items():
@@ -96,7 +96,7 @@ def style() -> Iterator[None]:
         yield
 
 
-def only(run: Run) -> Cell:
+def only(run: StoredRun) -> RequestCell:
     (cell,) = throughput_cells(run)
     return cell
 

@@ -24,18 +24,18 @@ from s2a_bench.experiments.timeline.view.tables import (
     skill_table,
     timeline_csv,
 )
-from s2a_bench.harness.timelines.config import Setting
+from s2a_bench.harness.timelines.config import PlanSetting
 from s2a_bench.harness.timelines.rows import skill_rows, token_rows
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
 from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
-from s2a_bench.store.run import Run, RunWriter, read_run
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import TextTable
 
-MakeRun: TypeAlias = Callable[..., Run]
+MakeRun: TypeAlias = Callable[..., StoredRun]
 BOARD = {"name": "orin", "title": "Orin", "origin": "paper", "prompt_s": 0.5, "prompt_origin": "assumed"}
 STARTS = {"naive": lambda t, _d: t[0], "wait-then-act": lambda t, _d: t[-1], "stream-to-act": safe_start}
 
@@ -48,11 +48,11 @@ def plans_of(tokens: int, shift_s: float = 0.0) -> Plans:
 
 
 @pytest.fixture
-def computed(tmp_path: Path) -> Run:
+def computed(tmp_path: Path) -> StoredRun:
     """Make a run in virtual time: two granularities, three policies on the same arrivals."""
     with RunWriter.create(tmp_path, "timeline", {"boards": [BOARD]}) as writer:
         for tokens in (6, 4):
-            setting = Setting("orin", "Orin", 4.8, 0.5, tokens, 8, 1.0)
+            setting = PlanSetting("orin", "Orin", 4.8, 0.5, tokens, 8, 1.0)
             plans = plans_of(tokens)
             ids = [setting.request_id(0)]
             writer.append(TOKENS, token_rows(setting.name, uniform(0.5, 1, 4.8, 8 * tokens), ids))
@@ -66,10 +66,10 @@ def computed(tmp_path: Path) -> Run:
 
 
 @pytest.fixture
-def live(tmp_path: Path) -> Run:
+def live(tmp_path: Path) -> StoredRun:
     """Make a run as an executor leaves it: a request a policy, calls with texts, one skill stretched by half."""
     with RunWriter.create(tmp_path, "timeline", {}) as writer:
-        setting = Setting("", "tiny dummy", 4.8, None, 6, 8, 1.0, mode="live", emulated=False)
+        setting = PlanSetting("", "tiny dummy", 4.8, None, 6, 8, 1.0, mode="live", emulated=False)
         for place, (policy, first) in enumerate(STARTS.items()):
             plans = plans_of(6, 0.1 * place)
             requested_ns = 10**15 * (place + 1)
@@ -89,7 +89,7 @@ def live(tmp_path: Path) -> Run:
     return read_run(writer.path)
 
 
-def drawn(run: Run) -> Figure:
+def drawn(run: StoredRun) -> Figure:
     with paper_column():
         return build_timelines(run, timelines_of(run))
 
@@ -98,7 +98,7 @@ def bars(axes: Any, *, hatched: bool) -> list[Rectangle]:
     return [patch for patch in axes.patches if isinstance(patch, Rectangle) and bool(patch.get_hatch()) == hatched]
 
 
-def test_a_panel_shows_each_skill_and_each_stall_where_it_was(computed: Run) -> None:
+def test_a_panel_shows_each_skill_and_each_stall_where_it_was(computed: StoredRun) -> None:
     figure = drawn(computed)
     six, four = figure.axes
     assert [text.get_text() for text in six.get_yticklabels()] == ["tokens", *STARTS]
@@ -112,7 +112,7 @@ def test_a_panel_shows_each_skill_and_each_stall_where_it_was(computed: Run) -> 
     assert [first[lane].get_x() for lane in (1, 2, 3)] == pytest.approx([1.75, 10.5, 3.5])
 
 
-def test_the_colours_are_the_papers_and_differ_in_grey(computed: Run) -> None:
+def test_the_colours_are_the_papers_and_differ_in_grey(computed: StoredRun) -> None:
     colours = policy_colours(list(STARTS))
     red = {name: int(colour[1:3], 16) for name, colour in colours.items()}
     blue = {name: int(colour[5:7], 16) for name, colour in colours.items()}
@@ -126,7 +126,7 @@ def test_the_colours_are_the_papers_and_differ_in_grey(computed: Run) -> None:
     assert len(drawn_colours) == 3
 
 
-def test_the_safe_start_and_every_token_are_marked(computed: Run) -> None:
+def test_the_safe_start_and_every_token_are_marked(computed: StoredRun) -> None:
     axes = drawn(computed).axes[0]
     lines = [segments for found in axes.collections for segments in [found.get_segments()]]
     dashed = [segments for found, segments in zip(axes.collections, lines, strict=True) if found.get_linestyle()[0][1]]
@@ -134,28 +134,28 @@ def test_the_safe_start_and_every_token_are_marked(computed: Run) -> None:
     assert sorted(len(segments) for segments in lines) == [1] * 6 + [8, 48]
 
 
-def test_each_panel_has_the_time_axis_it_needs(computed: Run) -> None:
+def test_each_panel_has_the_time_axis_it_needs(computed: StoredRun) -> None:
     six, four = drawn(computed).axes
     assert six.get_xlim()[1] == pytest.approx(18.5 * 1.02)
     assert four.get_xlim()[1] == pytest.approx(15.1667 * 1.02, rel=1e-4)
 
 
-def test_the_figure_says_what_is_emulated_and_assumed(computed: Run, live: Run) -> None:
+def test_the_figure_says_what_is_emulated_and_assumed(computed: StoredRun, live: StoredRun) -> None:
     caption = " ".join(caption_of(drawn(computed)))
     assert "EMULATED in virtual time" in caption
     assert "assumption of ours" in caption
     assert "EMULATED" not in " ".join(caption_of(drawn(live)))
 
 
-def test_the_legend_explains_only_what_is_drawn(computed: Run, live: Run) -> None:
-    def labels(run: Run) -> set[str]:
+def test_the_legend_explains_only_what_is_drawn(computed: StoredRun, live: StoredRun) -> None:
+    def labels(run: StoredRun) -> set[str]:
         return {text.get_text() for text in drawn(run).legends[0].get_texts()}
 
     assert labels(computed) == {"token", "skill complete", "not started", "$S_0$", "stall"}
     assert labels(live) - labels(computed) == {"stretched (paler)"}
 
 
-def test_requests_of_their_own_have_their_tokens_in_their_lanes(live: Run) -> None:
+def test_requests_of_their_own_have_their_tokens_in_their_lanes(live: StoredRun) -> None:
     axes = drawn(live).axes[0]
     assert [text.get_text() for text in axes.get_yticklabels()] == list(STARTS)
     ticks = [found.get_segments() for found in axes.collections if len(found.get_segments()) == 48]
@@ -196,7 +196,7 @@ def check_trace(trace: dict[str, Any]) -> None:
     assert {tid for name, tid in names if name == "process_name"} == set(process_of.values())
 
 
-def test_the_trace_is_one_that_viewers_open(computed: Run, live: Run) -> None:
+def test_the_trace_is_one_that_viewers_open(computed: StoredRun, live: StoredRun) -> None:
     for run in (computed, live):
         write_trace(run, run.path / TRACE)
         trace = json.loads((run.path / TRACE).read_text())
@@ -204,7 +204,7 @@ def test_the_trace_is_one_that_viewers_open(computed: Run, live: Run) -> None:
         check_trace(trace)
 
 
-def test_the_trace_holds_skills_stalls_waiting_and_tokens(computed: Run) -> None:
+def test_the_trace_holds_skills_stalls_waiting_and_tokens(computed: StoredRun) -> None:
     trace = to_trace(computed)
     threads = {event["tid"]: event["args"]["name"] for event in trace["traceEvents"] if event["name"] == "thread_name"}
     assert list(threads.values()) == ["tokens", *STARTS] * 2
@@ -221,7 +221,7 @@ def test_the_trace_holds_skills_stalls_waiting_and_tokens(computed: Run) -> None
     assert "EMULATED" in trace["otherData"]["about"]
 
 
-def test_the_trace_names_the_calls_that_a_model_wrote(live: Run) -> None:
+def test_the_trace_names_the_calls_that_a_model_wrote(live: StoredRun) -> None:
     slices = [event for event in to_trace(live)["traceEvents"] if event["ph"] == "X"]
     assert {"pick(cup0)", "waiting", "stall"} <= {event["name"] for event in slices}
     last = [event for event in slices if event["name"] == "pick(cup7)"]
@@ -232,7 +232,7 @@ def column(table: TextTable, name: str) -> list[str]:
     return [row[table.header.index(name)] for row in table.rows]
 
 
-def test_the_table_groups_rows_by_board_and_granularity(computed: Run) -> None:
+def test_the_table_groups_rows_by_board_and_granularity(computed: StoredRun) -> None:
     table = execution_table(computed)
     assert column(table, "board") == ["Orin", "", "", "", "", ""]
     assert column(table, "L") == ["6", "", "", "4", "", ""]
@@ -241,21 +241,21 @@ def test_the_table_groups_rows_by_board_and_granularity(computed: Run) -> None:
     assert column(table, "late end") == ["0%", "61%", "0%", "0%", "62%", "0%"]
 
 
-def test_the_skill_table_names_calls_and_stalls(live: Run) -> None:
+def test_the_skill_table_names_calls_and_stalls(live: StoredRun) -> None:
     table = skill_table(timelines_of(live)[:1])
     assert column(table, "skill")[:2] == ["pick(cup0)", "pick(cup1)"]
     assert column(table, "stall before") == ["0.00"] + ["0.25"] * 7
     assert column(table, "stretch")[-1] == "1.50"
 
 
-def test_csv_keeps_every_digit_and_leaves_out_what_is_absent(computed: Run) -> None:
+def test_csv_keeps_every_digit_and_leaves_out_what_is_absent(computed: StoredRun) -> None:
     lines = timeline_csv(computed)["timelines.csv"].text(computed.origins).splitlines()
     assert f"orin/L6/N8/T1/naive,stall_s,1,1.75,1.75,,1.75,1.75,{computed.origins.code}" in lines
     (share,) = [line for line in lines if line.startswith("orin/L6/N8/T1/naive,p_any_stall")]
     assert share == f"orin/L6/N8/T1/naive,p_any_stall,1,,1.0,,,,{computed.origins.code}"
 
 
-def test_json_has_no_key_for_what_a_live_run_does_not_know(live: Run) -> None:
+def test_json_has_no_key_for_what_a_live_run_does_not_know(live: StoredRun) -> None:
     cells = timelines_json(live)["cells"]
     assert all("prompt_s" not in cell and "caution" not in cell for cell in cells)
     assert [cell["emulated"] for cell in cells] == [False] * 3

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from s2a_bench.experiments import Compared, Metric, Shown, Subject
+from s2a_bench.experiments import Comparable, Metric, Shown, Subject
 from s2a_bench.stats import summary_of
-from s2a_bench.store.run import Run
+from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.as_json import frame, summaries
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 from s2a_toy.clock_run import READINGS
@@ -14,17 +14,17 @@ from s2a_toy.clock_run import READINGS
 COST = Metric("cost", "ns", title="cost of a reading")
 
 
-def subjects(run: Run) -> list[Subject]:
+def subjects(run: StoredRun) -> list[Subject]:
     """Return the one cell of a run."""
     rows = run.table(READINGS)
     values = rows["cost_ns"].to_numpy(dtype="float64")[:, None]
     return [Subject("monotonic", {}, len(rows), 0, lambda _name: list(values))]
 
 
-COMPARED = Compared({"cost": COST}, subjects, lambda _run: (), ("cost",))
+COMPARED = Comparable({"cost": COST}, subjects, lambda _run: (), ("cost",))
 
 
-def show(run: Run, **_: Any) -> Shown:
+def show(run: StoredRun, **_: Any) -> Shown:
     """Return a table of one row, and the same as JSON."""
     costs = run.table(READINGS)["cost_ns"].to_numpy(dtype="float64")
     found = summary_of(costs)

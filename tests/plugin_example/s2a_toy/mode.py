@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from s2a_bench.policy.chunks import Action, ChunkStepper, Mode, Setting
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, Mode, ControlSetting
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class ToyMode(Mode):
 
     trigger: int = 0
 
-    def stepper(self, setting: Setting) -> ChunkStepper:
+    def stepper(self, setting: ControlSetting) -> ChunkStepper:
         """Follow one robot."""
         return ToyChunks(setting.horizon, self.trigger)
 
@@ -44,9 +44,9 @@ class ToyChunks(ChunkStepper):
         self.waits = True
         return True
 
-    def act(self, tick: int) -> Action | None:  # noqa: ARG002 - whatever is next
+    def act(self, tick: int) -> ChunkAction | None:  # noqa: ARG002 - whatever is next
         """Return the next action."""
         if self.newest < 0 or self.done == self.horizon:
             return None
         self.done += 1
-        return Action(self.newest, self.done - 1)
+        return ChunkAction(self.newest, self.done - 1)

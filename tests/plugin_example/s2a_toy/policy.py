@@ -9,7 +9,7 @@ from typing import ClassVar
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import CAUTION, PlanShape, Policy, Start, Stepper, Timing
 from s2a_bench.policy.estimator import VAGUE, GapPrior
-from s2a_bench.policy.naive import Queue
+from s2a_bench.policy.naive import NominalQueue
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class ToyStepper:
     """Count the skills that are missing before the start."""
 
     missing: int
-    queue: Queue = field(default_factory=Queue)
+    queue: NominalQueue = field(default_factory=NominalQueue)
 
     def token(self, at_s: float) -> None:
         """Ignore it."""

@@ -7,13 +7,13 @@ from typing import ClassVar
 
 from s2a_bench.facts import PAYLOAD_BYTES, Fact
 from s2a_bench.options import option
-from s2a_bench.transport import SERVER, Client, Handler, Options, Server, Transport, Wiring
+from s2a_bench.transport import SERVER, Client, Handler, TransportOptions, Server, Transport, Wiring
 
 
 TOY_MESSAGES = Fact("toy_messages", "messages", "messages of the answer")
 
 
-class ToyOptions(Options):
+class ToyOptions(TransportOptions):
     """The options of `toy`."""
 
     toy_port: int = option(0, "port of the toy server; 0: any free one", ge=0, le=65535, side=SERVER)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from s2a_bench.policy.chunks import Mode, Setting, mode
+from s2a_bench.policy.chunks import ControlSetting, Mode, mode
 from s2a_bench.policy.chunks.aggregate import WEIGHTS, Aggregate
 from s2a_bench.policy.chunks.append import Queue, Streamed, Sync
 from s2a_bench.policy.chunks.replace import Replace
@@ -15,20 +15,20 @@ from tests.policy.chunks.plain import Aggregates, Appends, Log, Replaces
 
 
 @st.composite
-def settings_of_chunks(draw: st.DrawFn) -> Setting:
-    return Setting(
+def settings_of_chunks(draw: st.DrawFn) -> ControlSetting:
+    return ControlSetting(
         draw(st.sampled_from([1, 2, 7, 20])), draw(st.integers(1, 10)), draw(st.sampled_from(["floor", "ceil"]))
     )
 
 
 @st.composite
-def latencies(draw: st.DrawFn, setting: Setting) -> Any:
+def latencies(draw: st.DrawFn, setting: ControlSetting) -> Any:
     most = draw(st.sampled_from([1, 2, setting.horizon, 3 * setting.horizon])) * setting.period_ns
     return np.array(draw(st.lists(st.integers(0, most), max_size=12)), np.int64)
 
 
 @st.composite
-def modes(draw: st.DrawFn, setting: Setting, name: str) -> Mode:
+def modes(draw: st.DrawFn, setting: ControlSetting, name: str) -> Mode:
     execute, trigger = st.integers(1, setting.horizon), st.integers(0, setting.horizon + 2)
     if name == "sync":
         return mode(f"sync?execute={draw(execute)}")
@@ -44,12 +44,12 @@ def modes(draw: st.DrawFn, setting: Setting, name: str) -> Mode:
 
 
 @st.composite
-def cases(draw: st.DrawFn, name: str) -> tuple[Mode, Any, Setting]:
+def cases(draw: st.DrawFn, name: str) -> tuple[Mode, Any, ControlSetting]:
     setting = draw(settings_of_chunks())
     return draw(modes(setting, name)), draw(latencies(setting)), setting
 
 
-def plainly(made: Mode, latency_ns: Any, setting: Setting) -> Log:
+def plainly(made: Mode, latency_ns: Any, setting: ControlSetting) -> Log:
     common = (latency_ns.tolist(), setting.period_ns, setting.horizon, setting.rounding, made.gap_ns)
     match made:
         case Sync():

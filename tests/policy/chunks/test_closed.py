@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from s2a_bench.policy.chunks import Mode, Rounding, Setting, mode
+from s2a_bench.policy.chunks import ControlSetting, Mode, Rounding, mode
 from s2a_bench.policy.chunks.aggregate import Aggregate
 from s2a_bench.policy.chunks.append import Queue, Streamed, Sync
 from s2a_bench.policy.chunks.closed import (
@@ -87,7 +87,7 @@ def test_a_queue_stalls_for_what_the_delay_exceeds_the_trigger_by(
     latency: int, trigger: int, extra: int, rounding: Rounding, rest: int
 ) -> None:
     s = trigger + extra
-    setting = Setting(PERIOD, s + rest, rounding)
+    setting = ControlSetting(PERIOD, s + rest, rounding)
     log = plainly(Queue(trigger, s), constant(latency), setting)
     delay = int(setting.delay_ticks(np.array(latency)))
     assert boundaries(log) == [int(queue_stall_ticks(np.array(delay), trigger))] * 7
@@ -108,7 +108,7 @@ def test_a_queue_stalls_for_what_the_delay_exceeds_the_trigger_by(
 def test_with_any_trigger_it_stalls_for_what_answers_take_longer_than_they_last_too(
     latency: int, trigger: int, s: int, gap: int, rounding: Rounding
 ) -> None:
-    setting = Setting(PERIOD, 9, rounding)
+    setting = ControlSetting(PERIOD, 9, rounding)
     made = Streamed(trigger, s, gap * 1e-9)
     log = plainly(made, constant(latency, 60), setting)
     ready = setting.delay_ticks(np.array(latency)) + made.hold_ticks(setting)
@@ -129,18 +129,18 @@ def test_without_a_tick_the_stall_is_the_latency_less_what_is_left(latency: int,
 
 def test_a_queue_that_asks_before_it_has_what_it_asked_for_stalls_otherwise() -> None:
     # m = s = 2 and 2.5 ticks: no request can follow from the answer before one of its two actions has left.
-    setting = Setting(PERIOD, 2)
+    setting = ControlSetting(PERIOD, 2)
     assert int(queue_stall_ticks(np.array(2), 2)) == 0
     assert int(steady_stall_ticks(np.array(2), np.array(3), 2, 2)) == 1
     assert boundaries(plainly(Queue(2), constant(50), setting)) == [1] * 7
-    assert not any(boundaries(plainly(Queue(2), constant(50), Setting(PERIOD, 3))))
+    assert not any(boundaries(plainly(Queue(2), constant(50), ControlSetting(PERIOD, 3))))
     # m = 9 > s = 2 and d = 3 > s: an answer takes longer than it lasts, whatever the trigger.
     assert boundaries(plainly(Queue(9), constant(60), setting))[2:] == [1] * 4
 
 
 @given(latency=st.integers(0, 400), s=st.integers(1, 9), rounding=ROUNDINGS)
 def test_sync_moves_for_the_share_of_its_actions(latency: int, s: int, rounding: Rounding) -> None:
-    setting = Setting(PERIOD, 9, rounding)
+    setting = ControlSetting(PERIOD, 9, rounding)
     log = plainly(Sync(s), constant(latency), setting)
     share = sum(act is not None for act in log.acts) / len(log.acts)
     delay = int(setting.delay_ticks(np.array(latency)))
@@ -161,7 +161,7 @@ def test_sync_moves_for_the_share_of_its_actions(latency: int, s: int, rounding:
 def test_replace_stalls_for_what_a_cycle_and_a_delay_exceed_the_chunk_by(
     latency: int, s: int, rest: int, rounding: Rounding, under_way: str
 ) -> None:
-    setting = Setting(PERIOD, s + rest, rounding)
+    setting = ControlSetting(PERIOD, s + rest, rounding)
     log = plainly(Replace(s, under_way), constant(latency, 24), setting)  # type: ignore[arg-type]
     delay, known = (int(each(np.array(latency))) for each in (setting.delay_ticks, setting.known_ticks))
     cycle = max(s, known) if under_way == "one" else s
@@ -184,14 +184,14 @@ def test_replace_stalls_for_what_a_cycle_and_a_delay_exceed_the_chunk_by(
 
 def test_with_one_request_under_way_a_delay_above_s_stalls_though_s_plus_d_fits() -> None:
     # H = 8, s = 2, d = 5: s + d - H < 0, but a cycle lasts 5 ticks, and 5 + 5 - 8 = 2.
-    setting = Setting(PERIOD, 8)
+    setting = ControlSetting(PERIOD, 8)
     assert boundaries(plainly(Replace(2), constant(100), setting))[1:] == [2] * 5
     assert int(replace_stall_ticks(np.array(5), 5, 8)) == 2
     assert not any(boundaries(plainly(Replace(2, "many"), constant(100), setting))[1:])
 
 
 def test_a_delay_of_a_whole_chunk_executes_nothing() -> None:
-    log = plainly(Replace(4), constant(160), Setting(PERIOD, 8))
+    log = plainly(Replace(4), constant(160), ControlSetting(PERIOD, 8))
     assert {act[0] for act in log.acts if act} == {0}  # only the first, which is due when it arrives
     with pytest.raises(ValueError, match="no action of 8"):
         replace_age_ticks(8, 8, 8)
@@ -203,7 +203,7 @@ def test_a_delay_of_a_whole_chunk_executes_nothing() -> None:
 @steady
 @given(latency=st.integers(0, 300), s=st.integers(1, 9), trigger=st.integers(0, 5), name=st.sampled_from("qrsa"))
 def test_a_reaction_takes_the_wait_and_up_to_a_cycle(latency: int, s: int, trigger: int, name: str) -> None:
-    setting = Setting(PERIOD, 18, "ceil")
+    setting = ControlSetting(PERIOD, 18, "ceil")
     made: Mode = {"q": Queue(trigger, s + trigger), "r": Replace(s, "many"), "s": Sync(s), "a": Aggregate(trigger)}[
         name
     ]
@@ -234,7 +234,7 @@ def test_random_latencies_cost_a_blocking_robot_more_than_their_mean() -> None:
     rng = np.random.default_rng(3)
     latency = lognormal(rng, 3 * PERIOD * 1_000_000, 0.8, 100_000)
     period = PERIOD * 1_000_000
-    cycles = Sync(4).cycles(latency, Setting(period, 4, "ceil"))
+    cycles = Sync(4).cycles(latency, ControlSetting(period, 4, "ceil"))
     moments = rng.uniform(0, cycles.request_tick[-1], 400_000)
     answered = np.searchsorted(cycles.request_tick, moments)
     reactions = cycles.start_tick[answered] - moments
@@ -269,7 +269,7 @@ RANDOM = [
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
 @pytest.mark.parametrize(("made", "slack"), RANDOM)
 def test_a_cycle_stalls_as_often_as_its_latency_exceeds_the_slack(made: Mode, slack: int, rounding: Rounding) -> None:
-    setting, count = Setting(20 * MS, 16, rounding), 200_000
+    setting, count = ControlSetting(20 * MS, 16, rounding), 200_000
     latency = np.minimum(lognormal(np.random.default_rng(5), 60 * MS, 0.35, count), 12 * 20 * MS)  # no overlap
     cycles = made.cycles(latency, setting)
     stalls = int(np.count_nonzero(cycles.stall_ticks[1:]))
@@ -282,7 +282,7 @@ def test_a_cycle_stalls_as_often_as_its_latency_exceeds_the_slack(made: Mode, sl
 
 @pytest.mark.parametrize(("made", "slack"), [(Queue(2, 4), 2), (Replace(3, "one"), 1), (Aggregate(1), 1)])
 def test_so_it_does_for_a_robot_in_continuous_time(made: Mode, slack: int) -> None:
-    setting, count = Setting(20 * MS, 4, "ceil"), 100_001
+    setting, count = ControlSetting(20 * MS, 4, "ceil"), 100_001
     latency = np.minimum(lognormal(np.random.default_rng(6), 18 * MS, 0.5, count), 60 * MS)
     stalls = np.count_nonzero(boundaries(plainly(made, latency, setting)))
     variance = np.log1p(0.5**2)
@@ -292,7 +292,7 @@ def test_so_it_does_for_a_robot_in_continuous_time(made: Mode, slack: int) -> No
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
 def test_where_latencies_exceed_s_one_late_answer_makes_the_next_one_late_too(rounding: Rounding) -> None:
-    setting, s, count = Setting(20 * MS, 8, rounding), 3, 200_000
+    setting, s, count = ControlSetting(20 * MS, 8, rounding), 3, 200_000
     latency = lognormal(np.random.default_rng(7), 60 * MS, 0.5, count)
     cycles = Replace(s).cycles(latency, setting)
     settled = cycles.settled
@@ -336,16 +336,16 @@ def test_slowed_down_by_beta_no_cycle_stalls_and_by_less_each_does(
     # Ticks of 1000 ns, so that rounding to whole ns is little.
     latency_ns = constant(latency * 1000, 30)
     beta = slow_down(latency * 1e-6, slack, 1e-6)
-    slowed = Setting(1000, horizon, rounding).slowed(beta)
+    slowed = ControlSetting(1000, horizon, rounding).slowed(beta)
     assert not any(Replace(s, under_way).cycles(latency_ns, slowed).stall_ticks[12:])
     if beta > 1.01 and rounding == "ceil":
-        hasty = Setting(1000, horizon, rounding).slowed(beta * 0.995)
+        hasty = ControlSetting(1000, horizon, rounding).slowed(beta * 0.995)
         assert Replace(s, under_way).ticks(latency_ns, hasty).stalled[-4 * horizon :].any()
 
 
 def test_the_slack_h_less_s_is_not_enough_with_one_request_under_way() -> None:
     # H = 8, s = 1: slowed until d = 7 = H - s the next request waits for 7 ticks, and 7 + 7 > 8.
-    slowed = Setting(1000, 8, "ceil").slowed(slow_down(20e-6, 8 - 1, 1e-6))
+    slowed = ControlSetting(1000, 8, "ceil").slowed(slow_down(20e-6, 8 - 1, 1e-6))
     assert (Replace(1).cycles(constant(20_000), slowed).stall_ticks[2:-1] == 6).all()
     assert not Replace(1, "many").cycles(constant(20_000), slowed).stall_ticks[8:].any()
     with pytest.raises(ValueError, match="any speed"):
@@ -354,7 +354,7 @@ def test_the_slack_h_less_s_is_not_enough_with_one_request_under_way() -> None:
 
 def test_no_start_delay_helps_where_progress_asks_but_playing_back_late_does() -> None:
     # H = 8, s = 6, d = 4. A robot that begins late asks late.
-    setting = Setting(PERIOD, 8)
+    setting = ControlSetting(PERIOD, 8)
     for first in (80, 800, 8000):
         latency_ns = np.concatenate(([first], constant(80)))
         assert (Replace(6).cycles(latency_ns, setting).stall_ticks[1:] == 2).all()
@@ -371,7 +371,7 @@ def test_no_start_delay_helps_where_progress_asks_but_playing_back_late_does() -
 def test_a_fixed_estimate_makes_the_robot_jump_by_its_error(
     latency: int, assumed: int, s: int, rounding: Rounding
 ) -> None:
-    setting = Setting(PERIOD, 16, rounding)
+    setting = ControlSetting(PERIOD, 16, rounding)
     delay = int(setting.delay_ticks(np.array(latency)))
     made = Replace(s, "one", assumed)
     assume(max(s, -(-latency // PERIOD)) + assumed <= 16)
@@ -400,4 +400,4 @@ def test_a_fixed_estimate_makes_the_robot_jump_by_its_error(
     ],
 )
 def test_where_no_closed_form_holds_none_is_told(name: str, latency: int) -> None:
-    assert mode(name).closed_form(constant(latency * PERIOD), Setting(PERIOD, 16)) == Closed()
+    assert mode(name).closed_form(constant(latency * PERIOD), ControlSetting(PERIOD, 16)) == Closed()

@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from s2a_bench.policy.chunks import Rounding, Setting
+from s2a_bench.policy.chunks import ControlSetting, Rounding
 from s2a_bench.policy.chunks.append import Queue
 from s2a_bench.policy.chunks.cycles import step
-from s2a_bench.policy.chunks.trigger import Learning, LearningStepper, Maximum, Mean, Rule, Tracked, follow
+from s2a_bench.policy.chunks.trigger import (
+    Learning,
+    LearningStepper,
+    Maximum,
+    Mean,
+    TrackedLatency,
+    TriggerRule,
+    follow,
+)
 
-SETTING = Setting(20_000_000, 16)
+SETTING = ControlSetting(20_000_000, 16)
 
 
 def drawn(count: int, seed: int, scale: float = 80e6) -> NDArray[np.int64]:
@@ -20,27 +28,27 @@ def drawn(count: int, seed: int, scale: float = 80e6) -> NDArray[np.int64]:
     return ticks.astype(np.int64) * SETTING.period_ns + SETTING.period_ns // 2
 
 
-def maximum() -> Rule:
+def maximum() -> TriggerRule:
     return Maximum()
 
 
-def mean() -> Rule:
+def mean() -> TriggerRule:
     return Mean()
 
 
-def tracked() -> Rule:
-    return Tracked.begin(drawn(500, 1).tolist(), 0.05)
+def tracked() -> TriggerRule:
+    return TrackedLatency.begin(drawn(500, 1).tolist(), 0.05)
 
 
 @pytest.mark.parametrize("begin", [maximum, mean, tracked])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[], Rule], seed: int) -> None:
+def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[], TriggerRule], seed: int) -> None:
     latency_ns = drawn(300, 100 + seed)
     mode = Learning(Queue(), begin)
     steppers: list[LearningStepper] = []
 
     class Watched(Learning):
-        def stepper(self, setting: Setting) -> LearningStepper:
+        def stepper(self, setting: ControlSetting) -> LearningStepper:
             steppers.append(mode.stepper(setting))
             return steppers[-1]
 
@@ -54,7 +62,7 @@ def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[],
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
 def test_a_mean_of_ticks_is_the_mean(rounding: Rounding) -> None:
-    setting = Setting(SETTING.period_ns, 16, rounding)
+    setting = ControlSetting(SETTING.period_ns, 16, rounding)
     latency_ns = np.random.default_rng(7).lognormal(np.log(70e6), 0.5, 4000).astype(np.int64)
     stepper = Learning(Queue(), mean).stepper(setting)
     tick = 0
@@ -69,7 +77,7 @@ def test_a_mean_of_ticks_is_the_mean(rounding: Rounding) -> None:
 def test_a_rule_that_tracks_comes_back_after_a_slow_time() -> None:
     calm, slow = drawn(600, 2, 40e6), drawn(600, 3, 160e6)
     latency_ns = np.concatenate([calm, slow, calm, calm, calm])
-    stepper = Learning(Queue(), lambda: Tracked.begin(calm.tolist(), 0.05)).stepper(SETTING)
+    stepper = Learning(Queue(), lambda: TrackedLatency.begin(calm.tolist(), 0.05)).stepper(SETTING)
     stepper_of = {"maximum": Learning(Queue(), maximum).stepper(SETTING)}
     for each in (stepper, stepper_of["maximum"]):
         tick = 0

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.policy.chunks import MODES, Setting
+from s2a_bench.policy.chunks import MODES, ControlSetting
 from s2a_bench.policy.chunks.append import Queue, Sync
 from s2a_bench.policy.chunks.metrics import margin_ticks, measure, reaction_ticks
 from s2a_bench.policy.chunks.replace import Replace
 from tests.policy.chunks.drawn import cases
 
-SETTING = Setting(10, 4)
+SETTING = ControlSetting(10, 4)
 
 
 def test_a_run_by_hand() -> None:
@@ -48,7 +48,7 @@ def test_of_nothing_there_is_nothing_to_count() -> None:
     none = np.array([], np.int64)
     for name in MODES:
         mode = MODES[name]()
-        found = measure(mode, mode.cycles(none, Setting(10, 16)), mode.ticks(none, Setting(10, 16)))
+        found = measure(mode, mode.cycles(none, ControlSetting(10, 16)), mode.ticks(none, ControlSetting(10, 16)))
         assert (found.ticks, found.requests, found.stall_ticks) == (0, 0, 0)
         assert math.isnan(found.age_ticks_mean)
         assert math.isnan(found.p_stall_cycle)
@@ -68,7 +68,7 @@ def test_reactions_are_those_of_the_first_chunk_observed_afterwards(name: str, d
 
 def test_the_margin_is_the_greatest_added_delay_without_a_stall() -> None:
     latency_ns = np.array([20, 25, 10, 35, 20])
-    setting = Setting(10, 16)
+    setting = ControlSetting(10, 16)
     assert margin_ticks(Queue(5, 16), latency_ns, setting) == 2  # d is 3 at most
     assert margin_ticks(Queue(3, 16), latency_ns, setting) == 0
     assert margin_ticks(Queue(2, 16), latency_ns, setting) == -1

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
-from s2a_bench.policy.chunks import MODES, Mode, Setting, mode
+from s2a_bench.policy.chunks import MODES, ControlSetting, Mode, mode
 from s2a_bench.policy.chunks.aggregate import Aggregate
 from s2a_bench.policy.chunks.append import Queue, Streamed, Sync
 from s2a_bench.policy.chunks.cycles import step
@@ -87,7 +87,7 @@ def test_blended_ages_are_those_of_the_weights(data: st.DataObject) -> None:
 
 
 @given(data=st.data(), setting=settings_of_chunks())
-def test_sync_is_a_queue_that_is_empty_when_it_asks(data: st.DataObject, setting: Setting) -> None:
+def test_sync_is_a_queue_that_is_empty_when_it_asks(data: st.DataObject, setting: ControlSetting) -> None:
     latency_ns = data.draw(latencies(setting))
     for each, same in zip(simulate(Sync(), latency_ns, setting), simulate(Queue(), latency_ns, setting), strict=True):
         for field in fields(each):
@@ -95,7 +95,7 @@ def test_sync_is_a_queue_that_is_empty_when_it_asks(data: st.DataObject, setting
 
 
 def test_a_mode_by_hand() -> None:
-    setting = Setting(10, 4)
+    setting = ControlSetting(10, 4)
     queue = mode("queue?trigger=1").ticks(np.array([5, 25, 9]), setting)
     # Asked at 0 and usable at once; at 3 with one left, late by one tick; at 8.
     assert queue.chunk.tolist() == [0, 0, 0, 0, -1, 1, 1, 1, 1, 2, 2, 2]
@@ -115,14 +115,14 @@ def test_a_mode_by_hand() -> None:
 
 def test_a_latency_of_whole_ticks_is_one_delay_by_both_conventions() -> None:
     latency_ns = np.array([0, 1, 19, 20, 21, 40])
-    assert Setting(20, 4).delay_ticks(latency_ns).tolist() == [0, 0, 0, 1, 1, 2]
-    assert Setting(20, 4, "ceil").delay_ticks(latency_ns).tolist() == [0, 1, 1, 1, 2, 2]
-    assert Setting(20, 4).known_ticks(latency_ns).tolist() == [0, 1, 1, 1, 2, 2]
+    assert ControlSetting(20, 4).delay_ticks(latency_ns).tolist() == [0, 0, 0, 1, 1, 2]
+    assert ControlSetting(20, 4, "ceil").delay_ticks(latency_ns).tolist() == [0, 1, 1, 1, 2, 2]
+    assert ControlSetting(20, 4).known_ticks(latency_ns).tolist() == [0, 1, 1, 1, 2, 2]
 
 
 def test_time_scaling_takes_longer_ticks_and_never_shorter_ones_than_asked() -> None:
-    assert Setting(20, 4).slowed(1.26) == Setting(26, 4)
-    assert Setting(20, 4).slowed(1.0) == Setting(20, 4)
+    assert ControlSetting(20, 4).slowed(1.26) == ControlSetting(26, 4)
+    assert ControlSetting(20, 4).slowed(1.0) == ControlSetting(20, 4)
 
 
 @pytest.mark.parametrize(
@@ -149,14 +149,14 @@ def test_a_mode_has_its_name_and_its_parameters() -> None:
 
 def test_what_is_no_setting_is_refused() -> None:
     with pytest.raises(ValueError, match="period 0 ns"):
-        Setting(0, 4)
+        ControlSetting(0, 4)
     with pytest.raises(ValueError, match="horizon 0"):
-        Setting(20, 0)
+        ControlSetting(20, 0)
     with pytest.raises(ValueError, match="a latency of -1 ns"):
-        Setting(20, 4).delay_ticks(np.array([3, -1]))
+        ControlSetting(20, 4).delay_ticks(np.array([3, -1]))
     with pytest.raises(ValueError, match="execute = 5 of a chunk of 4"):
-        Queue(0, 5).cycles(np.array([3]), Setting(20, 4))
+        Queue(0, 5).cycles(np.array([3]), ControlSetting(20, 4))
 
 
-def simulate(made: Mode, latency_ns: Any, setting: Setting) -> tuple[Any, Any]:
+def simulate(made: Mode, latency_ns: Any, setting: ControlSetting) -> tuple[Any, Any]:
     return made.ticks(latency_ns, setting), made.cycles(latency_ns, setting)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.policy import policy
-from s2a_bench.policy.chunks import Setting
+from s2a_bench.policy.chunks import ControlSetting
 from s2a_bench.policy.chunks.append import Streamed
 from s2a_bench.policy.schedule import safe_start
 from tests.policy.chunks.forms import start_s
@@ -33,7 +33,7 @@ def test_the_start_of_a_streamed_chunk_is_the_safe_start_of_its_plan(
 )
 @pytest.mark.parametrize("gap_ticks", [0, 1, 2, 3])
 def test_a_policy_over_skills_decides_for_actions_as_the_mode_does(name: str, mode: str, gap_ticks: int) -> None:
-    setting, latency = Setting(PERIOD, 8, "ceil"), np.array([3 * PERIOD])
+    setting, latency = ControlSetting(PERIOD, 8, "ceil"), np.array([3 * PERIOD])
     streamed = Streamed(gap_s=gap_ticks * PERIOD / 1e9, start=mode)  # type: ignore[arg-type]
     acted = np.flatnonzero(streamed.ticks(latency, setting).chunk == 0)
     plans = as_plans(streamed_arrivals(latency, streamed.gap_ns, 8), PERIOD)
@@ -45,7 +45,7 @@ def test_a_policy_over_skills_decides_for_actions_as_the_mode_does(name: str, mo
 def test_waiting_for_the_whole_plan_is_an_answer_that_comes_whole() -> None:
     arrivals = streamed_arrivals(np.array([3 * PERIOD]), 2 * PERIOD, 8)
     starts = policy("wait-then-act").schedule(as_plans(arrivals, PERIOD)).start_s[:, 0] * 1e9 / PERIOD
-    whole = Streamed().ticks(arrivals[-1], Setting(PERIOD, 8, "ceil"))
+    whole = Streamed().ticks(arrivals[-1], ControlSetting(PERIOD, 8, "ceil"))
     np.testing.assert_allclose(np.flatnonzero(whole.chunk == 0), starts, atol=1e-6)
 
 
@@ -56,7 +56,7 @@ def test_waiting_for_the_whole_plan_is_an_answer_that_comes_whole() -> None:
     s=st.integers(1, 9),
 )
 def test_a_safe_start_is_never_early_and_at_most_a_tick_late(latency: int, gap: int, rounding: str, s: int) -> None:
-    setting = Setting(20, 9, rounding)  # type: ignore[arg-type]
+    setting = ControlSetting(20, 9, rounding)  # type: ignore[arg-type]
     safe, naive = (Streamed(0, s, gap * 1e-9, start) for start in ("safe", "naive"))  # type: ignore[arg-type]
     latency_ns = np.array([latency])
     ticks = safe.ticks(latency_ns, setting)

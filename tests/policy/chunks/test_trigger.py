@@ -16,16 +16,16 @@ from scipy import stats
 
 from s2a_bench.boards.gaps import Gaps, Lognormal, Markov
 from s2a_bench.errors import UsageError
-from s2a_bench.policy.chunks import Rounding, Setting
+from s2a_bench.policy.chunks import ControlSetting, Rounding
 from s2a_bench.policy.chunks.aggregate import Aggregate
 from s2a_bench.policy.chunks.append import Queue
 from s2a_bench.policy.chunks.replace import Replace
 from s2a_bench.policy.chunks.trigger import (
     Maximum,
     Mean,
-    Rule,
-    Tracked,
+    TrackedLatency,
     Trigger,
+    TriggerRule,
     calibrate,
     follow,
     trigger,
@@ -46,7 +46,7 @@ class Fixed:
         """Learn nothing."""
 
 
-def oracle_ticks(survival: Callable[[float], float], setting: Setting, epsilon: float = EPSILON) -> int:
+def oracle_ticks(survival: Callable[[float], float], setting: ControlSetting, epsilon: float = EPSILON) -> int:
     """Return the smallest safe trigger, the least m with P(d > m) <= ``epsilon``, from P(L > x) with x in s.
 
     It is ceil(F^-1(1 - epsilon) / Delta t) where actions leave at the start of their tick, and the floor of that where
@@ -86,11 +86,11 @@ def law(latencies: Lognormal | Markov) -> Callable[[float], float]:
     return lambda x: float((1 - share) * normal.sf(x) + share * pause.sf(x))
 
 
-def world(seed: int, family: str) -> tuple[Lognormal | Markov, Setting]:
+def world(seed: int, family: str) -> tuple[Lognormal | Markov, ControlSetting]:
     """Draw latencies of 20 to 200 ms in the mean, at a control rate of 30 to 200 Hz."""
     rng = np.random.default_rng([seed, 1])
     mean_s = float(rng.uniform(0.02, 0.2))
-    setting = Setting(int(rng.choice([5, 10, 20, 33])) * MS, 4096, "floor" if rng.random() < 0.5 else "ceil")
+    setting = ControlSetting(int(rng.choice([5, 10, 20, 33])) * MS, 4096, "floor" if rng.random() < 0.5 else "ceil")
     if family == "lognormal":
         return Lognormal(mean_s, float(rng.uniform(0.05, 0.8))), setting
     share = float(rng.uniform(0.005, 0.3))
@@ -112,7 +112,7 @@ def study(settings: int, *families: str, period_ns: int = 0) -> dict[str, Found]
     for family, seed in product(families, range(settings)):
         latencies, setting = world(seed, family)
         if period_ns:
-            setting = Setting(period_ns, 10**6)
+            setting = ControlSetting(period_ns, 10**6)
         known = draw(latencies, np.random.default_rng([seed, 2]), CALIBRATION)
         fresh = draw(latencies, np.random.default_rng([seed, 3]), FRESH)
         chosen = {
@@ -133,7 +133,7 @@ def study(settings: int, *families: str, period_ns: int = 0) -> dict[str, Found]
     return found
 
 
-def ticks_of(latency_ns: float, setting: Setting) -> int:
+def ticks_of(latency_ns: float, setting: ControlSetting) -> int:
     return trigger(float(latency_ns), setting, setting.horizon).ticks
 
 
@@ -167,7 +167,7 @@ def test_bursty_latencies_stall_as_rarely_as_asked_when_pooled() -> None:
     assert np.median(found["high-confidence"].age) == pytest.approx(1, abs=0.1)
 
 
-def stalled(triggers: Any, latency_ns: Any, setting: Setting) -> Any:
+def stalled(triggers: Any, latency_ns: Any, setting: ControlSetting) -> Any:
     """Tell in which cycles a queue with these triggers stalls."""
     return setting.delay_ticks(latency_ns) > triggers
 
@@ -175,12 +175,12 @@ def stalled(triggers: Any, latency_ns: Any, setting: Setting) -> Any:
 @pytest.mark.parametrize("scale", [1.0, 1.3, 1.6])
 @pytest.mark.parametrize("latencies", [Lognormal(0.1, 0.3), Markov(0.1, 0.15, 0.05, 3.0, 12.0)], ids=["calm", "bursty"])
 def test_tracking_brings_a_machine_that_drifts_back_to_epsilon(latencies: Gaps, scale: float) -> None:
-    setting = Setting(20 * MS, 64)
+    setting = ControlSetting(20 * MS, 64)
     known = draw(latencies, np.random.default_rng(1), CALIBRATION)
     fresh = np.rint(draw(latencies, np.random.default_rng(2), 40_000) * scale).astype(np.int64)
-    rules: dict[str, Rule] = {
+    rules: dict[str, TriggerRule] = {
         "fixed": Fixed(calibrate(known).caution),
-        "tracked": Tracked.begin(known),
+        "tracked": TrackedLatency.begin(known),
         "maximum": Maximum(float(known.max())),
         "mean": Mean(int(known.sum()), known.size),
     }
@@ -196,12 +196,12 @@ def test_tracking_brings_a_machine_that_drifts_back_to_epsilon(latencies: Gaps, 
 
 
 def test_the_maximum_never_forgets_one_outlier_and_tracking_does() -> None:
-    setting, latency_ns = Setting(20 * MS, 64), np.full(2000, 50 * MS)
+    setting, latency_ns = ControlSetting(20 * MS, 64), np.full(2000, 50 * MS)
     latency_ns[500] = 900 * MS
     found = follow(Maximum(), latency_ns, setting, 60)
     assert set(found[501:].tolist()) == {45}
     assert np.flatnonzero(stalled(found, latency_ns, setting)).tolist() == [0, 500]
-    found = follow(Tracked.begin(latency_ns[:500], 0.01, step=0.002), latency_ns[500:], setting, 60)
+    found = follow(TrackedLatency.begin(latency_ns[:500], 0.01, step=0.002), latency_ns[500:], setting, 60)
     assert set(found.tolist()) == {2}
     assert np.flatnonzero(stalled(found, latency_ns[500:], setting)).tolist() == [0]
 
@@ -216,7 +216,7 @@ def test_a_trigger_is_safe_at_its_latency_slowed_down_or_not(
     latency: int, most: int, rounding: Rounding, s: int
 ) -> None:
     latency *= 1000
-    setting = Setting(20_000, 13 + s, rounding)
+    setting = ControlSetting(20_000, 13 + s, rounding)
     found = trigger(latency, setting, most)
     slowed = setting.slowed(found.beta)
     assert found.ticks <= most
@@ -230,7 +230,7 @@ def test_a_trigger_is_safe_at_its_latency_slowed_down_or_not(
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
 def test_where_no_trigger_helps_slowing_down_keeps_epsilon(rounding: Rounding) -> None:
     # H = 16, s = 12: four actions are left, 80 ms, for latencies of 120 ms in the mean.
-    setting, latencies = Setting(20 * MS, 16, rounding), Lognormal(0.12, 0.2)
+    setting, latencies = ControlSetting(20 * MS, 16, rounding), Lognormal(0.12, 0.2)
     known = draw(latencies, np.random.default_rng(1), CALIBRATION)
     fresh = draw(latencies, np.random.default_rng(2), FRESH)
     found = trigger(calibrate(known).caution, setting, 4)
@@ -245,7 +245,7 @@ def test_where_no_trigger_helps_slowing_down_keeps_epsilon(rounding: Rounding) -
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
 def test_the_oracle_s_trigger_is_the_smallest_safe_one(rounding: Rounding) -> None:
-    setting = Setting(20 * MS, 64, rounding)
+    setting = ControlSetting(20 * MS, 64, rounding)
     for seed in range(40):
         survival = law(world(seed, "bimodal")[0])
         for epsilon in (0.001, 0.01, 0.2):
@@ -256,23 +256,23 @@ def test_the_oracle_s_trigger_is_the_smallest_safe_one(rounding: Rounding) -> No
 
 
 def test_a_rule_that_needs_the_greatest_trigger_gets_it() -> None:
-    assert trigger(math.inf, Setting(20, 8), 5) == Trigger(5, 1.0)
-    assert Tracked.begin([1.0] * 50, 0.01).latency_ns == math.inf  # too few to promise 1 %
-    found = follow(Tracked.begin([1.0] * 50, 0.01), np.array([90, 110, 130]), Setting(20, 8), 5)
+    assert trigger(math.inf, ControlSetting(20, 8), 5) == Trigger(5, 1.0)
+    assert TrackedLatency.begin([1.0] * 50, 0.01).latency_ns == math.inf  # too few to promise 1 %
+    found = follow(TrackedLatency.begin([1.0] * 50, 0.01), np.array([90, 110, 130]), ControlSetting(20, 8), 5)
     assert found.tolist() == [5, 5, 5]
 
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
 def test_a_tracked_robot_stalls_while_its_latencies_exceed_the_slack(rounding: Rounding) -> None:
-    setting, latencies = Setting(20 * MS, 16, rounding), Lognormal(0.05, 0.2)
+    setting, latencies = ControlSetting(20 * MS, 16, rounding), Lognormal(0.05, 0.2)
     known = draw(latencies, np.random.default_rng(1), 2000)
     fresh = draw(latencies, np.random.default_rng(2), 30_000)
     fresh[10_000:20_000] *= 2  # above the slack of 80 ms for a while
-    stalls = stalled(follow(Tracked.begin(known), fresh, setting, 4), fresh, setting)
+    stalls = stalled(follow(TrackedLatency.begin(known), fresh, setting, 4), fresh, setting)
     assert np.mean(stalls[10_000:20_000]) > 0.1
     assert np.mean(stalls[:10_000]) < 0.0115
     assert np.mean(stalls[24_000:]) < 0.0115
     with pytest.raises(UsageError, match="calibrating on 98 promises"):
         calibrate(np.arange(98))
     with pytest.raises(ValueError, match="any speed"):
-        trigger(50, Setting(20, 8), 0)
+        trigger(50, ControlSetting(20, 8), 0)

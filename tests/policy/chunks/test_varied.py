@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from s2a_bench.policy.chunks import Setting
+from s2a_bench.policy.chunks import ControlSetting
 from s2a_bench.policy.chunks.append import Queue, VariedQueue
 from s2a_bench.policy.chunks.cycles import step
 from s2a_bench.policy.chunks.trigger import Varied
@@ -17,7 +17,7 @@ from tests.policy.chunks.drawn import latencies, settings_of_chunks
 
 
 @st.composite
-def varied(draw: st.DrawFn) -> tuple[Varied, Any, Setting]:
+def varied(draw: st.DrawFn) -> tuple[Varied, Any, ControlSetting]:
     setting = draw(settings_of_chunks())
     triggers = draw(st.lists(st.integers(0, setting.horizon), min_size=1, max_size=14))
     execute = draw(st.integers(0, setting.horizon))
@@ -32,13 +32,13 @@ def agree(one: tuple[Any, ...], other: tuple[Any, ...]) -> None:
 
 @settings(max_examples=300)
 @given(case=varied())
-def test_its_arrays_and_its_stepper_agree(case: tuple[Varied, Any, Setting]) -> None:
+def test_its_arrays_and_its_stepper_agree(case: tuple[Varied, Any, ControlSetting]) -> None:
     mode, latency_ns, setting = case
     agree((mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)), step(mode, latency_ns, setting))
 
 
 @given(case=varied())
-def test_with_one_trigger_it_is_queue(case: tuple[Varied, Any, Setting]) -> None:
+def test_with_one_trigger_it_is_queue(case: tuple[Varied, Any, ControlSetting]) -> None:
     mode, latency_ns, setting = case
     queue = mode.mode.varied(mode.triggers[:1])
     assert isinstance(queue, Queue)
@@ -47,7 +47,7 @@ def test_with_one_trigger_it_is_queue(case: tuple[Varied, Any, Setting]) -> None
 
 
 @given(case=varied())
-def test_a_mode_without_arrays_of_its_own_does_the_same(case: tuple[Varied, Any, Setting]) -> None:
+def test_a_mode_without_arrays_of_its_own_does_the_same(case: tuple[Varied, Any, ControlSetting]) -> None:
     mode, latency_ns, setting = case
     stepped = Varied(mode.mode, mode.triggers)
     agree((stepped.cycles(latency_ns, setting),), (mode.cycles(latency_ns, setting),))

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from s2a_bench.scenario.ccrb.cars import Cars
-from s2a_bench.scenario.ccrb.follower import Hdm, Hybrid, Idm, Motion, Seen, idm_acceleration
+from s2a_bench.scenario.ccrb.follower import CarMotion, DriverView, Hdm, Hybrid, Idm, idm_acceleration
 
 CARS = Cars(speed_mps=14.0, rear_gap_m=20.0, reaction_s=0.8)
 
 
-def motion(position: float, speed: float, acceleration: float) -> Motion:
-    return Motion(*(np.array([value]) for value in (position, speed, acceleration)))
+def motion(position: float, speed: float, acceleration: float) -> CarMotion:
+    return CarMotion(*(np.array([value]) for value in (position, speed, acceleration)))
 
 
-SEEN = Seen(
+SEEN = DriverView(
     ego=motion(60.0, 11.0, -3.0),
     own=motion(40.0, 13.0, -0.5),
     ego_then=motion(50.0, 12.0, -1.0),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
     from PIL.ImageFont import FreeTypeFont
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 FRAMES_A_S: Final = 20
 WIDTH, ROAD_HEIGHT, TEXT_HEIGHT, FOOT_HEIGHT = 880, 96, 46, 40
@@ -39,7 +39,7 @@ _HITS: Final[dict[str, frozenset[int]]] = {
 _INK, _PAPER, _RED, _FAINT = (20, 20, 20), (255, 255, 255), (200, 60, 0), (110, 110, 110)
 
 
-def animation_files(run: Run) -> dict[str, Callable[[Path], None]]:
+def animation_files(run: StoredRun) -> dict[str, Callable[[Path], None]]:
     """Return what writes the animation in real time, by file name; raises StoreError where that fails.
 
     A panel stops at its first impact: what comes after one is not modelled.
@@ -56,18 +56,18 @@ def animation_files(run: Run) -> dict[str, Callable[[Path], None]]:
     return {"figures/scenario.gif": partial(write, _write_gif), "figures/scenario.mp4": partial(write, _write_film)}
 
 
-def frames_of(run: Run, frames_a_s: int = FRAMES_A_S) -> list[Image]:
+def frames_of(run: StoredRun, frames_a_s: int = FRAMES_A_S) -> list[Image]:
     """Draw every frame of the animation."""
-    panels = [Panel(run, row) for row in rollouts_of(run, "point").to_dict("records")]
+    panels = [RoadPanel(run, row) for row in rollouts_of(run, "point").to_dict("records")]
     until_s = max(panel.until_s for panel in panels)
     foot = f"{tokens_line(run)} Yellow: lead, green: ego, blue: car behind, red: impact.\n{law(configuration(run))}"
     return [_frame(panels, step / frames_a_s, foot) for step in range(int(until_s * frames_a_s) + 1)]
 
 
-class Panel:
+class RoadPanel:
     """One policy's road with a line of text above it."""
 
-    def __init__(self, run: Run, row: dict[Any, Any]) -> None:
+    def __init__(self, run: StoredRun, row: dict[Any, Any]) -> None:
         self._row = row
         self._path = path_of(run, row["cell"])
         skills = run.table(SKILLS)
@@ -105,7 +105,7 @@ class Panel:
         return _PHASES[now["phase"]]
 
 
-def _frame(panels: list[Panel], at_s: float, foot: str) -> Image:
+def _frame(panels: list[RoadPanel], at_s: float, foot: str) -> Image:
     from PIL import Image, ImageDraw
 
     height = len(panels) * (TEXT_HEIGHT + ROAD_HEIGHT) + FOOT_HEIGHT

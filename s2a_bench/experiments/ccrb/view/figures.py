@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 LOOKS: Final[dict[str, tuple[str, Literal["-", "--", ":"]]]] = {
     "lead": ("#0072B2", "--"),
@@ -69,7 +69,7 @@ _POINT: Final[dict[str, Any]] = {
 }
 
 
-def build_scenario(run: Run) -> Figure:
+def build_scenario(run: StoredRun) -> Figure:
     """Draw the operating point: a column a policy; positions, speeds and gaps over time."""
     found = rollouts_of(run, "point")
     survives, rows = survives_of(found), found.to_dict("records")
@@ -100,7 +100,7 @@ def build_scenario(run: Run) -> Figure:
     return figure
 
 
-def ccrb_figures(run: Run) -> dict[str, Callable[[], Figure]]:
+def ccrb_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
     """Return every figure by its file's name; those of studies where the run has them."""
     builders: dict[str, Callable[[], Figure]] = {"scenario": partial(build_scenario, run)}
     if has(run, "phase"):
@@ -110,7 +110,7 @@ def ccrb_figures(run: Run) -> dict[str, Callable[[], Figure]]:
     return builders
 
 
-def path_of(run: Run, cell: str) -> pd.DataFrame:
+def path_of(run: StoredRun, cell: str) -> pd.DataFrame:
     """Return the trajectory of a shown roll-out with times in s, speeds in km/h, and gaps."""
     rows = run.table(TRAJECTORIES)
     path: pd.DataFrame = rows[rows["cell"] == cell].reset_index(drop=True)
@@ -128,7 +128,7 @@ def rest_of(path: pd.DataFrame) -> int:
     return int(moving[moving].index[-1]) if moving.any() else 0
 
 
-def _path(run: Run, row: dict[Any, Any]) -> pd.DataFrame:
+def _path(run: StoredRun, row: dict[Any, Any]) -> pd.DataFrame:
     """Return a trajectory up to rest; after an impact from behind the trailing car is out."""
     path = path_of(run, row["cell"])
     shown = path["time_s"] <= float(path["time_s"].iloc[rest_of(path)]) + _AFTER_S
@@ -174,7 +174,7 @@ def _verdict(row: dict[Any, Any], survives: bool) -> str:
     return said(row["outcome"], survives) + (" (late)" if row["late"] is True else "")
 
 
-def _title(run: Run) -> str:
+def _title(run: StoredRun) -> str:
     asked = configuration(run)
     return (
         f"CCRB with a car behind ({asked['simulator']} simulator): {operating_point(asked)}, "
@@ -208,7 +208,7 @@ def region_of(scenes: pd.DataFrame) -> list[str]:
     return named
 
 
-def build_phase(run: Run) -> Figure:
+def build_phase(run: StoredRun) -> Figure:
     """Draw a panel a gap behaviour, the operating point marked, the findings above each."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -248,7 +248,7 @@ def build_phase(run: Run) -> Figure:
     return figure
 
 
-def _draw_panel(axes: Axes, scenes: pd.DataFrame, asked: dict[str, Any], run: Run) -> set[str]:
+def _draw_panel(axes: Axes, scenes: pd.DataFrame, asked: dict[str, Any], run: StoredRun) -> set[str]:
     from matplotlib.colors import ListedColormap
 
     named = region_of(scenes)
@@ -275,13 +275,13 @@ def _draw_panel(axes: Axes, scenes: pd.DataFrame, asked: dict[str, Any], run: Ru
     return set(np.unique(named))
 
 
-def _here(run: Run, gap: str, asked: dict[str, Any]) -> str:
+def _here(run: StoredRun, gap: str, asked: dict[str, Any]) -> str:
     span = rate_span_here(run, gap)
     where = f"R {span[0]:.1f}\N{EN DASH}{span[1]:.1f}" if span else "no R"
     return f"at {asked['rear_gap_m']:g} m: {where}"
 
 
-def build_sensitivity(run: Run) -> Figure:
+def build_sensitivity(run: StoredRun) -> Figure:
     """Draw the ordering's share of the plane over each varied number, the range over the seeds as a band."""
     found, asked = run.table(SENSITIVITY), configuration(run)
     shares = found.assign(share=100 * found["paper"] / found["points"])

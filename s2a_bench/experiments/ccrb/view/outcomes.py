@@ -16,7 +16,7 @@ from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 if TYPE_CHECKING:
     import pandas as pd
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 VARIED_TITLES: Final = {
     "gap_decel_mps2": "braking in gaps (m/s\N{SUPERSCRIPT TWO})",
@@ -48,18 +48,18 @@ class Share:
         return float(found.low), float(found.high)
 
 
-def rollouts_of(run: Run, study: str) -> pd.DataFrame:
+def rollouts_of(run: StoredRun, study: str) -> pd.DataFrame:
     """Return the roll-outs of the operating point (point), the phase diagram (phase) or random scenarios (random)."""
     rows = run.table(ROLLOUTS)
     return rows[rows["study"] == study].reset_index(drop=True)
 
 
-def cells_of(run: Run) -> list[dict[str, Any]]:
+def cells_of(run: StoredRun) -> list[dict[str, Any]]:
     """Return each policy's roll-out at the operating point: names and metrics, times in s; what it lacks is no key."""
     return [_cell(row) for row in rollouts_of(run, "point").to_dict("records")]
 
 
-def scenes_of(run: Run, study: str, gap: str) -> pd.DataFrame:
+def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
     """Return a row a scenario of a study under one gap behaviour, with columns of truth values for each ordering.
 
     ``paper``: naive is hit from behind only, wait-then-act hits the lead only, stream-to-act nobody. ``wait_worse``,
@@ -96,12 +96,12 @@ def survives_of(rows: pd.DataFrame) -> bool:
     return bool(rows["follower_survives"].all())
 
 
-def rate_span(run: Run, gap: str) -> tuple[float, float] | None:
+def rate_span(run: StoredRun, gap: str) -> tuple[float, float] | None:
     """Return the least and greatest R of the phase diagram at which the paper's ordering holds; None where nowhere."""
     return _span_of(scenes_of(run, "phase", gap))
 
 
-def rate_span_here(run: Run, gap: str) -> tuple[float, float] | None:
+def rate_span_here(run: StoredRun, gap: str) -> tuple[float, float] | None:
     """Return the same at the grid's rear gap that is nearest to the operating point's."""
     scenes = scenes_of(run, "phase", gap)
     wanted = configuration(run)["rear_gap_m"]
@@ -114,18 +114,18 @@ def _span_of(scenes: pd.DataFrame) -> tuple[float, float] | None:
     return (float(rates.min()), float(rates.max())) if len(rates) else None
 
 
-def has(run: Run, study: str) -> bool:
+def has(run: StoredRun, study: str) -> bool:
     """Return whether a run holds a study."""
     return bool((run.table(ROLLOUTS)["study"] == study).any())
 
 
-def configuration(run: Run) -> dict[str, Any]:
+def configuration(run: StoredRun) -> dict[str, Any]:
     """Return what was asked for."""
     found: dict[str, Any] = run.manifest["configuration"]
     return found
 
 
-def token_times_s(run: Run) -> list[float]:
+def token_times_s(run: StoredRun) -> list[float]:
     """Return when the tokens of the shown plan arrived, in s from the request."""
     request_id = run.table(SKILLS)["request_id"].iloc[0]
     tokens = run.table(TOKENS)
@@ -151,7 +151,7 @@ def _compared(theirs: pd.DataFrame, mine: pd.DataFrame, column: str) -> tuple[pd
     return difference > LEAST_IMPACT_MPS, difference < -LEAST_IMPACT_MPS
 
 
-def origin_notes(run: Run) -> tuple[str, ...]:
+def origin_notes(run: StoredRun) -> tuple[str, ...]:
     """Return what the numbers are made of, and which laws they hang on."""
     asked = configuration(run)
     notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
@@ -162,7 +162,7 @@ def origin_notes(run: Run) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def tokens_line(run: Run) -> Note:
+def tokens_line(run: StoredRun) -> Note:
     """Say in one line where the tokens come from."""
     if (live := run.manifest.get("live")) is None:
         return Note(f"EMULATED tokens, {run.manifest['boards'][0]['tokens_per_s']:g}/s.", EMULATED)
@@ -173,7 +173,7 @@ def tokens_line(run: Run) -> Note:
     return Note(line, *([EMULATED] if live["emulated"] else []))
 
 
-def _live_notes(run: Run) -> list[str]:
+def _live_notes(run: StoredRun) -> list[str]:
     live = run.manifest["live"]
     rate = rollouts_of(run, "point")["tokens_per_s"].iloc[0]
     line = tokens_line(run)
@@ -186,7 +186,7 @@ def _live_notes(run: Run) -> list[str]:
     return [line, road, f"What the plan says is not driven; {driven}"]
 
 
-def _emulated_notes(run: Run) -> list[str]:
+def _emulated_notes(run: StoredRun) -> list[str]:
     board = run.manifest["boards"][0]
     rates = {"paper": "the paper's rate (table II)", "measured": "a measured rate", "given": "a rate as given"}
     rate = f"{rates[board['origin']]}, {board['tokens_per_s']:g}/s"

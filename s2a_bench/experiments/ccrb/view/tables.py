@@ -49,11 +49,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from s2a_bench.experiments import Metric
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
     from s2a_bench.store.schema import Table
 
 
-def show(run: Run, *, animation: bool = False, **_: Any) -> Shown:
+def show(run: StoredRun, *, animation: bool = False, **_: Any) -> Shown:
     """Return what a CCRB run shows; the animation where it is asked for."""
     tables = ccrb_tables(run)
     return Shown(
@@ -67,7 +67,7 @@ def show(run: Run, *, animation: bool = False, **_: Any) -> Shown:
     )
 
 
-def ccrb_sentences(run: Run) -> list[str]:
+def ccrb_sentences(run: StoredRun) -> list[str]:
     """Return what became of the cars, where that ordering of the policies holds, and the studies' speed."""
     rows = rollouts_of(run, "point")
     survives = survives_of(rows)
@@ -84,12 +84,12 @@ def ccrb_sentences(run: Run) -> list[str]:
     return told
 
 
-def findings(run: Run) -> list[str]:
+def findings(run: StoredRun) -> list[str]:
     """Return what the phase diagram shows, gap behaviour by gap behaviour."""
     return [_finding(run, gap) for gap in GAPS] if has(run, "phase") else []
 
 
-def _finding(run: Run, gap: str) -> str:
+def _finding(run: StoredRun, gap: str) -> str:
     share = share_of(scenes_of(run, "phase", gap), "paper")
     said = f"{gap}: the paper's ordering holds at {share.value:.1%} of the diagram"
     span, here = rate_span(run, gap), rate_span_here(run, gap)
@@ -100,7 +100,7 @@ def _finding(run: Run, gap: str) -> str:
     return f"{said}, for R = {span[0]:.1f} to {span[1]:.1f} tokens/s; {where}."
 
 
-def _sensitivity(run: Run) -> str:
+def _sensitivity(run: StoredRun) -> str:
     """Return between which shares the ordering moves, number by number."""
     found = run.table(SENSITIVITY)
     summed = found.groupby(["varied", "value"], sort=False)[["paper", "points"]].sum()
@@ -188,7 +188,7 @@ class CcrbStudy:
     ] = None
 
 
-def outcome_table(run: Run) -> TextTable:
+def outcome_table(run: StoredRun) -> TextTable:
     """Lay out what became of the three cars under each policy."""
     rows, shown = [], [metric for metric in (*TIMES, *IMPACTS) if metric.title]
     for cell in cells_of(run):
@@ -200,7 +200,7 @@ def outcome_table(run: Run) -> TextTable:
     return TextTable(title, header, rows, 2, notes=(*origin_notes(run), *_deadline_note(run), NO_SCORE))
 
 
-def margin_table(run: Run) -> TextTable:
+def margin_table(run: StoredRun) -> TextTable:
     """Lay out how near an impact was, and how smoothly the ego drove."""
     rows = [(cell["policy"], *(_entry(cell, metric) for metric in (*MARGINS, *MOTION))) for cell in cells_of(run)]
     notes = (
@@ -210,7 +210,7 @@ def margin_table(run: Run) -> TextTable:
     return TextTable("Margins and motion", ("policy", *map(_title, (*MARGINS, *MOTION))), rows, 1, notes=notes)
 
 
-def phase_table(run: Run) -> TextTable:
+def phase_table(run: StoredRun) -> TextTable:
     """Lay out at which share of the diagram each ordering holds, a column a gap behaviour."""
     rows = _share_rows(run, "phase", lambda share: f"{share.value:.1%}")
     asked = configuration(run)
@@ -224,14 +224,14 @@ def phase_table(run: Run) -> TextTable:
     return TextTable(title, ("share of the diagram", *GAPS), rows, 1, rules, _ORDERING_NOTES)
 
 
-def random_table(run: Run) -> TextTable:
+def random_table(run: StoredRun) -> TextTable:
     """Lay out in which share of random scenarios each ordering holds, with its interval."""
     asked = configuration(run)
     title = f"{asked['random']} random scenarios: % [95 % Clopper-Pearson], {asked['follower']} follower"
     return TextTable(title, ("ordering", *GAPS), _share_rows(run, "random", _with_interval), 1, notes=_ORDERING_NOTES)
 
 
-def _share_rows(run: Run, study: str, written: Callable[[Share], str]) -> list[tuple[str, ...]]:
+def _share_rows(run: StoredRun, study: str, written: Callable[[Share], str]) -> list[tuple[str, ...]]:
     """Return a row an ordering, and one of the check on the car behind where the run has it."""
     scenes = {gap: scenes_of(run, study, gap) for gap in GAPS}
     checked = all(found["survives"].notna().all() for found in scenes.values())
@@ -239,7 +239,7 @@ def _share_rows(run: Run, study: str, written: Callable[[Share], str]) -> list[t
     return [(text, *(written(share_of(scenes[gap], name)) for gap in GAPS)) for name, text in counted.items()]
 
 
-def follower_tables(run: Run) -> dict[str, TextTable]:
+def follower_tables(run: StoredRun) -> dict[str, TextTable]:
     """Lay out each follower at Euro NCAP's combinations: what came of the operating point, and shares of the plane."""
     found, asked = run.table(FOLLOWER_STUDY), configuration(run)
     rate = run.manifest["boards"][0]["tokens_per_s"]
@@ -314,7 +314,7 @@ def _range(count: pd.Series[Any], of: pd.Series[Any]) -> str:
     return f"{share.mean():.0f} [{share.min():.0f}, {share.max():.0f}]"
 
 
-def ccrb_tables(run: Run) -> dict[str, TextTable]:
+def ccrb_tables(run: StoredRun) -> dict[str, TextTable]:
     """Return every table of a run by its file's name; what is compared comes last."""
     tables = {}
     if has(run, "random"):
@@ -326,7 +326,7 @@ def ccrb_tables(run: Run) -> dict[str, TextTable]:
     return {**tables, "margins": margin_table(run), "outcomes": outcome_table(run)}
 
 
-def ccrb_csv(run: Run) -> dict[str, CsvTable]:
+def ccrb_csv(run: StoredRun) -> dict[str, CsvTable]:
     """Return file name -> CSV table: the shares of the studies; the roll-outs are in rollouts.csv."""
     rows: list[tuple[Any, ...]] = []
     for study in ("phase", "random"):
@@ -342,7 +342,7 @@ def ccrb_csv(run: Run) -> dict[str, CsvTable]:
     }
 
 
-def ccrb_json(run: Run) -> dict[str, Any]:
+def ccrb_json(run: StoredRun) -> dict[str, Any]:
     """Return the object that ``--json`` prints, as docs/schema/s2a-bench-1.json describes it; SI units, float seconds.
 
     A cell a policy at the operating point; studies are summed up as shares, their roll-outs are in the run folder.
@@ -354,13 +354,13 @@ def ccrb_json(run: Run) -> dict[str, Any]:
     return frame(run, cells_of(run), [], **live, follower_law=law(configuration(run)), studies=studies, **more)
 
 
-def _counts(run: Run, table: Table[Any]) -> list[dict[str, Any]]:
+def _counts(run: StoredRun, table: Table[Any]) -> list[dict[str, Any]]:
     """Return the rows of a study that counts; what one lacks is no key."""
     rows = run.table(table).drop(columns=["cell", PROVENANCE])
     return [{str(name): value for name, value in row.dropna().items()} for _, row in rows.astype(object).iterrows()]
 
 
-def _study(run: Run, study: str, gap: str) -> dict[str, Any]:
+def _study(run: StoredRun, study: str, gap: str) -> dict[str, Any]:
     scenes = scenes_of(run, study, gap)
     found = {name: share_of(scenes, name) for name in ORDERINGS}
     shares = {
@@ -376,7 +376,7 @@ def _study(run: Run, study: str, gap: str) -> dict[str, Any]:
     return {"study": study, "gap_behaviour": gap, "scenarios": len(scenes), "orderings": shares, **check, **rates}
 
 
-def _deadline_note(run: Run) -> tuple[str, ...]:
+def _deadline_note(run: StoredRun) -> tuple[str, ...]:
     deadline_s = float(rollouts_of(run, "point")["deadline_ns"].iloc[0]) / 1e9
     return (f"S_front = {deadline_s:.2f} s: who brakes as planned from then on keeps 2 m to the lead.",)
 

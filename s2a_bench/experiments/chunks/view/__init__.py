@@ -18,10 +18,10 @@ from s2a_bench.experiments.chunks.view.tables import (
 from s2a_bench.writers.tables import number
 
 if TYPE_CHECKING:
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 
-def show(run: Run, **_: Any) -> Shown:
+def show(run: StoredRun, **_: Any) -> Shown:
     """Return what a run of chunks shows."""
     tables = chunk_tables(run)
     return Shown(
@@ -35,7 +35,7 @@ def show(run: Run, **_: Any) -> Shown:
     )
 
 
-def chunk_sentences(run: Run) -> list[str]:
+def chunk_sentences(run: StoredRun) -> list[str]:
     """Return what calibration costs over the oracle, what the other rules do, and how a control loop kept time."""
     said = []
     epsilon = float(run.manifest["configuration"]["epsilon"])

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 MOST_LANES: Final = 12
 """More would not be legible; chunk_ticks.csv has all."""
@@ -39,7 +39,7 @@ _BULK: Final = 0.9975
 
 
 @dataclass(frozen=True, slots=True)
-class Lane:
+class CellTicks:
     """The first ticks of one cell, and the requests that left in them."""
 
     name: str
@@ -54,7 +54,7 @@ class Lane:
         return self.name if self.rule == "given" else f"{self.name}, {self.rule}"
 
 
-def lanes_of(run: Run) -> list[Lane]:
+def lanes_of(run: StoredRun) -> list[CellTicks]:
     """Return the lanes of a run: the modes as given, and the calibrated trigger."""
     ticks, requests = run.table(TICKS), run.table(REQUESTS)
     shown = int(run.manifest["configuration"]["shown_ticks"])
@@ -64,11 +64,11 @@ def lanes_of(run: Run) -> list[Lane]:
         mine = ticks[ticks["cell"] == row["cell"]]
         if len(mine) and row["rule"] in {"given", "calibrated"}:
             asked = requests[requests["cell"] == row["cell"]]
-            found.append(Lane(row["mode"], row["rule"], row["latency"], mine, asked, row["delta_t_s"]))
+            found.append(CellTicks(row["mode"], row["rule"], row["latency"], mine, asked, row["delta_t_s"]))
     return found[:MOST_LANES]
 
 
-def build_lanes(run: Run) -> Figure:
+def build_lanes(run: StoredRun) -> Figure:
     """Draw the lanes below one another: actions coloured by chunk, stalls hatched, requests above, ages below."""
     from matplotlib.legend_handler import HandlerTuple
 
@@ -102,7 +102,7 @@ def build_lanes(run: Run) -> Figure:
     return figure
 
 
-def draw_lane(axes: Axes, lane: Lane, place: int, oldest: int) -> None:
+def draw_lane(axes: Axes, lane: CellTicks, place: int, oldest: int) -> None:
     """Draw one lane around y = ``place``; ``oldest`` is the age that the curve below reaches the next lane with."""
     top = place - _BAR / 2
     chunk = lane.ticks["chunk"].fillna(-1).to_numpy(dtype="int64")
@@ -144,7 +144,7 @@ def runs_of(values: np.ndarray) -> list[tuple[int, int]]:
     return list(pairwise(bounds))
 
 
-def _label(lane: Lane, *, several: bool) -> str:
+def _label(lane: CellTicks, *, several: bool) -> str:
     parts = [lane.title, lane.source] if several else [lane.title]
     return "\n".join(short(part, 30) for part in parts)
 
@@ -167,7 +167,7 @@ def _legend() -> dict[str, Any]:
     }
 
 
-def chunk_figures(run: Run) -> dict[str, Callable[[], Figure]]:
+def chunk_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
     """Return each figure that the run has rows for, by its file's name."""
     found: dict[str, Callable[[], Figure]] = {}
     if lanes_of(run):
@@ -183,18 +183,18 @@ def chunk_figures(run: Run) -> dict[str, Callable[[], Figure]]:
     return found
 
 
-def build_stability(run: Run) -> Figure:
+def build_stability(run: StoredRun) -> Figure:
     """Draw the stalled share of the ticks over mean latency, a line a mode."""
     return _over_means(run, "Stalled share of the ticks", {"stall_share": "stalled share"})
 
 
-def build_smoothness(run: Run) -> Figure:
+def build_smoothness(run: StoredRun) -> Figure:
     """Draw tracking error and jerk over mean latency; dashed what the plant alone does, asked in every tick."""
     panels = {"tracking_rms": "tracking error (sd)", "jerk_rms": "jerk (sd/s$^3$)"}
     return _over_means(run, "Following a target", panels)
 
 
-def _over_means(run: Run, what: str, shown: Mapping[str, str]) -> Figure:
+def _over_means(run: StoredRun, what: str, shown: Mapping[str, str]) -> Figure:
     """Draw columns, each with its label, a panel each; dashed the ideal of those that have one."""
     rows = run.table(MEANS)
     modes = [str(mode) for mode in rows["mode"].unique()][: len(LOOKS)]
@@ -223,7 +223,7 @@ def _over_means(run: Run, what: str, shown: Mapping[str, str]) -> Figure:
     return figure
 
 
-def build_triggers(run: Run) -> Figure:
+def build_triggers(run: StoredRun) -> Figure:
     """Draw P(stall) over the trigger with its closed form, a line a source, and where each rule ends up."""
     rows = run.table(TRIGGERS)
     epsilon = float(run.manifest["configuration"]["epsilon"])
@@ -274,7 +274,7 @@ def build_triggers(run: Run) -> Figure:
     return figure
 
 
-def build_reactions(run: Run) -> Figure:
+def build_reactions(run: StoredRun) -> Figure:
     """Draw the distribution of reaction times, a panel a source and a line a mode, the closed form dashed over it."""
     rows = run.table(REACTIONS)
     groups = sources_of(rows_of(run))[:_MOST_PANELS]
@@ -313,7 +313,7 @@ def _who(cell: dict[str, Any]) -> str:
     return str(cell["mode"]) if cell["rule"] == "given" else f"{cell['mode']}, {cell['rule']}"
 
 
-def _caption(run: Run, what: str, *notes: str) -> tuple[str, ...]:
+def _caption(run: StoredRun, what: str, *notes: str) -> tuple[str, ...]:
     asked = run.manifest["configuration"]
     setting = f"H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {asked['rounding']}"
     return (f"{what}, {setting}", *notes)

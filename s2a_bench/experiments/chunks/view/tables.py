@@ -15,7 +15,7 @@ from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.tables import ABSENT, EMULATED, Note, TextTable, number
 
 if TYPE_CHECKING:
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 ChunkCell = cell_of_row(
     "ChunkCell",
@@ -56,7 +56,7 @@ _EMULATED: Final = Note(
 )
 
 
-def rows_of(run: Run) -> list[Row]:
+def rows_of(run: StoredRun) -> list[Row]:
     """Return the rows of a run; what a row lacks is None. Live they are made in random order, which is put right."""
     table = run.table(CHUNKS).drop(columns=PROVENANCE)
     whole = table.astype(object).where(table.notna(), None)
@@ -76,17 +76,17 @@ def sources_of(rows: list[Row]) -> list[tuple[str, list[Row]]]:
     return [(name, [row for row in rows if row["latency"] == name]) for name in names]
 
 
-def stall_table(run: Run) -> TextTable:
+def stall_table(run: StoredRun) -> TextTable:
     """Lay out how often each mode stalls, and what would have been safe."""
     return _table(run, "Stalls", _STALLS)
 
 
-def action_table(run: Run) -> TextTable:
+def action_table(run: StoredRun) -> TextTable:
     """Lay out how old the actions are, how soon the robot reacts, and what is lost at boundaries."""
     return _table(run, "Actions: ages in ticks", _ACTIONS)
 
 
-def loop_table(run: Run) -> TextTable:
+def loop_table(run: StoredRun) -> TextTable:
     """Lay out how well the control loop of a live run kept time."""
     note = (
         "alike: share of the ticks that virtual time has the same way, on the latencies that were measured; jitter: "
@@ -96,12 +96,12 @@ def loop_table(run: Run) -> TextTable:
     return _table(run, "Control loop", _LOOP, (_convention(run), note))
 
 
-def live(run: Run) -> bool:
+def live(run: StoredRun) -> bool:
     """Whether a run acted in real time."""
     return bool(run.manifest["configuration"].get("live"))
 
 
-def smoothness_table(run: Run) -> TextTable:
+def smoothness_table(run: StoredRun) -> TextTable:
     """Lay out how smoothly a plant moves under each mode; in virtual time, how well it follows a target besides."""
     robot = run.manifest["configuration"]["robot"]
     jump = "jump: from one action to the next across a boundary, step: within a chunk."
@@ -115,7 +115,7 @@ def smoothness_table(run: Run) -> TextTable:
     return _table(run, "Smoothness", _FOLLOWING, (_convention(run), note, _EMULATED))
 
 
-def chunk_tables(run: Run) -> dict[str, TextTable]:
+def chunk_tables(run: StoredRun) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
     found = {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
     found |= {"loop": loop_table(run)} if live(run) else {}
@@ -123,7 +123,7 @@ def chunk_tables(run: Run) -> dict[str, TextTable]:
     return found | ({"smoothness": smoothness_table(run)} if smooth else {})
 
 
-def delay_table(run: Run) -> TextTable:
+def delay_table(run: StoredRun) -> TextTable:
     """Lay out the realised delays of each source, live of each mode beside the d that it is ready for."""
     names = ["delay_ticks_mean", "delay_ticks_p99", "delay_ticks_max"]
     names += ["delay_assumed_ticks", "p_delay_above"] if live(run) else []
@@ -140,12 +140,12 @@ def delay_table(run: Run) -> TextTable:
     return TextTable(title, header, rows, 2, notes=(_convention(run),))
 
 
-def chunk_csv(run: Run) -> dict[str, CsvTable]:
+def chunk_csv(run: StoredRun) -> dict[str, CsvTable]:
     """Return file name -> CSV table: every metric of every row."""
     return {"chunks.csv": CsvTable.of_frame(run.table(CHUNKS))}
 
 
-def chunk_json(run: Run) -> dict[str, Any]:
+def chunk_json(run: StoredRun) -> dict[str, Any]:
     """Return the object that ``--json`` prints."""
     origins = run.origins
     return frame(
@@ -153,7 +153,7 @@ def chunk_json(run: Run) -> dict[str, Any]:
     )
 
 
-def _table(run: Run, title: str, names: Sequence[str], notes: Iterable[str] | None = None) -> TextTable:
+def _table(run: StoredRun, title: str, names: Sequence[str], notes: Iterable[str] | None = None) -> TextTable:
     """Lay out a line a row; of several sources the first column has the number that the table of delays names."""
     found = sources_of(rows_of(run))
     several = len(found) > 1
@@ -202,15 +202,15 @@ def entry(value: float) -> str:
     return str(int(value)) if float(value).is_integer() else number(value)
 
 
-def _rounding(run: Run) -> str:
+def _rounding(run: StoredRun) -> str:
     return str(run.manifest["configuration"]["rounding"])
 
 
-def _convention(run: Run) -> str:
+def _convention(run: StoredRun) -> str:
     return _CONVENTION[_rounding(run)]
 
 
-def _notes(run: Run) -> Iterator[str]:
+def _notes(run: StoredRun) -> Iterator[str]:
     yield _convention(run)
     yield (
         "P(stall): share of the cycles, with its 95 % interval; form: what the closed form says, where it holds; "

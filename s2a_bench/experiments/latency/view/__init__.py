@@ -11,7 +11,7 @@ from s2a_bench.experiments import Shown
 from s2a_bench.experiments.latency.metrics import METRICS, latency_csv, latency_json
 from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import (
-    Cell,
+    RequestCell,
     asked,
     cells_of,
     chunks,
@@ -37,7 +37,7 @@ from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interv
 if TYPE_CHECKING:
     from s2a_bench.experiments.requests import Floats, RequestMetric
     from s2a_bench.stats import Ratio
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 _STAGE_CELLS = 5
 """With more cells than these the cells become rows, where there is no room for the whole table."""
@@ -45,7 +45,7 @@ _MOST = 6
 """Sentences of one kind; the tables have the rest."""
 
 
-def show(run: Run, *, against: str = "", **_: Any) -> Shown:
+def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
     """Return what a latency run shows."""
     tables = latency_tables(run)
     return Shown(
@@ -58,7 +58,7 @@ def show(run: Run, *, against: str = "", **_: Any) -> Shown:
     )
 
 
-def latency_sentences(run: Run) -> list[str]:
+def latency_sentences(run: StoredRun) -> list[str]:
     """Return how long each cell takes, and how many times as long as ROS or loopback."""
     if not (cells := cells_of(run)):
         return []
@@ -94,7 +94,7 @@ def _of(payload: str) -> str:
     return f" with {payload} pictures" if payload else ""
 
 
-def _times(cell: Cell, base: Cell, ratio: Ratio) -> str:
+def _times(cell: RequestCell, base: RequestCell, ratio: Ratio) -> str:
     between = ""
     if ratio.low is not None and ratio.high is not None:
         over = f"over {ratio.launches} launches" if ratio.launches > 1 else "of one launch"
@@ -117,7 +117,7 @@ _FRAME_FOOT = {
 """What stands below the stages of frames."""
 
 
-def stage_table(run: Run, *, full: bool = True) -> TextTable:
+def stage_table(run: StoredRun, *, full: bool = True) -> TextTable:
     """Lay out the stages in the order of the path, a column a cell: the median, and mean ± sd where ``full``.
 
     Inference stands below the residual, so that what is compared, e2e without inference, reads as one sum, and so do
@@ -145,7 +145,7 @@ def stage_table(run: Run, *, full: bool = True) -> TextTable:
     return TextTable(title, header, rows, 2, frozenset({below + 1}), _notes(run, cells), brief=brief)
 
 
-def group_table(run: Run) -> TextTable:
+def group_table(run: StoredRun) -> TextTable:
     """Lay out the groups as columns and the cells as rows: for runs of many cells."""
     cells = cells_of(run)
     groups = [group for group in groups_present(cells) if group != "inference"]
@@ -160,7 +160,11 @@ def group_table(run: Run) -> TextTable:
 
 
 def _by_cell(
-    title: str, header: Sequence[str], cells: Sequence[Cell], rows: Sequence[tuple[str, ...]], notes: Iterable[str]
+    title: str,
+    header: Sequence[str],
+    cells: Sequence[RequestCell],
+    rows: Sequence[tuple[str, ...]],
+    notes: Iterable[str],
 ) -> TextTable:
     """Lay out a row a cell, and where there are several payloads a block each."""
     if len(payloads_of(cells)) < 2:  # noqa: PLR2004 - one payload, which the notes say
@@ -172,10 +176,10 @@ def _by_cell(
     return TextTable.grouped(title, ("payload", "cell", *header), blocks.values(), 2, notes, once=1)
 
 
-def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
+def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> TextTable:
     """Lay out what a publication quotes: n, spread, percentiles, and the ratios to what is compared with."""
     cells = cells_of(run)
-    bases: dict[str, list[Cell]] = {}
+    bases: dict[str, list[RequestCell]] = {}
     for base in cells:
         if base.values_ms(metric).size and any(cell.is_compared_with(base) for cell in cells):
             bases.setdefault(base.name if base.mixed else base.label, []).append(base)
@@ -193,7 +197,7 @@ def summary_table(run: Run, metric: str = "e2e_without_inference") -> TextTable:
     return _by_cell(title, header, cells, rows, (*_notes(run, cells), *launches_note(found)))
 
 
-def token_table(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> TextTable | None:
+def token_table(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> TextTable | None:
     """Lay out what happens to every token after it left the engine; None where no server tells when that was."""
     cells = [cell for cell in cells_of(run) if cell.values("token_delay").size]
     if not cells:
@@ -205,7 +209,7 @@ def token_table(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> TextTab
     return _by_cell(title, header, cells, rows, engine_notes(run, cells))
 
 
-def fact_table(run: Run) -> TextTable | None:
+def fact_table(run: StoredRun) -> TextTable | None:
     """Lay out what was told of the requests besides their marks; None where nothing was."""
     cells = cells_of(run) if run.facts else []
     told = [[json.loads(str(facts)) for facts in cell.good["facts"]] for cell in cells]
@@ -219,7 +223,7 @@ def fact_table(run: Run) -> TextTable | None:
     return TextTable("Facts: medians", header, rows, 2, notes=_notes(run, cells)) if rows else None
 
 
-def _foot(cells: list[Cell]) -> list[str]:
+def _foot(cells: list[RequestCell]) -> list[str]:
     """List what stands below the stages: preprocessing and e2e without model only where somebody tells them."""
     told = {"preprocess", "e2e_without_model"}
     return [name for name in _FOOT if name not in told or any(cell.values_ms(name).size for cell in cells)]
@@ -230,7 +234,7 @@ def _entry(values: Floats, *, full: bool = False) -> str:
     return f"{middle} ({entries(values, MEAN_SD)[0]})" if full and values.size else middle
 
 
-def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
+def _notes(run: StoredRun, cells: list[RequestCell]) -> tuple[str, ...]:
     counts = span_of(cell.n for cell in cells)
     notes = [f"n = {counts} samples a cell, warm-ups left out." if counts else "No samples."]
     if cells:
@@ -252,7 +256,7 @@ def _notes(run: Run, cells: list[Cell]) -> tuple[str, ...]:
     return (*notes, *failure_notes(cells, "samples"))
 
 
-def frame_table(run: Run) -> TextTable | None:
+def frame_table(run: StoredRun) -> TextTable | None:
     """Lay out the budget of the frames that a prompt was about: medians in ms, a column a cell; None without frames.
 
     The last row is the age of the frame when inference starts, from the samples.
@@ -278,12 +282,12 @@ def frame_table(run: Run) -> TextTable | None:
     )
 
 
-def _used(run: Run, cell: Cell) -> dict[str, Floats]:
+def _used(run: StoredRun, cell: RequestCell) -> dict[str, Floats]:
     frames = run.frames[run.frames["used_by"].isin(cell.good["request_id"])]
     return {name: numbers_ms(frames[f"{name}_ns"]) for name in (*run.stages, *_FRAME_FOOT)}
 
 
-def latency_tables(run: Run, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, TextTable]:
+def latency_tables(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, TextTable]:
     """Return every table of a latency run by its file's name."""
     tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
     if any(cell.values_ms("e2e_without_model").size for cell in cells_of(run)):

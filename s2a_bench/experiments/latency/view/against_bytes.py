@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from s2a_bench.experiments.requests import Cell, payloads_of, stand_ins
+from s2a_bench.experiments.requests import RequestCell, payloads_of, stand_ins
 from s2a_bench.stats.line import Estimate, Line, crossing, fit_line
 from s2a_bench.transport import declared
 from s2a_bench.writers.figures import new_figure
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from s2a_bench.experiments.requests import Floats, Split
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 METRIC = "e2e_without_inference"
 MB = 1e6
@@ -40,7 +40,7 @@ FIT = (
 
 
 @dataclass(frozen=True, slots=True)
-class Pipeline:
+class FittedPipeline:
     """One pipeline with one payload, over all runs."""
 
     name: str
@@ -53,9 +53,9 @@ class Pipeline:
     """Bytes on the wire for each of the pixels; None where nothing travels, or nobody tells."""
 
 
-def against_bytes(runs: Split) -> list[Pipeline]:
+def against_bytes(runs: Split) -> list[FittedPipeline]:
     """Return the pipelines of latency runs that differ in how many bytes their pictures have; nothing of others."""
-    found: dict[tuple[str, str], list[tuple[float, Cell]]] = {}
+    found: dict[tuple[str, str], list[tuple[float, RequestCell]]] = {}
     for run, cells in runs:
         if run.manifest["command"] != "latency" or run.samples.empty or not (pixels := _pixels(run)):
             continue
@@ -71,23 +71,23 @@ def against_bytes(runs: Split) -> list[Pipeline]:
     return order if any(each.line for each in order) else []
 
 
-def _pipeline(name: str, payload: str, cells: Sequence[tuple[float, Cell]]) -> Pipeline:
+def _pipeline(name: str, payload: str, cells: Sequence[tuple[float, RequestCell]]) -> FittedPipeline:
     groups = tuple((pixels / MB, cell.values_ms(METRIC)) for pixels, cell in cells)
     told = [
         float(sent.median()) / pixels for pixels, cell in cells if (sent := cell.good["payload_bytes"].dropna()).size
     ]
     travels = float(np.median(told)) if told else None
-    return Pipeline(name, payload, cells[0][1].path, groups, fit_line(groups), travels)
+    return FittedPipeline(name, payload, cells[0][1].path, groups, fit_line(groups), travels)
 
 
-def _pixels(run: Run) -> int:
+def _pixels(run: StoredRun) -> int:
     """Return the bytes of a request's pictures as pixels, scaled if they are before they travel."""
     asked: Mapping[str, Any] = run.manifest["configuration"]
     width, height = asked.get("resize") or (asked.get("width", 0), asked.get("height", 0))
     return int(width) * int(height) * 3 * int(asked.get("cameras") or 1)
 
 
-def crossings(pipelines: Sequence[Pipeline]) -> list[tuple[Pipeline, Pipeline, Estimate]]:
+def crossings(pipelines: Sequence[FittedPipeline]) -> list[tuple[FittedPipeline, FittedPipeline, Estimate]]:
     """Return the pairs whose lines cross between the smallest and the largest picture: the cheaper below first."""
     found = []
     for one, other in combinations([each for each in pipelines if each.line], 2):
@@ -101,7 +101,7 @@ def crossings(pipelines: Sequence[Pipeline]) -> list[tuple[Pipeline, Pipeline, E
     return found
 
 
-def line_table(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> TextTable:
+def line_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable:
     """Lay out each line: the fixed cost, the cost a megabyte, what of the pixels travels, how well a line fits."""
     rows: list[tuple[str, ...]] = [
         (
@@ -120,7 +120,7 @@ def line_table(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> TextTa
     return TextTable("Time against bytes: a line for each pipeline", header, rows, 2, notes=notes)
 
 
-def crossing_table(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> TextTable | None:
+def crossing_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable | None:
     """Lay out where lines cross, with loopback, which no picture travels over, left out; None where none do."""
     wired = [each for each in pipelines if not declared(each.path[0]).in_process]
     rows: list[tuple[str, ...]] = [
@@ -137,7 +137,7 @@ def crossing_table(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> Te
     return TextTable("Where one becomes faster than another", header, rows, 2, notes=notes)
 
 
-def _said(each: Pipeline) -> str:
+def _said(each: FittedPipeline) -> str:
     return f"{each.name}, {each.payload}"
 
 
@@ -145,7 +145,7 @@ def _estimate(found: Estimate) -> str:
     return f"{number(found.value)} [{number(found.low)}, {number(found.high)}]"
 
 
-def build_lines(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> Figure:
+def build_lines(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> Figure:
     """Draw medians and lines, a panel a payload, both axes logarithmic."""
     drawn = [each for each in pipelines if each.line]
     payloads = list(dict.fromkeys(each.payload for each in drawn))
@@ -164,7 +164,7 @@ def build_lines(pipelines: Sequence[Pipeline], answered: Sequence[str]) -> Figur
     return figure
 
 
-def _draw(axes: Axes, pipelines: Sequence[Pipeline], looks: Mapping[str, tuple[str, str]]) -> None:
+def _draw(axes: Axes, pipelines: Sequence[FittedPipeline], looks: Mapping[str, tuple[str, str]]) -> None:
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     for each in pipelines:

@@ -7,7 +7,16 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.paper import CAVEAT, LABEL, paper_latency
-from s2a_bench.experiments.requests import Cell, asked, caption_for, cells_of, chunks, groups_present, spelled, titles
+from s2a_bench.experiments.requests import (
+    RequestCell,
+    asked,
+    caption_for,
+    cells_of,
+    chunks,
+    groups_present,
+    spelled,
+    titles,
+)
 from s2a_bench.writers.figures import (
     WHISKERS,
     WIDE_SPREAD,
@@ -26,10 +35,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from s2a_bench.experiments.requests import Floats
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 
-def build_latency_bars(run: Run, *, against_paper: bool = False) -> Figure:
+def build_latency_bars(run: StoredRun, *, against_paper: bool = False) -> Figure:
     """Draw medians of e2e without inference, a bar a cell (the paper's figure 4), from zero on a linear axis."""
     cells, metric = _shown(run)
     looks = cell_looks({cell.name: cell.path for cell in cells})
@@ -50,7 +59,7 @@ def build_latency_bars(run: Run, *, against_paper: bool = False) -> Figure:
     return build_bars(caption, bars, _axis_label(metric), LABEL if against_paper else "")
 
 
-def build_stage_breakdown(run: Run) -> Figure:
+def build_stage_breakdown(run: StoredRun) -> Figure:
     """Draw the median of every group of stages, stacked, the residual hatched (the paper's figure 6).
 
     A line marks the median of the whole, which medians of parts do not add up to. Where the cells differ by more than
@@ -94,7 +103,7 @@ def build_stage_breakdown(run: Run) -> Figure:
     return figure
 
 
-def build_latency_distribution(run: Run) -> Figure:
+def build_latency_distribution(run: StoredRun) -> Figure:
     """Draw the empirical distribution of e2e without inference, a line a cell; logarithmic where it spreads widely."""
     cells, metric = _shown(run)
     looks = cell_looks({cell.name: cell.path for cell in cells})
@@ -103,7 +112,7 @@ def build_latency_distribution(run: Run) -> Figure:
     return build_distribution(_caption(run, cells, "Distribution", metric), lines, "samples", _axis_label(metric))
 
 
-def latency_figures(run: Run, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
+def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
     """Return every figure by its file's name; the paper's values only when asked for. No samples, no figures."""
     if not _shown(run)[0]:
         return {}
@@ -114,7 +123,7 @@ def latency_figures(run: Run, *, against_paper: bool = False) -> dict[str, Calla
     }
 
 
-def _shown(run: Run) -> tuple[list[Cell], str]:
+def _shown(run: StoredRun) -> tuple[list[RequestCell], str]:
     """Return the cells that can be drawn and by what: e2e only where no cell tells its inference apart."""
     cells = cells_of(run)
     for metric in ("e2e_without_inference", "e2e"):
@@ -123,7 +132,7 @@ def _shown(run: Run) -> tuple[list[Cell], str]:
     return [], "e2e"
 
 
-def _caption(run: Run, cells: list[Cell], what: str, metric: str, *notes: str) -> tuple[str, ...]:
+def _caption(run: StoredRun, cells: list[RequestCell], what: str, metric: str, *notes: str) -> tuple[str, ...]:
     facts = [asked(run, cells), *sorted({f"{cell.about['mode']} mode" for cell in cells})]
     facts += [f"chunks of {shape}"] if (shape := chunks(run)) else []
     shown = {cell.name for cell in cells}
@@ -135,13 +144,13 @@ def _axis_label(metric: str) -> str:
     return "e2e without inference (ms)" if metric == "e2e_without_inference" else "e2e, inference included (ms)"
 
 
-def _label(cell: Cell) -> str:
+def _label(cell: RequestCell) -> str:
     """Name a row by its cell, and by what travels where that is not said yet."""
     name = cell.label.replace("?", "\n?")
     return f"{name}\n({cell.payload})" if cell.payload else name
 
 
-def _median(cell: Cell, name: str, n: int) -> float:
+def _median(cell: RequestCell, name: str, n: int) -> float:
     """Return the median of a group over all samples; one without the group spent no time there."""
     values: Floats = cell.values_ms("residual") if name == "residual" else cell.group_ms(name)
     return float(median((*values.tolist(), *[0.0] * (n - values.size))))

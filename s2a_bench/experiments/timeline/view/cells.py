@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from s2a_bench.experiments import TIME, Compared, Subject
+from s2a_bench.experiments import TIME, Comparable, Subject
 from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import SKILLS, TOKENS
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from s2a_bench.policy import Floats
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class Timelines:
         return float(self.rows[METRICS[metric].column].iloc[0]) / 1e9
 
 
-def timelines_of(run: Run) -> list[Timelines]:
+def timelines_of(run: StoredRun) -> list[Timelines]:
     """Split a run into its cells, in the order in which they were run; the shown plan is the first."""
     rows, skills, tokens = run.table(TIMELINES), run.table(SKILLS), run.table(TOKENS)
     skills_of = dict(list(skills.groupby(["cell", "request_id"], sort=False)))
@@ -94,7 +94,7 @@ def panels(cells: Sequence[Timelines]) -> Iterator[tuple[tuple[str, int, int, fl
     yield from groups.items()
 
 
-def origin_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
+def origin_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
     """Return what the timelines are made of: emulated or not, whose rates, what is assumed."""
     boards = run.manifest.get("boards", [])
     notes = []
@@ -118,12 +118,12 @@ def origin_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _jitter(run: Run) -> str:
+def _jitter(run: StoredRun) -> str:
     jitter = run.manifest.get("configuration", {}).get("jitter", "none")
     return {"none": "evenly", "profile": "with the profiles' jitter"}.get(jitter, f"with jitter {jitter}")
 
 
-def _live_notes(run: Run) -> list[Note]:
+def _live_notes(run: StoredRun) -> list[Note]:
     live = run.manifest.get("live")
     if not live:
         return []
@@ -140,7 +140,7 @@ def _live_notes(run: Run) -> list[Note]:
     return [Note(f"{tokens} over {live['transport']}{paced}, {how}.{dummy}", *labels)]
 
 
-def jitter_notes(run: Run) -> tuple[str, ...]:
+def jitter_notes(run: StoredRun) -> tuple[str, ...]:
     """Return how late the executors' robots had their orders."""
     found = run.manifest.get("start_jitter")
     if not found:
@@ -184,7 +184,7 @@ TimelineCell = with_fields(
 _SETTING: Final = ("tokens_per_s", "prompt_s", "tokens_per_skill", "n_skills", "t_nom_s", "mode", "emulated")
 
 
-def timelines_json(run: Run) -> dict[str, Any]:
+def timelines_json(run: StoredRun) -> dict[str, Any]:
     """Return the object that ``--json`` prints, as docs/schema/s2a-bench-1.json describes it."""
     executed = {name: run.manifest[name] for name in ("live", "start_jitter") if run.manifest.get(name)}
     return frame(run, [_cell(cell) for cell in timelines_of(run)], [], **executed)
@@ -197,7 +197,7 @@ def _cell(cell: Timelines) -> dict[str, Any]:
     return present(TimelineCell(**told, **{name: cell.mean(name) for name in METRICS}))
 
 
-def _subjects(run: Run) -> list[Subject]:
+def _subjects(run: StoredRun) -> list[Subject]:
     asked = run.manifest.get("configuration", {})
     even = asked.get("jitter") == "none" and not asked.get("t_nom_cv")
     return [
@@ -213,7 +213,7 @@ def _subjects(run: Run) -> list[Subject]:
     ]
 
 
-COMPARED: Final = Compared(
+COMPARED: Final = Comparable(
     metrics=METRICS,
     subjects=_subjects,
     origin=lambda run: origin_notes(run, timelines_of(run)),

@@ -18,13 +18,13 @@ from s2a_bench.errors import StoreError
 from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, panels, timelines_of
 
 if TYPE_CHECKING:
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 TRACE: Final = "trace.json"
 Event: TypeAlias = dict[str, Any]
 
 
-def to_trace(run: Run) -> dict[str, Any]:
+def to_trace(run: StoredRun) -> dict[str, Any]:
     """Return the trace of the shown plan of every cell that has one."""
     cells = [cell for cell in timelines_of(run) if len(cell.skills)]
     return {
@@ -34,7 +34,7 @@ def to_trace(run: Run) -> dict[str, Any]:
     }
 
 
-def write_trace(run: Run, path: Path) -> None:
+def write_trace(run: StoredRun, path: Path) -> None:
     """Write the trace; raises StoreError."""
     try:
         path.write_text(json.dumps(to_trace(run), ensure_ascii=False, allow_nan=False), encoding="utf-8")

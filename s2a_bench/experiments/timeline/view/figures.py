@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 _LEGEND_COLUMNS: Final = {WIDTH_IN: 3, WIDE_IN: 6}
 
@@ -35,7 +35,7 @@ def policy_colours(policies: Sequence[str]) -> dict[str, str]:
     return known | {name: _OTHERS[place % len(_OTHERS)] for place, name in enumerate(others)}
 
 
-def build_timelines(run: Run, cells: Sequence[Timelines]) -> Figure:
+def build_timelines(run: StoredRun, cells: Sequence[Timelines]) -> Figure:
     """Draw the shown plan of every cell: boards side by side, granularities below one another, policies as lanes.
 
     ``cells`` share plan length and T_nom. Every panel has its own time axis: boards differ by orders of magnitude.
@@ -91,7 +91,7 @@ def draw_panel(axes: Axes, cells: Sequence[Timelines], colours: dict[str, str], 
     axes.set_xlim(0, end_s * 1.02)
 
 
-def timeline_figures(run: Run) -> dict[str, Callable[[], Figure]]:
+def timeline_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
     """Return every figure by its file's name: one for every plan length and T_nom."""
     cells = [cell for cell in timelines_of(run) if len(cell.skills)]
     shapes = list(dict.fromkeys(cell.setting[2:] for cell in cells))
@@ -158,7 +158,7 @@ def _stretched(cell: Timelines) -> bool:
     return bool((longer_ns > _VISIBLE_NS).any())
 
 
-def _caption(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
+def _caption(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
     n_skills, t_nom_s = cells[0].setting[2:]
     what = f"Execution timelines: N = {n_skills} skills, T_nom = {t_nom_s:g} s"
     if (plans := max(cell.n for cell in cells)) > 1:

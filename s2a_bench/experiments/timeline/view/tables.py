@@ -24,10 +24,10 @@ from s2a_bench.writers.csv_text import SUMMARY, CsvTable
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
-    from s2a_bench.store.run import Run
+    from s2a_bench.store.run import StoredRun
 
 
-def show(run: Run, **_: Any) -> Shown:
+def show(run: StoredRun, **_: Any) -> Shown:
     """Return what a run of timelines shows."""
     return Shown(
         sentences=timeline_sentences(run),
@@ -41,7 +41,7 @@ def show(run: Run, **_: Any) -> Shown:
     )
 
 
-def timeline_sentences(run: Run) -> list[str]:
+def timeline_sentences(run: StoredRun) -> list[str]:
     """Say of each policy where it stalls, when it starts, and when it ends."""
     cells = timelines_of(run)
     by_policy: dict[str, list[Timelines]] = {}
@@ -101,7 +101,7 @@ _MOTION_NOTES = (
 )
 
 
-def execution_table(run: Run) -> TextTable:
+def execution_table(run: StoredRun) -> TextTable:
     """Lay out starts, ends, stalls and regrets: means over the plans, in s."""
     cells = timelines_of(run)
     random = any(cell.n > 1 for cell in cells)
@@ -127,7 +127,7 @@ def skill_table(cells: Sequence[Timelines]) -> TextTable:
     return TextTable.grouped(f"Skills{_common(cells)}: {plan}", header, groups, 4, once=3)
 
 
-def timeline_tables(run: Run) -> dict[str, TextTable]:
+def timeline_tables(run: StoredRun) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
     cells = timelines_of(run)
     shape = _common(cells)
@@ -139,7 +139,7 @@ def timeline_tables(run: Run) -> dict[str, TextTable]:
     }
 
 
-def timeline_csv(run: Run) -> dict[str, CsvTable]:
+def timeline_csv(run: StoredRun) -> dict[str, CsvTable]:
     """Return file name -> CSV table in long form, every digit kept, times in s; what is absent has no row."""
     summaries = []
     for cell in timelines_of(run):
@@ -202,7 +202,7 @@ def _promise(calibrations: Iterable[Mapping[str, Any]]) -> str:
 ONLINE_LIVE = (ONLINE, "live")
 
 
-def _plan_notes(run: Run, cells: Sequence[Timelines]) -> tuple[str, ...]:
+def _plan_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
     """Return how many plans there are, and what stream-to-act knew before them."""
     notes = []
     plans = {cell.n for cell in cells}

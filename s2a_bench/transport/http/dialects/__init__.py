@@ -22,7 +22,7 @@ OWN = "s2a"
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class EncodedPicture:
     """A picture that is ready to be packed; ``shape`` is that of the bytes: (n,) or (height, width, 3)."""
 
     media_type: str

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit, urlunsplit
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CACHE_N, PROMPT_N, USAGE_ZERO, Fact
 from s2a_bench.trace import FACT_LIMIT, Trace
-from s2a_bench.transport.http.dialects import Event, Picture
+from s2a_bench.transport.http.dialects import EncodedPicture, Event
 from s2a_bench.transport.http.dialects.framing import Framing, ServerSentEvents
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Frame, Pixels, Request
@@ -67,7 +67,7 @@ class Dialect:
         """Return the media type and the bytes of a picture, marking each stage."""
         return encoded(frame, payload, trace)
 
-    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
+    def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
         """Return the request's body; raises UsageError for what the dialect cannot say."""
         raise NotImplementedError
 

@@ -6,7 +6,7 @@ from typing import Any
 from urllib.parse import quote
 
 from s2a_bench.facts import CACHE_N, PREDICTED_N, PROMPT_N, THINKING_N, USAGE_ZERO
-from s2a_bench.transport.http.dialects import Event, Picture
+from s2a_bench.transport.http.dialects import EncodedPicture, Event
 from s2a_bench.transport.http.dialects.common import (
     NO_LIST,
     NO_MODEL,
@@ -62,7 +62,7 @@ class Gemini(Dialect):
         """Return Google's own header."""
         return {"x-goog-api-key": key}
 
-    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:  # noqa: ARG002
+    def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:  # noqa: ARG002
         """Return one turn of the user; how much the model thinks is left to its default."""
         inline = [{"inline_data": {"mime_type": picture.media_type, "data": picture.base64}} for picture in pictures]
         return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from s2a_bench.facts import PREDICTED_MS, PREDICTED_N, PROMPT_MS, Fact
-from s2a_bench.transport.http.dialects import Event, Picture
+from s2a_bench.transport.http.dialects import EncodedPicture, Event
 from s2a_bench.transport.http.dialects.common import Dialect, numbers, sampled, text_of
 from s2a_bench.transport.http.dialects.framing import JsonLines
 from s2a_bench.types import Request
@@ -34,7 +34,7 @@ class Ollama(Dialect):
     framing = JsonLines
     tells = (*COUNTS.values(), *DURATIONS.values(), OUTSIDE_MODEL_MS)
 
-    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
+    def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
         """Return one user message; whether the model thinks is left to the server's default."""
         message = {"role": "user", "content": request.prompt, "images": [picture.base64 for picture in pictures]}
         return {

@@ -30,7 +30,7 @@ from s2a_bench.trace import Remote
 from s2a_bench.transport.chunks import NUMBERS as TICKS
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http import own as dialect
-from s2a_bench.transport.http.dialects import OWN, Event, Picture
+from s2a_bench.transport.http.dialects import OWN, EncodedPicture, Event
 from s2a_bench.transport.http.dialects.common import (
     Dialect,
     evaluated,
@@ -69,7 +69,7 @@ class OpenAI(Dialect):
     root, path = "/v1", "/chat/completions"
     tells = (*TIMINGS.values(), *METRICS.values(), THINKING_N, PREDICTED_STEPS, USAGE_ZERO)
 
-    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
+    def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
         """Return standard fields and one user message."""
         extra = self._extra(request)
         uris = [dialect.data_uri(picture.media_type, picture.base64) for picture in pictures]

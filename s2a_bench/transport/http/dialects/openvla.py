@@ -15,7 +15,7 @@ from s2a_bench import extras
 from s2a_bench.facts import Fact
 from s2a_bench.frames.convert import to_rgb
 from s2a_bench.trace import Trace
-from s2a_bench.transport.http.dialects import Event, Picture
+from s2a_bench.transport.http.dialects import EncodedPicture, Event
 from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.framing import WholeBody
 from s2a_bench.types import Frame, Pixels, Request
@@ -50,7 +50,7 @@ class OpenVla(Dialect):
         trace.mark("convert")
         return "", pixels
 
-    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:
+    def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
         """Return what ``json_numpy.dumps`` makes of the array, and the instruction."""
         fields: dict[str, Any] = {"instruction": request.prompt}
         if model:

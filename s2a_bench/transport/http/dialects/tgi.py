@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from s2a_bench.facts import PREDICTED_N, PROMPT_N
-from s2a_bench.transport.http.dialects import Event, Picture
+from s2a_bench.transport.http.dialects import EncodedPicture, Event
 from s2a_bench.transport.http.dialects.common import Dialect, numbers, sampled, text_of, token_id
 from s2a_bench.types import Request
 
@@ -20,7 +20,7 @@ class Tgi(Dialect):
     lists_models = False
     tells = tuple(DETAILS.values())
 
-    def body(self, request: Request, pictures: list[Picture], model: str) -> dict[str, Any]:  # noqa: ARG002
+    def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:  # noqa: ARG002
         """Return the prompt with its pictures in Markdown, and ask for details."""
         marked = [f"![](data:{picture.media_type};base64,{picture.base64})" for picture in pictures]
         parameters = {**sampled(request, "max_new_tokens"), "details": True}
