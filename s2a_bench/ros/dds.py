@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import islice
+from threading import Lock
 from typing import Any
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
@@ -133,10 +134,15 @@ def user_data(endpoint: Any) -> dict[str, str]:
     return dict(item.split("=", 1) for item in text.split(";") if "=" in item)
 
 
+_reading = Lock()
+"""cyclonedds reads every quality of service through one set of buffers, which two threads would overwrite."""
+
+
 def _known(ask: Callable[[int], Any], handle: int) -> Any:
     """Return what is known of a peer, None if it has left, even while its quality of service was being read."""
     try:
-        return ask(handle)
+        with _reading:
+            return ask(handle)
     except Exception as error:
         if str(error).startswith("Callfunc"):  # a bare Exception, of cyclonedds' C extension
             return None
@@ -228,7 +234,12 @@ class RawReader(_Endpoint):
         """Returns the writers of the domain; the reader is kept, as Cyclone gives back no memory of one."""
         reader = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         alive = ReadCondition(reader, ViewState.Any | SampleState.Any | InstanceState.Alive)
-        return lambda: reader.read(WRITERS_AT_MOST, alive)
+
+        def read() -> list[Any]:
+            with _reading:
+                return list(reader.read(WRITERS_AT_MOST, alive))
+
+        return read
 
 
 class DdsWaiter:
