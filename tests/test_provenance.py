@@ -13,7 +13,7 @@ import s2a_bench as s2a
 from s2a_bench.experiments import EXPERIMENTS, Shown, write_shown
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.provenance import Origins, Provenance, joined
-from s2a_bench.report.compare.alike import differences
+from s2a_bench.report.compare.agreement import differences
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
 from s2a_bench.report.page.files import make_report, write_report

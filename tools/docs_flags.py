@@ -72,8 +72,8 @@ def _belongs(command: str, name: str, row: str, group: str) -> bool:
 def fact_table() -> str:
     """Return the table of the facts, in the order in which they come to be told."""
     tellers: dict[str, Sequence[Fact]] = {name: TRANSPORTS[name].facts for name in TRANSPORTS.built_in()}
-    tellers |= {name: DIALECTS[name]().tells for name in DIALECTS.built_in()}
-    tellers |= {name: ENGINES[name].tells for name in ENGINES.built_in()}
+    tellers |= {name: DIALECTS[name]().facts for name in DIALECTS.built_in()}
+    tellers |= {name: ENGINES[name].declared_facts for name in ENGINES.built_in()}
     tellers |= {"`--mode stream`": (FRAMES_PUBLISHED, FRAMES_LOST), "[resources](resources.md)": SPENT}
     lines = ["| fact | unit | what it says | told by |", "|---|---|---|---|"]
     for fact in dict.fromkeys(fact for told in tellers.values() for fact in told):

@@ -25,8 +25,8 @@ from s2a_bench.inference.gguf_file import GgufInfo
 from s2a_bench.provenance import Origins
 from s2a_bench.report.compare.shown import CompareJson
 from s2a_bench.store.manifest import RunWarning
-from s2a_bench.sweep.as_json import PlannedCell, SweptCell
-from s2a_bench.writers.as_json import RatioJson
+from s2a_bench.sweep.json import PlannedCell, SweptCell
+from s2a_bench.writers.json import RatioJson
 
 FOLDER = Path(__file__).parent.parent / "docs/schema"
 PLAIN = {str: "string", Path: "string", int: "integer", float: "number", bool: "boolean", type(None): "null"}

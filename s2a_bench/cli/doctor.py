@@ -13,14 +13,14 @@ from s2a_bench.inference import CHECKS as OF_ENGINES
 from s2a_bench.machine import environment
 from s2a_bench.machine.doctor import CHECKS, LEVELS, DoctorConfig, Finding, Machine, examine, warnings_of, worst
 from s2a_bench.store.schema import SCHEMA
-from s2a_bench.transport import TRANSPORTS, dangers
+from s2a_bench.transport import TRANSPORTS, risks
 
 STYLES = {"state": "green", "advice": "cyan", "warning": "yellow", "error": "bold red"}
 
 
 def _doctor(config: DoctorConfig, *, json_: Json = False) -> None:
     machine = replace(Machine(), output=config.output)
-    findings = dangers.examine(config.url) if config.url else examine(machine, all_checks())
+    findings = risks.examine(config.url) if config.url else examine(machine, all_checks())
     if json_:
         print_json(_as_json(findings))
     else:

@@ -26,8 +26,8 @@ from s2a_bench.secrets import struck
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.sweep import CELLS, Sweep, read_sweep
 from s2a_bench.sweep import WORKERS, CellWorkers, SweepCell, SweepCommand, SweepConfig
-from s2a_bench.sweep.as_json import plan_json, sweep_json
 from s2a_bench.sweep.file import read_sweep_file
+from s2a_bench.sweep.json import plan_json, sweep_json
 from s2a_bench.sweep.plan import SweepPlan, plan_sweep
 from s2a_bench.sweep.run import Expected, SweepRun, check_resume, earlier, expect, only_one, pending, start_sweep
 from s2a_bench.text import none_of, visible

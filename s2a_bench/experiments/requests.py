@@ -37,8 +37,8 @@ from s2a_bench.store.schema import Count, about, with_fields
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import PAYLOADS, declared
 from s2a_bench.transport.pipeline import without
-from s2a_bench.writers.as_json import summaries
 from s2a_bench.writers.csv_text import CsvTable
+from s2a_bench.writers.json import summaries
 from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:

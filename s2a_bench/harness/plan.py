@@ -126,7 +126,7 @@ def resolve(config: RequestsConfig) -> RunPlan:
     large = config.size[0] * config.size[1] > LARGE_PICTURE
     stages = path_of(transport.stages for transport in used)
     facts = [fact for cell in cells for fact in cell.capabilities.facts]
-    facts += engine.kind.told(engine) if config.own_engine else ()
+    facts += engine.kind.facts_for(engine) if config.own_engine else ()
     facts += (FRAMES_PUBLISHED, FRAMES_LOST) if stream else ()
     facts += SPENT if config.sample_resources_hz else ()
     max_pieces = engine.horizon if config.answer == ACTIONS else config.max_tokens

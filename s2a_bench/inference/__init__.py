@@ -40,9 +40,9 @@ class Engine(Protocol):
     """The skill set of the plans that it writes, and their tokens a skill, where those of a recording are played."""
     needs: ClassVar[tuple[str, ...]] = ()
     """The extra of this package that it needs, and the modules that this brings."""
-    own: ClassVar[tuple[str, ...]] = ()
+    exclusive_options: ClassVar[tuple[str, ...]] = ()
     """The options that no other engine honours."""
-    tells: ClassVar[Sequence[Fact]] = ()
+    declared_facts: ClassVar[Sequence[Fact]] = ()
     """The facts that it may tell."""
     honours: ClassVar[Sequence[str]] = ()
     """The names in `Request.sampling` that it honours."""
@@ -56,9 +56,9 @@ class Engine(Protocol):
         return
 
     @classmethod
-    def told(cls, config: EngineConfig) -> Sequence[Fact]:  # noqa: ARG003 - for subclasses
+    def facts_for(cls, config: EngineConfig) -> Sequence[Fact]:  # noqa: ARG003 - for subclasses
         """Return the facts that it tells, set like this."""
-        return cls.tells
+        return cls.declared_facts
 
     def open_beside(self, config: EngineConfig) -> Engine:
         """Open one like it in this process, which takes turns with it and is closed before it."""
@@ -248,7 +248,7 @@ def declared(name: str) -> type[Engine]:
 def check_engine(config: EngineConfig) -> None:
     """Raise UsageError where an engine's own options, and the engine, do not go together."""
     for name, kind in ENGINES.loaded():
-        given = next((option for option in kind.own if getattr(config, option)), "")
+        given = next((option for option in kind.exclusive_options if getattr(config, option)), "")
         if given and name != config.name:
             raise UsageError(f"`{given}` needs `engine` {name}; `engine` {config.name} answers at its own speed")
     config.kind.check(config)

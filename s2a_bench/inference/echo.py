@@ -34,8 +34,8 @@ class EchoEngine(Engine):
     acts = True
     needs_model = False
     computes = False
-    own = ("latency",)
-    tells = (LATENCY_DRAWN_MS,)
+    exclusive_options = ("latency",)
+    declared_facts = (LATENCY_DRAWN_MS,)
 
     @classmethod
     def check(cls, config: EngineConfig) -> None:
@@ -47,8 +47,8 @@ class EchoEngine(Engine):
         _sequence_ns(config)
 
     @classmethod
-    def told(cls, config: EngineConfig) -> Sequence[Fact]:
-        return cls.tells if config.latency else ()
+    def facts_for(cls, config: EngineConfig) -> Sequence[Fact]:
+        return cls.declared_facts if config.latency else ()
 
     def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
         """Read the latencies, if any; raises UsageError for what `check` refuses."""

@@ -120,7 +120,7 @@ class Llama(OneThreadEngine):
     """The llama engine, on a thread of its own or of another one."""
 
     needs = ("llama", "llama_cpp", "gguf")
-    tells = LLAMA
+    declared_facts = LLAMA
     honours = (*SAMPLER_ARGUMENTS, PENALTY_LAST_N)
 
     def __init__(self, config: EngineConfig, thread: ThreadPoolExecutor | None = None) -> None:

@@ -71,10 +71,10 @@ class ReplayEngine(Engine):
     times for all requests of a run would hide the spread; a recording goes on where the request before ended.
     """
 
-    tells = (PROMPT_MS, PREDICTED_N, PREDICTED_MS)
+    declared_facts = (PROMPT_MS, PREDICTED_N, PREDICTED_MS)
     acts = True
     needs_model = False
-    own = ("profile", "gaps")
+    exclusive_options = ("profile", "gaps")
     plays = ("household", 6)
 
     @classmethod

@@ -10,8 +10,8 @@ from itertools import product
 
 from s2a_bench.errors import UsageError
 from s2a_bench.plan.formats import Format, Tokenize, spelled
+from s2a_bench.plan.labels import Calls, Codes, Letters, Words
 from s2a_bench.plan.skillset import SkillSet
-from s2a_bench.plan.wordings import Calls, Codes, Letters, Words
 
 GRANULARITIES = (6, 4, 2, 1)
 """Tokens a skill in the paper (section IV-E)."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
+from s2a_bench.plan.labels import Calls, normalise
 from s2a_bench.plan.skillset import Call, SkillSet
-from s2a_bench.plan.wordings import Calls, normalise
 
 Tokenize: TypeAlias = Callable[[str], list[int]]
 """A model's own tokenizer: text to token ids, nothing added (`s2a_bench.inference.tokenizer` has llama.cpp's)."""

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
 from s2a_bench.plan.formats import Format
+from s2a_bench.plan.labels import normalise
 from s2a_bench.plan.skillset import Call
-from s2a_bench.plan.wordings import normalise
 
 Problem: TypeAlias = Literal["unknown-skill", "bad-argument", "malformed", "too-long", "incomplete"]
 

@@ -79,7 +79,7 @@ class EngineSuite:
 
     def test_every_fact_that_it_tells_is_declared(self, engine: Engine) -> None:
         ask(engine, images=(rgb_frame(),))
-        told = declared(str(engine.describe()["engine"])).tells
+        told = declared(str(engine.describe()["engine"])).declared_facts
         assert set(engine.facts) <= set(told)
         assert all(fact.about for fact in told)
 

@@ -289,7 +289,7 @@ class Urls:
 
     schemes: tuple[str, ...] = ()
     examine: str = ""
-    """``module:function`` of what `doctor --url` looks at, see `transport.dangers`."""
+    """``module:function`` of what `doctor --url` looks at, see `transport.risks`."""
     cache_hits: str = ""
     """``module:function`` that returns counter -> hits of its caches that the server of a wiring has counted so far."""
 

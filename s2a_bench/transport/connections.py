@@ -181,7 +181,7 @@ class Wire:
                 raise Disconnected("the client does not read its answer")
             self.sendall(b"")
 
-    def gone(self) -> bool:
+    def disconnected(self) -> bool:
         """Whether the client has hung up; noticed while bytes of it lie unread, too."""
         return not self._stopping and any(events & GONE for _, events in self._poll.poll(0))
 

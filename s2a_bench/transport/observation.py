@@ -74,7 +74,7 @@ class Template:
         self.name = name
         self.pictures = 0
         """How many pictures it has places for."""
-        self.takes_state = False
+        self.accepts_state = False
         self.encoded = False
         """Whether pictures are the bytes of a file, as JPEG."""
         self._values = 0
@@ -89,7 +89,7 @@ class Template:
         """
         if len(pictures) > self.pictures:
             raise RequestFailed(f"`template` {self.name} has places for {self.pictures} pictures, not {len(pictures)}")
-        if len(state) and not self.takes_state:
+        if len(state) and not self.accepts_state:
             raise RequestFailed(f"`template` {self.name} has no place for the robot's state")
         try:
             filled: dict[str, Any] = self._make(_Given(pictures, np.asarray(state, np.float32), prompt))
@@ -196,7 +196,7 @@ class Template:
         first, last = int(start or 0), int(stop) if stop else None
         if last is not None and last <= first:
             self._refuse(path, f"wants the numbers {first}:{last} of the state, which are none")
-        self.takes_state = True
+        self.accepts_state = True
 
         def make(given: _Given) -> Vector:
             if len(given.state) < (last or first + 1):
@@ -285,7 +285,7 @@ class PolicyTransport(Transport[P]):
         options, template = choice.options, template_of(choice.options.template_name)
         pixels = self.payloads[:1] if options.url else self.payloads
         payloads = self.payloads[1:] if template.encoded else pixels
-        return Capabilities(options, payloads, self.answer_kinds, template.takes_state, self.facts)
+        return Capabilities(options, payloads, self.answer_kinds, template.accepts_state, self.facts)
 
     def require(self, choice: Choice[P]) -> None:
         """Refuse a key that is not there, and a template for other pictures; raises MissingExtra too."""

@@ -45,11 +45,11 @@ _log = logging.getLogger(__name__)
 class Turn:
     """One request's place in the queue, then its time with the engine."""
 
-    __slots__ = ("_answer_s", "_turns", "alive_ns", "come", "deadline_ns")
+    __slots__ = ("_answer_s", "_turns", "alive_ns", "deadline_ns", "ready")
 
     def __init__(self, turns: Turns, answer_s: float) -> None:
         """Take a place; only `Turns.join` does."""
-        self.come: Event | None = None
+        self.ready: Event | None = None
         """Set when it is this request's turn; None where it was at once."""
         self.alive_ns = now_ns()
         """When the answer last showed a sign of life, on CLOCK_MONOTONIC."""
@@ -61,15 +61,15 @@ class Turn:
     @property
     def has_come(self) -> bool:
         """Whether it is this request's turn, or was."""
-        return self.come is None or self.come.is_set()
+        return self.ready is None or self.ready.is_set()
 
-    def wait(self, gone: Callable[[], bool] = lambda: False) -> bool:
+    def wait(self, disconnected: Callable[[], bool] = lambda: False) -> bool:
         """Wait on this thread; return False if the client was ``gone`` before its turn came. Raises Overdue."""
-        while self.come is not None and not self.come.wait(POLL_S):
-            if gone():
+        while self.ready is not None and not self.ready.wait(POLL_S):
+            if disconnected():
                 return False
             self.check(now_ns())
-        return not gone()
+        return not disconnected()
 
     def alive(self, at_ns: int) -> None:
         """Note a sign of life; raises Overdue."""
@@ -106,7 +106,7 @@ class Turns:
             if len(self._waiting) >= self._limits.waiting:
                 waiting = f"{self._limits.waiting} requests are waiting for the engine already"
                 raise Busy(f"{waiting}; come again later", retry_after_s=RETRY_AFTER_S)
-            turn.come = Event()
+            turn.ready = Event()
             self._waiting.append(turn)
         return turn
 
@@ -118,9 +118,9 @@ class Turns:
                     self._waiting.remove(turn)
                 return
             self._running = following = self._waiting.popleft() if self._waiting else None
-        if following is not None and following.come is not None:
+        if following is not None and following.ready is not None:
             following.alive_ns = now_ns()
-            following.come.set()
+            following.ready.set()
 
     @property
     def waiting(self) -> int:
@@ -169,7 +169,7 @@ class Queued:
         """Wait for a turn and answer; raises Busy or Overdue."""
         turn = self.turns.join()
         try:
-            if turn.come is not None:
+            if turn.ready is not None:
                 trace.mark(RESIDUAL)
                 turn.wait()
                 trace.mark("queue")
@@ -235,7 +235,7 @@ class Exchange:
         """Send in one line why there is no answer, or no more of it. Raises Disconnected."""
         raise NotImplementedError
 
-    def gone(self) -> bool:
+    def disconnected(self) -> bool:
         """Whether the client has disconnected or cancelled."""
         return False
 
@@ -328,10 +328,10 @@ class Core:
 
     def _answer(self, exchange: Exchange, request: Request, turn: Turn) -> None:
         """Send the pieces once the request's turn has come, as long as they are wanted."""
-        waits = turn.come is not None
+        waits = turn.ready is not None
         if waits:
             exchange.trace.mark(RESIDUAL)
-        if not turn.wait(exchange.gone):
+        if not turn.wait(exchange.disconnected):
             exchange.abandon()
             return
         if waits:

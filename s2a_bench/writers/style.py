@@ -37,7 +37,7 @@ GROUP_FILLS: Final = {
 
 RESIDUAL_FILL: Final = ("#FFFFFF", "//////")
 
-_OTHER_LOOKS: Final = (("#56B4E9", "-."), ("#F0E442", "--"), ("#999999", ":"), ("#666666", "-"))
+_OTHER_STYLES: Final = (("#56B4E9", "-."), ("#F0E442", "--"), ("#999999", ":"), ("#666666", "-"))
 
 
 def ink_on(colour: str) -> str:
@@ -46,19 +46,19 @@ def ink_on(colour: str) -> str:
     return "white" if 0.299 * red + 0.587 * green + 0.114 * blue < 128 else "black"  # noqa: PLR2004 - half way
 
 
-def cell_looks(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, str]]:
+def cell_styles(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, str]]:
     """Return name -> colour and line style, for cells given as name -> (transport, variant).
 
     A cell as its transport declares it looks the same in every figure of every run, dotted where its name has a
-    payload; others get other looks: those with options of their own, and those whose transport is not here.
+    payload; others get other styles: those with options of their own, and those whose transport is not here.
     """
-    looks: dict[str, tuple[str, str]] = {}
+    styles: dict[str, tuple[str, str]] = {}
     for name, (transport, variant) in cells.items():
         plain, style = without(name, "payload"), declared(transport).style
         if "?" not in plain and variant in style:
-            looks[name] = style[variant] if plain == name else (style[variant][0], ":")
-    others = [name for name in cells if name not in looks]
-    return looks | {name: _OTHER_LOOKS[place % len(_OTHER_LOOKS)] for place, name in enumerate(others)}
+            styles[name] = style[variant] if plain == name else (style[variant][0], ":")
+    others = [name for name in cells if name not in styles]
+    return styles | {name: _OTHER_STYLES[place % len(_OTHER_STYLES)] for place, name in enumerate(others)}
 
 
 @contextmanager

@@ -33,8 +33,8 @@ from s2a_bench.plan.skillset import GAPS
 from s2a_bench.policy import Schedule
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.drive import drive
+from s2a_bench.scenario.ccrb.labels import MARK, NO_SCORE
 from s2a_bench.scenario.ccrb.options import CcrbOptions
-from s2a_bench.scenario.ccrb.words import MARK, NO_SCORE
 from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.store.run import StoredRun, read_run
 from tests.made_runs import SCHEMA

@@ -17,9 +17,9 @@ from s2a_bench.boards.gaps import Constant, Lognormal, Markov, Recorded
 from s2a_bench.boards.profile import Profile
 from s2a_bench.boards.tokens import board_of_profile, gaps_of
 from s2a_bench.errors import StoreError, UsageError
+from s2a_bench.experiments.timeline.metrics import timeline_rows
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import recordings, run_timeline
-from s2a_bench.experiments.timeline.to_rows import timeline_rows
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.tables import timeline_tables
 from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, settings

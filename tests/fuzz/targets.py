@@ -122,7 +122,7 @@ def client() -> TestClient:
     async def connected(scope: Any, receive: Any, send: Any) -> None:
         """Stand in for uvicorn's connection."""
         scope.setdefault("state", {})["protocol"] = Mock(
-            spec=Protocol, gone=lambda: False, trace=Trace(), held=ExitStack()
+            spec=Protocol, disconnected=lambda: False, trace=Trace(), held=ExitStack()
         )
         await app(scope, receive, send)
 

@@ -19,7 +19,7 @@ from s2a_bench.experiments import EXPERIMENTS, Metric
 from s2a_bench.experiments.latency import metrics as latency
 from s2a_bench.experiments.throughput import metrics as throughput
 from s2a_bench.experiments.timeline.view import cells as timeline
-from s2a_bench.report.compare.alike import differences
+from s2a_bench.report.compare.agreement import differences
 from s2a_bench.report.compare.comparison import (
     ComparedRuns,
     compare,

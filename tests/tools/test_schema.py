@@ -14,7 +14,7 @@ import pytest
 
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import NonNegative, about
-from s2a_bench.writers.as_json import cell_of_row
+from s2a_bench.writers.json import cell_of_row
 
 ROOT = Path(__file__).parent.parent.parent
 spec = importlib.util.spec_from_file_location("s2a_schema", ROOT / "tools/schema.py")

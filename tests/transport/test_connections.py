@@ -73,12 +73,12 @@ def test_a_client_that_does_not_read_is_given_up_in_time(ends: tuple[Wire, socke
 def test_a_client_that_has_gone_is_noticed_while_its_bytes_lie_unread(ends: tuple[Wire, socket.socket]) -> None:
     wire, client = ends
     client.sendall(bytes(1000))
-    assert not wire.gone()
+    assert not wire.disconnected()
     client.close()
     ends_ns = now_ns() + 10 * 10**9
-    while not wire.gone() and now_ns() < ends_ns:
+    while not wire.disconnected() and now_ns() < ends_ns:
         pass
-    assert wire.gone()
+    assert wire.disconnected()
 
 
 def test_what_is_late_goes_on_with_what_follows(ends: tuple[Wire, socket.socket]) -> None:

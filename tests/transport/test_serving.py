@@ -36,7 +36,7 @@ class Told(Exchange):
     def accept(self) -> None:
         self.told.append("accept")
 
-    def gone(self) -> bool:
+    def disconnected(self) -> bool:
         return self._has_gone
 
     def send(self, piece: Piece) -> bool:
@@ -153,7 +153,7 @@ def test_marks_that_are_not_known_keep_nothing_of_who_asks() -> None:
 def test_a_message_of_a_client_that_has_gone_counts_as_no_connection() -> None:
     context = zmq.Context()
     watch = ConnectionWatch(context.socket(zmq.ROUTER))
-    assert not watch.of(12345).gone
+    assert not watch.of(12345).disconnected
     assert watch.connections == {}
     watch.close()
     context.destroy(0)

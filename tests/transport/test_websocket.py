@@ -30,8 +30,8 @@ from s2a_bench.provenance import Provenance
 from s2a_bench.testing.transport import Connect, RecordingHandler, ask, connector, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client
-from s2a_bench.transport.dangers import examine
 from s2a_bench.transport.limits import Limits
+from s2a_bench.transport.risks import examine
 from s2a_bench.transport.serving import Queued
 from s2a_bench.transport.websocket import connection
 from s2a_bench.transport.websocket.codec import packb, unpackb

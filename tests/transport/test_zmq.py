@@ -29,9 +29,9 @@ from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client
-from s2a_bench.transport.dangers import examine
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
+from s2a_bench.transport.risks import examine
 from s2a_bench.transport.zmq.watch import ConnectionWatch
 from s2a_bench.types import Action, Piece, Request
 from tests.waiting import until
@@ -340,7 +340,7 @@ class TestWatch:
             descriptor = router.recv_multipart(copy=False)[-1].get(zmq.SRCFD)
             connection = watch.of(descriptor)
             watch.hear()
-            assert not connection.gone
+            assert not connection.disconnected
             descriptors.append(descriptor)
             watch.monitor.poll(0)
             peer.close(0)

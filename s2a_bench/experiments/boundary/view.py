@@ -12,9 +12,9 @@ import numpy as np
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
 from s2a_bench.store.schema import PROVENANCE, Positive, about
-from s2a_bench.writers.as_json import cell_of_row, frame
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import new_figure, write_beside
+from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, EMULATED, PAPERS, Note, TextTable, number
 
 if TYPE_CHECKING:
@@ -186,12 +186,12 @@ def build_boundary(run: StoredRun) -> Figure:
     else:
         _shade_regions(axes, tokens, lines, low, high)
         _mark_trials(axes, run)
-    looks = {
+    styles = {
         "t_nom": ("-", r"$R = L\,/\,T_\mathrm{nom}$ (naive as it runs)"),
         "t_min": ("--", r"$R = L\,/\,T_\mathrm{min}$ (the paper's line)"),
     }
     for name, duration_s in lines.items():
-        style, label = looks[name]
+        style, label = styles[name]
         axes.plot(tokens, tokens / duration_s, style, color="black", label=label)
     _mark_boards(axes, run)
     axes.set_xticks(range(1, most + 1))

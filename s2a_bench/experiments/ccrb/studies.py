@@ -36,10 +36,10 @@ from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import NCAP_DECELS_MPS2, NCAP_GAPS_M, OUTCOMES, Cars, start_deadline
 from s2a_bench.scenario.ccrb.drive import Trajectory
 from s2a_bench.scenario.ccrb.ego import PHASES
+from s2a_bench.scenario.ccrb.labels import PAPER
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.outcome import Outcomes
 from s2a_bench.scenario.ccrb.studies import Scenes, draw, drive_along, plane, spread, survived
-from s2a_bench.scenario.ccrb.words import PAPER
 from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.stats.seeds import generator
 

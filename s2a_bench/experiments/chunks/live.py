@@ -22,8 +22,8 @@ from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.chunks.asking import Asking, Job, warm_up
 from s2a_bench.experiments.chunks.cells import ChunkCell, LatencyDraw, cells
 from s2a_bench.experiments.chunks.latencies import Source, delay_rows, measured, write_delays
+from s2a_bench.experiments.chunks.metrics import stall_metrics, stalls_of, write_cell
 from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
-from s2a_bench.experiments.chunks.to_rows import stall_metrics, stalls_of, write_cell
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Place, Session
@@ -197,7 +197,7 @@ def _act(
 ) -> LiveResult:
     """Act in one mode, and write down every request as it is measured."""
     setting = config.setting.slowed(cell.slower)
-    told = robot is not None and _takes_state(config, sessions[0], robot)
+    told = robot is not None and _accepts_state(config, sessions[0], robot)
 
     def heard(request: int, actions: Sequence[Any], at_ns: int) -> None:
         loop.arrived(request, actions, at_ns)
@@ -226,7 +226,7 @@ def _nowhere(action: Vector | None, at_ns: int) -> None:
     """Take actions that nobody executes."""
 
 
-def _takes_state(config: ChunksConfig, session: Session, robot: ActionRobot) -> bool:
+def _accepts_state(config: ChunksConfig, session: Session, robot: ActionRobot) -> bool:
     """Return whether requests tell the policy of the robot; raises UsageError for another state than was asked for."""
     cell, numbers, wanted = session.cell, len(robot.state()), config.requests.state
     if numbers and wanted and numbers != wanted:

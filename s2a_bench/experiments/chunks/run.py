@@ -12,9 +12,9 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.cells import ChunkCell, LatencyDraw, cells, draw, without_trigger
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.latencies import delay_rows, write_delays
+from s2a_bench.experiments.chunks.metrics import stalls_of, write_cell
 from s2a_bench.experiments.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS, MeanRow, TriggerRow
 from s2a_bench.experiments.chunks.smooth import TrackingPlant, follower
-from s2a_bench.experiments.chunks.to_rows import stalls_of, write_cell
 from s2a_bench.machine import environment
 from s2a_bench.policy.chunks.closed import closed
 from s2a_bench.policy.chunks.metrics import measure

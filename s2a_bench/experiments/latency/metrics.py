@@ -23,8 +23,8 @@ from s2a_bench.experiments.requests import (
 from s2a_bench.stats import Summary, summary_of
 from s2a_bench.store.schema import Count, about
 from s2a_bench.trace import GROUPS
-from s2a_bench.writers.as_json import frame, ratio_entry, summaries
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
+from s2a_bench.writers.json import frame, ratio_entry, summaries
 
 if TYPE_CHECKING:
     from s2a_bench.experiments import Comparable

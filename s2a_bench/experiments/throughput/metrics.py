@@ -23,8 +23,8 @@ from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import Count, Table, about
 from s2a_bench.transport import declared
-from s2a_bench.writers.as_json import frame, ratio_entry
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
+from s2a_bench.writers.json import frame, ratio_entry
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.requests import Floats

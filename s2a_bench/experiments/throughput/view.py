@@ -33,7 +33,7 @@ from s2a_bench.experiments.throughput.metrics import (
 )
 from s2a_bench.stats import summary_of
 from s2a_bench.writers.figures import WHISKERS, Bar, build_bars, build_distribution, new_figure
-from s2a_bench.writers.style import cell_looks
+from s2a_bench.writers.style import cell_styles
 from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interval, mean_sd, number
 
 if TYPE_CHECKING:
@@ -199,8 +199,8 @@ def build_throughput_bars(run: StoredRun, *, against_paper: bool = False) -> Fig
     Bars from zero; points on a logarithmic axis where the rates are too far apart for one scale.
     """
     cells = [cell for cell in throughput_cells(run) if cell.values(ENGINE_METRIC).size]
-    looks = cell_looks({cell.name: cell.path for cell in cells})
-    bars = [Bar.of(cell.name, cell.values(ENGINE_METRIC), looks[cell.name][0]) for cell in cells]
+    styles = cell_styles({cell.name: cell.path for cell in cells})
+    bars = [Bar.of(cell.name, cell.values(ENGINE_METRIC), styles[cell.name][0]) for cell in cells]
     if reference := reference_values(run):
         bars.append(Bar.of(f"{LLAMA_BENCH}\n(decode)", np.array(reference), _REFERENCE_FILL))
     if against_paper:
@@ -215,9 +215,9 @@ def build_throughput_bars(run: StoredRun, *, against_paper: bool = False) -> Fig
 def build_gap_distribution(run: StoredRun) -> Figure:
     """Draw the empirical distribution of the gaps between tokens, a line a cell."""
     cells = [cell for cell in throughput_cells(run) if cell.values("itl").size]
-    looks = cell_looks({cell.name: cell.path for cell in cells})
+    styles = cell_styles({cell.name: cell.path for cell in cells})
     lines = {
-        f"{cell.name}, p99 {entries(gaps, 'p99')[0]} ms": (gaps, looks[cell.name])
+        f"{cell.name}, p99 {entries(gaps, 'p99')[0]} ms": (gaps, styles[cell.name])
         for cell in cells
         for gaps in [cell.values("itl")]
     }
@@ -231,7 +231,7 @@ def build_rate_by_position(run: StoredRun) -> Figure:
     Not means: tokens that arrive together after a pause have any rate at all.
     """
     cells = [cell for cell in throughput_cells(run) if rates_by_position(cell)]
-    looks = cell_looks({cell.name: cell.path for cell in cells})
+    styles = cell_styles({cell.name: cell.path for cell in cells})
     caption = _caption(run, cells, f"Decode rate by position, bins of {BIN}: medians", "Bands: quartiles.")
     figure = new_figure(2.2 + 0.14 * -(-len(cells) // 2), caption)
     axes = figure.subplots()
@@ -240,7 +240,7 @@ def build_rate_by_position(run: StoredRun) -> Figure:
         found = rates_by_position(cell)
         middles = [(first + last) / 2 + 1 for first, last in found]
         low, medians, high = np.array([np.percentile(rates, (25, 50, 75)) for rates in found.values()]).T
-        colour, line = looks[cell.name]
+        colour, line = styles[cell.name]
         highest = max(highest, *medians)
         axes.plot(middles, medians, color=colour, linestyle=line, marker="o", markersize=3, label=cell.name)
         axes.fill_between(middles, low, high, color=colour, alpha=0.2, linewidth=0)

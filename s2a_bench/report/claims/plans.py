@@ -30,8 +30,8 @@ from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
 from s2a_bench.provenance import UNKNOWN
 from s2a_bench.report.claims import Check, Met, Need, RunPart, Trial
 from s2a_bench.report.claims.requests import LIKE, PAPERS_MODEL, change, emulated, exact, facts_of, on_board, one_of
+from s2a_bench.scenario.ccrb.labels import PAPER, SAID, law
 from s2a_bench.scenario.ccrb.options import CcrbOptions
-from s2a_bench.scenario.ccrb.words import PAPER, SAID, law
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import Change
 from s2a_bench.store.run import StoredRun

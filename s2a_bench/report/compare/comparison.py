@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from s2a_bench.errors import UnlikeRuns, UsageError
 from s2a_bench.experiments import EXPERIMENTS, Comparable, Metric, Subject, by_name, experiment_of
 from s2a_bench.provenance import Origins, joined
-from s2a_bench.report.compare.alike import Difference, differences, in_words
+from s2a_bench.report.compare.agreement import Difference, differences, in_words
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.stats.change import Change, change_between, holm
 from s2a_bench.store.manifest import RunWarning

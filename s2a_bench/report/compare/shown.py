@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments import Better
-from s2a_bench.report.compare.alike import Difference
+from s2a_bench.report.compare.agreement import Difference
 from s2a_bench.report.compare.comparison import LEVEL, SAME, TOO_FEW, UNCLEAR
 from s2a_bench.stats.batches import BATCHES
 from s2a_bench.stats.change import POWER

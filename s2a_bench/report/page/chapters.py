@@ -11,7 +11,7 @@ from typing import Any
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments import Shown, experiment_of
-from s2a_bench.report.compare.alike import SETTING, Difference, differences, names_of, of_machine
+from s2a_bench.report.compare.agreement import SETTING, Difference, differences, names_of, of_machine
 from s2a_bench.report.page.sweeps import overview, pooled, words_of
 from s2a_bench.store.run import StoredRun, fits, read_run
 from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep

@@ -19,7 +19,7 @@ from s2a_bench.scenario.ccrb.cars import (
     plan_decel,
     start_deadline,
 )
-from s2a_bench.scenario.ccrb.words import law
+from s2a_bench.scenario.ccrb.labels import law
 
 SKILL_SET: Final = "driving"
 

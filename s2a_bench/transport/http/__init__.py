@@ -72,7 +72,7 @@ class Http(Transport[HttpOptions]):
     )
     urls = Urls(
         HttpOptions.SCHEMES,
-        examine="s2a_bench.transport.http.dangers:examine",
+        examine="s2a_bench.transport.http.risks:examine",
         cache_hits="s2a_bench.transport.http.detect:counted_hits",
     )
 
@@ -123,7 +123,7 @@ class Http(Transport[HttpOptions]):
             payloads=jpeg if choice.variant == LLAMA_SERVER else dialects[0].payloads,
             answer_kinds=(TOKENS,),
             accepts_state=False,
-            facts=(*self.facts, *(fact for dialect in dialects for fact in dialect.tells)),
+            facts=(*self.facts, *(fact for dialect in dialects for fact in dialect.facts)),
         )
 
     def require(self, choice: Choice[HttpOptions]) -> None:

@@ -149,7 +149,7 @@ class ChatExchange(Exchange):
             event = own.chunk(self._asked.id, {})
             event["choices"][0] |= {"tick": piece.index, "action": piece.values.tolist()}
             self._write(self._framed(event))
-        if self.gone():
+        if self.disconnected():
             raise Disconnected
         return True
 

@@ -224,7 +224,7 @@ class FastExchange(ChatExchange):
         """What came of the next request."""
         self._wire, self._head, self._reads, self._body, self._limits = wire, head, reads, body, limits
 
-    def gone(self) -> bool:
+    def disconnected(self) -> bool:
         """Whether the client has hung up, or floods us; what it left is read, for its end comes behind."""
         try:
             self.early += self._wire.socket.recv(PIECE, MSG_DONTWAIT)
@@ -232,7 +232,7 @@ class FastExchange(ChatExchange):
             pass
         except OSError:
             return True
-        return self._wire.gone() or len(self.early) > EARLY
+        return self._wire.disconnected() or len(self.early) > EARLY
 
     def read(self) -> tuple[Request, bool]:
         body, self._body = self._body, memoryview(b"")

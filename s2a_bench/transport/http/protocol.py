@@ -49,7 +49,7 @@ class Protocol(HttpToolsProtocol):
             most = f"{self._limits.connections} connections are open already"
             self._refuse(Refused(503, most, {"retry-after": "1"}))
 
-    def gone(self) -> bool:
+    def disconnected(self) -> bool:
         """Whether the client has hung up, noticed while bytes of it lie unread, too; from any thread."""
         return self._lost or any(events & GONE for _, events in self._poll.poll(0))
 

@@ -76,9 +76,9 @@ class DeployedExchange(ChatExchange):
         self.given_up = False
         self.messages: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
         self._body, self._limits = body, limits
-        self._disconnected, self._loop = protocol.gone, asyncio.get_running_loop()
+        self._disconnected, self._loop = protocol.disconnected, asyncio.get_running_loop()
 
-    def gone(self) -> bool:
+    def disconnected(self) -> bool:
         return self.given_up or self._disconnected()
 
     def read(self) -> tuple[Request, bool]:

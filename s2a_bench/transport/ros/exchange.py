@@ -59,7 +59,7 @@ class RosExchange(Exchange):
         """Send the end of the answer, with an ``error`` if something failed."""
         raise NotImplementedError
 
-    def gone(self) -> bool:
+    def disconnected(self) -> bool:
         return self._shared.stopped.is_set() or self.cancelled()
 
     def abandon(self) -> None:

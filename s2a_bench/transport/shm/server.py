@@ -152,7 +152,7 @@ class ShmExchange(Exchange):
     ) -> None:
         """Answer what lies at a ``place`` in ``requests``."""
         super().__init__()
-        self.gone = wire.gone  # type: ignore[method-assign]
+        self.disconnected = wire.disconnected  # type: ignore[method-assign]
         self._requests, self._writer, self._place, self._core = requests, writer, place, core
         writer.begin()
 

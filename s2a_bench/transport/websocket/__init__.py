@@ -48,7 +48,7 @@ class Websocket(PolicyTransport[WebsocketOptions]):
     name = "websocket"
     options = WebsocketOptions
     variants = VARIANTS
-    urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.transport.websocket.dangers:examine")
+    urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.transport.websocket.risks:examine")
     modules = PACKAGES
     compared_with = ("ros", "loopback")
     facts = (PAYLOAD_BYTES, RECONNECTS, INFER_MS, PREV_TOTAL_MS)

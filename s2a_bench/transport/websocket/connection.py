@@ -60,7 +60,7 @@ class PolicyConnection:
     ) -> None:
         """Greet with ``metadata``, and answer each message by an ``exchange``."""
         self.wire, self.core = wire, core
-        self.ours = self.streams = False
+        self.native = self.streams = False
         """Whether it is our client, which is told our marks; whether actions are sent one by one."""
         self.previous_ms: float | None = None
         """What the request before took."""
@@ -136,7 +136,7 @@ class PolicyConnection:
         if path == codec.HEALTH:
             stuck = self.core.stuck()
             return protocol.reject(HTTPStatus.SERVICE_UNAVAILABLE if stuck else HTTPStatus.OK, f"{stuck or 'OK'}\n")
-        self.ours = codec.MARKS_HEADER in request.headers
+        self.native = codec.MARKS_HEADER in request.headers
         self.streams = path.rstrip("/").endswith(STREAM_PATH)
         response = protocol.accept(request)
         if response.status_code == HTTPStatus.SWITCHING_PROTOCOLS:

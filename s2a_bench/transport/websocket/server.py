@@ -65,7 +65,7 @@ class WebsocketExchange(Exchange):
         """Answer a ``message`` that is whole."""
         super().__init__()
         self.trace.mark("network")
-        self.gone = connection.wire.gone  # type: ignore[method-assign]
+        self.disconnected = connection.wire.disconnected  # type: ignore[method-assign]
         self._connection, self._message = connection, message
         self._began_ns = self.trace.marks[0][1]
         self._actions: list[Any] = []
@@ -73,7 +73,7 @@ class WebsocketExchange(Exchange):
     def request(self) -> Request:
         observation, self._message = unpackb(self._message), b""
         self.trace.mark("msgpack_parse")
-        told = observed.told_in(observation) if self._connection.ours else None
+        told = observed.told_in(observation) if self._connection.native else None
         request = observed.request_of(observation, told, self.trace, self._connection.core.limits)
         self.trace.mark("msgpack_parse")
         return request
@@ -84,7 +84,7 @@ class WebsocketExchange(Exchange):
 
     def send(self, piece: Piece) -> bool:
         """Keep an action, and send it where the chunk is streamed."""
-        if self.gone():
+        if self.disconnected():
             raise Disconnected
         if not isinstance(piece, Action):
             raise EngineError(
@@ -111,7 +111,7 @@ class WebsocketExchange(Exchange):
         kind = {codec.TYPE: codec.FINAL} if connection.streams else {}
         connection.send(packb({**kind, codec.ACTIONS: np.stack(self._actions), codec.TIMING: timing}))
         connection.previous_ms = (now_ns() - self._began_ns) / 1e6
-        if connection.ours:
+        if connection.native:
             connection.send(packb(observed.remote_message(trace.to_remote())))
         connection.flush(self.left_s())
 

@@ -60,7 +60,7 @@ class Zmq(PolicyTransport[ZmqOptions]):
     name = "zmq"
     options = ZmqOptions
     variants = (GR00T,)
-    urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.transport.zmq.dangers:examine")
+    urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.transport.zmq.risks:examine")
     modules = PACKAGES
     compared_with = ("ros", "loopback")
     facts = (PAYLOAD_BYTES, RECONNECTS)

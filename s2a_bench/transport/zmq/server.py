@@ -261,7 +261,7 @@ class ActionExchange(Exchange):
 
     def send(self, piece: Piece) -> bool:
         self._pieces.append(piece)
-        return not self.gone()
+        return not self.disconnected()
 
     def end(self) -> None:
         """Send the chunk, then find the marks, which may take time, for our own client."""
@@ -276,8 +276,8 @@ class ActionExchange(Exchange):
         if self._promised is not None and not self._promised.marks.done():
             self._promised.marks.set_exception(_unknown())
 
-    def gone(self) -> bool:
-        return self._client.connection.gone
+    def disconnected(self) -> bool:
+        return self._client.connection.disconnected
 
 
 class Promise:

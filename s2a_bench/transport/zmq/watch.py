@@ -19,11 +19,11 @@ REFUSED: Final = {zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CLOSED}
 class Connection:
     """One TCP connection of a ZeroMQ socket."""
 
-    __slots__ = ("gone", "ready")
+    __slots__ = ("disconnected", "ready")
 
     def __init__(self) -> None:
         """Know of a connection that has begun."""
-        self.gone = False
+        self.disconnected = False
         self.ready = False
         """Whether both sides have greeted."""
 
@@ -80,4 +80,4 @@ class ConnectionWatch:
 
     def _end(self, descriptor: int) -> None:
         if (connection := self.connections.pop(descriptor, None)) is not None:
-            connection.gone = True
+            connection.disconnected = True

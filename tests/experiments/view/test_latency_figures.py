@@ -20,7 +20,7 @@ from s2a_bench.experiments.paper import LABEL
 from s2a_bench.store.run import StoredRun
 from s2a_bench.trace import GROUPS
 from s2a_bench.writers.figures import Bar, caption_of
-from s2a_bench.writers.style import GREY, GROUP_FILLS, cell_looks, paper_column
+from s2a_bench.writers.style import GREY, GROUP_FILLS, cell_styles, paper_column
 
 MakeRun = Callable[..., StoredRun]
 HAND = {
@@ -142,7 +142,7 @@ def test_every_group_has_a_look_and_every_cell_one_of_its_own() -> None:
         "shm?payload=png": ("shm", ""),
     }
     names = [*cells]
-    looks = cell_looks(cells)
+    looks = cell_styles(cells)
     assert set(looks) == set(names)
     assert len(set(looks.values())) == len(names)
 

@@ -7,7 +7,7 @@ from typing import Any
 from s2a_bench.experiments import Comparable, Metric, Shown, Subject
 from s2a_bench.stats import summary_of
 from s2a_bench.store.run import StoredRun
-from s2a_bench.writers.as_json import frame, summaries
+from s2a_bench.writers.json import frame, summaries
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 from s2a_toy.clock_run import READINGS
 

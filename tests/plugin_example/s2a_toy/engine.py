@@ -19,7 +19,7 @@ class ToyWords(Engine):
     acts = True
     needs_model = False
     computes = False
-    tells: ClassVar[tuple[Fact, ...]] = (TOY_COUNTED,)
+    declared_facts: ClassVar[tuple[Fact, ...]] = (TOY_COUNTED,)
 
     def __init__(self, config: EngineConfig) -> None:
         """Keep what is asked for."""

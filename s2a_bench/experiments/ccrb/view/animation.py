@@ -13,8 +13,8 @@ from s2a_bench.errors import StoreError
 from s2a_bench.experiments.ccrb.view.figures import path_of, rest_of
 from s2a_bench.experiments.ccrb.view.outcomes import configuration, rollouts_of, tokens_line
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES
+from s2a_bench.scenario.ccrb.labels import SAID, law
 from s2a_bench.scenario.ccrb.render import TopView
-from s2a_bench.scenario.ccrb.words import SAID, law
 from s2a_bench.store.requests import SKILLS
 
 if TYPE_CHECKING:

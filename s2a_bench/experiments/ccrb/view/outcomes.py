@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from s2a_bench.experiments import TIME
 from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
-from s2a_bench.scenario.ccrb.words import NAIVE, OURS, PAPER, WAIT, check, law
+from s2a_bench.scenario.ccrb.labels import NAIVE, OURS, PAPER, WAIT, check, law
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note

@@ -37,10 +37,10 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 )
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.cars import OUTCOMES as CODES
-from s2a_bench.scenario.ccrb.words import MARK, NAIVE, NO_SCORE, ORDERING, PAPER, law, marked, operating_point, said
+from s2a_bench.scenario.ccrb.labels import MARK, NAIVE, NO_SCORE, ORDERING, PAPER, law, marked, operating_point, said
 from s2a_bench.store.schema import PROVENANCE, Count, Facts, Fraction, Many, Positive, about
-from s2a_bench.writers.as_json import cell_of_row, frame
 from s2a_bench.writers.csv_text import CsvTable
+from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, number
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from s2a_bench.experiments.chunks.rows import CHUNKS, METRICS, ChunkRow
 from s2a_bench.policy.chunks import streams
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import PROVENANCE, about
-from s2a_bench.writers.as_json import cell_of_row, frame
 from s2a_bench.writers.csv_text import CsvTable
+from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, EMULATED, Note, TextTable, number
 
 if TYPE_CHECKING:

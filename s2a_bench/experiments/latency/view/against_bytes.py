@@ -17,7 +17,7 @@ from s2a_bench.experiments.requests import RequestCell, payloads_of, stand_ins
 from s2a_bench.stats.line import Estimate, Line, crossing, fit_line
 from s2a_bench.transport import declared
 from s2a_bench.writers.figures import new_figure
-from s2a_bench.writers.style import cell_looks
+from s2a_bench.writers.style import cell_styles
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
@@ -150,12 +150,12 @@ def build_lines(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) ->
     drawn = [each for each in pipelines if each.line]
     payloads = list(dict.fromkeys(each.payload for each in drawn))
     names = {each.name: each.path for each in drawn}
-    looks = cell_looks(names)
+    styles = cell_styles(names)
     height = 0.6 + 2.3 * len(payloads) + 0.14 * -(-len(names) // 2)
     figure = new_figure(height, ("Time against bytes: medians and fitted lines", *answered))
     panels = figure.subplots(len(payloads), 1, squeeze=False, sharex=True)[:, 0]
     for axes, payload in zip(panels, payloads, strict=True):
-        _draw(axes, [each for each in drawn if each.payload == payload], looks)
+        _draw(axes, [each for each in drawn if each.payload == payload], styles)
         axes.set_title(f"payload {payload}", loc="left")
         axes.set_ylabel("e2e without inference (ms)")
     panels[-1].set_xlabel("pictures of a request, as pixels (MB)")
@@ -164,11 +164,11 @@ def build_lines(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) ->
     return figure
 
 
-def _draw(axes: Axes, pipelines: Sequence[FittedPipeline], looks: Mapping[str, tuple[str, str]]) -> None:
+def _draw(axes: Axes, pipelines: Sequence[FittedPipeline], styles: Mapping[str, tuple[str, str]]) -> None:
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     for each in pipelines:
-        colour, style = looks[each.name]
+        colour, style = styles[each.name]
         sizes = np.array([size for size, _ in each.groups])
         medians = [float(np.median(values)) for _, values in each.groups]
         axes.scatter(sizes, medians, s=7, color=colour, linewidths=0)

@@ -28,7 +28,7 @@ from s2a_bench.writers.figures import (
     new_figure,
     write_beside,
 )
-from s2a_bench.writers.style import GROUP_FILLS, RESIDUAL_FILL, cell_looks
+from s2a_bench.writers.style import GROUP_FILLS, RESIDUAL_FILL, cell_styles
 from s2a_bench.writers.tables import number
 
 if TYPE_CHECKING:
@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 def build_latency_bars(run: StoredRun, *, against_paper: bool = False) -> Figure:
     """Draw medians of e2e without inference, a bar a cell (the paper's figure 4), from zero on a linear axis."""
     cells, metric = _shown(run)
-    looks = cell_looks({cell.name: cell.path for cell in cells})
-    bars = [Bar.of(_label(cell), cell.values_ms(metric), looks[cell.name][0]) for cell in cells]
+    styles = cell_styles({cell.name: cell.path for cell in cells})
+    bars = [Bar.of(_label(cell), cell.values_ms(metric), styles[cell.name][0]) for cell in cells]
     notes = [WHISKERS]
     if against_paper:
         notes.append(f"Grey: {LABEL}, mean ± sd; {CAVEAT}.")
@@ -106,9 +106,9 @@ def build_stage_breakdown(run: StoredRun) -> Figure:
 def build_latency_distribution(run: StoredRun) -> Figure:
     """Draw the empirical distribution of e2e without inference, a line a cell; logarithmic where it spreads widely."""
     cells, metric = _shown(run)
-    looks = cell_looks({cell.name: cell.path for cell in cells})
+    styles = cell_styles({cell.name: cell.path for cell in cells})
     named = zip(titles(cells), cells, strict=True)
-    lines = {title: (cell.values_ms(metric), looks[cell.name]) for title, cell in named}
+    lines = {title: (cell.values_ms(metric), styles[cell.name]) for title, cell in named}
     return build_distribution(_caption(run, cells, "Distribution", metric), lines, "samples", _axis_label(metric))
 
 

@@ -11,7 +11,7 @@ from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.schema import Facts, Many, NonNegative, Positive, about, with_fields
-from s2a_bench.writers.as_json import frame
+from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:

@@ -46,7 +46,7 @@ class Dialect:
     payloads: tuple[str, ...] = ("jpeg", "jpeg-preencoded", "png")
     """How pictures can travel."""
     framing: Callable[[], Framing] = ServerSentEvents
-    tells: Sequence[Fact] = ()
+    facts: Sequence[Fact] = ()
     """The facts of its events."""
 
     def met(self, base: str, model: str, get: Get) -> tuple[str, str]:

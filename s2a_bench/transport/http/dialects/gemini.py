@@ -37,7 +37,7 @@ class Gemini(Dialect):
     """Google's API, by key."""
 
     name = "gemini"
-    tells = (*USAGE.values(), USAGE_ZERO)
+    facts = (*USAGE.values(), USAGE_ZERO)
 
     def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
         """Return the URL with the version that the server has, and the first model that it lists unless one is told."""

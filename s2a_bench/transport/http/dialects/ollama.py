@@ -32,7 +32,7 @@ class Ollama(Dialect):
     root, path = "/api", "/chat"
     media_type = "application/x-ndjson"
     framing = JsonLines
-    tells = (*COUNTS.values(), *DURATIONS.values(), OUTSIDE_MODEL_MS)
+    facts = (*COUNTS.values(), *DURATIONS.values(), OUTSIDE_MODEL_MS)
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
         """Return one user message; whether the model thinks is left to the server's default."""

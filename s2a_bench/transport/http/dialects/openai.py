@@ -67,7 +67,7 @@ class OpenAI(Dialect):
 
     name = "openai"
     root, path = "/v1", "/chat/completions"
-    tells = (*TIMINGS.values(), *METRICS.values(), THINKING_N, PREDICTED_STEPS, USAGE_ZERO)
+    facts = (*TIMINGS.values(), *METRICS.values(), THINKING_N, PREDICTED_STEPS, USAGE_ZERO)
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
         """Return standard fields and one user message."""
@@ -128,7 +128,7 @@ class Vllm(OpenAI):
 
     name = "vllm"
     takes_grammar = True
-    tells = (*OpenAI.tells, END_N)
+    facts = (*OpenAI.facts, END_N)
 
     def _extra(self, request: Request) -> dict[str, Any]:
         """Keep prefixes apart by a salt of the request's own, and ask for metrics, which some versions want."""
@@ -155,7 +155,7 @@ class Own(OpenAI):
 
     name = OWN
     takes_grammar = True
-    tells = (*LLAMA, LATENCY_DRAWN_MS)  # our engines behind it
+    facts = (*LLAMA, LATENCY_DRAWN_MS)  # our engines behind it
     payloads = (*OpenAI.payloads, "raw")
 
     def _extra(self, request: Request) -> dict[str, Any]:

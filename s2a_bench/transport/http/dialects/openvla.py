@@ -40,7 +40,7 @@ class OpenVla(Dialect):
     media_type = "application/json"
     payloads = ("raw",)
     framing = WholeBody
-    tells = (ACTION_N,)
+    facts = (ACTION_N,)
 
     def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:  # noqa: ARG002 - always pixels
         """Return the pixels as RGB, height x width x 3, marking `convert`."""

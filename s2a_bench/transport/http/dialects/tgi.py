@@ -18,7 +18,7 @@ class Tgi(Dialect):
     name = "tgi"
     path = "/generate_stream"
     lists_models = False
-    tells = tuple(DETAILS.values())
+    facts = tuple(DETAILS.values())
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:  # noqa: ARG002
         """Return the prompt with its pictures in Markdown, and ask for details."""

@@ -12,7 +12,7 @@ from s2a_bench.store.schema import SCHEMA
 from s2a_bench.store.sweep import Sweep
 from s2a_bench.sweep import SweepCell
 from s2a_bench.sweep.run import Expected
-from s2a_bench.writers.as_json import frame
+from s2a_bench.writers.json import frame
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,9 +9,9 @@ import httpx
 
 from s2a_bench.errors import S2AError, ServerDied
 from s2a_bench.machine.doctor import Finding
-from s2a_bench.transport.dangers import for_anybody, shown
 from s2a_bench.transport.http.detect import asker, getter
 from s2a_bench.transport.http.dialects.common import NO_LIST, first_model
+from s2a_bench.transport.risks import for_anybody, shown
 
 
 def examine(parts: SplitResult) -> Iterator[Finding]:

@@ -12,8 +12,8 @@ import pytest
 from s2a_bench.errors import UsageError
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.testing.transport import RecordingHandler, served, wiring
-from s2a_bench.transport import dangers
-from s2a_bench.transport.dangers import PREFACE, examine, shown
+from s2a_bench.transport import risks
+from s2a_bench.transport.risks import PREFACE, examine, shown
 
 SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 
@@ -63,7 +63,7 @@ def test_a_server_of_models_without_a_key_is_told_of() -> None:
 
 
 def test_off_this_machine_both_are_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dangers, "is_here", lambda _host: False)
+    monkeypatch.setattr(risks, "is_here", lambda _host: False)
     body = b'{"data": [{"id": "a\\u001b[31m"}]}'
     with answering(b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%b" % (len(body), body)) as (place, _):
         findings = found(f"http://{place}")

@@ -9,8 +9,8 @@ from urllib.parse import SplitResult, urlunsplit
 from s2a_bench import extras
 from s2a_bench.errors import RequestFailed
 from s2a_bench.machine.doctor import Finding
-from s2a_bench.transport.dangers import PATIENCE_S, for_anybody, shown
 from s2a_bench.transport.limits import Bounds
+from s2a_bench.transport.risks import PATIENCE_S, for_anybody, shown
 from s2a_bench.transport.zmq import PACKAGES, layouts
 
 PORT = 5555
