@@ -24,6 +24,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from difflib import unified_diff
 from functools import cache
@@ -216,18 +217,24 @@ class Workers:
 
     def try_unchanged(self, package: str) -> None:
         """Run the tests of a package without a change, which gives the limit in time of its mutants."""
-        tree, start = self._trees.get(), time.monotonic()
-        code, output = run_tests(tree, package, None, None)
+        with self._tree() as tree:
+            start = time.monotonic()
+            code, output = run_tests(tree, package, None, None)
         if code:
             sys.exit(f"the tests of {package} fail without a change:\n{output}")
         self._limits_s[package] = 30 + 4 * (time.monotonic() - start)
-        self._trees.put(tree)
+        print(f"the tests of {package} pass in {time.monotonic() - start:.0f} s", flush=True)
 
     def judge(self, mutant: Mutant) -> tuple[Mutant, str]:
         """Return the mutant and its verdict."""
+        with self._tree() as tree:
+            return mutant, judge(mutant, tree, self._limits_s[mutant.package])
+
+    @contextmanager
+    def _tree(self) -> Iterator[Path]:
         tree = self._trees.get()
         try:
-            return mutant, judge(mutant, tree, self._limits_s[mutant.package])
+            yield tree
         finally:
             self._trees.put(tree)
 
