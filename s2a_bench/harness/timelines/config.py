@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import product
 from pathlib import Path
@@ -74,7 +74,8 @@ class PlanSetting:
     @property
     def key(self) -> Verbatim:
         """Return what its draws follow from: another field, or another name of one, is another draw."""
-        return Verbatim(repr(self))
+        values = ", ".join(f"{field.name}={getattr(self, field.name)!r}" for field in fields(self))
+        return Verbatim(f"Setting({values})")  # a name in the seeds of all published runs
 
     def request_id(self, plan: int, policy: str = "") -> str:
         """Name a request; policies that share arrivals share the request."""
