@@ -1,52 +1,54 @@
-"""The tables of flags and facts in docs/ are those of the declarations."""
+"""The pages of flags and facts in docs/ are those of the declarations."""
 
 from __future__ import annotations
 
-import importlib.util
 import re
+import runpy
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent.parent
-PAGES = [page for page in sorted((ROOT / "docs").glob("*.md")) if "<!-- /f" in page.read_text(encoding="utf-8")]
-SPEC = importlib.util.spec_from_file_location("docs_flags", ROOT / "tools" / "docs_flags.py")
-assert SPEC is not None
-assert SPEC.loader is not None
-docs_flags = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(docs_flags)
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+TOOL = runpy.run_path(str(ROOT / "tools" / "docs_flags.py"))
+PAGES: dict[Path, str] = TOOL["pages"]()
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_page_has_its_tables_as_they_are(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    assert docs_flags.written(text) == text, "run tools/docs_flags.py"
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(DOCS)))
+def test_a_generated_page_is_up_to_date(path: Path) -> None:
+    assert path.read_text(encoding="utf-8") == PAGES[path], "run tools/docs_flags.py"
 
 
-def test_a_table_can_be_of_one_group_or_of_the_others() -> None:
-    live, others = docs_flags.table("timeline", group="LiveOptions"), docs_flags.table("timeline", "-", "LiveOptions")
-    assert "| `--warmup` | 1 | answers before, which policies learn the rate from |" in live.splitlines()
-    assert "`--pace`" in live
-    assert "`--jitter`" not in live
-    assert "| `--n-skills` | 8 | N, skills a plan; several with commas |" in others.splitlines()
-    assert "`--warmup`" not in others
-    assert "`--output`" in others
+def test_no_page_of_flags_is_left_of_a_command_that_has_gone() -> None:
+    assert {*(DOCS / "flags").iterdir()} == {*PAGES} - {DOCS / "facts.md"}
 
 
-def test_a_table_can_be_of_what_another_command_has_otherwise() -> None:
-    lines = docs_flags.table("throughput", "-", "latency").splitlines()
-    assert "| `--requests` | 10, quick: 3 | requests a cell |" in lines
-    assert not [line for line in lines if "`--prompt`" in line]
+@pytest.mark.parametrize("name", [path.stem for path in PAGES if path.parent.name == "flags"])
+def test_a_page_of_flags_and_the_page_of_its_command_link_to_each_other(name: str) -> None:
+    about = DOCS / f"{TOOL['ABOUT'].get(name, name)}.md"
+    assert f"](flags/{name}.md)" in about.read_text(encoding="utf-8")
+    assert f"](../{about.name})" in PAGES[DOCS / "flags" / f"{name}.md"]
 
 
-def test_a_group_within_a_configuration_is_left_out_or_alone() -> None:
-    live, others = docs_flags.table("ccrb", "", "PlanRequest"), docs_flags.table("ccrb", "-", "Asked")
-    assert "| `--pace` | the model's own | hold the answer back to so many tokens/s |" in live.splitlines()
-    assert "`--rear-gap`" in others
-    assert "`--rear-gap`" not in live
+def test_flags_have_the_headings_of_the_help_and_arguments_are_first() -> None:
+    assert re.findall("^## (.*)$", PAGES[DOCS / "flags" / "compare.md"], re.MULTILINE) == ["Arguments", "Options"]
+    assert re.findall("^## (.*)$", PAGES[DOCS / "flags" / "boundary.md"], re.MULTILINE)[-1] == "Options"
+    plans, live = (
+        PAGES[DOCS / "flags" / "timeline.md"].split(f"\n## {name}\n")[1].split("\n## ")[0].splitlines()
+        for name in ("Plans", "A model that answers")
+    )
+    assert "| `--n-skills` | 8 | N, skills a plan; several with commas |" in plans
+    assert "| `--warmup` | 1 | --live: answers before, which policies learn the rate from |" in live
+
+
+def test_the_commands_of_a_group_share_a_page() -> None:
+    page = PAGES[DOCS / "flags" / "profile.md"]
+    assert re.findall("^## (.*)$", page, re.MULTILINE) == [
+        f"profile {name}" for name in ("capture", "list", "match", "show")
+    ]
+    assert "| `NAME` |  | name of the profile; its file is NAME.toml |" in page
 
 
 def test_no_table_of_flags_is_by_hand() -> None:
-    for page in sorted((ROOT / "docs").glob("*.md")):
-        by_hand = docs_flags.TABLE.sub("", page.read_text(encoding="utf-8"))
-        assert not re.search(r"^\| (flag|option) +\|", by_hand, re.MULTILINE), page.name
+    for page in sorted(DOCS.glob("*.md")):
+        assert not re.search(r"^\| (flag|option) +\|", page.read_text(encoding="utf-8"), re.MULTILINE), page.name
