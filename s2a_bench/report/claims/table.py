@@ -227,7 +227,7 @@ CLAIMS: Final[tuple[Claim, ...]] = (
             "V-F",
             f"{title} is less safe than stream-to-act",
             "Over the phase diagram (2 to 12 tokens/s, rear gap 6 to 30 m) more points are worse than better, by an "
-            "impact faster by .5 m/s, for every gap behaviour (supported); fewer for every one (contradicted).",
+            "impact faster by 0.5 m/s, for every gap behaviour (supported); fewer for every one (contradicted).",
             Trial(
                 _CCRB,
                 of.drives,
