@@ -1,6 +1,6 @@
 """Acting: an `Executor` carries out one policy's decisions, a `ControlLoop` a chunk's actions, and robots take both.
 
-docs/executor.md and docs/chunks.md say what happens when, and how a robot is plugged in.
+docs/executor.md and docs/chunks-live.md say what happens when, and how a robot is plugged in.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Every relative link of the pages leads to a file that there is, and to a heading of it."""
+"""Every relative link of the pages leads to a file and a heading, and no page by hand is long."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ PAGES: Final = sorted(
     for pattern in ("*.md", "docs/**/*.md", "studies/*.md", "results/*.md", "results/reference/*.md")
     for path in ROOT.glob(pattern)
 )
+
+
+LINES: Final = 250
+"""The longest page of docs/ that is not generated."""
 
 
 def anchors(page: Path) -> set[str]:
@@ -42,6 +46,11 @@ def test_every_relative_link_of_a_page_leads_somewhere(page: Path) -> None:
         target = (page.parent / name).resolve() if name else page
         assert target.exists(), f"{link}: there is no {target}"
         assert not anchor or anchor in anchors(target), f"{link}: {target.name} has no such heading"
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda page: page.name)
+def test_a_page_is_about_one_subject(page: Path) -> None:
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= LINES, "split it by subject"
 
 
 def test_anchors_are_those_that_github_makes(tmp_path: Path) -> None:
