@@ -96,19 +96,22 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
 
     def death(self) -> ServerDied:
         """Describe how the process ended, with the last line it wrote."""
-        log = f"; its log is {self.log}" if self.log else ""
-        return ServerDied(f"the {self.name} server (pid {self.pid}) died, {self._end()}{self._last_lines(1)}{log}")
+        return ServerDied(f"the {self.name} server (pid {self.pid}) died, {self._end()}{self._last_lines(1)}")
 
     def no_start(self, why: str = "") -> ServerDied:
-        """Describe why it never was ready by the last lines it wrote: a run without samples keeps no log."""
+        """Describe why it never was ready, with the last lines it wrote."""
         return ServerDied(f"the {self.name} server {why or f'did not start, {self._end()}'}{self._last_lines(4)}")
 
     def _end(self) -> str:
         return how_it_ended(self._process.poll(), self._cure)
 
     def _last_lines(self, count: int) -> str:
-        lines = self.log.read_text(errors="replace").strip().splitlines()[-count:] if self.log else []
-        return f": {' / '.join(line.strip()[:200] for line in lines)}" if lines else ""
+        """Return the end of the log and where it is; a run keeps the folder of a log that its error names."""
+        if self.log is None:
+            return ""
+        lines = self.log.read_text(errors="replace").strip().splitlines()[-count:]
+        shown = f": {' / '.join(line.strip()[:200] for line in lines)}" if lines else ""
+        return f"{shown}; its log is {self.log}"
 
     def stop(self) -> None:
         """Ask the process to stop, then make it; an impatient second Ctrl-C makes it at once."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -14,7 +15,7 @@ from threading import Timer
 import pytest
 
 from s2a_bench.errors import ServerDied
-from s2a_bench.harness.processes import LlamaServerProcess, OwnServer, ServerProcess, keep_serving
+from s2a_bench.harness.processes import LlamaServerProcess, OwnProcess, OwnServer, ServerProcess, keep_serving
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
 from s2a_bench.sweep.perform import _outside
@@ -43,6 +44,17 @@ def test_a_server_that_met_an_illegal_instruction_says_to_set_up_again(tmp_path:
 def test_another_signal_is_only_told(tmp_path: Path) -> None:
     with Dies(tmp_path / "log", "SIGTERM") as server, pytest.raises(ServerDied, match="by signal 15; its log is"):
         server.wait_ready()
+
+
+def test_a_server_that_does_not_start_says_its_last_lines_and_where_its_log_is(tmp_path: Path) -> None:
+    log = tmp_path / "server-http-launch-2.log"
+    with OwnProcess("http", "s2a_bench.nothing", "{}", log) as server, pytest.raises(ServerDied) as error:
+        server.wait_ready()
+    start, *lines, where = re.split(": |; ", str(error.value))
+    assert start == "the http server did not start, exit code 1"
+    assert lines[-1] == "No module named s2a_bench.nothing"
+    assert where == f"its log is {log}"
+    assert lines[-1] in log.read_text()
 
 
 @pytest.fixture
