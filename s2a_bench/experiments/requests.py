@@ -143,7 +143,7 @@ class RequestCell:
     def by_launch(self, metric: str) -> dict[int, dict[int, list[float]]]:
         """Return the values of a metric by the launch and the block in which they were taken, times in ms."""
         values = self.column(metric).dropna()
-        return by_launch(self.good.loc[values.index], values)
+        return by_launch(self.good[["launch", "block"]].loc[values.index], values)
 
     def column(self, metric: RequestMetric | str) -> pd.Series[Any]:
         """Return a metric's column, times in ms; one of the samples' is named with or without ``_ms``."""
