@@ -320,8 +320,13 @@ def numbers_ms(column: pd.Series[Any]) -> Floats:
 
 
 def cells_of(run: StoredRun) -> list[RequestCell]:
-    """Split a run into its cells, in the order that their transports declare, then by name."""
-    return _cells(run, run.samples)
+    """Split a run into its cells, once, in the order that their transports declare, then by name."""
+    samples, tokens = run.samples, run.tokens
+    if (kept := run.derived.get("cells")) and kept[0] is samples and kept[1] is tokens:
+        return [*kept[2]]
+    cells = _cells(run, samples)
+    run.derived["cells"] = samples, tokens, cells
+    return [*cells]
 
 
 def split(runs: Iterable[StoredRun]) -> Split:

@@ -225,6 +225,8 @@ class StoredRun:
     manifest: dict[str, Any]
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
     """By name, what was read so far; what is put in here is not looked for in the folder."""
+    derived: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """What views computed of the tables once, by a name of theirs."""
 
     def table(self, table: Table[Any]) -> pd.DataFrame:
         """Return a table with all its columns, empty where the run has none; raises StoreError for a damaged file."""

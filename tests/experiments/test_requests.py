@@ -35,6 +35,14 @@ def test_cells_stand_in_a_fixed_order_whatever_the_order_of_the_samples(make_run
     assert [cell.name for cell in cells_of(run)] == expected
 
 
+def test_a_run_is_split_into_its_cells_once_and_again_where_its_samples_are_others(make_run: MakeRun) -> None:
+    run = make_run(HAND, n=4)
+    first, again = cells_of(run), cells_of(run)
+    assert [id(cell) for cell in first] == [id(cell) for cell in again]
+    run.tables["samples"] = run.samples[run.samples["cell"] == "ros/topic"]
+    assert [cell.name for cell in cells_of(run)] == ["ros/topic"]
+
+
 def test_stages_and_groups_of_a_cell_by_hand(make_run: MakeRun) -> None:
     http, ros = cells_of(make_run(HAND, n=4, spread=0))
     assert http.values_ms("convert").tolist() == [2.0] * 4
