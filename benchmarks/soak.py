@@ -33,10 +33,10 @@ import httpx
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.stats.change import ratio_of_blocks
 from s2a_bench.testing.hostile import Attack, Case
-from s2a_bench.testing.hostile.asker import Usage, family, usage
-from s2a_bench.testing.transport import ask, wiring
+from s2a_bench.testing.hostile.client import Usage, family, usage
+from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import Client, Wiring, open_client
-from s2a_bench.transport.http.own import PATHS
+from s2a_bench.transport.http.native import PATHS
 from s2a_bench.types import Request
 from tests.hostile.test_floods import FLOODS
 from tests.hostile.wires import http, ros, shm, websocket, zmq
@@ -180,10 +180,10 @@ def served(transport: str, engine: str, name: str, log: Path) -> Iterator[Served
             process.kill()
 
 
-def told(name: str, address: str) -> Wiring[Any]:
+def wiring(name: str, address: str) -> Wiring[Any]:
     """Return what a client of a server is told."""
     silence_s = SILENCE_S if name.startswith("ros") else PATIENCE_S
-    return wiring(name, address, timeout_s=silence_s, max_tokens=TOKENS)
+    return wiring_of(name, address, timeout_s=silence_s, max_tokens=TOKENS)
 
 
 class Honest:
@@ -192,7 +192,7 @@ class Honest:
     def __init__(self, name: str, address: str) -> None:
         """Connect."""
         self._url = address + PATHS["as-deployed"]
-        self._client: Client | None = None if name == "whole" else open_client(told(name, address))
+        self._client: Client | None = None if name == "whole" else open_client(wiring(name, address))
 
     def ask(self) -> int:
         """Return how many tokens answered; raises RequestFailed."""
@@ -282,7 +282,7 @@ class Load:
     def attack(self, case: Any) -> None:
         """Let one hostile client do its work."""
         with suppress(OSError, S2AError):  # whatever becomes of it
-            case.does(told(HONEST[self._result.transport][0], self._address))
+            case.does(wiring(HONEST[self._result.transport][0], self._address))
         with self._lock:
             self.attacks[case.name] += 1
 
@@ -348,7 +348,7 @@ def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = B
             with ExitStack() as clients:  # one that does not read for minutes would have heard all the attackers
                 name = HONEST[transport][0]
                 client, other = (
-                    clients.enter_context(closing(open_client(told(name, each.address)))) for each in (server, twin)
+                    clients.enter_context(closing(open_client(wiring(name, each.address)))) for each in (server, twin)
                 )
                 idle(client, other, 1, 5)
                 uses = settled(pid, before or usage(pid), result.lazy, client)
@@ -381,8 +381,8 @@ def result_json(result: Result) -> dict[str, Any]:
     """Return it as plain data."""
     plain = {name: value for name, value in vars(result).items() if name not in {"before", "after", "failed"}}
     uses = {name: asdict(use) for name in ("before", "after") if (use := getattr(result, name))}
-    told = {"failed": len(result.failed), "failures": result.failed[:20], "growth_mib": result.growth_mib}
-    return {**plain, **uses, **told, "broken": result.broken()}
+    counts = {"failed": len(result.failed), "failures": result.failed[:20], "growth_mib": result.growth_mib}
+    return {**plain, **uses, **counts, "broken": result.broken()}
 
 
 def main() -> None:

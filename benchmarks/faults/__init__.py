@@ -19,7 +19,7 @@ from threading import Event, Thread
 from benchmarks.faults.peers import BOUND_S, SILENCE_S, TOKENS, Peer, others, relayed, serving
 from s2a_bench.errors import S2AError
 from s2a_bench.harness.processes import OwnServer
-from s2a_bench.testing.transport import wiring
+from s2a_bench.testing.transport import wiring_of
 from s2a_bench.trace import Trace
 from s2a_bench.transport import open_client
 from s2a_bench.types import Request
@@ -106,8 +106,8 @@ def happens(fault: Fault, server: OwnServer) -> str:
         address, cut = server.address, lambda: None
         if fault.what == "connection cut":
             address, cut = stack.enter_context(relayed(server.address))
-        told = wiring(fault.transport, address, timeout_s=SILENCE_S, max_tokens=TOKENS)
-        peer = Peer(told, server.pid)
+        wiring = wiring_of(fault.transport, address, timeout_s=SILENCE_S, max_tokens=TOKENS)
+        peer = Peer(wiring, server.pid)
         stack.callback(peer.close)
         peer.hear("ready", seconds=60)
         if fault.when == "in the queue":
@@ -124,8 +124,8 @@ def _occupied(server: OwnServer, transport: str, over: Event) -> Thread:
     started = Event()
 
     def hold() -> None:
-        told = wiring(transport, server.address, timeout_s=SILENCE_S, max_tokens=TOKENS)
-        with suppress(S2AError), closing(open_client(told, server.alive)) as client:
+        wiring = wiring_of(transport, server.address, timeout_s=SILENCE_S, max_tokens=TOKENS)
+        with suppress(S2AError), closing(open_client(wiring, server.alive)) as client:
             for _ in client.request(Request("first", "go on", max_tokens=TOKENS), Trace()):
                 started.set()
                 if over.is_set():

@@ -18,7 +18,7 @@ from s2a_bench.errors import MessagesLost, S2AError
 from s2a_bench.harness.processes import OwnServer
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
-from s2a_bench.testing.transport import ask, wiring
+from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.trace import RESIDUAL, Trace
 from s2a_bench.transport import Wiring, open_client
 from s2a_bench.types import Request
@@ -34,10 +34,10 @@ _numbers = count()
 class Peer:
     """The client's process, as the matrix sees it."""
 
-    def __init__(self, told: Wiring[Any], server_pid: int) -> None:
+    def __init__(self, wiring: Wiring[Any], server_pid: int) -> None:
         """Start it: a fork of a process that has imported all this already."""
         self._pipe, other = FORKS.Pipe()
-        self.process = FORKS.Process(target=client, args=(other, told.to_json(), server_pid), daemon=True)
+        self.process = FORKS.Process(target=client, args=(other, wiring.to_json(), server_pid), daemon=True)
         self.process.start()
         other.close()
 
@@ -67,9 +67,9 @@ class Peer:
         self.process.join()
 
 
-def client(pipe: Any, told: dict[str, Any], server_pid: int) -> None:
+def client(pipe: Any, wiring: dict[str, Any], server_pid: int) -> None:
     """Ask, and say how it goes, until told to close."""
-    own = open_client(Wiring.from_json(told), lambda: _lives(server_pid))
+    own = open_client(Wiring.from_json(wiring), lambda: _lives(server_pid))
     pipe.send({"event": "ready"})
     while pipe.recv() != "close":
         trace, got, error = Trace(), 0, ""
@@ -136,13 +136,13 @@ def relayed(address: str) -> Iterator[tuple[str, Callable[[], None]]]:
 @contextmanager
 def serving(transport: str) -> Iterator[OwnServer]:
     """Run a server whose answers take a second."""
-    told = wiring(transport, timeout_s=SILENCE_S, max_tokens=TOKENS)
+    wiring = wiring_of(transport, timeout_s=SILENCE_S, max_tokens=TOKENS)
     if transport.startswith("ros"):
-        told = replace(told, address=f"/faults_{next(_numbers)}")
-    answer = told.capabilities.answer_kinds[0]
+        wiring = replace(wiring, address=f"/faults_{next(_numbers)}")
+    answer = wiring.capabilities.answer_kinds[0]
     engine = EngineConfig(name="echo", pace=PER_S, answer=answer, horizon=TOKENS)
     with tempfile.TemporaryDirectory() as folder:
-        server = OwnServer("faulty", ServerJob(told, engine), Path(folder) / "log")
+        server = OwnServer("faulty", ServerJob(wiring, engine), Path(folder) / "log")
         with server:
             server.wait_ready()
             yield server
@@ -150,11 +150,11 @@ def serving(transport: str) -> Iterator[OwnServer]:
 
 def others(server: OwnServer, transport: str) -> str:
     """Return an error of somebody else's request, or nothing; whose messages were lost comes again."""
-    told = wiring(transport, server.address, timeout_s=BOUND_S, max_tokens=TOKENS)
+    wiring = wiring_of(transport, server.address, timeout_s=BOUND_S, max_tokens=TOKENS)
     error = ""
     for _ in range(3):
         try:
-            with closing(open_client(told, server.alive)) as client:
+            with closing(open_client(wiring, server.alive)) as client:
                 tokens, _ = ask(client, Request("other", "go on", max_tokens=TOKENS))
             return "" if len(tokens) == TOKENS else f"{len(tokens)} tokens"
         except MessagesLost as lost:

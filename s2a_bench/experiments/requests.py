@@ -35,7 +35,7 @@ from s2a_bench.stats import Ratio, Summary, summary_of
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import Count, about, with_fields
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
-from s2a_bench.transport import PAYLOADS, declared
+from s2a_bench.transport import PAYLOADS, declared_transport
 from s2a_bench.transport.pipeline import without
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import summaries
@@ -118,7 +118,7 @@ class RequestCell:
     def is_compared_with(self, base: RequestCell) -> bool:
         """Whether its transport declares that its cells are divided by those of another, and both have one payload."""
         alike = self.mixed or not (self.payload and base.payload) or self.payload == base.payload
-        return alike and base.pipeline in declared(self.pipeline).compared_with
+        return alike and base.pipeline in declared_transport(self.pipeline).compared_with
 
     def values(self, metric: RequestMetric | str) -> Floats:
         """Return a metric's values, times in ms: one a request that has it, or one a token."""
@@ -483,7 +483,7 @@ def _cell(
 def _place(cell: RequestCell) -> tuple[int, float, str, int, str]:
     """Sort by the payload, the transport's order, its variants in theirs, then by name."""
     travels = PAYLOADS.index(cell.payload) if cell.payload in PAYLOADS else len(PAYLOADS)
-    transport, variant = declared(cell.pipeline), cell.about["variant"]
+    transport, variant = declared_transport(cell.pipeline), cell.about["variant"]
     known = transport.variants.index(variant) if variant in transport.variants else len(transport.variants)
     return travels, transport.order, cell.pipeline, known, cell.name
 

@@ -83,7 +83,7 @@ def ask(client: Client, request: Request) -> tuple[list[Piece], Trace]:
     return list(client.request(request, trace)), trace
 
 
-def wiring(
+def wiring_of(
     name: str,
     address: str = "",
     *,
@@ -99,9 +99,9 @@ def wiring(
 
 
 @contextmanager
-def served(told: Wiring[Any], handler: Handler) -> Iterator[tuple[Server, Thread]]:
+def served(wiring: Wiring[Any], handler: Handler) -> Iterator[tuple[Server, Thread]]:
     """Serve on a thread of its own for as long as the context lasts."""
-    server = open_server(told, handler)
+    server = open_server(wiring, handler)
     thread = Thread(target=server.serve)
     thread.start()
     try:
@@ -111,13 +111,13 @@ def served(told: Wiring[Any], handler: Handler) -> Iterator[tuple[Server, Thread
         thread.join()
 
 
-def connector(told: Wiring[Any]) -> Iterator[Connect]:
+def connector(wiring: Wiring[Any]) -> Iterator[Connect]:
     """Connect through a server on a thread of its own; everything is stopped afterwards."""
     with ExitStack() as stack:
 
         def connect(handler: Handler) -> Client:
-            server, thread = stack.enter_context(served(told, handler))
-            client = open_client(replace(told, address=server.address), thread.is_alive)
+            server, thread = stack.enter_context(served(wiring, handler))
+            client = open_client(replace(wiring, address=server.address), thread.is_alive)
             stack.callback(client.close)
             return client
 
@@ -138,27 +138,27 @@ class TransportSuite:
     """Whether an answer is sent as one piece: then none of it comes before a break."""
 
     @pytest.fixture
-    def told(self) -> Wiring[Any]:
+    def wiring(self) -> Wiring[Any]:
         """What client and server are told; override it for options that only a fixture knows."""
-        return wiring(self.name)
+        return wiring_of(self.name)
 
     @pytest.fixture
-    def connect(self, told: Wiring[Any]) -> Iterator[Connect]:
-        yield from connector(told)
+    def connect(self, wiring: Wiring[Any]) -> Iterator[Connect]:
+        yield from connector(wiring)
 
     @pytest.fixture
-    def transport(self, told: Wiring[Any]) -> Transport[Any]:
-        return TRANSPORTS[told.transport]
+    def transport(self, wiring: Wiring[Any]) -> Transport[Any]:
+        return TRANSPORTS[wiring.transport]
 
-    def handler(self, told: Wiring[Any], words: Sequence[str]) -> RecordingHandler:
+    def handler(self, wiring: Wiring[Any], words: Sequence[str]) -> RecordingHandler:
         """A handler that answers with words, or where those cannot travel with as many actions."""
-        if TOKENS in told.capabilities.answer_kinds:
+        if TOKENS in wiring.capabilities.answer_kinds:
             return RecordingHandler(words)
         return RecordingHandler([[place / 8, -place] for place in range(len(words))])
 
-    def test_it_is_found_by_the_name_that_it_declares(self, transport: Transport[Any], told: Wiring[Any]) -> None:
-        assert transport.name == told.transport
-        assert told.variant in (transport.variants or ("",))
+    def test_it_is_found_by_the_name_that_it_declares(self, transport: Transport[Any], wiring: Wiring[Any]) -> None:
+        assert transport.name == wiring.transport
+        assert wiring.variant in (transport.variants or ("",))
 
     def test_its_stages_are_new_ones_of_known_groups(self, transport: Transport[Any]) -> None:
         assert set(transport.stages.values()) <= set(GROUPS)
@@ -173,22 +173,22 @@ class TransportSuite:
         assert transport.options.model_config.get("frozen")
         assert transport.options.model_config.get("extra") == "forbid"
 
-    def test_what_a_server_process_is_told_survives_json(self, told: Wiring[Any]) -> None:
-        assert Wiring.from_json(json.loads(json.dumps(told.to_json()))) == told
+    def test_what_a_server_process_is_told_survives_json(self, wiring: Wiring[Any]) -> None:
+        assert Wiring.from_json(json.loads(json.dumps(wiring.to_json()))) == wiring
 
-    def test_the_name_of_a_cell_names_the_same_cell(self, transport: Transport[Any], told: Wiring[Any]) -> None:
-        said = {transport.name: told.options.model_dump(exclude_unset=True)}
+    def test_the_name_of_a_cell_names_the_same_cell(self, transport: Transport[Any], wiring: Wiring[Any]) -> None:
+        said = {transport.name: wiring.options.model_dump(exclude_unset=True)}
         for cell in pipelines([transport.name], said):
             assert pipelines([cell.name], said) == [cell]
 
-    def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect, told: Wiring[Any]) -> None:
-        self._needs(TOKENS, told)
+    def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        self._needs(TOKENS, wiring)
         words = ["go", "_to(", "キッチン", ")\n", ""]
         tokens, _ = ask(connect(RecordingHandler(words)), Request("a", "plan", (yuyv_frame(),)))
         assert tokens == [Token(index, text, 7 + index) for index, text in enumerate(words)]
 
-    def test_actions_arrive_in_order_with_every_bit(self, connect: Connect, told: Wiring[Any]) -> None:
-        self._needs(ACTIONS, told)
+    def test_actions_arrive_in_order_with_every_bit(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        self._needs(ACTIONS, wiring)
         chunk = np.random.default_rng(5).normal(size=(16, 7)).astype(np.float32)
         chunk[0, :3] = 1e-42, 3.4e38, -0.0
         actions, trace = ask(
@@ -202,10 +202,10 @@ class TransportSuite:
         assert len(trace.remote.token_ns) == 16
         assert trace.chain()[-1][0] == "return"
 
-    def test_several_pictures_and_the_state_reach_the_handler(self, connect: Connect, told: Wiring[Any]) -> None:
-        if not told.capabilities.accepts_state:
-            pytest.skip(f"{told.transport}/{told.variant} carries no observations of policies")
-        handler = self.handler(told, ["x"])
+    def test_several_pictures_and_the_state_reach_the_handler(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        if not wiring.capabilities.accepts_state:
+            pytest.skip(f"{wiring.transport}/{wiring.variant} carries no observations of policies")
+        handler = self.handler(wiring, ["x"])
         state = (0.5, -1.25, 3.0)
         frames = tuple(yuyv_frame(width, height, seed=width) for width, height in ((64, 48), (32, 32), (48, 64)))
         ask(connect(handler), Request("a", "plan", frames, state=state))
@@ -214,12 +214,12 @@ class TransportSuite:
         assert [image.data.shape for image in got.images] == [(48, 64, 3), (32, 32, 3), (64, 48, 3)]
 
     @staticmethod
-    def _needs(kind: str, told: Wiring[Any]) -> None:
-        if kind not in told.capabilities.answer_kinds:
-            pytest.skip(f"{told.transport}/{told.variant} does not carry {kind}")
+    def _needs(kind: str, wiring: Wiring[Any]) -> None:
+        if kind not in wiring.capabilities.answer_kinds:
+            pytest.skip(f"{wiring.transport}/{wiring.variant} does not carry {kind}")
 
-    def test_every_field_of_a_request_reaches_the_handler(self, connect: Connect, told: Wiring[Any]) -> None:
-        handler = self.handler(told, ["x"])
+    def test_every_field_of_a_request_reaches_the_handler(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        handler = self.handler(wiring, ["x"])
         sent = Request("id-7", 'Grüße,\n"robot"\t机器人', (), max_tokens=9, grammar='root ::= "x"\n', seed=42)
         ask(connect(handler), sent)
         (got,) = handler.requests
@@ -227,10 +227,10 @@ class TransportSuite:
         lost = {"grammar": "", "seed": 0}
         assert got == replace(expected, **{name: lost[name] for name in lost.keys() - self.carries})  # type: ignore[arg-type]
 
-    def test_the_picture_arrives_as_rgb(self, connect: Connect, told: Wiring[Any]) -> None:
+    def test_the_picture_arrives_as_rgb(self, connect: Connect, wiring: Wiring[Any]) -> None:
         import cv2
 
-        handler = self.handler(told, ["x"])
+        handler = self.handler(wiring, ["x"])
         frame = yuyv_frame(seed=3)
         ask(connect(handler), Request("a", "", (frame,)))
         (image,) = handler.requests[0].images
@@ -241,9 +241,9 @@ class TransportSuite:
             np.testing.assert_array_equal(image.data, expected)
 
     def test_stages_and_residual_sum_to_the_whole(
-        self, connect: Connect, transport: Transport[Any], told: Wiring[Any]
+        self, connect: Connect, transport: Transport[Any], wiring: Wiring[Any]
     ) -> None:
-        client = connect(self.handler(told, ["x", "y"]))
+        client = connect(self.handler(wiring, ["x", "y"]))
         begin = now_ns()
         _, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
         end = now_ns()
@@ -256,21 +256,21 @@ class TransportSuite:
         assert all(duration >= 0 for duration in spent.stages_ns.values())
         assert {"inference", "return"} <= set(spent.stages_ns)
 
-    def test_the_servers_marks_come_back(self, connect: Connect, told: Wiring[Any]) -> None:
-        _, trace = ask(connect(self.handler(told, ["x", "y", "z"])), Request("a", "plan"))
+    def test_the_servers_marks_come_back(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        _, trace = ask(connect(self.handler(wiring, ["x", "y", "z"])), Request("a", "plan"))
         assert trace.remote is not None
         assert trace.remote.clock == clock_id()
         assert len(trace.remote.token_ns) == 3
         assert trace.remote.token_ns == sorted(trace.remote.token_ns)
         assert trace.facts[PROMPT_N] == 12.0
 
-    def test_every_fact_that_it_tells_is_declared(self, connect: Connect, told: Wiring[Any]) -> None:
-        _, trace = ask(connect(self.handler(told, ["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
-        assert set(trace.facts) <= {*told.capabilities.facts, PROMPT_N}  # which the handler tells
-        assert all(fact.about for fact in told.capabilities.facts)
+    def test_every_fact_that_it_tells_is_declared(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        _, trace = ask(connect(self.handler(wiring, ["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
+        assert set(trace.facts) <= {*wiring.capabilities.facts, PROMPT_N}  # which the handler tells
+        assert all(fact.about for fact in wiring.capabilities.facts)
 
-    def test_an_engine_that_refuses_fails_this_request_only(self, connect: Connect, told: Wiring[Any]) -> None:
-        handler = self.handler(told, ["x"])
+    def test_an_engine_that_refuses_fails_this_request_only(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        handler = self.handler(wiring, ["x"])
         client = connect(handler)
         handler.fail_at = 0
         with pytest.raises(RequestFailed, match="the engine has had enough"):
@@ -280,8 +280,8 @@ class TransportSuite:
         assert len(tokens) == 1
 
     @pytest.mark.parametrize("fail_at", [1, 2, 3])
-    def test_tokens_before_a_break_are_seen(self, connect: Connect, told: Wiring[Any], fail_at: int) -> None:
-        handler = self.handler(told, ["a", "b", "c"])
+    def test_tokens_before_a_break_are_seen(self, connect: Connect, wiring: Wiring[Any], fail_at: int) -> None:
+        handler = self.handler(wiring, ["a", "b", "c"])
         handler.fail_at = fail_at
         seen: list[int] = []
         with pytest.raises(RequestFailed, match="the engine has had enough"):
@@ -289,27 +289,27 @@ class TransportSuite:
         # what a generator hands to extend before it raises is kept
         assert seen == ([] if self.whole else [0, 1, 2][:fail_at])
 
-    def test_an_empty_answer_is_no_error(self, connect: Connect, told: Wiring[Any]) -> None:
-        self._needs(TOKENS, told)
+    def test_an_empty_answer_is_no_error(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        self._needs(TOKENS, wiring)
         tokens, _ = ask(connect(RecordingHandler([])), Request("a", "plan"))
         assert tokens == []
 
-    def test_a_burst_of_a_thousand_tokens_is_complete(self, connect: Connect, told: Wiring[Any]) -> None:
-        handler = self.handler(told, [f"t{number} " for number in range(1000)])
+    def test_a_burst_of_a_thousand_tokens_is_complete(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        handler = self.handler(wiring, [f"t{number} " for number in range(1000)])
         tokens, _ = ask(connect(handler), Request("a", "plan", max_tokens=1000))
         acts = not isinstance(handler.answer[0], str)
         expected = [Action(0, np.float32(each)).text for each in handler.answer] if acts else handler.answer  # type: ignore[arg-type]
         assert [token.text for token in tokens] == expected
 
-    def test_a_request_can_be_left_early(self, connect: Connect, told: Wiring[Any]) -> None:
-        client = connect(self.handler(told, [f"t{number}" for number in range(50)]))
+    def test_a_request_can_be_left_early(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        client = connect(self.handler(wiring, [f"t{number}" for number in range(50)]))
         tokens = client.request(Request("a", "plan"), Trace())
         assert next(tokens).index == 0
         tokens.close()  # type: ignore[attr-defined]  # both are generators
         again, _ = ask(client, Request("b", "plan", max_tokens=50))
         assert len(again) == 50
 
-    def test_closing_twice_does_no_harm(self, connect: Connect, told: Wiring[Any]) -> None:
-        client = connect(self.handler(told, ["x"]))
+    def test_closing_twice_does_no_harm(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        client = connect(self.handler(wiring, ["x"]))
         client.close()
         client.close()

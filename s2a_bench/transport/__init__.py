@@ -375,7 +375,7 @@ class _UndeclaredTransport(Transport[TransportOptions]):
 
 
 @cache
-def declared(name: str) -> Transport[Any]:
+def declared_transport(name: str) -> Transport[Any]:
     """Return what is said about a transport, for showing a run; one that is not installed is like any other."""
     try:
         return TRANSPORTS[name]

@@ -195,7 +195,7 @@ class Bounds:
             )
         return left_ns / 1e9
 
-    def came(self, size: int) -> None:
+    def count_bytes(self, size: int) -> None:
         """Count bytes; raises RequestFailed for more than an answer can need."""
         self._bytes -= size
         if self._bytes < 0:
@@ -203,7 +203,7 @@ class Bounds:
                 f"{self._who} sent more than {self._most_bytes} bytes for {self._max_tokens} tokens (`max_tokens`)"
             )
 
-    def piece(self) -> None:
+    def count_piece(self) -> None:
         """Count a piece of the answer; raises RequestFailed where the server does not stop."""
         self._pieces -= 1
         if self._pieces < 0:

@@ -5,9 +5,9 @@ any axes of batch and time in front, or (n,) the bytes of a JPEG or PNG, as byte
 number with a fraction, or array of such, is part of the state; the prompt is the text under ``prompt``, else the first
 text there is. All in the order of the keys. Whole numbers and truths are ignored.
 
-What our clients and servers add to a policy server's protocol is here, too: between them alone, never sent to anybody
-else's. A request has the key `OWN` with its fields that no observation has, and so has the message with the server's
-marks. How the two know each other, and when the marks travel, is each protocol's own.
+Our client and server add fields to a policy server's protocol, between each other alone. A request has them under the
+key `EXTENSION`, which no observation has; the message with the server's marks has the same key. Each protocol decides
+how the two recognise each other and when the marks are sent.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from s2a_bench.types import Frame, Request
 PICTURES: Final = 64
 NUMBERS: Final = 4096
 """The most of one request: pictures, and numbers of the state."""
-OWN: Final = "s2a"
+EXTENSION: Final = "s2a"
 PROMPT: Final = "prompt"
 DEPTH: Final = 32
 COLOURS: Final = 3
@@ -95,17 +95,17 @@ def _pictures(key: str, value: Any, trace: Trace, limits: Limits) -> Sequence[Fr
     return [Frame(-1, 0, width, height, "rgb8", picture) for picture in planes]
 
 
-def parameters(request: Request) -> dict[str, Any]:
+def extension_of(request: Request) -> dict[str, Any]:
     """Return the fields of a request that no observation has."""
     told = {"id": request.id, "max_tokens": request.max_tokens, "seed": request.seed, "grammar": request.grammar}
     return {name: value for name, value in told.items() if value}
 
 
-def told_in(message: Any) -> dict[Any, Any] | None:
+def take_extension(message: Any) -> dict[Any, Any] | None:
     """Take what our client added out of a message, None from anybody else's."""
-    told = message.pop(OWN, None) if isinstance(message, dict) else None
+    told = message.pop(EXTENSION, None) if isinstance(message, dict) else None
     if told is not None and not isinstance(told, dict):
-        raise RequestFailed(f"{OWN} should be a map")
+        raise RequestFailed(f"{EXTENSION} should be a map")
     return told
 
 
@@ -126,12 +126,12 @@ def request_of(observation: Any, told: dict[Any, Any] | None, trace: Trace, limi
 
 def remote_message(remote: Remote) -> dict[str, Any]:
     """Return what carries a server's marks."""
-    return {OWN: remote.to_json()}
+    return {EXTENSION: remote.to_json()}
 
 
 def remote_of(message: Any) -> Remote:
     """Read a server's marks; raises RequestFailed for what can be none."""
     try:
-        return Remote.of_json(message[OWN])
+        return Remote.of_json(message[EXTENSION])
     except (LookupError, TypeError, ValueError) as error:
         raise RequestFailed(f"what should be the server's marks is none: {error!r}") from error

@@ -63,7 +63,7 @@ def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
     return f"image/{payload}", data
 
 
-def told(frame: Frame, payload: str, trace: Trace) -> Pixels:
+def policy_picture(frame: Frame, payload: str, trace: Trace) -> Pixels:
     """Return a picture as policies are told it: (H, W, 3) RGB, or a file's (n,) bytes; marks as `encoded` does."""
     if payload != "raw":
         return encoded(frame, payload, trace)[1].reshape(-1)

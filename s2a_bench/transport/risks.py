@@ -52,34 +52,34 @@ def examine(url: str) -> list[Finding]:
             f"`url`: '{said}' should look like http://192.168.0.5:8000: one of {schemes}, a host, and its port"
         )
     own: Examine = grpc if parts.scheme == GRPC else resolve_name(known[parts.scheme])
-    findings = [in_plain_text(parts)]
+    findings = [plain_text(parts)]
     try:
         findings += own(parts)
     except (OSError, TransportError) as error:
         findings.append(
-            Finding("server", "error", f"{host} does not answer: {shown(str(error))}", "start it, or name another")
+            Finding("server", "error", f"{host} does not answer: {printable(str(error))}", "start it, or name another")
         )
     return findings
 
 
-def shown(text: str, most: int = 120) -> str:
+def printable(text: str, most: int = 120) -> str:
     """Return what a server said as one short line."""
     return "".join(letter if letter.isprintable() else "?" for letter in text[:most])
 
 
-def is_here(host: str) -> bool:
+def is_local(host: str) -> bool:
     """Whether a name means this machine alone."""
     with suppress(OSError, ValueError):
         return all(ip_address(found[4][0]).is_loopback for found in socket.getaddrinfo(host, None))
     return False
 
 
-def in_plain_text(parts: SplitResult) -> Finding:
+def plain_text(parts: SplitResult) -> Finding:
     """Say whether pictures, keys and actions can be read and changed on their way."""
     host, port = parts.hostname or "", parts.port or "PORT"
     if parts.scheme in ENCRYPTED:
         return Finding("plain-text", "state", f"what travels to {host} is encrypted")
-    if is_here(host):
+    if is_local(host):
         return Finding("plain-text", "state", f"{host} is this machine: nothing leaves it")
     return Finding(
         "plain-text",
@@ -89,9 +89,9 @@ def in_plain_text(parts: SplitResult) -> Finding:
     )
 
 
-def for_anybody(parts: SplitResult, what: str, cure: str) -> Finding:
+def no_key(parts: SplitResult, what: str, cure: str) -> Finding:
     """Say that a server asks for no key: on this machine that is a choice, off it whoever reaches it uses it."""
-    here = is_here(parts.hostname or "")
+    here = is_local(parts.hostname or "")
     return Finding("no-key", "advice" if here else "warning", f"it wants no key: {what}", cure)
 
 

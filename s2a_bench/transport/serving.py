@@ -59,7 +59,7 @@ class Turn:
         self._turns = turns
 
     @property
-    def has_come(self) -> bool:
+    def has_started(self) -> bool:
         """Whether it is this request's turn, or was."""
         return self.ready is None or self.ready.is_set()
 
@@ -79,7 +79,7 @@ class Turn:
     def check(self, at_ns: int) -> None:
         """Raise Overdue after the deadline."""
         if at_ns > self.deadline_ns:
-            doing = "waiting for the engine" if not self.has_come else "being answered"
+            doing = "waiting for the engine" if not self.has_started else "being answered"
             raise Overdue(f"{self._answer_s:g} s after it came the request is still {doing}: the server gives it up")
 
     def leave(self) -> None:
@@ -321,7 +321,7 @@ class Core:
         except Disconnected:
             return False
         except Exception as error:  # noqa: BLE001 - the client must hear of it, whatever broke
-            return _fail(exchange, told_of(error))
+            return _fail(exchange, client_error(error))
         finally:
             exchange.held.close()
         return True
@@ -417,7 +417,7 @@ class SharedSourceWorkers:
         return True
 
 
-def told_of(error: Exception) -> S2AError:
+def client_error(error: Exception) -> S2AError:
     """Return what a client is told of what a request raised; a bug is for the log."""
     if isinstance(error, S2AError):
         return error

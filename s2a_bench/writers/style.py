@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final
 
-from s2a_bench.transport import declared
+from s2a_bench.transport import declared_transport
 from s2a_bench.transport.pipeline import without
 
 WIDTH_IN: Final = 3.5
@@ -54,7 +54,7 @@ def cell_styles(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, st
     """
     styles: dict[str, tuple[str, str]] = {}
     for name, (transport, variant) in cells.items():
-        plain, style = without(name, "payload"), declared(transport).style
+        plain, style = without(name, "payload"), declared_transport(transport).style
         if "?" not in plain and variant in style:
             styles[name] = style[variant] if plain == name else (style[variant][0], ":")
     others = [name for name in cells if name not in styles]

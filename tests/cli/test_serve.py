@@ -23,7 +23,7 @@ from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.router import free_endpoint
 from s2a_bench.store.run import read_run
-from s2a_bench.testing.transport import ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import ask, wiring_of, yuyv_frame
 from s2a_bench.transport import open_client
 from s2a_bench.types import Action, Request
 from tests.cli.program import refused
@@ -72,7 +72,7 @@ def test_ros_answers_goals_and_publishes_tokens(start: Start, dds_domain: int, n
     assert "/robot_llama/generate_response" in line
     middleware = open_middleware(domain_id=dds_domain)
     plotted = middleware.subscription("/robot_llama/token", ros.TOKEN, QoS(0))
-    client = open_client(wiring("ros/action", "/robot_llama", domain_id=dds_domain))
+    client = open_client(wiring_of("ros/action", "/robot_llama", domain_id=dds_domain))
     try:
         while not plotted.matched():
             plotted.take(0.01)
@@ -138,7 +138,7 @@ def test_a_ros_server_that_died_is_started_again_at_once(start: Start, dds_domai
     assert process.stdout
     os.kill(child_of(process), signal.SIGKILL)
     assert process.stdout.readline() == line
-    client = open_client(wiring("ros/action", "/reborn", domain_id=dds_domain))
+    client = open_client(wiring_of("ros/action", "/reborn", domain_id=dds_domain))
     try:
         tokens, _ = ask(client, Request("a", "go to the kitchen", (yuyv_frame(),)))
         assert len(tokens) == 5
@@ -251,7 +251,7 @@ def test_ros_args_name_the_node_its_topics_and_its_parameters(start: Start, dds_
         assert [value.integer_value for value in values[:2]] == [3, 7]
         assert values[2].string_value == "echo"
         plotted = middleware.subscription("/robot/words", ros.TOKEN, QoS(0))
-        action = open_client(replace(wiring("ros/action", action="/ask", domain_id=dds_domain), black_box=True))
+        action = open_client(replace(wiring_of("ros/action", action="/ask", domain_id=dds_domain), black_box=True))
         try:
             tokens, _ = ask(action, Request("a", "one two three four five", max_tokens=20))
         finally:
@@ -286,7 +286,7 @@ def test_zmq_says_where_a_policy_is_asked_and_ends_with_a_signal(start: Start) -
     process, line = start("zmq", "--engine", "echo", "--port", "0", "--horizon", "5", "--action-dim", "2")
     found = re.search(r"serving GR00T's protocol at (tcp://127\.0\.0\.1:\d+)", line)
     assert found
-    client = open_client(wiring("zmq", found[1]))
+    client = open_client(wiring_of("zmq", found[1]))
     try:
         actions, _ = ask(client, Request("a", "pick it up", max_tokens=20))
     finally:
@@ -300,7 +300,7 @@ def test_shm_says_where_memory_is_handed_over_and_leaves_no_socket(start: Start,
     path = tmp_path / "robot.sock"
     process, line = start("shm", "--engine", "echo", "--socket", str(path))
     assert line.startswith(f"serving shared memory at {path} for this user alone; ")
-    client = open_client(wiring("shm", str(path)))
+    client = open_client(wiring_of("shm", str(path)))
     tokens, _ = ask(client, Request("a", "hello robot", (yuyv_frame(),), max_tokens=2))
     client.close()
     assert "".join(token.text for token in tokens) == "hello robot"
@@ -313,7 +313,7 @@ def test_a_policy_server_says_where_it_is_and_answers_with_chunks(start: Start) 
     process, line = start("websocket/openpi", "--engine", "echo", "--port", "0", "--horizon", "5", "--action-dim", "3")
     address = re.search(r"at (ws://\S+), streamed at \1/stream; ", line)
     assert address
-    client = open_client(wiring("websocket", address[1]))
+    client = open_client(wiring_of("websocket", address[1]))
     actions, _ = ask(client, Request("a", "hello robot", (yuyv_frame(),), max_tokens=50))
     client.close()
     assert [action.values.shape for action in actions if isinstance(action, Action)] == [(3,)] * 5

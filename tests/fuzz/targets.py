@@ -46,7 +46,7 @@ from s2a_bench.transport.http.chat import of_json, of_picture
 from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
 from s2a_bench.transport.http.fast import Head
-from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS, Refused
+from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS, Refused
 from s2a_bench.transport.http.protocol import Protocol
 from s2a_bench.transport.http.server import application
 from s2a_bench.transport.limits import LIMITS
@@ -273,7 +273,7 @@ METADATA = b"""rosbag2_bagfile_information:
 def read_observation(data: bytes) -> None:
     """Read what a policy server is asked, and what its client is answered."""
     message = unpackb(data)
-    observed.request_of(message, observed.told_in(message), Trace(), LIMITS)
+    observed.request_of(message, observed.take_extension(message), Trace(), LIMITS)
     actions_of(message.get("actions") if isinstance(message, dict) else message)
 
 
@@ -292,7 +292,7 @@ def read_gr00t(data: bytes) -> None:
         observed.remote_of(message)
     if isinstance(message, dict):
         observation, layout = layouts.observation_in(message.get("data"))
-        observed.request_of(observation, observed.told_in(message), Trace(), LIMITS)
+        observed.request_of(observation, observed.take_extension(message), Trace(), LIMITS)
         layouts.answer_of(observation, layout, [Action(0, np.zeros(2, np.float32))])
     layouts.actions_in(message)
 

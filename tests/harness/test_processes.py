@@ -19,7 +19,7 @@ from s2a_bench.harness.processes import LlamaServerProcess, OwnProcess, OwnServe
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
 from s2a_bench.sweep.perform import _outside
-from s2a_bench.testing.transport import wiring
+from s2a_bench.testing.transport import wiring_of
 
 
 class Dies(ServerProcess):
@@ -93,7 +93,7 @@ def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same(interrupt: 
 
     guard: list[Timer] = []
     died: list[str] = []
-    keep_serving(ServerJob(wiring("http/binary"), EngineConfig(name="echo")), ready, died.append)
+    keep_serving(ServerJob(wiring_of("http/binary"), EngineConfig(name="echo")), ready, died.append)
     guard[0].cancel()
     assert not late
     assert not died

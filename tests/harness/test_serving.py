@@ -11,7 +11,7 @@ import pytest
 from s2a_bench.errors import EngineError
 from s2a_bench.harness.serving import ServerJob, engine_handler
 from s2a_bench.inference import EngineConfig
-from s2a_bench.testing.transport import wiring
+from s2a_bench.testing.transport import wiring_of
 from s2a_bench.trace import Trace
 from s2a_bench.types import Request, Token
 
@@ -105,6 +105,6 @@ def test_a_failure_frees_the_engine() -> None:
     [EngineConfig(name="echo"), EngineConfig(name="llama", model=Path("/m.gguf"), mmproj=Path("/p.gguf"), threads=2)],
 )
 def test_a_job_survives_its_line(engine: EngineConfig) -> None:
-    job = ServerJob(wiring("http/binary", "127.0.0.1:0", payload="raw"), engine, tuned=False)
+    job = ServerJob(wiring_of("http/binary", "127.0.0.1:0", payload="raw"), engine, tuned=False)
     assert "\n" not in job.to_json()
     assert ServerJob.from_json(job.to_json()) == job

@@ -12,8 +12,8 @@ import pytest
 
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.testing.transport import served, wiring
-from s2a_bench.transport.http.own import PATHS
+from s2a_bench.testing.transport import served, wiring_of
+from s2a_bench.transport.http.native import PATHS
 
 KEY = "sekret-0123456789"
 CHAT = PATHS["as-deployed"]
@@ -31,7 +31,7 @@ def key_in_the_environment() -> Iterator[None]:
 def serving(variant: str = "as-deployed", **options: Any) -> Iterator[str]:
     """Serve echo for as long as the context lasts."""
     handler = engine_handler(open_engine(EngineConfig(name="echo")))
-    with served(wiring(f"http/{variant}", **options), handler) as (server, _):
+    with served(wiring_of(f"http/{variant}", **options), handler) as (server, _):
         yield server.address
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.store.run import read_run
-from s2a_bench.testing.transport import connector, wiring
+from s2a_bench.testing.transport import connector, wiring_of
 from s2a_bench.trace import Trace
 from s2a_bench.transport import open_client
 from s2a_bench.transport.http import detect
@@ -46,7 +46,7 @@ def case(request: pytest.FixtureRequest) -> Case:
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
 def test_it_ends_in_one_line_and_costs_little(case: Case, variant: str) -> None:
     with serving(lambda _: case.pieces()) as url:
-        client = open_client(wiring(f"http/{variant}", url=url, dialect=DIALECT, deadline_s=case.deadline_s))
+        client = open_client(wiring_of(f"http/{variant}", url=url, dialect=DIALECT, deadline_s=case.deadline_s))
         Path("/proc/self/clear_refs").write_text("5")
         before_mib, started = memory_mib("VmRSS"), time.monotonic()
         lean = "|answered 103|sent more than" * (variant != "as-deployed")  # no interim answer, trailers without end
@@ -64,7 +64,7 @@ def test_it_ends_in_one_line_and_costs_little(case: Case, variant: str) -> None:
 def test_who_asks_what_a_server_is_does_not_wait_for_ever(name: str) -> None:
     with serving(lambda _: CASES[name].pieces()) as url:
         started = time.monotonic()
-        client = open_client(wiring("http/as-deployed", url=url))
+        client = open_client(wiring_of("http/as-deployed", url=url))
         assert client.describe()["dialect"] == "openai"
         assert time.monotonic() - started < detect.PATIENCE_S + 10
         client.close()
@@ -115,8 +115,8 @@ def test_ros_clients_have_the_same_bounds(name: str, every_s: float, says: str) 
             if left.wait(every_s):
                 return
 
-    told = wiring(name, deadline_s=30 if not every_s else 1)
-    with contextmanager(connector)(told) as connect:
+    wiring = wiring_of(name, deadline_s=30 if not every_s else 1)
+    with contextmanager(connector)(wiring) as connect:
         client = connect(talks)
         try:
             with pytest.raises(RequestFailed, match=says):
@@ -129,7 +129,7 @@ def test_a_server_that_counts_otherwise_is_not_cut() -> None:
     """A gateway may send letters, and what a model thinks beside."""
     pieces = [head(), *[delta(reasoning_content="h")] * 999, *[delta(content="x")] * 40, b"data: [DONE]\n\n"]
     with serving(lambda _: pieces) as url:
-        client = open_client(wiring("http/as-deployed", url=url, dialect=DIALECT))
+        client = open_client(wiring_of("http/as-deployed", url=url, dialect=DIALECT))
         assert len(list(client.request(Request("a", "plan", max_tokens=MAX_TOKENS), Trace()))) == 40
         client.close()
 

@@ -10,11 +10,11 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.testing.hostile import own_server
-from s2a_bench.testing.hostile.asker import usage
+from s2a_bench.testing.hostile.client import usage
 from s2a_bench.testing.hostile.tcp import crowd, sends
-from s2a_bench.testing.transport import ask, wiring
+from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import open_client
-from s2a_bench.transport.http.own import PATHS
+from s2a_bench.transport.http.native import PATHS
 from s2a_bench.types import Request
 from tests.hostile.wires.http import chat
 
@@ -28,9 +28,9 @@ def test_1000_clients_at_once(
     tmp_path: Path, variant: str, stream: str, record_property: Callable[[str, object], None]
 ) -> None:
     fields = f'"stream": {stream}, "max_tokens": 3, "request_id": "one of many"'
-    told = wiring(f"http/{variant}")
-    with own_server(told, tmp_path / "log") as server:
-        here = replace(told, address=server.address)
+    wiring = wiring_of(f"http/{variant}")
+    with own_server(wiring, tmp_path / "log") as server:
+        here = replace(wiring, address=server.address)
         began = now_ns()
         said = crowd(CLIENTS, sends(chat(fields=fields, path=PATHS[variant]), seconds=120))(here)
         seconds = (now_ns() - began) / 1e9

@@ -11,9 +11,9 @@ import pytest
 
 from s2a_bench.errors import BadRequest, Overdue, RequestFailed
 from s2a_bench.harness.serving import engine_handler
-from s2a_bench.testing.transport import ask, wiring
+from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import open_client
-from s2a_bench.transport.http.own import PATHS
+from s2a_bench.transport.http.native import PATHS
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.serving import Turns
 from s2a_bench.types import Request, Token
@@ -71,7 +71,7 @@ def test_a_request_waits_no_longer_than_to_its_deadline() -> None:
     ],
 )
 def test_a_grammar_that_is_none_is_the_client_s_mistake(name: str, says: str) -> None:
-    with serving(engine_handler(Endless()), name) as address, closing(open_client(wiring(name, address))) as client:
+    with serving(engine_handler(Endless()), name) as address, closing(open_client(wiring_of(name, address))) as client:
         with pytest.raises(RequestFailed, match=says):
             ask(client, Request("a", "a", grammar="x"))
         assert len(ask(client, Request("b", "a", max_tokens=2))[0]) == 2

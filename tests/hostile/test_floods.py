@@ -22,11 +22,11 @@ import pytest
 
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.testing.hostile import Attack, answer_of, own_server
-from s2a_bench.testing.hostile.asker import forget_peak, usage
+from s2a_bench.testing.hostile.client import forget_peak, usage
 from s2a_bench.testing.hostile.tcp import RESET, connect, crowd, sends, sends_made
-from s2a_bench.testing.transport import wiring
+from s2a_bench.testing.transport import wiring_of
 from s2a_bench.transport import Client, Wiring, open_client
-from s2a_bench.transport.http.own import PATHS
+from s2a_bench.transport.http.native import PATHS
 from tests.hostile.wires import websocket, zmq
 from tests.hostile.wires.http import CHUNKS, JSON, chat, head, post
 
@@ -49,10 +49,10 @@ class Flood:
 def lasting(attack: Attack, seconds: float = 5.0) -> Attack:
     """Return an attack that begins again until the time is over."""
 
-    def again(told: Wiring[Any]) -> str:
+    def again(wiring: Wiring[Any]) -> str:
         ends_ns, said = now_ns() + round(seconds * 1e9), ""
         while now_ns() < ends_ns:
-            said = attack(told)
+            said = attack(wiring)
         return said
 
     return again
@@ -61,9 +61,9 @@ def lasting(attack: Attack, seconds: float = 5.0) -> Attack:
 def leaves_unread(path: str) -> Attack:
     """Return clients that ask, send 200 KB more behind their request, and go without an answer."""
 
-    def attack(told: Wiring[Any]) -> str:
+    def attack(wiring: Wiring[Any]) -> str:
         for _ in range(3):
-            with connect(told, 10) as connection:
+            with connect(wiring, 10) as connection:
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
                 connection.sendall(chat(fields='"stream": true, "max_tokens": 60000', path=path))
                 connection.sendall(bytes(200_000))
@@ -129,15 +129,15 @@ FLOODS = (
 def test_honest_clients_are_answered_beside_it(
     flood: Flood, tmp_path: Path, record_property: Callable[[str, object], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = wiring(flood.pipeline, timeout_s=60)
+    wiring = wiring_of(flood.pipeline, timeout_s=60)
     with ExitStack() as stack:
-        servers = [stack.enter_context(own_server(told, tmp_path / name)) for name in ("attacked", "twin")]
-        honest = [stack.enter_context(closing(open_client(replace(told, address=each.address)))) for each in servers]
+        servers = [stack.enter_context(own_server(wiring, tmp_path / name)) for name in ("attacked", "twin")]
+        honest = [stack.enter_context(closing(open_client(replace(wiring, address=each.address)))) for each in servers]
         expected = [answer_of(client) for client in honest]
         for server in servers:
             forget_peak(server.pid)
         said: list[str] = []
-        attacker = Thread(target=lambda: said.append(flood.does(replace(told, address=servers[0].address))))
+        attacker = Thread(target=lambda: said.append(flood.does(replace(wiring, address=servers[0].address))))
         attacker.start()
         waits: list[tuple[float, float]] = []
         while attacker.is_alive() or len(waits) < ROUNDS:
@@ -168,9 +168,9 @@ def timed(client: Client) -> tuple[float, list[str]]:
 
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
 def test_out_of_descriptors_those_that_are_connected_are_answered(variant: str, tmp_path: Path) -> None:
-    told = wiring(f"http/{variant}")
-    with own_server(told, tmp_path / "log") as server, ExitStack() as stack:
-        here = replace(told, address=server.address)
+    wiring = wiring_of(f"http/{variant}")
+    with own_server(wiring, tmp_path / "log") as server, ExitStack() as stack:
+        here = replace(wiring, address=server.address)
         client = stack.enter_context(closing(open_client(here)))
         expected = answer_of(client)
         limits = resource.prlimit(server.pid, resource.RLIMIT_NOFILE)

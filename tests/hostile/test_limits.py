@@ -24,8 +24,8 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import RequestFailed
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.testing.transport import served, wiring
-from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS
+from s2a_bench.testing.transport import served, wiring_of
+from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS
 from s2a_bench.transport.limits import LIMITS, MIB, Limits, check_encoded
 from tests.hostile.wires.http import png_of_zeros
 
@@ -39,7 +39,7 @@ HEAD = b"POST /v1/chat/completions HTTP/1.1\r\nHost: localhost\r\nContent-Type: 
 def serving(limits: Limits = LIMITS, variant: str = "as-deployed") -> Iterator[str]:
     """Serve echo for as long as the context lasts."""
     handler = engine_handler(open_engine(EngineConfig(name="echo")), limits=limits)
-    with served(replace(wiring(f"http/{variant}"), limits=limits), handler) as (server, _):
+    with served(replace(wiring_of(f"http/{variant}"), limits=limits), handler) as (server, _):
         yield server.address
 
 
@@ -223,7 +223,7 @@ sys.exit(serving.main())
 def test_a_signal_ends_the_server_whatever_it_does(stream: bool) -> None:
     from s2a_bench.harness.serving import ServerJob
 
-    job = ServerJob(wiring("http"), EngineConfig(name="echo")).to_json()
+    job = ServerJob(wiring_of("http"), EngineConfig(name="echo")).to_json()
     process = subprocess.Popen(
         [sys.executable, "-c", STUCK], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     )

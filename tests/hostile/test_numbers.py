@@ -17,7 +17,7 @@ from s2a_bench.harness.rounds import Task, run_requests
 from s2a_bench.progress import NullProgress
 from s2a_bench.provenance import Provenance
 from s2a_bench.store.run import read_run
-from s2a_bench.testing.transport import wiring
+from s2a_bench.testing.transport import wiring_of
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import open_client
 from s2a_bench.transport.http.detect import cache_hits
@@ -127,7 +127,7 @@ def test_marks_that_can_be_none_fail_their_sample(odd: dict[str, Any]) -> None:
     last = b"data: " + json.dumps({"choices": [], "usage": {}, "s2a": {**MARKS, **odd}}).encode() + b"\n\n"
     pieces = [head(), delta(content="x"), last, b"data: [DONE]\n\n"]
     with serving(lambda _: pieces) as url:
-        client = open_client(wiring("http/as-deployed", url=url, dialect="s2a"))
+        client = open_client(wiring_of("http/as-deployed", url=url, dialect="s2a"))
         with pytest.raises(RequestFailed, match="this is not the dialect 's2a'"):
             list(client.request(Request("a", "plan"), Trace()))
         client.close()

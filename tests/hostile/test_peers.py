@@ -20,8 +20,8 @@ class TestHttp(HostileSuite):
     servers = http.SERVERS
 
     @classmethod
-    def told(cls) -> Wiring[Any]:
-        return replace(super().told(), limits=Limits(head_s=2))  # one case waits for it
+    def wiring(cls) -> Wiring[Any]:
+        return replace(super().wiring(), limits=Limits(head_s=2))  # one case waits for it
 
 
 class TestHttpBestEffort(HostileSuite):
@@ -30,8 +30,8 @@ class TestHttpBestEffort(HostileSuite):
     servers = http.SERVERS
 
     @classmethod
-    def told(cls) -> Wiring[Any]:
-        return replace(super().told(), limits=Limits(head_s=2))  # as above
+    def wiring(cls) -> Wiring[Any]:
+        return replace(super().wiring(), limits=Limits(head_s=2))  # as above
 
 
 class TestHttpBinary(HostileSuite):
@@ -86,8 +86,8 @@ class TestWebsocket(HostileSuite):
     servers = websocket.SERVERS
 
     @classmethod
-    def told(cls) -> Wiring[Any]:
-        return replace(super().told(), limits=Limits(head_s=2, body_s=3))  # three cases wait for them
+    def wiring(cls) -> Wiring[Any]:
+        return replace(super().wiring(), limits=Limits(head_s=2, body_s=3))  # three cases wait for them
 
 
 class TestWebsocketStreamed(HostileSuite):

@@ -17,10 +17,10 @@ import pytest
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, EngineError
 from s2a_bench.harness.serving import engine_handler
-from s2a_bench.testing.transport import ask, served, wiring
+from s2a_bench.testing.transport import ask, served, wiring_of
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Handler, open_client
-from s2a_bench.transport.http.own import PATHS
+from s2a_bench.transport.http.native import PATHS
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.serving import Queued, Turn, Turns
 from s2a_bench.types import Request, Token
@@ -34,7 +34,7 @@ paths = pytest.mark.parametrize("path", [CHAT, BEST_EFFORT])
 @contextmanager
 def serving(handler: Handler, name: str = "http", limits: Limits = LIMITS) -> Iterator[str]:
     """Serve for as long as the context lasts."""
-    with served(replace(wiring(name), limits=limits), handler) as (server, _):
+    with served(replace(wiring_of(name), limits=limits), handler) as (server, _):
         yield server.address
 
 
@@ -66,7 +66,7 @@ class TestTurns:
         turns = Turns()
         queue = [turns.join() for _ in range(5)]
         for index, turn in enumerate(queue):
-            assert [other.has_come for other in queue[index:]] == [True] + [False] * (4 - index)
+            assert [other.has_started for other in queue[index:]] == [True] + [False] * (4 - index)
             turn.leave()
 
     def test_whoever_is_one_too_many_is_refused_at_once(self) -> None:
@@ -82,8 +82,8 @@ class TestTurns:
         first, second, third = (turns.join() for _ in range(3))
         first.leave()
         first.leave()
-        assert second.has_come
-        assert not third.has_come
+        assert second.has_started
+        assert not third.has_started
 
     def test_whoever_waits_and_goes_is_passed_over(self) -> None:
         turns = Turns()
@@ -91,7 +91,7 @@ class TestTurns:
         assert not second.wait(lambda: True)
         second.leave()
         first.leave()
-        assert third.has_come
+        assert third.has_started
 
     def test_silence_is_that_of_the_running_answer(self) -> None:
         turns = Turns()
@@ -114,7 +114,7 @@ class TestTurns:
         for _ in range(2):
             with pytest.raises(type(fails)):
                 list(queued(Request("a", ""), Trace()))
-        assert queued.turns.join().has_come
+        assert queued.turns.join().has_started
 
 
 class Slow:
@@ -168,7 +168,7 @@ def test_requests_end_in_the_order_of_their_acceptance(name: str) -> None:
     queued = []
 
     def many(number: int, address: str) -> None:
-        client = open_client(wiring(name, address))
+        client = open_client(wiring_of(name, address))
         lengths = random.Random(number)
         try:
             for turn in range(10):

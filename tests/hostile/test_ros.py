@@ -21,7 +21,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import STATUS_ARRAY, Status
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
-from s2a_bench.testing.transport import RecordingHandler, ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, open_client
 from s2a_bench.transport.limits import LIMITS, Limits
@@ -79,8 +79,10 @@ def test_a_goal_too_many_is_rejected_at_once(goals: Callable[[], Any], caplog: p
         until(lambda: queued.turns.waiting == 1)
         third = client.send(client.pack(generate_goal("go", [])))
         assert next_of(client, Rejected).goal_id == third
-        told = [line for line in caplog.messages if "are waiting for the engine already" in line]
-        assert told == [f"goal {third.hex()} rejected: 1 requests are waiting for the engine already; come again later"]
+        lines = [line for line in caplog.messages if "are waiting for the engine already" in line]
+        assert lines == [
+            f"goal {third.hex()} rejected: 1 requests are waiting for the engine already; come again later"
+        ]
         gate.go.set()
         for goal_id in (first, second):
             client.cancel(goal_id)
@@ -160,7 +162,7 @@ def test_a_request_whose_client_has_gone_lives_to_its_deadline_only() -> None:
     engine, soon = Endless(), Limits(answer_s=4.0)  # enough for the short one on a machine at work
     queued = engine_handler(engine, pixels=False, limits=soon)
     with serving(queued, "ros/topic", soon) as address:
-        leaver, other = (open_client(wiring("ros/topic", address)) for _ in range(2))
+        leaver, other = (open_client(wiring_of("ros/topic", address)) for _ in range(2))
         next(iter(leaver.request(Request("a", "for ever", max_tokens=60_000), Trace())))
         leaver.close()
         until(lambda: engine.closed == 1)
@@ -174,7 +176,7 @@ def test_garbage_and_guesses_beside_the_tokens_are_skipped_and_counted(stranger:
     with ExitStack() as stack:
         handler = engine_handler(open_engine(EngineConfig(name="echo")))
         address = stack.enter_context(serving(handler, f"ros/{variant}", Limits(answer_tokens=4)))
-        client = open_client(wiring(f"ros/{variant}", address))
+        client = open_client(wiring_of(f"ros/{variant}", address))
         stack.callback(client.close)
         publisher = stranger.publisher(NAMESPACE + topic, kind, TOKEN_QOS)
         until(lambda: bool(publisher.matched()))
@@ -194,7 +196,7 @@ def test_the_name_of_a_request_on_the_topic_cannot_be_guessed(stranger: Middlewa
     handler = RecordingHandler(["x"])
     with serving(handler, "ros/topic") as address:
         heard = stranger.subscription(NAMESPACE + "/request", ros.REQUEST, READER_QOS)
-        client = open_client(wiring("ros/topic", address))
+        client = open_client(wiring_of("ros/topic", address))
         until(lambda: bool(heard.matched()))
         for _ in range(2):
             ask(client, Request("cell-1", "go"))
@@ -237,7 +239,7 @@ def test_a_picture_that_cannot_be_is_refused_before_it_is_converted(message: Any
 def test_a_smaller_limit_is_the_server_s_own(stranger: Middleware) -> None:
     small = Limits(pixels=1000, answer_tokens=3)
     with serving(engine_handler(open_engine(EngineConfig(name="echo"))), "ros/topic", small) as address:
-        client = open_client(wiring("ros/topic", address))
+        client = open_client(wiring_of("ros/topic", address))
         try:
             with pytest.raises(RequestFailed, match="64x48; at most 1000 pixels"):
                 ask(client, Request("a", "a", (yuyv_frame(),), max_tokens=1))
@@ -272,7 +274,7 @@ def test_the_threads_of_ros_requests_that_waited_end() -> None:
 
     queued = Queued.around(answer)
     with serving(queued, "ros/topic") as address:
-        middleware = join(wiring("ros/topic", address), "crowd")
+        middleware = join(wiring_of("ros/topic", address), "crowd")
         publisher = middleware.publisher(address + "/request", ros.REQUEST, QoS(depth=0))
         until(lambda: bool(publisher.matched()))
         for index in range(30):
@@ -301,7 +303,7 @@ def test_the_bytes_of_ros_requests_are_bounded_and_given_back() -> None:
     limits, long = Limits(body_mib=1, in_flight_mib=1.5), "a" * 1_000_000
     with ExitStack() as stack:
         address = stack.enter_context(serving(Queued.around(answer), "ros/topic", limits))
-        first, second, goals = (open_client(wiring(f"ros/{way}", address)) for way in ("topic", "topic", "action"))
+        first, second, goals = (open_client(wiring_of(f"ros/{way}", address)) for way in ("topic", "topic", "action"))
         for client in (first, second, goals):
             stack.callback(client.close)
         with pytest.raises(RequestFailed, match="larger than 1048576 bytes"):

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.soak import HOSTILE, served, told
-from s2a_bench.testing.hostile.asker import usage
+from benchmarks.soak import HOSTILE, served, wiring
+from s2a_bench.testing.hostile.client import usage
 
 MINUTES = float(os.environ.get("S2A_SOAK_MINUTES", "0.5"))
 KEPT_MIB = 100.0
@@ -26,7 +26,7 @@ def test_bodies_that_no_framework_lets_go_are_not_kept(tmp_path: Path) -> None:
     with served("http", "echo", "big", tmp_path / "log") as server:
         before = usage(server.process.pid)
         for _ in range(8):
-            big.does(told("http", server.address))
+            big.does(wiring("http", server.address))
         deadline = time.monotonic() + 30
         while usage(server.process.pid).rss_mib > before.rss_mib + KEPT_MIB and time.monotonic() < deadline:
             time.sleep(0.2)

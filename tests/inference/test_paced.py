@@ -11,7 +11,7 @@ from s2a_bench.clock import VirtualClock
 from s2a_bench.inference import Engine, EngineConfig, PacedEngine, open_engine
 from s2a_bench.inference.echo import EchoEngine
 from s2a_bench.testing.engine import EngineSuite
-from s2a_bench.testing.transport import wiring
+from s2a_bench.testing.transport import wiring_of
 from s2a_bench.types import Request, Token
 
 SECOND = 10**9
@@ -87,5 +87,5 @@ def test_it_says_what_the_rate_is_and_else_what_the_engine_says() -> None:
 def test_a_server_process_is_told_the_pace() -> None:
     from s2a_bench.harness.serving import ServerJob
 
-    job = ServerJob(wiring("http"), EngineConfig(model=Path("m.gguf"), pace=4.8))
+    job = ServerJob(wiring_of("http"), EngineConfig(model=Path("m.gguf"), pace=4.8))
     assert ServerJob.from_json(job.to_json()) == job

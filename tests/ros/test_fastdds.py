@@ -22,7 +22,7 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import Middleware, QoS, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.llama import GENERATE_RESPONSE
-from s2a_bench.testing.transport import wiring
+from s2a_bench.testing.transport import wiring_of
 from s2a_bench.transport import open_client
 from s2a_bench.types import Frame
 from tests.ros.middleware_suite import until
@@ -197,8 +197,8 @@ def test_a_fast_dds_server_of_an_action_is_named(
     monkeypatch.setattr("s2a_bench.transport.ros.joining.MATCH_TIMEOUT_S", 5.0)
     topic = f"rq/llama/generate_response/_action/send_goalRequest={GOAL_TYPE}"
     start("localhost", "sub", topic, "reliable", 1)
-    told = wiring("ros/action", action="/llama/generate_response", domain_id=dds_domain)
+    wiring = wiring_of("ros/action", action="/llama/generate_response", domain_id=dds_domain)
     with pytest.raises(
         TransportError, match="/llama/generate_response is on Fast DDS, whose services have another form"
     ):
-        open_client(told)
+        open_client(wiring)

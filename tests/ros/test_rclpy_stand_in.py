@@ -21,7 +21,7 @@ from s2a_bench.ros import Accepted, Feedback, QoS, Result, llama, open_middlewar
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.diagnostics import LOG, ROSOUT_QOS
 from s2a_bench.ros.parameters import SERVICE, Parameter, value_of
-from s2a_bench.testing.transport import RecordingHandler, ask, connector, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, connector, wiring_of, yuyv_frame
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.ros.node import NodeApi
 from s2a_bench.types import Frame, Request
@@ -143,8 +143,8 @@ def test_topics_are_served_without_llama_msgs_and_the_log_says_what_is_not(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     without_llama_msgs(monkeypatch)
-    told = wiring("ros/topic", "/s2a", middleware="rclpy", domain_id=7)
-    with closing(connector(told)) as connecting:
+    wiring = wiring_of("ros/topic", "/s2a", middleware="rclpy", domain_id=7)
+    with closing(connector(wiring)) as connecting:
         client = next(connecting)(RecordingHandler(["a ", "b"]))
         tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),)))
     assert [token.text for token in tokens] == ["a ", "b"]
@@ -155,8 +155,8 @@ def test_topics_are_served_without_llama_msgs_and_the_log_says_what_is_not(
 
 def test_the_action_needs_llama_msgs(monkeypatch: pytest.MonkeyPatch) -> None:
     without_llama_msgs(monkeypatch)
-    told = wiring("ros/action", "/s2a", middleware="rclpy", domain_id=7)
-    for opened in (lambda: open_server(told, RecordingHandler([])), lambda: open_client(told)):
+    wiring = wiring_of("ros/action", "/s2a", middleware="rclpy", domain_id=7)
+    for opened in (lambda: open_server(wiring, RecordingHandler([])), lambda: open_client(wiring)):
         with pytest.raises(MissingInterface, match="colcon build --packages-select llama_msgs"):
             opened()
     assert GRAPH == []
@@ -219,8 +219,8 @@ def test_without_a_name_the_environment_chooses(monkeypatch: pytest.MonkeyPatch)
 def test_a_node_has_parameters_and_a_log_there_too(join: Join) -> None:
     serving, peer = join(), join()
     heard = peer.subscription("/rosout", LOG, ROSOUT_QOS)
-    told = [Parameter("depth", 3, live=True)]
-    node = NodeApi(serving, "/robot/brain", told, lambda _: None, lambda: iter(()), "info")
+    parameters = [Parameter("depth", 3, live=True)]
+    node = NodeApi(serving, "/robot/brain", parameters, lambda _: None, lambda: iter(()), "info")
     stopped = Event()
     node.start(stopped)
     try:

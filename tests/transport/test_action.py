@@ -20,7 +20,7 @@ from s2a_bench.ros import ActionClient, ActionServer, Rejected, Result, ServerGo
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import ServedAction, Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
-from s2a_bench.testing.transport import RecordingHandler, ask, connector, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, connector, served, wiring_of, yuyv_frame
 from s2a_bench.trace import budget
 from s2a_bench.transport import Handler, Wiring, open_client, open_server
 from s2a_bench.transport.serving import Queued
@@ -33,7 +33,7 @@ Node = Callable[..., list[ServerGoal]]
 @pytest.fixture
 def foreign(dds_domain: int) -> Wiring[Any]:
     """A told to somebody else's node."""
-    return wiring("ros/action", action=NODE, domain_id=dds_domain)
+    return wiring_of("ros/action", action=NODE, domain_id=dds_domain)
 
 
 class Stranger(Protocol):
@@ -46,7 +46,7 @@ def stranger(dds_domain: int) -> Iterator[Stranger]:
     with ExitStack() as stack:
 
         def start(name: str, handler: Handler, **more: Any) -> ActionClient:
-            stack.enter_context(served(wiring("ros/action", name, domain_id=dds_domain, **more), handler))
+            stack.enter_context(served(wiring_of("ros/action", name, domain_id=dds_domain, **more), handler))
             middleware = stack.enter_context(closing(open_middleware(domain_id=dds_domain)))
             client = middleware.action_client(name + "/generate_response", GENERATE_RESPONSE)
             assert client.wait_for_server(20)
@@ -207,8 +207,8 @@ def test_what_a_goal_wants_of_sampling_reaches_the_engine_or_fails_it(stranger: 
 
 def test_tokens_faster_than_the_interval_share_a_feedback_and_none_is_lost(dds_domain: int) -> None:
     words = [f"t{number} " for number in range(200)]
-    told = wiring("ros/action", "/test_pace", domain_id=dds_domain, max_tokens=200, feedback_interval=0.02)
-    with closing(connector(told)) as connecting:
+    wiring = wiring_of("ros/action", "/test_pace", domain_id=dds_domain, max_tokens=200, feedback_interval=0.02)
+    with closing(connector(wiring)) as connecting:
         tokens, _ = ask(next(connecting)(RecordingHandler(words)), Request("a", "plan", max_tokens=200))
     assert "".join(token.text for token in tokens) == "".join(words)
     assert len(tokens) < 100
@@ -257,8 +257,8 @@ def test_a_goal_that_cannot_start_ends_and_says_why(dds_domain: int, monkeypatch
         return execute(server, goal_id)
 
     monkeypatch.setattr(ServedAction, "execute", executing)
-    told = wiring("ros/action", "/test_start", domain_id=dds_domain)
-    with closing(connector(told)) as connecting:
+    wiring = wiring_of("ros/action", "/test_start", domain_id=dds_domain)
+    with closing(connector(wiring)) as connecting:
         client = next(connecting)(RecordingHandler(["fine"]))
         with pytest.raises(RequestFailed, match="no status can be sent"):
             ask(client, Request("a", "plan"))
@@ -268,15 +268,15 @@ def test_a_goal_that_cannot_start_ends_and_says_why(dds_domain: int, monkeypatch
 def test_our_server_does_not_join_a_node_that_answers_already(node: Node, dds_domain: int) -> None:
     node()
     with pytest.raises(TransportError, match="another server answers under /llama_ros"):
-        open_server(wiring("ros/action", "/llama_ros", domain_id=dds_domain), RecordingHandler(["x"]))
+        open_server(wiring_of("ros/action", "/llama_ros", domain_id=dds_domain), RecordingHandler(["x"]))
 
 
 @pytest.mark.parametrize(("served", "other"), [("4.4", "6.0"), ("6.0", "4.4")])
 def test_our_server_speaks_the_version_it_is_told_and_logs_who_speaks_another(
     dds_domain: int, caplog: pytest.LogCaptureFixture, served: str, other: str
 ) -> None:
-    told = wiring("ros/action", "/s2a", domain_id=dds_domain, llama_msgs=served)
-    with closing(connector(told)) as connecting:
+    wiring = wiring_of("ros/action", "/s2a", domain_id=dds_domain, llama_msgs=served)
+    with closing(connector(wiring)) as connecting:
         recorder = RecordingHandler(["a ", "b"])
         client = next(connecting)(recorder)
         tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),), grammar='root ::= "x"'))

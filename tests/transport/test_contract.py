@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.testing.transport import TransportSuite, wiring
+from s2a_bench.testing.transport import TransportSuite, wiring_of
 from s2a_bench.transport import Wiring
 
 
@@ -19,8 +19,8 @@ class TestLoopback(TransportSuite):
 @pytest.mark.parametrize("payload", ["raw", "png"])
 class TestHttp(TransportSuite):
     @pytest.fixture
-    def told(self, variant: str, payload: str) -> Wiring[Any]:
-        return wiring(f"http/{variant}", payload=payload)
+    def wiring(self, variant: str, payload: str) -> Wiring[Any]:
+        return wiring_of(f"http/{variant}", payload=payload)
 
 
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort", "binary"])
@@ -28,38 +28,38 @@ class TestHttpJpeg(TransportSuite):
     lossless = False
 
     @pytest.fixture
-    def told(self, variant: str) -> Wiring[Any]:
-        return wiring(f"http/{variant}")
+    def wiring(self, variant: str) -> Wiring[Any]:
+        return wiring_of(f"http/{variant}")
 
 
 @pytest.mark.parametrize("connection", ["per-request", "client-per-request"])
 class TestHttpConnections(TransportSuite):
     @pytest.fixture
-    def told(self, connection: str) -> Wiring[Any]:
-        return wiring("http/best-effort?payload=raw", connection=connection)
+    def wiring(self, connection: str) -> Wiring[Any]:
+        return wiring_of("http/best-effort?payload=raw", connection=connection)
 
 
 @pytest.mark.parametrize("payload", ["raw", "yuyv", "png"])
 class TestRosTopic(TransportSuite):
     @pytest.fixture
-    def told(self, dds_domain: int, payload: str) -> Wiring[Any]:
-        return wiring("ros/topic", domain_id=dds_domain, payload=payload)
+    def wiring(self, dds_domain: int, payload: str) -> Wiring[Any]:
+        return wiring_of("ros/topic", domain_id=dds_domain, payload=payload)
 
 
 class TestRosTopicJpeg(TransportSuite):
     lossless = False
 
     @pytest.fixture
-    def told(self, dds_domain: int) -> Wiring[Any]:
-        return wiring("ros/topic?payload=jpeg", domain_id=dds_domain)
+    def wiring(self, dds_domain: int) -> Wiring[Any]:
+        return wiring_of("ros/topic?payload=jpeg", domain_id=dds_domain)
 
 
 class TestRosAction(TransportSuite):
     carries_id_and_limit = False  # llama_msgs goals have neither
 
     @pytest.fixture
-    def told(self, dds_domain: int) -> Wiring[Any]:
-        return wiring("ros/action", domain_id=dds_domain, max_tokens=2000)
+    def wiring(self, dds_domain: int) -> Wiring[Any]:
+        return wiring_of("ros/action", domain_id=dds_domain, max_tokens=2000)
 
 
 @pytest.mark.parametrize("payload", ["raw", "png"])
@@ -67,8 +67,8 @@ class TestWebsocket(TransportSuite):
     whole = True
 
     @pytest.fixture
-    def told(self, payload: str) -> Wiring[Any]:
-        return wiring("websocket/openpi", payload=payload)
+    def wiring(self, payload: str) -> Wiring[Any]:
+        return wiring_of("websocket/openpi", payload=payload)
 
 
 class TestWebsocketStreamed(TransportSuite):
@@ -85,8 +85,8 @@ class TestZmq(TransportSuite):
     whole = True
 
     @pytest.fixture
-    def told(self, layout: str, payload: str) -> Wiring[Any]:
-        return wiring("zmq/gr00t", layout=layout, payload=payload)
+    def wiring(self, layout: str, payload: str) -> Wiring[Any]:
+        return wiring_of("zmq/gr00t", layout=layout, payload=payload)
 
 
 class TestZmqJpeg(TransportSuite):
@@ -100,8 +100,8 @@ needs_zenoh = pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh
 @pytest.mark.parametrize("payload", ["raw", "yuyv", "png"])
 class TestRosTopicOverZenoh(TransportSuite):
     @pytest.fixture
-    def told(self, dds_domain: int, payload: str) -> Wiring[Any]:
-        return wiring("ros/topic?middleware=zenoh", domain_id=dds_domain, payload=payload)
+    def wiring(self, dds_domain: int, payload: str) -> Wiring[Any]:
+        return wiring_of("ros/topic?middleware=zenoh", domain_id=dds_domain, payload=payload)
 
 
 @needs_zenoh
@@ -109,5 +109,5 @@ class TestRosActionOverZenoh(TransportSuite):
     carries_id_and_limit = False
 
     @pytest.fixture
-    def told(self, dds_domain: int) -> Wiring[Any]:
-        return wiring("ros/action?middleware=zenoh", domain_id=dds_domain, max_tokens=2000)
+    def wiring(self, dds_domain: int) -> Wiring[Any]:
+        return wiring_of("ros/action?middleware=zenoh", domain_id=dds_domain, max_tokens=2000)

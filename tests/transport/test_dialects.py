@@ -14,7 +14,7 @@ import pytest
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.frames.convert import decode_image, encode_png, to_bgr
-from s2a_bench.testing.transport import Connect, RecordingHandler, TransportSuite, ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import Connect, RecordingHandler, TransportSuite, ask, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client
 from s2a_bench.transport.http import HTTP
@@ -31,7 +31,7 @@ def route(speaker: Speaker, url: str, **more: object) -> Wiring[Any]:
     """A route that leaves nothing to be asked first."""
     fields = {"payload": "png", "dialect": speaker.dialect, "served_model": "default", **more}
     url += "/v1beta" if fields["dialect"] == "gemini" else ""
-    return wiring("http/as-deployed", url=url, **fields)  # type: ignore[arg-type]
+    return wiring_of("http/as-deployed", url=url, **fields)  # type: ignore[arg-type]
 
 
 @contextmanager
@@ -69,7 +69,7 @@ class TestContract(TransportSuite):
     lossless = False
 
     @pytest.fixture
-    def told(self, speaker: Speaker) -> Wiring[Any]:
+    def wiring(self, speaker: Speaker) -> Wiring[Any]:
         return route(speaker, "http://localhost")
 
     @pytest.fixture
@@ -135,8 +135,8 @@ FACTS = {
 def test_what_a_server_tells_of_itself_is_kept_by_clear_names(speaker: Speaker) -> None:
     texts, trace = said(speaker, answer(speaker))
     assert texts == ["go", "_to"]
-    told = {name: value for name, value in trace.facts.items() if name not in HTTP.facts}
-    assert told == pytest.approx(FACTS[speaker.dialect])
+    facts = {name: value for name, value in trace.facts.items() if name not in HTTP.facts}
+    assert facts == pytest.approx(FACTS[speaker.dialect])
 
 
 def test_only_llama_server_shows_where_ingest_ends(speaker: Speaker) -> None:
@@ -395,7 +395,7 @@ class TestKeys:
         if value is not None:
             monkeypatch.setenv(name, value)
         with pytest.raises(UsageError, match="`api_key_env`") as error:
-            open_client(wiring("http/as-deployed", url="http://x", dialect="openai", api_key_env=name))
+            open_client(wiring_of("http/as-deployed", url="http://x", dialect="openai", api_key_env=name))
         assert "sk-12" not in str(error.value)
         assert "a\nb" not in str(error.value)
 
@@ -421,7 +421,7 @@ class TestKeys:
     ],
 )
 def test_a_url_may_end_at_the_server_the_api_or_the_route(dialect: str, base: str, path: str) -> None:
-    client = open_client(wiring("http/as-deployed", url="http://h:1" + base, dialect=dialect, served_model="a/b"))
+    client = open_client(wiring_of("http/as-deployed", url="http://h:1" + base, dialect=dialect, served_model="a/b"))
     client.close()
     assert client.describe() == {"url": "http://h:1" + path, "dialect": dialect}
 
@@ -517,9 +517,9 @@ class TestWhatAServerHas:
 
     def described(self, reply: Reply, **options: Any) -> dict[str, str]:
         with serving(reply) as url:
-            client = open_client(wiring("http/as-deployed", url=url, **options))
+            client = open_client(wiring_of("http/as-deployed", url=url, **options))
             client.close()
-            return {name: told.removeprefix(url) for name, told in client.describe().items()}
+            return {name: wiring.removeprefix(url) for name, wiring in client.describe().items()}
 
     @pytest.mark.parametrize("dialect", ["openai", "vllm", "ollama", ""])
     def test_the_first_model_of_the_list_is_asked(self, dialect: str) -> None:
@@ -532,7 +532,7 @@ class TestWhatAServerHas:
 
         reply = listing("/v1/models", '{"data":[{"id":"qwen-vl","owned_by":"x"},{"id":"other"}]}', chat)
         with serving(reply) as url:
-            client = open_client(wiring("http/as-deployed", url=url, dialect=dialect))
+            client = open_client(wiring_of("http/as-deployed", url=url, dialect=dialect))
             ask(client, Request("a", "plan"))
             client.close()
         assert client.describe()["model"] == "qwen-vl"
@@ -551,9 +551,9 @@ class TestWhatAServerHas:
         models = (
             '{"models":[{"name":"models/embed","supportedGenerationMethods":["embedContent"]},{"name":"models/g"}]}'
         )
-        told = self.described(listing(f"{version}/models", models, lambda _: []), dialect="gemini")
-        assert told["url"] == f"{version}/models/g:streamGenerateContent?alt=sse"
-        assert told["model"] == "g"
+        described = self.described(listing(f"{version}/models", models, lambda _: []), dialect="gemini")
+        assert described["url"] == f"{version}/models/g:streamGenerateContent?alt=sse"
+        assert described["model"] == "g"
 
     def test_a_gateway_lists_its_models_as_openai_does_and_speaks_geminis_usual_version(self) -> None:
         reply = listing("/v1/models", '{"data":[{"id":"gpt"}]}', lambda _: [])
@@ -561,7 +561,7 @@ class TestWhatAServerHas:
 
     def test_a_dead_server_is_told_before_flags_are_judged(self) -> None:
         with pytest.raises(ServerDied, match=r"nothing answers at http://127\.0\.0\.1:9/v1/models"):
-            open_client(wiring("http/as-deployed", url="http://127.0.0.1:9"))
+            open_client(wiring_of("http/as-deployed", url="http://127.0.0.1:9"))
 
     def test_a_dead_server_that_needs_no_asking_is_told_with_the_first_request(self, speaker: Speaker) -> None:
         client = open_client(route(speaker, "http://127.0.0.1:9"))

@@ -12,7 +12,7 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import PortInUse, RequestFailed, TransportError, UsageError
-from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, open_client, open_server
 from s2a_bench.transport.limits import Limits
@@ -64,12 +64,12 @@ Connect = Callable[[], Client]
 @contextmanager
 def serving(name: str, handler: Handler, **limits: float) -> Iterator[Connect]:
     """Serve within limits; yields what connects another client, which is closed in the end."""
-    told = replace(wiring(name), limits=Limits(**limits))
-    with served(told, handler) as (server, _):
+    wiring = replace(wiring_of(name), limits=Limits(**limits))
+    with served(wiring, handler) as (server, _):
         clients: list[Client] = []
 
         def connect() -> Client:
-            clients.append(open_client(wiring(name, server.address)))
+            clients.append(open_client(wiring_of(name, server.address)))
             return clients[-1]
 
         try:
@@ -215,10 +215,10 @@ def test_what_breaks_inside_is_not_shown_and_fails_this_request_only(name: str) 
 @every
 def test_a_server_that_stops_ends_the_answer_under_way(name: str) -> None:
     gate = Gate(name, 10**9)
-    server = open_server(wiring(name), gate)
+    server = open_server(wiring_of(name), gate)
     thread = Thread(target=server.serve)
     thread.start()
-    with closing(open_client(wiring(name, server.address), thread.is_alive)) as client:
+    with closing(open_client(wiring_of(name, server.address), thread.is_alive)) as client:
         asking = Asking(client, "for ever")
         until(lambda: gate.began)
         gate.go.set()
@@ -263,12 +263,12 @@ def test_a_connection_too_many_is_refused(name: str) -> None:
 def test_off_this_machine_a_key_is_needed_or_none_is_asked_for(name: str) -> None:
     handler = recorder(name)
     with pytest.raises(UsageError, match=r"`host`: others reach 0.0.0.0; .*`api_key_env`, .*`no_auth`"):
-        open_server(wiring(name, "0.0.0.0:0"), handler)
+        open_server(wiring_of(name, "0.0.0.0:0"), handler)
     with pytest.raises(UsageError, match=r"`no_auth` .* `api_key_env`"):
-        wiring(name, no_auth=True, api_key_env="MY_KEY")
+        wiring_of(name, no_auth=True, api_key_env="MY_KEY")
     with pytest.raises(UsageError, match="`api_key_env`: the environment has no such variable"):
-        open_server(wiring(name, api_key_env="NO_KEY"), handler)
-    with served(wiring(name, "0.0.0.0:0", no_auth=True), handler) as (server, _):
+        open_server(wiring_of(name, api_key_env="NO_KEY"), handler)
+    with served(wiring_of(name, "0.0.0.0:0", no_auth=True), handler) as (server, _):
         assert server.address
 
 
@@ -276,11 +276,11 @@ def test_off_this_machine_a_key_is_needed_or_none_is_asked_for(name: str) -> Non
 def test_a_key_is_sent_and_who_has_none_is_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MY_KEY", "s3cret-robot-key")
     handler = recorder(name)
-    with served(wiring(name, api_key_env="MY_KEY"), handler) as (server, _):
-        with closing(open_client(wiring(name, server.address, api_key_env="MY_KEY"))) as client:
+    with served(wiring_of(name, api_key_env="MY_KEY"), handler) as (server, _):
+        with closing(open_client(wiring_of(name, server.address, api_key_env="MY_KEY"))) as client:
             assert len(ask(client, Request("a", "go"))[0]) == 3
         with (
-            closing(open_client(wiring(name, server.address))) as stranger,
+            closing(open_client(wiring_of(name, server.address))) as stranger,
             pytest.raises(RequestFailed, match=r"401|Unauthorized") as refused,
         ):
             ask(stranger, Request("b", "go"))
@@ -291,7 +291,7 @@ def test_a_key_is_sent_and_who_has_none_is_refused(name: str, monkeypatch: pytes
 @on_ports
 def test_a_port_in_use_is_named(name: str) -> None:
     with (
-        served(wiring(name), recorder(name)) as (server, _),
+        served(wiring_of(name), recorder(name)) as (server, _),
         pytest.raises(PortInUse, match=r"`port`: \d+ is in use"),
     ):
-        open_server(wiring(name, server.address.partition("//")[2]), recorder(name))
+        open_server(wiring_of(name, server.address.partition("//")[2]), recorder(name))

@@ -15,10 +15,10 @@ import httpx
 import numpy as np
 import pytest
 
-from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import Remote, Trace, budget
 from s2a_bench.transport import Handler, open_client, open_server
-from s2a_bench.transport.http import own as dialect
+from s2a_bench.transport.http import native
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.types import Request, Token
 
@@ -31,7 +31,7 @@ def handler() -> RecordingHandler:
 @contextmanager
 def serving(handler: Handler, name: str = "http") -> Iterator[str]:
     """Serve for as long as the context lasts."""
-    with served(wiring(name), handler) as (server, _):
+    with served(wiring_of(name), handler) as (server, _):
         yield server.address
 
 
@@ -64,19 +64,19 @@ COMMON = {"convert", "json_pack", "network", "json_parse", "inference", "return"
 def test_each_variant_has_its_stages_and_no_other(
     urls: dict[str, str], variant: str, payload: str, expected: set[str]
 ) -> None:
-    with closing(open_client(wiring(f"http/{variant}", urls[variant], payload=payload))) as client:
+    with closing(open_client(wiring_of(f"http/{variant}", urls[variant], payload=payload))) as client:
         _, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
     assert set(budget(trace.chain()).stages_ns) == COMMON | expected
 
 
 def test_a_new_client_per_request_shows_as_connect(url: str) -> None:
-    client = open_client(wiring("http/as-deployed", url, connection="client-per-request"))
+    client = open_client(wiring_of("http/as-deployed", url, connection="client-per-request"))
     _, trace = ask(client, Request("a", "plan"))
     assert "connect" in budget(trace.chain()).stages_ns
 
 
 def test_our_own_server_is_known_by_its_url_and_keeps_its_marks(url: str) -> None:
-    client = open_client(wiring("http/as-deployed", url=url))
+    client = open_client(wiring_of("http/as-deployed", url=url))
     _, trace = ask(client, Request("a", "plan"))
     client.close()
     assert client.describe() == {"url": url + "/v1/chat/completions", "dialect": "s2a", "model": "s2a"}
@@ -87,7 +87,7 @@ def test_marks_of_another_hosts_clock_are_not_mixed_with_ours(url: str, monkeypa
     monkeypatch.setattr("s2a_bench.transport.http.client.clock_id", lambda: "another boot")
     monkeypatch.setattr("s2a_bench.trace.clock_id", lambda: "another boot")
     monkeypatch.setattr(Remote, "to_json", lambda remote: {**asdict(remote), "clock": "this boot"})
-    client = open_client(wiring("http/as-deployed", url))
+    client = open_client(wiring_of("http/as-deployed", url))
     _, trace = ask(client, Request("a", "plan"))
     client.close()
     assert set(budget(trace.chain()).stages_ns) == {"json_pack", "server"}
@@ -104,7 +104,7 @@ def test_connections_are_kept_or_not(
     monkeypatch.setattr(socket, "create_connection", lambda *a, **k: opened.append(1) or connect(*a, **k))
     with (
         serving(handler) as url,
-        closing(open_client(wiring("http/as-deployed", url, connection=connection))) as client,
+        closing(open_client(wiring_of("http/as-deployed", url, connection=connection))) as client,
     ):
         for _ in range(3):
             ask(client, Request("a", "plan"))
@@ -157,15 +157,15 @@ def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: Reco
 )
 def test_a_bad_body_is_refused_with_the_reason(urls: dict[str, str], variant: str, body: bytes, message: str) -> None:
     headers = {"content-type": "application/json"}
-    answer = httpx.post(urls[variant] + dialect.PATHS[variant], content=body, headers=headers)
+    answer = httpx.post(urls[variant] + native.PATHS[variant], content=body, headers=headers)
     assert answer.status_code == 400
     assert message in answer.json()["error"]["message"]
 
 
 @pytest.mark.parametrize("header", ["[1]", '{"prompt": 3}', '{"seed": [1]}', f"[{'1,' * 20_000}1]"])
 def test_a_bad_header_of_a_binary_request_is_refused(urls: dict[str, str], header: str) -> None:
-    headers = {dialect.PARAMETERS_HEADER: header}
-    assert httpx.post(urls["binary"] + dialect.PATHS["binary"], headers=headers).status_code == 400
+    headers = {native.PARAMETERS_HEADER: header}
+    assert httpx.post(urls["binary"] + native.PATHS["binary"], headers=headers).status_code == 400
 
 
 def test_an_answer_that_nobody_reads_any_more_ends_on_its_own_thread() -> None:
@@ -200,7 +200,7 @@ def test_stopping_in_the_middle_of_an_answer_leaves_no_traceback(capsys: pytest.
         over.wait(30)
         yield Token(1, "on")
 
-    server = open_server(wiring("http"), slow)
+    server = open_server(wiring_of("http"), slow)
     thread = Thread(target=server.serve)
     thread.start()
     body = {"messages": [{"role": "user", "content": "plan"}], "stream": True}
@@ -244,7 +244,7 @@ def test_a_page_in_a_browser_is_not_answered(
 
 
 def test_best_effort_and_binary_share_a_server_and_as_deployed_has_its_own() -> None:
-    deployed, best_effort, binary = (one_pipeline(f"http/{name}").server for name in dialect.PATHS)
+    deployed, best_effort, binary = (one_pipeline(f"http/{name}").server for name in native.PATHS)
     assert deployed != best_effort == binary
 
 
@@ -252,8 +252,8 @@ def test_servers_bind_loopback_unless_told(url: str) -> None:
     assert url.startswith("http://127.0.0.1:")
 
 
-@pytest.mark.parametrize("codec", [dialect.STANDARD, dialect.FAST])
-def test_both_codecs_write_the_same_wire(codec: dialect.Codec) -> None:
+@pytest.mark.parametrize("codec", [native.STANDARD, native.FAST])
+def test_both_codecs_write_the_same_wire(codec: native.Codec) -> None:
     data = np.arange(256, dtype=np.uint8)
     assert codec.to_base64(data) == base64.b64encode(bytes(range(256))).decode()
     assert codec.from_base64(codec.to_base64(data)) == bytes(range(256))

@@ -14,10 +14,10 @@ from threading import Event
 
 import pytest
 
-from s2a_bench.testing.transport import RecordingHandler, served, wiring
+from s2a_bench.testing.transport import RecordingHandler, served, wiring_of
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler
-from s2a_bench.transport.http.own import PATHS
+from s2a_bench.transport.http.native import PATHS
 from s2a_bench.transport.limits import LIMITS, MIB, Limits
 from s2a_bench.types import Request, Token
 
@@ -30,8 +30,8 @@ def connected(
 ) -> Iterator[socket.socket]:
     """Serve, and connect, for as long as the context lasts."""
     with ExitStack() as stack:
-        told = replace(wiring(f"http/{variant}"), limits=limits)
-        server, _ = stack.enter_context(served(told, handler or RecordingHandler(["go", "_to"])))
+        wiring = replace(wiring_of(f"http/{variant}"), limits=limits)
+        server, _ = stack.enter_context(served(wiring, handler or RecordingHandler(["go", "_to"])))
         host, port = server.address.removeprefix("http://").split(":")
         yield stack.enter_context(socket.create_connection((host, int(port)), timeout=20))
 

@@ -11,7 +11,15 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import encode_png
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.transport.observed import OWN, observed, parameters, remote_message, remote_of, request_of, told_in
+from s2a_bench.transport.observed import (
+    EXTENSION,
+    extension_of,
+    observed,
+    remote_message,
+    remote_of,
+    request_of,
+    take_extension,
+)
 from s2a_bench.types import Request
 
 PICTURE = np.random.default_rng(1).integers(0, 256, (4, 6, 3), np.uint8)
@@ -96,8 +104,8 @@ PLAIN = Remote("c", [("queue", 1)], [2]).to_json()
 
 def test_a_request_s_own_fields_come_back_and_leave_the_observation() -> None:
     asked = Request("a", "go", max_tokens=3, seed=7, grammar="root ::= 'x'")
-    message = {"prompt": "go", OWN: parameters(asked)}
-    assert request_of(message, told_in(message), Trace(), LIMITS) == asked
+    message = {"prompt": "go", EXTENSION: extension_of(asked)}
+    assert request_of(message, take_extension(message), Trace(), LIMITS) == asked
     assert message == {"prompt": "go"}
 
 
@@ -108,9 +116,9 @@ def test_marks_come_back() -> None:
 @pytest.mark.parametrize(
     "message",
     [
-        *(None, 5, [], "s2a", {}, np.zeros(3), {OWN: None}, {OWN: np.zeros(3)}),
-        *({OWN: {**PLAIN, name: 5}} for name in ("clock", "marks", "token_ns", "facts")),
-        {OWN: {**PLAIN, "marks": [("queue", -1)]}},
+        *(None, 5, [], "s2a", {}, np.zeros(3), {EXTENSION: None}, {EXTENSION: np.zeros(3)}),
+        *({EXTENSION: {**PLAIN, name: 5}} for name in ("clock", "marks", "token_ns", "facts")),
+        {EXTENSION: {**PLAIN, "marks": [("queue", -1)]}},
     ],
     ids=str,
 )
@@ -121,6 +129,6 @@ def test_marks_that_are_none_are_refused_in_a_line(message: Any) -> None:
 
 
 def test_what_is_no_map_is_no_word_of_ours() -> None:
-    assert told_in(np.zeros(3)) is None
+    assert take_extension(np.zeros(3)) is None
     with pytest.raises(RequestFailed, match="s2a should be a map"):
-        told_in({OWN: [1]})
+        take_extension({EXTENSION: [1]})

@@ -11,7 +11,7 @@ import pytest
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import yuyv_to_rgb
-from s2a_bench.testing.transport import ask, wiring, yuyv_frame
+from s2a_bench.testing.transport import ask, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import open_client
 from s2a_bench.types import Frame, Request, Token
@@ -26,7 +26,7 @@ def json_head(body: bytes) -> bytes:
 
 def asked(reply: Reply, frame: Frame | None = None, **more: str) -> tuple[list[Token], Trace]:
     with serving(reply) as url:
-        client = open_client(wiring("http/as-deployed", url=url, payload="raw", dialect="openvla", **more))
+        client = open_client(wiring_of("http/as-deployed", url=url, payload="raw", dialect="openvla", **more))
         try:
             return ask(client, Request("a", "pick up the cup", (frame,) if frame else ()))
         finally:

@@ -32,7 +32,7 @@ from s2a_bench.transport import (
     Transport,
     TransportOptions,
     Wiring,
-    declared,
+    declared_transport,
 )
 from s2a_bench.transport.loopback.in_process import LoopbackClient, LoopbackServer
 from s2a_bench.types import Request, Token
@@ -77,7 +77,7 @@ def offer(monkeypatch: pytest.MonkeyPatch, offered: object) -> None:
 
 def forget() -> None:
     vars(TRANSPORTS).pop("_offered", None)
-    declared.cache_clear()
+    declared_transport.cache_clear()
 
 
 @pytest.fixture

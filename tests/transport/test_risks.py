@@ -11,9 +11,9 @@ import pytest
 
 from s2a_bench.errors import UsageError
 from s2a_bench.machine.doctor import Finding
-from s2a_bench.testing.transport import RecordingHandler, served, wiring
+from s2a_bench.testing.transport import RecordingHandler, served, wiring_of
 from s2a_bench.transport import risks
-from s2a_bench.transport.risks import PREFACE, examine, shown
+from s2a_bench.transport.risks import PREFACE, examine, printable
 
 SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 
@@ -42,9 +42,9 @@ def found(url: str) -> dict[str, Finding]:
 
 def test_grpc_is_told_of_without_calling_a_method() -> None:
     with answering(SETTINGS) as (place, heard):
-        told = found(f"grpc://{place}")
-    assert told["pickle"].level == "warning"
-    assert "unpickles what anybody sends" in told["pickle"].message
+        wiring = found(f"grpc://{place}")
+    assert wiring["pickle"].level == "warning"
+    assert "unpickles what anybody sends" in wiring["pickle"].message
     assert heard == [PREFACE]
 
 
@@ -55,7 +55,7 @@ def test_what_speaks_no_grpc_is_an_error(reply: bytes) -> None:
 
 
 def test_a_server_of_models_without_a_key_is_told_of() -> None:
-    with served(wiring("http"), RecordingHandler(["x"])) as (server, _):
+    with served(wiring_of("http"), RecordingHandler(["x"])) as (server, _):
         findings = found(server.address)
     assert findings["plain-text"].level == "state"
     assert findings["no-key"].level == "advice"
@@ -63,7 +63,7 @@ def test_a_server_of_models_without_a_key_is_told_of() -> None:
 
 
 def test_off_this_machine_both_are_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(risks, "is_here", lambda _host: False)
+    monkeypatch.setattr(risks, "is_local", lambda _host: False)
     body = b'{"data": [{"id": "a\\u001b[31m"}]}'
     with answering(b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%b" % (len(body), body)) as (place, _):
         findings = found(f"http://{place}")
@@ -91,4 +91,4 @@ def test_what_is_no_url_of_a_server_is_refused(url: str) -> None:
 
 
 def test_what_servers_say_is_one_short_line() -> None:
-    assert shown("a\nb\x1b" + "c" * 500) == "a?b?" + "c" * 116
+    assert printable("a\nb\x1b" + "c" * 500) == "a?b?" + "c" * 116

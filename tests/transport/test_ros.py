@@ -16,7 +16,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, TransportError
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client, open_server
 from s2a_bench.transport.ros.camera import CAMERA
@@ -25,19 +25,19 @@ from s2a_bench.types import Frame, Request, Token
 from tests.waiting import until
 
 
-def serve(stack: ExitStack, told: Wiring[Any], handler: Handler) -> Any:
-    return stack.enter_context(served(told, handler))[0]
+def serve(stack: ExitStack, wiring: Wiring[Any], handler: Handler) -> Any:
+    return stack.enter_context(served(wiring, handler))[0]
 
 
-def connect(stack: ExitStack, told: Wiring[Any]) -> Client:
-    client = open_client(told)
+def connect(stack: ExitStack, wiring: Wiring[Any]) -> Client:
+    client = open_client(wiring)
     stack.callback(client.close)
     return client
 
 
 @pytest.fixture
-def told(dds_domain: int) -> Wiring[Any]:
-    return wiring("ros/topic", "/test_ros", domain_id=dds_domain)
+def wiring(dds_domain: int) -> Wiring[Any]:
+    return wiring_of("ros/topic", "/test_ros", domain_id=dds_domain)
 
 
 def ask_until_seen(client: Client, handler: RecordingHandler, stamp_ns: int) -> Trace:
@@ -54,13 +54,13 @@ def ask_until_seen(client: Client, handler: RecordingHandler, stamp_ns: int) -> 
 
 @pytest.mark.parametrize("payload", ["raw", "yuyv", "jpeg", "png"])
 def test_a_request_without_a_picture_is_about_the_newest_frame(
-    stack: ExitStack, told: Wiring[Any], dds_domain: int, payload: str
+    stack: ExitStack, wiring: Wiring[Any], dds_domain: int, payload: str
 ) -> None:
     import cv2
 
     handler = RecordingHandler(["x"])
-    serve(stack, told, handler)
-    client = connect(stack, wiring("ros/topic", told.address, domain_id=dds_domain, payload=payload))
+    serve(stack, wiring, handler)
+    client = connect(stack, wiring_of("ros/topic", wiring.address, domain_id=dds_domain, payload=payload))
     assert client.camera is not None
     for seed in (1, 2):
         frame, published = yuyv_frame(seed=seed), Trace()
@@ -77,9 +77,9 @@ def test_a_request_without_a_picture_is_about_the_newest_frame(
     assert decoding not in budget(trace.chain()).stages_ns
 
 
-def test_a_client_is_a_camera_from_when_it_is_used_as_one(stack: ExitStack, told: Wiring[Any]) -> None:
-    server = serve(stack, told, RecordingHandler(["x"]))
-    clients = [connect(stack, replace(told, variant=variant)) for variant in ("topic", "action")]
+def test_a_client_is_a_camera_from_when_it_is_used_as_one(stack: ExitStack, wiring: Wiring[Any]) -> None:
+    server = serve(stack, wiring, RecordingHandler(["x"]))
+    clients = [connect(stack, replace(wiring, variant=variant)) for variant in ("topic", "action")]
     publishers = server._cache._cameras[0].publishers
     assert publishers() == 0
     for count, client in enumerate(clients, 1):
@@ -87,10 +87,10 @@ def test_a_client_is_a_camera_from_when_it_is_used_as_one(stack: ExitStack, told
         until(lambda count=count: publishers() == count)  # type: ignore[misc]  # bound at once
 
 
-def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, told: Wiring[Any], dds_domain: int) -> None:
+def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, wiring: Wiring[Any], dds_domain: int) -> None:
     handler = RecordingHandler(["x"])
-    serve(stack, told, handler)
-    client = connect(stack, told)
+    serve(stack, wiring, handler)
+    client = connect(stack, wiring)
     middleware = open_middleware(domain_id=dds_domain)
     stack.callback(middleware.close)
     publisher = middleware.publisher("/test_ros" + CAMERA, ros.IMAGE, QoS(1))
@@ -111,9 +111,9 @@ def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, told: 
 def test_a_frame_that_came_too_long_ago_fails_the_request_and_its_age_is_told(
     stack: ExitStack, dds_domain: int, variant: str
 ) -> None:
-    told = wiring(f"ros/{variant}", "/test_age", domain_id=dds_domain, max_frame_age=0.3)
-    serve(stack, told, RecordingHandler(["x"]))
-    client = connect(stack, told)
+    wiring = wiring_of(f"ros/{variant}", "/test_age", domain_id=dds_domain, max_frame_age=0.3)
+    serve(stack, wiring, RecordingHandler(["x"]))
+    client = connect(stack, wiring)
     assert client.camera is not None
     frame = replace(yuyv_frame(), stamp_ns=now_ns() - 5_000_000_000)
     client.camera.publish(frame, Trace())
@@ -148,9 +148,9 @@ def test_a_waiting_request_is_about_the_frame_that_is_the_newest_when_its_turn_c
         yield Token(0, "x")
 
     queued = Queued.around(handler)
-    told = wiring("ros/topic", "/test_turn", domain_id=dds_domain)
-    server = serve(stack, told, queued)
-    clients = [connect(stack, told) for _ in range(2)]
+    wiring = wiring_of("ros/topic", "/test_turn", domain_id=dds_domain)
+    server = serve(stack, wiring, queued)
+    clients = [connect(stack, wiring) for _ in range(2)]
     threads = [Thread(target=ask, args=(client, Request("a", "plan"))) for client in clients]
     threads[0].start()
     assert started.wait(20)
@@ -169,21 +169,21 @@ def test_a_waiting_request_is_about_the_frame_that_is_the_newest_when_its_turn_c
 
 @pytest.mark.parametrize(("came", "told_of"), [([0, 2], "piece 2 came instead of 1"), ([0, 0], "piece 0 .* of 1")])
 def test_tokens_out_of_order_are_messages_lost(
-    stack: ExitStack, told: Wiring[Any], came: list[int], told_of: str
+    stack: ExitStack, wiring: Wiring[Any], came: list[int], told_of: str
 ) -> None:
     def handler(_request: Request, trace: Trace) -> Generator[Token, None, None]:
         trace.mark("inference")
         for index in came:
             yield Token(index, "x")
 
-    serve(stack, told, handler)
-    answer = connect(stack, told).request(Request("a", "plan"), Trace())
+    serve(stack, wiring, handler)
+    answer = connect(stack, wiring).request(Request("a", "plan"), Trace())
     assert next(answer).index == 0
     with pytest.raises(MessagesLost, match=told_of):
         next(answer)
 
 
-def test_a_second_server_of_a_namespace_is_refused(stack: ExitStack, told: Wiring[Any]) -> None:
-    serve(stack, told, RecordingHandler(["x"]))
+def test_a_second_server_of_a_namespace_is_refused(stack: ExitStack, wiring: Wiring[Any]) -> None:
+    serve(stack, wiring, RecordingHandler(["x"]))
     with pytest.raises(TransportError, match="another server answers under /test_ros"):
-        open_server(told, RecordingHandler(["y"]))
+        open_server(wiring, RecordingHandler(["y"]))

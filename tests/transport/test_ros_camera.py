@@ -19,7 +19,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.diagnostics import ARRAY, Level
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
-from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.ros import camera as camera_module
 from s2a_bench.transport.ros.camera import CAMERA, CAMERA_QOS
@@ -33,19 +33,19 @@ WAIT_S = 20.0
 
 
 @pytest.fixture
-def told(from_pypi: str, dds_domain: int) -> Wiring[Any]:
+def wiring(from_pypi: str, dds_domain: int) -> Wiring[Any]:
     """What a server is told."""
     options = {"middleware": from_pypi, "domain_id": dds_domain, "node_api": True, "max_frame_age": 0.3}
-    return wiring("ros/topic", "/robot", **options)
+    return wiring_of("ros/topic", "/robot", **options)
 
 
 class Robot:
     """A server, and a peer in its domain."""
 
-    def __init__(self, stack: ExitStack, told: Wiring[Any]) -> None:
+    def __init__(self, stack: ExitStack, wiring: Wiring[Any]) -> None:
         self.handler = RecordingHandler(["x"])
-        self.server: Any = stack.enter_context(served(told, self.handler))[0]
-        self._stack, self._told = stack, replace(told, address=self.server.address)
+        self.server: Any = stack.enter_context(served(wiring, self.handler))[0]
+        self._stack, self._told = stack, replace(wiring, address=self.server.address)
         self.peer = self.join()
 
     def join(self) -> Middleware:
@@ -76,8 +76,8 @@ class Robot:
 
 
 @pytest.fixture
-def robot(stack: ExitStack, told: Wiring[Any]) -> Robot:
-    return Robot(stack, told)
+def robot(stack: ExitStack, wiring: Wiring[Any]) -> Robot:
+    return Robot(stack, wiring)
 
 
 def refusal(client: Client) -> str:
@@ -151,10 +151,10 @@ def test_without_a_publisher_text_is_answered_and_the_log_says_once_that_there_i
 
 
 def test_a_request_waits_for_the_first_frame_of_a_publisher_that_has_just_appeared(
-    stack: ExitStack, told: Wiring[Any], monkeypatch: pytest.MonkeyPatch
+    stack: ExitStack, wiring: Wiring[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(camera_module, "FIRST_FRAME_S", WAIT_S)
-    robot = Robot(stack, replace(told, options=told.options.but(max_frame_age=60.0)))
+    robot = Robot(stack, replace(wiring, options=wiring.options.but(max_frame_age=60.0)))
     client, publisher = robot.client(), robot.camera()
     asking = Thread(target=ask, args=(client, Request("a", "plan")))
     asking.start()

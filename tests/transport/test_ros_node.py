@@ -17,7 +17,7 @@ from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.diagnostics import ARRAY, LOG, LONGEST, Level, PartHealth, diagnostic_array, log_message
 from s2a_bench.ros.parameters import PARAMETER, SERVICE, value_message, value_of
-from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring, open_client
 from s2a_bench.transport.ros.joining import join
@@ -31,25 +31,25 @@ WAIT_S = 20.0
 
 
 @pytest.fixture
-def told(from_pypi: str, dds_domain: int) -> Wiring[Any]:
+def wiring(from_pypi: str, dds_domain: int) -> Wiring[Any]:
     """What a server is told."""
     options = {"middleware": from_pypi, "domain_id": dds_domain, "node_api": True, "node_name": "brain"}
-    return wiring("ros/topic?max_tokens=9", "/behaves", **options)
+    return wiring_of("ros/topic?max_tokens=9", "/behaves", **options)
 
 
 @pytest.fixture
-def peer(stack: ExitStack, told: Wiring[Any], server: RosServer) -> Middleware:
-    middleware = join(replace(told, address=server.address), "peer")
+def peer(stack: ExitStack, wiring: Wiring[Any], server: RosServer) -> Middleware:
+    middleware = join(replace(wiring, address=server.address), "peer")
     stack.callback(middleware.close)
     return middleware
 
 
 @pytest.fixture
-def server(stack: ExitStack, told: Wiring[Any]) -> RosServer:
+def server(stack: ExitStack, wiring: Wiring[Any]) -> RosServer:
     """A server as `serve ros` starts it."""
     handler = Queued.around(RecordingHandler(["a", "b"]))
     handler.settings = EngineConfig(name="echo")
-    server, _ = stack.enter_context(served(told, handler))
+    server, _ = stack.enter_context(served(wiring, handler))
     assert isinstance(server, RosServer)
     return server
 
@@ -106,9 +106,9 @@ def test_what_is_logged_is_on_rosout_for_who_joins_later(peer: Middleware) -> No
 
 
 def test_diagnostics_tell_of_requests_and_the_camera(
-    peer: Middleware, server: RosServer, stack: ExitStack, told: Wiring[Any]
+    peer: Middleware, server: RosServer, stack: ExitStack, wiring: Wiring[Any]
 ) -> None:
-    client = open_client(replace(told, address=server.address))
+    client = open_client(replace(wiring, address=server.address))
     stack.callback(client.close)
     diagnostics = peer.subscription("/diagnostics", ARRAY, QoS())
     assert client.camera is not None
@@ -130,9 +130,9 @@ def test_diagnostics_tell_of_requests_and_the_camera(
 
 
 def test_a_request_that_cannot_be_prepared_is_a_failure(
-    server: RosServer, stack: ExitStack, told: Wiring[Any], caplog: pytest.LogCaptureFixture
+    server: RosServer, stack: ExitStack, wiring: Wiring[Any], caplog: pytest.LogCaptureFixture
 ) -> None:
-    client = open_client(replace(told, address=server.address))
+    client = open_client(replace(wiring, address=server.address))
     stack.callback(client.close)
     for _ in range(2):
         with pytest.raises(RequestFailed):
@@ -216,8 +216,10 @@ def test_rosout_and_parameter_events_have_the_qos_that_was_recorded(server: RosS
     assert server.address == "/behaves"
     for end in wanted:
         ours, recorded = found[end].qos, ends[end]
-        told = {"reliability": Policy.Reliability, "durability": Policy.Durability, "history": Policy.History}
-        told |= {"userdata": Policy.Userdata, "repr": Policy.DataRepresentation}
-        assert {name: repr(ours[policy]) for name, policy in told.items()} == {name: recorded[name] for name in told}
+        wiring = {"reliability": Policy.Reliability, "durability": Policy.Durability, "history": Policy.History}
+        wiring |= {"userdata": Policy.Userdata, "repr": Policy.DataRepresentation}
+        assert {name: repr(ours[policy]) for name, policy in wiring.items()} == {
+            name: recorded[name] for name in wiring
+        }
         assert found[end].type_name == recorded["type"]
     assert found["writer", "rt/rosout"].qos[Policy.Lifespan] == Policy.Lifespan(10_000_000_000)

@@ -24,8 +24,8 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import PortInUse, RequestFailed, ServerDied, TransportError, UsageError
 from s2a_bench.frames.convert import to_bgr, to_rgb
 from s2a_bench.machine.doctor import Machine
-from s2a_bench.testing.hostile.asker import usage
-from s2a_bench.testing.transport import Connect, RecordingHandler, TransportSuite, ask, connector, wiring, yuyv_frame
+from s2a_bench.testing.hostile.client import usage
+from s2a_bench.testing.transport import Connect, RecordingHandler, TransportSuite, ask, connector, wiring_of, yuyv_frame
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.connections import Wire
@@ -66,7 +66,7 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def connect() -> Iterator[Connect]:
-    yield from connector(wiring("shm"))
+    yield from connector(wiring_of("shm"))
 
 
 def memory_of(pid: int) -> list[str]:
@@ -85,7 +85,7 @@ def named_memory(*pids: int) -> list[str]:
 def test_several_pictures_of_unlike_sizes_arrive_with_their_very_pixels(payload: str) -> None:
     handler = RecordingHandler(["x"])
     frames = tuple(yuyv_frame(width, height, seed) for seed, (width, height) in enumerate([(64, 48), (2, 2), (98, 30)]))
-    for connect in connector(wiring(f"shm?payload={payload}")):
+    for connect in connector(wiring_of(f"shm?payload={payload}")):
         ask(connect(handler), Request("a", "plan", frames))
     (got,) = handler.requests
     assert len(got.images) == 3
@@ -115,7 +115,7 @@ def test_a_larger_picture_opens_a_link_with_more_memory_and_says_so(connect: Con
 
 def test_a_server_that_is_killed_in_mid_answer_leaves_nothing_and_the_next_start_cleans_up(own_folder: Path) -> None:
     with serving("shm") as server:
-        peer = Peer(wiring("shm", server.address, timeout_s=10), server.pid)
+        peer = Peer(wiring_of("shm", server.address, timeout_s=10), server.pid)
         try:
             peer.hear("ready", seconds=60)
             before = usage(peer.pid).descriptors
@@ -134,7 +134,7 @@ def test_a_server_that_is_killed_in_mid_answer_leaves_nothing_and_the_next_start
         assert Path(server.address).is_socket()  # which has a name, unlike the memory
     with serving("shm") as second:
         assert [*own_folder.iterdir()] == [Path(second.address)]
-        with closing(open_client(wiring("shm", second.address))) as client:
+        with closing(open_client(wiring_of("shm", second.address))) as client:
             assert len(ask(client, Request("a", "go on", max_tokens=2))[0]) == 2
 
 
@@ -163,10 +163,10 @@ def test_an_answer_stops_when_a_client_that_did_not_read_has_gone(connect: Conne
 
 
 def test_a_client_that_is_killed_in_mid_answer_leaves_nothing() -> None:
-    with serving("shm") as server, closing(open_client(wiring("shm", server.address))) as honest:
+    with serving("shm") as server, closing(open_client(wiring_of("shm", server.address))) as honest:
         ask(honest, Request("a", "go on", max_tokens=1))
         before = usage(server.pid)
-        peer = Peer(wiring("shm", server.address), server.pid)
+        peer = Peer(wiring_of("shm", server.address), server.pid)
         try:
             peer.hear("ready", seconds=60)
             peer.tell("ask")
@@ -220,33 +220,33 @@ def test_the_socket_is_its_users_alone(own_folder: Path) -> None:
 def test_a_folder_that_others_may_enter_is_refused_in_one_line(own_folder: Path) -> None:
     own_folder.mkdir(mode=0o755)
     with pytest.raises(TransportError, match=r"is not a folder of ours alone: remove it, or name a `socket`"):
-        open_server(wiring("shm"), RecordingHandler([]))
+        open_server(wiring_of("shm"), RecordingHandler([]))
 
 
 def test_a_link_in_place_of_the_folder_is_refused(own_folder: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     own_folder.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(TransportError, match="is not a folder of ours alone"):
-        open_server(wiring("shm"), RecordingHandler([]))
+        open_server(wiring_of("shm"), RecordingHandler([]))
 
 
 def test_a_socket_of_ones_own_is_used_once_and_never_takes_the_place_of_a_file(tmp_path: Path) -> None:
     path = tmp_path / "robot.sock"
-    told = wiring("shm", str(path))
+    wiring = wiring_of("shm", str(path))
     listener, _ = door.listen(str(path))
     with listener, pytest.raises(PortInUse, match=r"`socket`: .*robot.sock cannot be had"):
-        open_server(told, RecordingHandler([]))
+        open_server(wiring, RecordingHandler([]))
     assert path.is_socket()  # as of a server that was killed
-    server = open_server(told, RecordingHandler([]))
+    server = open_server(wiring, RecordingHandler([]))
     server.stop()
     server.stop()
     assert not path.exists()
     path.write_text("mine")
     with pytest.raises(PortInUse):
-        open_server(told, RecordingHandler([]))
+        open_server(wiring, RecordingHandler([]))
     assert path.read_text() == "mine"
     with pytest.raises(PortInUse, match="nowhere"):
-        open_server(wiring("shm", str(tmp_path / "nowhere" / "a.sock")), RecordingHandler([]))
+        open_server(wiring_of("shm", str(tmp_path / "nowhere" / "a.sock")), RecordingHandler([]))
 
 
 def test_the_name_of_a_socket_may_be_nearly_as_long_as_the_kernel_takes(tmp_path: Path) -> None:
@@ -267,7 +267,7 @@ def test_another_version_of_us_is_told_as_such() -> None:
 
 
 def test_a_limit_that_is_no_whole_step_is_kept_all_the_same() -> None:
-    for connect in connector(replace(wiring("shm"), limits=Limits(body_mib=0.5))):
+    for connect in connector(replace(wiring_of("shm"), limits=Limits(body_mib=0.5))):
         client = connect(RecordingHandler(["x"]))
         assert len(ask(client, Request("a", "plan"))[0]) == 1
         with pytest.raises(RequestFailed):
@@ -305,7 +305,7 @@ def test_pictures_are_not_handed_to_another_users_server(monkeypatch: pytest.Mon
         monkeypatch.setattr(door, "user_of", lambda _: NOBODY)
         monkeypatch.setattr(door.os, "getuid", lambda: 1000)
         with pytest.raises(TransportError, match="is another user's"):
-            open_client(wiring("shm", path))
+            open_client(wiring_of("shm", path))
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")
@@ -316,7 +316,7 @@ def test_another_user_of_the_machine_gets_no_memory(tmp_path: Path, mode: int) -
     for folder in (tmp_path, *tmp_path.parents):
         if folder.name.startswith(("pytest", "popen", "test")):
             folder.chmod(0o755)
-    for connect in connector(wiring("shm", str(path))):
+    for connect in connector(wiring_of("shm", str(path))):
         connect(RecordingHandler(["x"]))
         path.chmod(mode)
         child = os.fork()
@@ -358,7 +358,7 @@ def test_a_header_of_many_values_is_refused_before_it_takes_memory(unit: bytes) 
 
 
 def test_memory_above_the_limit_is_refused() -> None:
-    for connect in connector(replace(wiring("shm"), limits=Limits(body_mib=2))):
+    for connect in connector(replace(wiring_of("shm"), limits=Limits(body_mib=2))):
         client = connect(RecordingHandler(["x"]))
         with pytest.raises(RequestFailed, match=r"refused: shared memory of \d+ bytes was offered; at most"):
             ask(client, Request("a", "plan", (yuyv_frame(1280, 960),)))
@@ -367,13 +367,16 @@ def test_memory_above_the_limit_is_refused() -> None:
 
 def test_nobody_there_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(ServerDied, match=r"nobody takes a link at .*: No such file or directory"):
-        open_client(wiring("shm", str(tmp_path / "nobody.sock")))
+        open_client(wiring_of("shm", str(tmp_path / "nobody.sock")))
 
 
 @pytest.mark.parametrize("gone", ["os.memfd_create", "socket.SO_PEERCRED"])
 def test_a_system_without_such_memory_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch, gone: str) -> None:
     monkeypatch.delattr(gone)
-    for opens in (lambda: open_client(wiring("shm", "x")), lambda: open_server(wiring("shm"), RecordingHandler([]))):
+    for opens in (
+        lambda: open_client(wiring_of("shm", "x")),
+        lambda: open_server(wiring_of("shm"), RecordingHandler([])),
+    ):
         with pytest.raises(UsageError, match=r"`transport` shm: it needs Linux \(memfd_create, SO_PEERCRED\); this is"):
             opens()
     found = shared_memory(Machine())
@@ -419,15 +422,15 @@ def test_any_bytes_are_a_piece_or_one_of_these_errors(data: bytes) -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 1 << 16), st.integers(0, 2)), max_size=400))
 def test_pieces_of_any_sizes_come_in_order_however_late_they_are_read(pieces: list[tuple[int, int]]) -> None:
-    told, heard = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    wiring, heard = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     file = os.memfd_create("test")
     os.ftruncate(file, ANSWER_BYTES)
     answers = SharedMemory(file, ANSWER_BYTES, writes=True)
     os.close(file)
-    with told, heard:
+    with wiring, heard:
         heard.setblocking(False)
-        told.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # as little as may be: a few packets
-        writer = Writer(Wire(told), answers)
+        wiring.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # as little as may be: a few packets
+        writer = Writer(Wire(wiring), answers)
         got: list[object] = []
 
         def take(most: int) -> None:

@@ -27,7 +27,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.provenance import Provenance
-from s2a_bench.testing.transport import Connect, RecordingHandler, ask, connector, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import Connect, RecordingHandler, ask, connector, served, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.limits import Limits
@@ -43,14 +43,14 @@ pytestmark = pytest.mark.filterwarnings("ignore:connect.. must be used as a cont
 
 @contextmanager
 def serving(handler: Handler, address: str = "", limits: Limits | None = None, **options: Any) -> Iterator[Server]:
-    told = wiring("websocket", address, **options)
-    with served(replace(told, limits=limits or told.limits), handler) as (server, _):
+    wiring = wiring_of("websocket", address, **options)
+    with served(replace(wiring, limits=limits or wiring.limits), handler) as (server, _):
         yield server
 
 
 @pytest.fixture
 def connect() -> Iterator[Connect]:
-    yield from connector(wiring("websocket/openpi", payload="raw"))
+    yield from connector(wiring_of("websocket/openpi", payload="raw"))
 
 
 @contextmanager
@@ -416,7 +416,7 @@ def test_the_parts_of_a_picture_are_marked(connect: Connect) -> None:
 def test_the_first_action_of_a_stream_comes_before_the_last_is_there() -> None:
     handler = Slow()
     with serving(handler) as server:
-        client = open_client(replace(wiring("websocket/openpi-stream"), address=server.address))
+        client = open_client(replace(wiring_of("websocket/openpi-stream"), address=server.address))
         actions = client.request(Request("a", "go"), Trace())
         assert [next(actions).index for _ in range(3)] == [0, 1, 2]
         handler.go.set()
@@ -427,7 +427,7 @@ def test_the_first_action_of_a_stream_comes_before_the_last_is_there() -> None:
 def test_a_server_that_came_back_is_connected_to_again() -> None:
     handler = RecordingHandler(list(CHUNK))
     with serving(handler) as server:
-        client = open_client(replace(wiring("websocket"), address=server.address))
+        client = open_client(replace(wiring_of("websocket"), address=server.address))
         ask(client, Request("a", "go"))
     with serving(handler, server.address) as again:
         assert again.address == server.address
@@ -437,7 +437,7 @@ def test_a_server_that_came_back_is_connected_to_again() -> None:
 
 
 def test_an_address_where_nobody_is() -> None:
-    client = open_client(replace(wiring("websocket"), address="ws://127.0.0.1:9"))
+    client = open_client(replace(wiring_of("websocket"), address="ws://127.0.0.1:9"))
     with pytest.raises(ServerDied, match=r"nothing answers at ws://127.0.0.1:9"):
         ask(client, Request("a", "go"))
 
@@ -448,13 +448,13 @@ def test_an_address_where_nobody_is() -> None:
 )
 def test_urls_that_are_none_are_refused(url: str, says: str) -> None:
     with pytest.raises(UsageError, match=says):
-        wiring("websocket", url=url)
+        wiring_of("websocket", url=url)
 
 
 def test_a_foreign_server_takes_pixels_unless_its_template_says_otherwise(tmp_path: Path) -> None:
     (tmp_path / "files.toml").write_text('image = "{image:0|bytes}"\n')
-    pixels = wiring("websocket", url="ws://a:1")
-    files = wiring("websocket", url="ws://a:1", template=str(tmp_path / "files.toml"))
+    pixels = wiring_of("websocket", url="ws://a:1")
+    files = wiring_of("websocket", url="ws://a:1", template=str(tmp_path / "files.toml"))
     assert (pixels.options.payload, files.options.payload) == ("raw", "jpeg")
 
 
@@ -493,7 +493,7 @@ def told_by(answer: Callable[[Any], Any], metadata: Any = None) -> Iterator[str]
 
 @contextmanager
 def foreign(address: str, name: str = "websocket/openpi", **options: Any) -> Iterator[Client]:
-    client = open_client(wiring(name, url=address, **options))
+    client = open_client(wiring_of(name, url=address, **options))
     try:
         yield client
     finally:

@@ -26,7 +26,7 @@ from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
-from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.limits import Limits
@@ -43,8 +43,8 @@ TASK = "annotation.human.task_description"
 
 @contextmanager
 def serving(handler: Handler, limits: Limits | None = None, **options: Any) -> Iterator[Server]:
-    told = wiring("zmq/gr00t", **options)
-    with served(replace(told, limits=limits or told.limits), handler) as (server, _):
+    wiring = wiring_of("zmq/gr00t", **options)
+    with served(replace(wiring, limits=limits or wiring.limits), handler) as (server, _):
         yield server
 
 
@@ -52,7 +52,7 @@ def serving(handler: Handler, limits: Limits | None = None, **options: Any) -> I
 def robot(server: str, **more: Any) -> Iterator[Client]:
     """Our own client."""
     timeout_s = more.pop("timeout_s", 20)
-    client = open_client(wiring("zmq/gr00t", server, timeout_s=timeout_s, **more))
+    client = open_client(wiring_of("zmq/gr00t", server, timeout_s=timeout_s, **more))
     try:
         yield client
     finally:
@@ -353,10 +353,10 @@ class TestWatch:
 class TestBlackBox:
     @pytest.mark.parametrize("layout", ["n1.5", "n1.6", "n1.7"])
     def test_a_foreign_policy_is_told_what_the_template_says(self, layout: str, peer: Any) -> None:
-        told: list[Any] = []
+        wiring: list[Any] = []
 
         def answers(request: Any) -> Any:
-            told.append(request)
+            wiring.append(request)
             arm, gripper = CHUNK[:, :2].astype(np.float64), CHUNK[:, 2:].astype(np.float64)
             if layout == "n1.5":
                 return {"action.arm": arm, "action.gripper": gripper[:, 0]}
@@ -367,7 +367,7 @@ class TestBlackBox:
         with policy(answers, **codec) as url, robot("", url=url, layout=layout) as client:
             actions, trace = ask(client, Request("a", "pick it up", (frame,), state=(0.5, 1.5)))
         np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)  # type: ignore[union-attr]
-        (request,) = told
+        (request,) = wiring
         assert set(request) == {"endpoint", "data"}
         data = request["data"]
         if layout == "n1.5":
@@ -384,10 +384,10 @@ class TestBlackBox:
         assert {"convert", "msgpack_pack", "server"} <= set(spent.stages_ns)
 
     def test_a_template_of_ones_own(self) -> None:
-        told: list[Any] = []
+        wiring: list[Any] = []
 
         def answers(request: Any) -> Any:
-            told.append(request["data"]["observation"])
+            wiring.append(request["data"]["observation"])
             return [{"robot": CHUNK[np.newaxis]}, {}]
 
         frames = (yuyv_frame(seed=1), yuyv_frame(seed=2))
@@ -395,7 +395,7 @@ class TestBlackBox:
             ask(client, Request("a", "go", frames, state=(1, 2, 3, 4, 5, 6)))
             with pytest.raises(RequestFailed, match=r"video\.wrist.* wants picture 1"):
                 ask(client, Request("a", "go", frames[:1], state=(1, 2, 3, 4, 5, 6)))
-        assert {key: value.shape for key, value in told[0]["state"].items()} == {
+        assert {key: value.shape for key, value in wiring[0]["state"].items()} == {
             "single_arm": (1, 1, 5),
             "gripper": (1, 1, 1),
         }
@@ -420,8 +420,8 @@ class TestBlackBox:
             return [{"robot": np.zeros((1, 4, 3), np.float32)}, {}]  # nobody waits for it
 
         with policy(answers) as url:
-            told = wiring("zmq/gr00t", url=url, layout="n1.6", timeout_s=0.5)
-            client = open_client(told)
+            wiring = wiring_of("zmq/gr00t", url=url, layout="n1.6", timeout_s=0.5)
+            client = open_client(wiring)
             with pytest.raises(RequestFailed, match=r"silent for too long: 0\.5 s"):
                 ask(client, Request("a", "go"))
             client.close()
@@ -460,8 +460,8 @@ class TestBlackBox:
         alive = Event()
         alive.set()
         with policy(lambda _: None) as url:
-            told = wiring("zmq/gr00t", url, timeout_s=30)
-            client = open_client(told, alive.is_set)
+            wiring = wiring_of("zmq/gr00t", url, timeout_s=30)
+            client = open_client(wiring, alive.is_set)
             failed: list[Any] = []
 
             def asks() -> None:
@@ -584,15 +584,15 @@ class TestLayoutOfAServer:
 
 class TestDangers:
     def test_who_answers_everybody_is_told_of_by_a_ping(self) -> None:
-        told: list[Any] = []
+        wiring: list[Any] = []
 
         def answers(request: Any) -> Any:
-            told.append(request)
+            wiring.append(request)
             return {"status": "ok"}
 
         with policy(answers) as url:
             found = {finding.code: finding for finding in examine(url)}
-        assert told == [{"endpoint": "ping"}, {"endpoint": "get_modality_config"}]
+        assert wiring == [{"endpoint": "ping"}, {"endpoint": "get_modality_config"}]
         assert found["no-key"].level == "advice"
         assert "`kill`" in found["no-key"].message
         assert found["pickle"].level == "advice"
@@ -600,10 +600,10 @@ class TestDangers:
 
     @pytest.mark.parametrize("answer", [b"ERROR", b"PK\x03\x04" + bytes(9), pickle.dumps({"status": "ok"})])
     def test_n1_is_known_by_its_answer_to_a_ping(self, answer: bytes) -> None:
-        told: list[Any] = []
-        with policy(lambda request: told.append(request) or answer) as url:  # type: ignore[func-returns-value]
+        wiring: list[Any] = []
+        with policy(lambda request: wiring.append(request) or answer) as url:  # type: ignore[func-returns-value]
             findings = examine(url)
-        assert told == [{"endpoint": "ping"}]
+        assert wiring == [{"endpoint": "ping"}]
         assert [(finding.code, finding.level) for finding in findings] == [
             ("plain-text", "state"),
             ("pickle", "warning"),

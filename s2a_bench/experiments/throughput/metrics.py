@@ -22,7 +22,7 @@ from s2a_bench.stats import Summary, summarise
 from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import Count, Table, about
-from s2a_bench.transport import declared
+from s2a_bench.transport import declared_transport
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.json import frame, ratio_entry
 
@@ -101,7 +101,7 @@ class Reference:
 
 def throughput_cells(run: StoredRun) -> list[RequestCell]:
     """Split a run into its cells: in-process first, then HTTP and ROS."""
-    return sorted(cells_of(run), key=lambda cell: not declared(cell.pipeline).in_process)
+    return sorted(cells_of(run), key=lambda cell: not declared_transport(cell.pipeline).in_process)
 
 
 def joined(cell: RequestCell) -> int:
@@ -205,7 +205,7 @@ def throughput_csv(run: StoredRun) -> dict[str, CsvTable]:
 
 def _base(cell: RequestCell, cells: Sequence[RequestCell]) -> RequestCell | None:
     """Return the cell in this process whose engine is set alike, as its name ends, or the first; None for itself."""
-    here = [each for each in cells if declared(each.pipeline).in_process]
+    here = [each for each in cells if declared_transport(each.pipeline).in_process]
     alike = [each for each in here if each is not cell and cell.name.endswith(each.name.partition("?")[2])]
     found = max(alike, key=lambda each: len(each.name), default=here[0] if here else None)
     return None if found is cell else found

@@ -18,7 +18,7 @@ from s2a_bench.report.claims import Need, RunPart
 from s2a_bench.stats import Ratio, summarise, summary_of
 from s2a_bench.stats.change import Blocks, Change, change_between, ratio_of_launches
 from s2a_bench.store.run import StoredRun
-from s2a_bench.transport import EXTERNAL, PROGRAM, declared
+from s2a_bench.transport import EXTERNAL, PROGRAM, declared_transport
 from s2a_bench.writers.tables import interval, mean_sd
 
 _MODEL: Final = "MiniCPM-V 2.6"
@@ -155,7 +155,7 @@ def _others(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
     pipelines = run.manifest.get("configuration", {}).get("pipelines", {})
     found = [f"{cell.name} {UNKNOWN}" for cell in pair if cell.name not in pipelines]
     for cell in pair:
-        external = declared(cell.pipeline).options.of_sides(EXTERNAL, PROGRAM)
+        external = declared_transport(cell.pipeline).options.of_sides(EXTERNAL, PROGRAM)
         named = {name for name in external if pipelines.get(cell.name, {}).get(name)}
         found += [f"{cell.name} by {name}" for name in sorted(named - {"llama_server"})]
     return ", ".join(found)

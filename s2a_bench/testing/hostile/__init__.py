@@ -36,8 +36,8 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.harness.processes import OwnServer
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import STAND_IN, EngineConfig
-from s2a_bench.testing.hostile.asker import TOKENS, forget_peak, usage
-from s2a_bench.testing.transport import ask, wiring
+from s2a_bench.testing.hostile.client import TOKENS, forget_peak, usage
+from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.limits import PIECES, PIECES_A_TOKEN
 from s2a_bench.types import Request
@@ -76,15 +76,15 @@ class ClientProcess:
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
 
-    def ask(self, told: Wiring[Any], seconds: float) -> dict[str, Any]:
+    def ask(self, wiring: Wiring[Any], seconds: float) -> dict[str, Any]:
         """Return what came of one request; fails the test after ``seconds``."""
         process = self._process
         if process is None or process.poll() is not None:
-            line = [sys.executable, "-c", "from s2a_bench.testing.hostile.asker import main; main()"]
+            line = [sys.executable, "-c", "from s2a_bench.testing.hostile.client import main; main()"]
             process = self._process = subprocess.Popen(line, stdin=-1, stdout=-1, text=True)  # noqa: S603 - ours
         assert process.stdin
         assert process.stdout
-        process.stdin.write(json.dumps(told.to_json()) + "\n")
+        process.stdin.write(json.dumps(wiring.to_json()) + "\n")
         process.stdin.flush()
         with DefaultSelector() as selector:
             selector.register(process.stdout, EVENT_READ)
@@ -121,9 +121,9 @@ class Attacked:
 class HostileTarget:
     """Our server in a process of its own, and a client that means well, connected all the while."""
 
-    def __init__(self, told: Wiring[Any], server: OwnServer, honest: Client) -> None:
+    def __init__(self, wiring: Wiring[Any], server: OwnServer, honest: Client) -> None:
         """Ask a first time: the connection is there from now on."""
-        self._told, self._server, self._honest = told, server, honest
+        self._told, self._server, self._honest = wiring, server, honest
         self._expected = answer_of(honest)
 
     def attacked(self, case: Case[Attack]) -> Attacked:
@@ -149,9 +149,9 @@ class HostileSuite:
     """Servers of ours that hostile clients meet, each one after the other; 1 where their address is told."""
 
     @classmethod
-    def told(cls) -> Wiring[Any]:
+    def wiring(cls) -> Wiring[Any]:
         """Return what client and server are told."""
-        return wiring(cls.name, timeout_s=PATIENCE_S, max_tokens=TOKENS)
+        return wiring_of(cls.name, timeout_s=PATIENCE_S, max_tokens=TOKENS)
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
         """Run each test once for each of its cases."""
@@ -165,12 +165,12 @@ class HostileSuite:
         cls, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     ) -> Iterator[dict[Case[Attack], Future[Attacked]]]:
         """What comes of the hostile clients of all tests that were chosen."""
-        told, folder = cls.told(), tmp_path_factory.mktemp("servers")
+        wiring, folder = cls.wiring(), tmp_path_factory.mktemp("servers")
         with ExitStack() as stack:
             targets: list[HostileTarget] = []
             for number in range(cls.targets):
-                server = stack.enter_context(own_server(told, folder / f"log-{number}"))
-                here = replace(told, address=server.address)
+                server = stack.enter_context(own_server(wiring, folder / f"log-{number}"))
+                here = replace(wiring, address=server.address)
                 honest = stack.enter_context(closing(open_client(replace(here, timeout_s=60.0))))
                 targets.append(HostileTarget(here, server, honest))
             yield stack.enter_context(_at_once(targets, HostileTarget.attacked, _chosen(request, "hostile_client")))
@@ -181,8 +181,8 @@ class HostileSuite:
         """What comes of asking the hostile servers of all tests that were chosen."""
 
         def ask_it(asker: ClientProcess, case: Case[Trap]) -> dict[str, Any]:
-            with case.does(told := cls.told()) as address:
-                return asker.ask(replace(told, address=address), case.seconds)
+            with case.does(wiring := cls.wiring()) as address:
+                return asker.ask(replace(wiring, address=address), case.seconds)
 
         with ExitStack() as stack:
             askers = [stack.enter_context(closing(ClientProcess())) for _ in range(AT_ONCE)]
@@ -250,11 +250,11 @@ def _at_once(
 
 
 @contextmanager
-def own_server(told: Wiring[Any], log: Path, **engine: Any) -> Iterator[OwnServer]:
+def own_server(wiring: Wiring[Any], log: Path, **engine: Any) -> Iterator[OwnServer]:
     """Run a server in a process of its own, with the echo engine, which may be told more."""
-    can = told.capabilities.answer_kinds
+    can = wiring.capabilities.answer_kinds
     config = EngineConfig(**{"name": STAND_IN, "answer": can[0], **engine})
-    server = OwnServer("hostile", ServerJob(told, config), log)
+    server = OwnServer("hostile", ServerJob(wiring, config), log)
     with server:
         server.wait_ready()
         yield server

@@ -27,9 +27,9 @@ RESET = struct.pack("ii", 1, 0)
 SAID_BYTES = 1 << 20
 
 
-def connect(told: Wiring[Any], seconds: float) -> socket.socket:
+def connect(wiring: Wiring[Any], seconds: float) -> socket.socket:
     """Connect to ``host:port``, or to a URL with them."""
-    host, _, port = told.address.rpartition("//")[2].partition("/")[0].rpartition(":")
+    host, _, port = wiring.address.rpartition("//")[2].partition("/")[0].rpartition(":")
     return socket.create_connection((host, int(port)), timeout=seconds)
 
 
@@ -51,9 +51,9 @@ def sends_made(
     After its first piece it goes on when ``first`` bytes have come.
     """
 
-    def attack(told: Wiring[Any]) -> str:
+    def attack(wiring: Wiring[Any]) -> str:
         said, clock = b"", SystemClock()
-        with connect(told, seconds) as connection:
+        with connect(wiring, seconds) as connection:
             try:
                 for piece in make():
                     connection.sendall(piece)
@@ -76,9 +76,9 @@ def sends_made(
 def crowd(number: int, attack: Attack) -> Attack:
     """Return many clients at once."""
 
-    def together(told: Wiring[Any]) -> str:
+    def together(wiring: Wiring[Any]) -> str:
         said: list[str] = []
-        threads = [Thread(target=lambda: said.append(attack(told))) for _ in range(number)]
+        threads = [Thread(target=lambda: said.append(attack(wiring))) for _ in range(number)]
         for thread in threads:
             thread.start()
         for thread in threads:

@@ -145,7 +145,7 @@ class Http(Transport[HttpOptions]):
 
     def ready(self, wiring: Wiring[HttpOptions]) -> str:
         """Return where chats are completed, and for whom."""
-        from s2a_bench.transport.http.own import PATHS
+        from s2a_bench.transport.http.native import PATHS
 
         whom = wiring.options.callers("has the key in {}, /health for all")
         return f"serving at {wiring.address}{PATHS[wiring.variant]}{whom}"

@@ -9,7 +9,7 @@ from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import Trace
 from s2a_bench.transport.chunks import state_of
-from s2a_bench.transport.http import blocks, own
+from s2a_bench.transport.http import blocks, native
 from s2a_bench.transport.limits import SEEDS, Limits, check_values, text, whole_number
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.serving import Disconnected, Exchange
@@ -24,15 +24,15 @@ Reads = Callable[[Headers, Buffer, Trace, Limits], tuple[Request, bool]]
 
 def of_json(_headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> tuple[Request, bool]:
     """Read a JSON body that nobody has validated; return the request, and whether its answer is streamed."""
-    return of_fields(_parsed(bytes(body), "the body", trace), trace, limits, own.FAST)
+    return of_fields(_parsed(bytes(body), "the body", trace), trace, limits, native.FAST)
 
 
 def of_picture(headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> tuple[Request, bool]:
     """Read a body that is the picture itself."""
     said = dict(headers)
-    fields = _parsed(said.get(own.PARAMETERS_HEADER, "").encode(), f"header {own.PARAMETERS_HEADER}", trace)
+    fields = _parsed(said.get(native.PARAMETERS_HEADER, "").encode(), f"header {native.PARAMETERS_HEADER}", trace)
     if not (isinstance(fields, dict) and isinstance(prompt := fields.get("prompt", ""), str)):
-        raise RequestFailed(f"header {own.PARAMETERS_HEADER} should be an object whose prompt is text")
+        raise RequestFailed(f"header {native.PARAMETERS_HEADER} should be an object whose prompt is text")
     pictures = _cut(fields.get("pictures"), said.get("content-type", ""), body)
     images = tuple(decoded(kind, data, trace, limits) for kind, data in pictures)
     return _request(fields, prompt, images, limits)
@@ -41,7 +41,7 @@ def of_picture(headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> 
 def _parsed(document: bytes, what: str, trace: Trace) -> Any:
     check_values(document)
     try:
-        fields = own.FAST.loads(document)
+        fields = native.FAST.loads(document)
     except ValueError as error:
         raise RequestFailed(f"{what} is no JSON: {error}") from error
     trace.mark("json_parse")
@@ -67,7 +67,7 @@ def _cut(pictures: Any, media_type: str, body: Buffer) -> list[tuple[str, Buffer
     return found
 
 
-def of_fields(fields: Any, trace: Trace, limits: Limits, codec: own.Codec) -> tuple[Request, bool]:
+def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) -> tuple[Request, bool]:
     """Read OpenAI's fields and decode the pictures of the messages."""
     images: list[Frame] = []
     texts: list[str] = []
@@ -79,7 +79,7 @@ def of_fields(fields: Any, trace: Trace, limits: Limits, codec: own.Codec) -> tu
                 if part["type"] != "image_url":
                     texts.append(part["text"])
                     continue
-                media_type, encoded = own.split_data_uri(part["image_url"]["url"])
+                media_type, encoded = native.split_data_uri(part["image_url"]["url"])
                 data = codec.from_base64(encoded)
                 trace.mark("base64_decode")
                 images.append(decoded(media_type, data, trace, limits))
@@ -109,7 +109,7 @@ class ChatExchange(Exchange):
     takes_blocks = False
     """Whether the client reads `blocks` where the answer is one of actions."""
 
-    def __init__(self, codec: own.Codec, trace: Trace | None = None) -> None:
+    def __init__(self, codec: native.Codec, trace: Trace | None = None) -> None:
         """Write JSON with ``codec``."""
         super().__init__(trace)
         self._codec = codec
@@ -140,13 +140,13 @@ class ChatExchange(Exchange):
         if not self._streamed:
             self._pieces.append(piece)
         elif not isinstance(piece, Action):
-            event = own.chunk(self._asked.id, {"content": piece.text})
+            event = native.stream_event(self._asked.id, {"content": piece.text})
             event["choices"][0]["token"] = piece.id
             self._write(self._framed(event))
         elif self.takes_blocks:
             self._write(blocks.of_action(piece), blocks.MEDIA_TYPE)
         else:
-            event = own.chunk(self._asked.id, {})
+            event = native.stream_event(self._asked.id, {})
             event["choices"][0] |= {"tick": piece.index, "action": piece.values.tolist()}
             self._write(self._framed(event))
         if self.disconnected():
@@ -166,9 +166,12 @@ class ChatExchange(Exchange):
             choice = {"index": 0, "message": message, "finish_reason": finish}
             self.whole(200, {**answer, "choices": [choice], "usage": usage, "s2a": marks}, {})
         elif self._kind == blocks.MEDIA_TYPE:
-            self._write(self._framed(own.chunk(request_id, {}, finish, s2a=marks)), last=True)
+            self._write(self._framed(native.stream_event(request_id, {}, finish, s2a=marks)), last=True)
         else:
-            end = own.chunk(request_id, {}, finish), own.chunk(request_id, {}, usage=usage, s2a=marks)
+            end = (
+                native.stream_event(request_id, {}, finish),
+                native.stream_event(request_id, {}, usage=usage, s2a=marks),
+            )
             self._write(b"".join(map(self._framed, end)) + b"data: [DONE]\n\n", last=True)
 
     def fail(self, error: S2AError) -> None:
@@ -176,8 +179,8 @@ class ChatExchange(Exchange):
             said = {"error": {"message": str(error), "type": type(error).__name__}}
             self._write(self._framed(said), last=True)
         else:
-            status = own.status_of(error)
-            self.whole(status, own.error_json(status, str(error)), own.headers_of(error))
+            status = native.status_of(error)
+            self.whole(status, native.error_json(status, str(error)), native.headers_of(error))
 
     def _write(self, data: bytes, kind: str = EVENTS, *, last: bool = False) -> None:
         first, self._kind = not self._kind, self._kind or kind

@@ -20,10 +20,10 @@ from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageErr
 from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, PROMPT_MS, RECONNECTS, THINKING_N
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, blocks, own
+from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, blocks, native
 from s2a_bench.transport.http.clients import BoundedClient, HttpResponse, LeanClient
 from s2a_bench.transport.http.detect import body_of, met
-from s2a_bench.transport.http.dialects import OWN, EncodedPicture, Event, open_dialect
+from s2a_bench.transport.http.dialects import NATIVE, EncodedPicture, Event, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
 from s2a_bench.transport.http.dialects.decoder import Decoder
 from s2a_bench.transport.http.merge import merged, read_patch
@@ -46,12 +46,12 @@ class HttpClient:
         self.camera = None
         self._wiring, self._alive = wiring, alive
         options, key = wiring.options, read_key(wiring.options.api_key_env)
-        self._codec = own.CODECS[wiring.variant]
+        self._codec = native.CODECS[wiring.variant]
         if wiring.black_box:
             self._dialect, self._url, self._model = met(wiring.address, key, options.spoken, options.served_model)
         else:
-            self._dialect, self._model = open_dialect(OWN), options.served_model or NO_MODEL
-            self._url = wiring.address.rstrip("/") + own.PATHS[wiring.variant]
+            self._dialect, self._model = open_dialect(NATIVE), options.served_model or NO_MODEL
+            self._url = wiring.address.rstrip("/") + native.PATHS[wiring.variant]
         self._options = options.model_copy(update={"served_model": self._model})  # for advice
         self._extra = read_patch(options.extra_body)
         self._headers = {"content-type": "application/json", **(self._dialect.authorization(key) if key else {})}
@@ -70,7 +70,7 @@ class HttpClient:
         The TLS context of httpx's alone takes about 20 ms, which is why it is normally built once.
         """
         bounds, timeout_s, tls = self._bounds(0), self._wiring.timeout_s, self._wiring.address.startswith("https:")
-        if self._wiring.variant in {own.BEST_EFFORT, own.BINARY} and not tls:
+        if self._wiring.variant in {native.BEST_EFFORT, native.BINARY} and not tls:
             return LeanClient(bounds, timeout_s)
         # a kept connection stays kept, however long a turn of the other cells takes; a cloud may be behind a proxy and
         # with certificates that the environment names, what is measured here is not
@@ -112,7 +112,7 @@ class HttpClient:
                 headers_ns = now_ns()
                 self._check(response)
                 for token in self._tokens(response, trace, headers_ns, packed_ns):
-                    bounds.piece()
+                    bounds.count_piece()
                     yield token
         finally:
             if client is not self._client:
@@ -121,7 +121,7 @@ class HttpClient:
     def _check(self, response: HttpResponse) -> None:
         """Raise RequestFailed for an answer whose headers say that there is none, or not as it was asked for."""
         kind = response.headers.get("content-type", "")
-        expected = self._dialect.media_type, *((blocks.MEDIA_TYPE,) if self._dialect.name == OWN else ())
+        expected = self._dialect.media_type, *((blocks.MEDIA_TYPE,) if self._dialect.name == NATIVE else ())
         if response.status_code != httpx.codes.OK or not kind.startswith(expected):
             text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
             raise refusal(self._url, response, text, self._options, self._dialect.media_type)
@@ -135,7 +135,7 @@ class HttpClient:
                 f"`grammar`: the dialect '{self._dialect.name}' has no field for a GBNF grammar; leave it out, or ask "
                 "a server of `dialect` llama-server or vllm"
             )
-        if self._wiring.variant == own.BINARY:
+        if self._wiring.variant == native.BINARY:
             body, headers = self._pack_binary(request, trace)
         else:
             pictures = []
@@ -157,13 +157,13 @@ class HttpClient:
             media_type, data = encoded(frame, self._options.payload, trace)
             types.append(media_type)
             bodies.append(data.reshape(-1).data)
-        fields = own.parameters(request, self._model)
-        fields |= {**own.own_parameters(request), "prompt": request.prompt}
+        fields = native.parameters(request, self._model)
+        fields |= {**native.native_parameters(request), "prompt": request.prompt}
         if len(bodies) > 1:
             fields["pictures"] = [[kind, len(body)] for kind, body in zip(types, bodies, strict=True)]
         header = json.dumps(fields)  # headers are ASCII, which the standard library's JSON is
         media_type = types[0] if len(types) == 1 else "application/octet-stream"
-        headers = {**self._headers, "content-type": media_type, own.PARAMETERS_HEADER: header}
+        headers = {**self._headers, "content-type": media_type, native.PARAMETERS_HEADER: header}
         if len(bodies) > 1:
             return bodies, {**headers, "content-length": str(sum(map(len, bodies)))}
         return (bodies[0] if bodies else b""), headers

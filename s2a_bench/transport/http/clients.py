@@ -78,7 +78,7 @@ class _BoundedStream(httpcore.NetworkStream):
     def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
         with _in_time(self._client.bounds, timeout) as left_s:
             data = self._stream.read(max_bytes, left_s)
-        self._client.bounds.came(len(data))
+        self._client.bounds.count_bytes(len(data))
         return data
 
     def write(self, buffer: bytes, timeout: float | None = None) -> None:
@@ -169,7 +169,7 @@ class _Socket(socket.socket):
         with _in_time(self._client.bounds, self._client.timeout_s) as left_s:
             self.settimeout(left_s)
             size = super().recv_into(*to)
-        self._client.bounds.came(size)
+        self._client.bounds.count_bytes(size)
         return size
 
     def sendall(self, *data: Any) -> None:

@@ -15,13 +15,13 @@ from s2a_bench.errors import RequestFailed, ServerDied
 from s2a_bench.trace import FACT_LIMIT
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.http.clients import BoundedClient, HttpResponse
-from s2a_bench.transport.http.dialects import OWN, open_dialect
+from s2a_bench.transport.http.dialects import NATIVE, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_LIST, NO_MODEL, Dialect, Get, first_model
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
 
-OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": OWN}
+OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": NATIVE}
 """``owned_by`` of the first model -> dialect. Ollama says ``library``, clouds their names: plain OpenAI."""
 
 HITS = re.compile(r"^(\w+:\w*(?:hits|cached_tokens|tokens_cached)(?:_total)?)(?:\{.*\})? (\S+)", re.MULTILINE)
@@ -36,7 +36,7 @@ def met(base: str, key: str, spoken: str, model: str) -> tuple[Dialect, str, str
 
     What makes no sense as a list of models means a plain server. Raises ServerDied where nothing answers.
     """
-    with asker(base) as client:
+    with probe(base) as client:
         if not spoken:
             owner, first = first_model(base, getter(client, open_dialect("openai").authorization(key) if key else {}))
             spoken, model = OWNERS.get(owner, "openai"), model or first or NO_MODEL
@@ -45,7 +45,7 @@ def met(base: str, key: str, spoken: str, model: str) -> tuple[Dialect, str, str
     return dialect, dialect.url(base, model), model
 
 
-def asker(url: str) -> BoundedClient:
+def probe(url: str) -> BoundedClient:
     """Return a client for questions that are not measured."""
     return BoundedClient(Bounds(url, PATIENCE_S, 0), timeout=PATIENCE_S, trust_env=url.startswith("https:"))
 
@@ -56,7 +56,7 @@ def cache_hits(base: str, key: str = "") -> Mapping[str, float]:
     try:
         parts = urlsplit(base)
         path = re.sub(r"/(v1|v1beta|api)(/.*)?$", "", parts.path.rstrip("/")) + "/metrics"
-        with asker(base) as client:
+        with probe(base) as client:
             headers = {"authorization": f"Bearer {key}"} if key else {}
             text = _text(urlunsplit((parts.scheme, parts.netloc, path, "", "")), client, headers)
         for name, value in HITS.findall(text):

@@ -19,10 +19,10 @@ from s2a_bench.errors import S2AError
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.access import Access
 from s2a_bench.transport.connections import LINGER_S, Connections, Wire
-from s2a_bench.transport.http import own
+from s2a_bench.transport.http import native
 from s2a_bench.transport.http.chat import ChatExchange, Reads, of_json, of_picture
+from s2a_bench.transport.http.native import Refused
 from s2a_bench.transport.http.options import HttpOptions
-from s2a_bench.transport.http.own import Refused
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.listening import bound_socket
 from s2a_bench.transport.serving import Core
@@ -34,9 +34,9 @@ EARLY: Final = 1 << 20
 END: Final = b"\r\n\r\n"
 CONTINUE: Final = b"HTTP/1.1 100 Continue\r\n\r\n"
 READS: Final[Mapping[str, Reads]] = {
-    own.PATHS[own.AS_DEPLOYED]: of_json,  # where clients of OpenAI's dialect look
-    own.PATHS[own.BEST_EFFORT]: of_json,
-    own.PATHS[own.BINARY]: of_picture,
+    native.PATHS[native.AS_DEPLOYED]: of_json,  # where clients of OpenAI's dialect look
+    native.PATHS[native.BEST_EFFORT]: of_json,
+    native.PATHS[native.BINARY]: of_picture,
 }
 
 
@@ -45,8 +45,8 @@ class Head:
 
     def __init__(self, data: bytes) -> None:
         """Parse what comes before a body, the empty line included; raises Refused."""
-        if data.count(b"\n") > own.LINES:
-            raise Refused(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, f"more than {own.LINES} lines of headers")
+        if data.count(b"\n") > native.LINES:
+            raise Refused(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, f"more than {native.LINES} lines of headers")
         self.headers: list[tuple[str, str]] = []
         self._url, self._complete = b"", False
         parser = httptools.HttpRequestParser(self)
@@ -97,7 +97,7 @@ class FastServer:
         host, port = listener.getsockname()
         self.address = f"http://{host}:{port}"
         self._core = Core(handler, wiring.limits)
-        self._access = Access(wiring.options, host, key, own.SCHEME)
+        self._access = Access(wiring.options, host, key, native.SCHEME)
         most = wiring.limits.connections
         full = Refused(HTTPStatus.SERVICE_UNAVAILABLE, f"{most} connections are open already", {"retry-after": "1"})
         self._connections = Connections(listener, self._answer_all, most, full.answer)
@@ -136,7 +136,7 @@ class FastServer:
         if not data:
             return None
         head, limits = Head(data), self._core.limits
-        own.admit(self._access, head.path, head.headers)
+        native.admit(self._access, head.path, head.headers)
         size = head.body_bytes(limits.body_bytes)
         if (page := self._page(head)) is not None and not size:
             wire.sendall(page)
@@ -171,7 +171,7 @@ class FastServer:
                 break
             if data and not ends_ns:
                 ends_ns = now_ns() + round(limits.head_s * 1e9)
-            wire.read_until(ends_ns or now_ns() + own.KEEP_ALIVE_S * 10**9)
+            wire.read_until(ends_ns or now_ns() + native.KEEP_ALIVE_S * 10**9)
             try:
                 piece = wire.recv(PIECE)
             except TimeoutError:
@@ -192,9 +192,11 @@ class FastServer:
         """Return what is answered without a request, None for another path."""
         if head.method != b"GET":
             return None
-        if head.path == own.HEALTH:
-            return own.answer(*own.health(self._core), keep=head.keep)
-        return own.answer(200, own.models(self._core.queued), keep=head.keep) if head.path == own.MODELS else None
+        if head.path == native.HEALTH:
+            return native.answer(*native.health(self._core), keep=head.keep)
+        return (
+            native.answer(200, native.models(self._core.queued), keep=head.keep) if head.path == native.MODELS else None
+        )
 
 
 def _body(wire: Wire, begun: bytes, size: int, came: Callable[[int], None]) -> memoryview:
@@ -216,7 +218,7 @@ class FastExchange(ChatExchange):
 
     def __init__(self, wire: Wire, head: Head, reads: Reads, body: memoryview, early: bytes, limits: Limits) -> None:
         """Answer on ``wire``; a stream is chunked, or ends with the connection where that is too old for it."""
-        super().__init__(own.FAST)
+        super().__init__(native.FAST)
         self.takes_blocks = reads is of_picture
         self.keep = False
         """Whether the connection may be kept: once the answer is on its way."""
@@ -243,13 +245,13 @@ class FastExchange(ChatExchange):
             data = b"%x\r\n%b\r\n%b" % (len(data), data, b"0\r\n\r\n" * last)
         if kind:
             headers = {"content-type": kind, **({"transfer-encoding": "chunked"} if self._head.chunks else {})}
-            data = own.head_of(200, headers, keep=self._head.keep) + data
+            data = native.head_of(200, headers, keep=self._head.keep) + data
         self._wire.sendall(data)
         if last:
             self._over()
 
     def whole(self, status: int, value: Any, headers: dict[str, str]) -> None:
-        self._wire.sendall(own.answer(status, value, headers, keep=self._head.keep))
+        self._wire.sendall(native.answer(status, value, headers, keep=self._head.keep))
         self._over()
 
     def _over(self) -> None:

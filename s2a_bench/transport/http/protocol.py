@@ -18,8 +18,8 @@ from s2a_bench.errors import S2AError, TooLarge
 from s2a_bench.trace import Trace
 from s2a_bench.transport.access import Access
 from s2a_bench.transport.connections import GONE, LINGER_S
-from s2a_bench.transport.http import own
-from s2a_bench.transport.http.own import Refused
+from s2a_bench.transport.http import native
+from s2a_bench.transport.http.native import Refused
 from s2a_bench.transport.limits import check_values
 from s2a_bench.transport.serving import Core
 
@@ -82,8 +82,8 @@ class Protocol(HttpToolsProtocol):
 
     def on_header(self, name: bytes, value: bytes) -> None:
         super().on_header(name, value)
-        if len(self.headers) > own.LINES:
-            raise Refused(431, f"more than {own.LINES} lines of headers")
+        if len(self.headers) > native.LINES:
+            raise Refused(431, f"more than {native.LINES} lines of headers")
 
     def on_headers_complete(self) -> None:
         """Refuse what uvicorn would take, before there is a body; start the time of one."""
@@ -93,7 +93,7 @@ class Protocol(HttpToolsProtocol):
         if self.parser.should_upgrade():
             raise Refused(400, "no connection of this server is upgraded")
         headers = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in self.headers]
-        own.admit(self._access, self.url.partition(b"?")[0].decode("latin-1"), headers)
+        native.admit(self._access, self.url.partition(b"?")[0].decode("latin-1"), headers)
         self._check_size(int(dict(headers).get("content-length", 0)))
         self._came = self.held.enter_context(self._core.in_flight.counted())
         self._came(head_bytes)

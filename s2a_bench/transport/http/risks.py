@@ -9,16 +9,16 @@ import httpx
 
 from s2a_bench.errors import S2AError, ServerDied
 from s2a_bench.machine.doctor import Finding
-from s2a_bench.transport.http.detect import asker, getter
+from s2a_bench.transport.http.detect import getter, probe
 from s2a_bench.transport.http.dialects.common import NO_LIST, first_model
-from s2a_bench.transport.risks import for_anybody, shown
+from s2a_bench.transport.risks import no_key, printable
 
 
 def examine(parts: SplitResult) -> Iterator[Finding]:
     """Ask for the list of models without a key."""
     url = urlunsplit(parts)
     try:
-        with asker(url) as client:
+        with probe(url) as client:
             owner, model = first_model(url, getter(client, {}))
     except ServerDied as error:
         raise OSError(str(error).rpartition(": ")[2]) from error
@@ -26,8 +26,8 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
         yield Finding("server", "state", f"it answers, and has no list of models for everybody: {error}")
         return
     if model:
-        said = f"{shown(model)} of {shown(owner)}" if owner else shown(model)
-        yield for_anybody(
+        said = f"{printable(model)} of {printable(owner)}" if owner else printable(model)
+        yield no_key(
             parts,
             f"it tells everybody its models ({said}), so it answers them too",
             "start it with a key, as llama-server --api-key, and name its variable with --api-key-env",

@@ -23,7 +23,7 @@ from pydantic import BaseModel, Field, StrictInt
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.access import Access
 from s2a_bench.transport.connections import LINGER_S
-from s2a_bench.transport.http import own
+from s2a_bench.transport.http import native
 from s2a_bench.transport.http.chat import ChatExchange, of_fields
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.http.protocol import Protocol
@@ -71,7 +71,7 @@ class DeployedExchange(ChatExchange):
 
     def __init__(self, body: ChatRequest, protocol: Protocol, limits: Limits) -> None:
         """Keep `messages` on the loop that runs, for as long as the client is there."""
-        super().__init__(own.STANDARD, protocol.trace)
+        super().__init__(native.STANDARD, protocol.trace)
         self.held = protocol.held.pop_all()
         self.given_up = False
         self.messages: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
@@ -83,7 +83,7 @@ class DeployedExchange(ChatExchange):
 
     def read(self) -> tuple[Request, bool]:
         self.trace.mark("json_parse")
-        return of_fields(self._body.model_dump(), self.trace, self._limits, own.STANDARD)
+        return of_fields(self._body.model_dump(), self.trace, self._limits, native.STANDARD)
 
     def write(self, data: bytes, kind: str, *, last: bool) -> None:
         if kind:
@@ -131,18 +131,18 @@ def application(core: Core, *, documented: bool = False) -> FastAPI:
     async def invalid(_: HttpRequest, error: RequestValidationError) -> Response:
         first = error.errors()[0]
         message = f"{'.'.join(str(step) for step in first['loc'])}: {first['msg']}"
-        return JSONResponse(own.error_json(400, message), 400)
+        return JSONResponse(native.error_json(400, message), 400)
 
-    @app.get(own.HEALTH)
+    @app.get(native.HEALTH)
     async def health() -> Response:
-        status, said = own.health(core)
+        status, said = native.health(core)
         return JSONResponse(said, status)
 
-    @app.get(own.MODELS)
+    @app.get(native.MODELS)
     async def models() -> dict[str, Any]:
-        return own.models(core.queued)
+        return native.models(core.queued)
 
-    @app.post(own.PATHS[own.AS_DEPLOYED])
+    @app.post(native.PATHS[native.AS_DEPLOYED])
     async def as_deployed(body: ChatRequest, request: HttpRequest) -> Response:
         exchange = DeployedExchange(body, request.scope["state"]["protocol"], core.limits)
         answering = asyncio.get_running_loop().run_in_executor(threads, core.answer, exchange)
@@ -180,13 +180,13 @@ class HttpServer:
         config = uvicorn.Config(
             ending,
             loop="uvloop",
-            http=partial(Protocol, core, Access(wiring.options, host, key, own.SCHEME)),  # type: ignore[arg-type]
+            http=partial(Protocol, core, Access(wiring.options, host, key, native.SCHEME)),  # type: ignore[arg-type]
             ws="none",
             log_level="warning",
             access_log=False,
             lifespan="off",
             timeout_graceful_shutdown=1,
-            timeout_keep_alive=own.KEEP_ALIVE_S,
+            timeout_keep_alive=native.KEEP_ALIVE_S,
         )
         self._server = _Server(config)
 

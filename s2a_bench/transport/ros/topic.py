@@ -73,7 +73,7 @@ class TopicClient(RosClient):
                 )
             if token.last:
                 break
-            bounds.piece()
+            bounds.count_piece()
             pieces = pieces_of(token)
             if not expected:
                 trace.mark("return")
@@ -90,7 +90,7 @@ class TopicClient(RosClient):
             if packed is not None:
                 token = readable(self._subscription, packed, trace)
                 if token is not None and token.id == name:
-                    bounds.came(len(packed))
+                    bounds.count_bytes(len(packed))
                     return token
             elif not self._alive():
                 raise ServerDied("the server's process is gone")

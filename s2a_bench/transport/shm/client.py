@@ -49,7 +49,7 @@ class ShmClient:
                 if isinstance(said, (Token, Action)):
                     if not said.index:
                         trace.mark("return")
-                    bounds.piece()
+                    bounds.count_piece()
                     yield said
                     continue
                 done = True
@@ -127,7 +127,7 @@ class ShmClient:
         try:
             while True:
                 data = link.next(min(self._wiring.timeout_s, bounds.left_s()))
-                bounds.came(len(data))
+                bounds.count_bytes(len(data))
                 yield from unpacked(data)
         except BlockingIOError as error:
             bounds.left_s()  # tells if it was the deadline

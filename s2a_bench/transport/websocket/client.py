@@ -24,7 +24,7 @@ from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
 from s2a_bench.transport.observation import template_of
-from s2a_bench.transport.pictures import told
+from s2a_bench.transport.pictures import policy_picture
 from s2a_bench.transport.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
 from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.transport.websocket.link import BoundedConnection, Broken
@@ -62,7 +62,7 @@ class WebsocketClient:
             message, packed_ns = self._asked(body, bounds, trace)
             trace.provenance = self._provenance
             for piece in self._answer(message, packed_ns, trace):
-                bounds.piece()
+                bounds.count_piece()
                 yield piece
             whole = True
         except Broken as error:
@@ -76,10 +76,10 @@ class WebsocketClient:
 
     def _pack(self, request: Request, trace: Trace) -> bytes:
         """Fill the template and write it as MessagePack, marking each stage."""
-        pictures = [told(frame, self._wiring.options.payload, trace) for frame in request.images]
+        pictures = [policy_picture(frame, self._wiring.options.payload, trace) for frame in request.images]
         observation = self._template.fill(pictures, request.state, request.prompt)
         if self._ours:
-            observation[observed.OWN] = observed.parameters(request)
+            observation[observed.EXTENSION] = observed.extension_of(request)
         body = packb(observation)
         trace.mark("msgpack_pack")
         trace.facts[PAYLOAD_BYTES] = len(body)

@@ -41,7 +41,7 @@ class _Counted(ClientConnection):
 
     def process_event(self, event: Any) -> None:
         if isinstance(event, Frame):
-            self.bounds.came(len(event.data) + FRAME_BYTES)
+            self.bounds.count_bytes(len(event.data) + FRAME_BYTES)
         super().process_event(event)
 
 

@@ -10,7 +10,7 @@ from s2a_bench import extras
 from s2a_bench.errors import S2AError, ServerDied
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.transport.limits import Bounds
-from s2a_bench.transport.risks import PATIENCE_S, for_anybody, shown
+from s2a_bench.transport.risks import PATIENCE_S, no_key, printable
 from s2a_bench.transport.websocket import PACKAGES
 
 PAGE = "https://example.org"
@@ -27,7 +27,7 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
     except S2AError as error:
         yield Finding("server", "state", f"it answers, and greets nobody without a key: {error}")
         return
-    yield for_anybody(
+    yield no_key(
         parts,
         f"it greets everybody ({said}), so it answers them too",
         "let it listen on 127.0.0.1 alone and reach it by ssh -L, or put a proxy that wants a key before it",
@@ -52,6 +52,8 @@ def _greeting(url: str, headers: Mapping[str, str]) -> str:
     with closing(BoundedConnection(url, headers, Bounds(url, PATIENCE_S, 0), PATIENCE_S)) as link:
         message = link.receive()
     if isinstance(message, str):
-        return shown(message)
+        return printable(message)
     metadata = unpackb(message)
-    return shown(", ".join(map(str, metadata)) if isinstance(metadata, dict) else type(metadata).__name__) or "nothing"
+    return (
+        printable(", ".join(map(str, metadata)) if isinstance(metadata, dict) else type(metadata).__name__) or "nothing"
+    )

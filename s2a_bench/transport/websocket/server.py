@@ -73,7 +73,7 @@ class WebsocketExchange(Exchange):
     def request(self) -> Request:
         observation, self._message = unpackb(self._message), b""
         self.trace.mark("msgpack_parse")
-        told = observed.told_in(observation) if self._connection.native else None
+        told = observed.take_extension(observation) if self._connection.native else None
         request = observed.request_of(observation, told, self.trace, self._connection.core.limits)
         self.trace.mark("msgpack_parse")
         return request

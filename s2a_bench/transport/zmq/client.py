@@ -23,7 +23,7 @@ from s2a_bench.transport import Wiring, observed
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
 from s2a_bench.transport.observation import template_of
-from s2a_bench.transport.pictures import told
+from s2a_bench.transport.pictures import policy_picture
 from s2a_bench.transport.zmq import ZmqOptions, layouts
 from s2a_bench.transport.zmq.npy import Room
 from s2a_bench.transport.zmq.watch import ConnectionWatch
@@ -85,11 +85,11 @@ class ZmqClient:
             seen_ns = now_ns()
             whole = True
             for action in actions:
-                bounds.piece()
+                bounds.count_piece()
                 yield action
             if self._ours:
                 whole = False
-                asked = {layouts.ENDPOINT: layouts.MARKS, observed.OWN: {"id": request.id}, **self._token()}
+                asked = {layouts.ENDPOINT: layouts.MARKS, observed.EXTENSION: {"id": request.id}, **self._token()}
                 trace.receive(observed.remote_of(self._said(link.asked(pack(asked), bounds))))
                 whole = True
             here = trace.remote is not None and trace.remote.clock == clock_id()
@@ -118,7 +118,7 @@ class ZmqClient:
         data = layouts.data_of(self._layout, observation)
         message: dict[str, Any] = {layouts.ENDPOINT: layouts.GET_ACTION, layouts.DATA: data, **self._token()}
         if self._ours:
-            message[observed.OWN] = observed.parameters(request)
+            message[observed.EXTENSION] = observed.extension_of(request)
         rooms = {room.address: room for room in self._rooms.values()}
         body = pack(message, rooms, maps=self._layout == layouts.N1_7)
         trace.mark("msgpack_pack")
@@ -128,7 +128,7 @@ class ZmqClient:
     def _told(self, frame: Frame, place: int, trace: Trace) -> Pixels:
         """Return a picture as it travels; what a camera has as YUYV is converted to where it is packed from."""
         if self._wiring.options.payload != "raw" or frame.encoding != "yuv422_yuy2":
-            return told(frame, self._wiring.options.payload, trace)
+            return policy_picture(frame, self._wiring.options.payload, trace)
         if len(self._rooms) > ROOMS:
             self._rooms.clear()
         key = place, frame.height, frame.width
@@ -220,7 +220,7 @@ class ReqSocket:
             more = bool(self._socket.rcvmore)  # the rest goes with the socket
         except zmq.ZMQError as error:
             raise RequestFailed(f"{self._url}: {error.strerror}") from error
-        bounds.came(len(answer))
+        bounds.count_bytes(len(answer))
         if more:
             raise RequestFailed(f"{self._url} answered with several frames, not one")
         return answer

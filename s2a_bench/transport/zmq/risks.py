@@ -10,7 +10,7 @@ from s2a_bench import extras
 from s2a_bench.errors import RequestFailed
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.transport.limits import Bounds
-from s2a_bench.transport.risks import PATIENCE_S, for_anybody, shown
+from s2a_bench.transport.risks import PATIENCE_S, no_key, printable
 from s2a_bench.transport.zmq import PACKAGES, layouts
 
 PORT = 5555
@@ -37,10 +37,10 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
         if not isinstance(answer, dict):
             raise RequestFailed(f"{url} answers a ping with {type(answer).__name__}, which GR00T's servers do not")
         if layouts.ERROR in answer:
-            error = shown(str(answer[layouts.ERROR]))
+            error = printable(str(answer[layouts.ERROR]))
             yield Finding("server", "state", f"it answers, and tells nobody without a key anything: {error}")
         else:
-            yield for_anybody(
+            yield no_key(
                 parts,
                 "it answers everybody's ping; if it is GR00T's, everybody moves the robot, and ends the server by "
                 "`kill`, which is not tried here",

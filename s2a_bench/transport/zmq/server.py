@@ -25,7 +25,7 @@ from s2a_bench.errors import Busy, RequestFailed, S2AError, TransportError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring, observed
 from s2a_bench.transport.listening import cannot_bind, key_for, split
-from s2a_bench.transport.serving import RETRY_AFTER_S, Core, Exchange, SharedSourceWorkers, told_of
+from s2a_bench.transport.serving import RETRY_AFTER_S, Core, Exchange, SharedSourceWorkers, client_error
 from s2a_bench.transport.zmq import ZmqOptions, layouts
 from s2a_bench.transport.zmq.watch import Connection, ConnectionWatch
 from s2a_bench.transport.zmq.wire import pack, read
@@ -162,7 +162,7 @@ class ZmqServer:
                 message, marks = read(frame.buffer)
                 trace.mark("msgpack_parse")
                 self._check(message)
-                endpoint, told = message.get(layouts.ENDPOINT, layouts.GET_ACTION), observed.told_in(message)
+                endpoint, told = message.get(layouts.ENDPOINT, layouts.GET_ACTION), observed.take_extension(message)
                 if endpoint == layouts.GET_ACTION:
                     promised = self._marks.promise(client.name, str(told.get("id"))) if told is not None else None
                     self._core.answer(ActionExchange(client, message, marks, told, trace, promised, self._core))
@@ -171,7 +171,7 @@ class ZmqServer:
                 else:
                     client.say(pack(self._reply(endpoint)))
             except Exception as error:  # noqa: BLE001 - the client must hear of it, whatever broke
-                client.say(_error(told_of(error)))
+                client.say(_error(client_error(error)))
 
     def _check(self, message: Any) -> None:
         """Raise RequestFailed for a message that is none, or has not the key, compared in constant time."""

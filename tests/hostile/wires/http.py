@@ -14,7 +14,7 @@ from typing import Any
 from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
 from s2a_bench.testing.hostile.tcp import CLIENTS as ANY_CLIENT
 from s2a_bench.testing.hostile.tcp import NOISE, answers, crowd, sends, sends_made, servers
-from s2a_bench.transport.http.own import PARAMETERS_HEADER, PATHS
+from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS
 
 CHAT = PATHS["as-deployed"]
 MIB = 1 << 20

@@ -35,11 +35,11 @@ def publishes(
 ) -> Attack:
     """Return a client that publishes messages, and returns the errors of so many ``answers`` on /token."""
 
-    def attack(told: Wiring[Any]) -> str:
+    def attack(wiring: Wiring[Any]) -> str:
         errors: list[str] = []
-        with closing(join(told, "hostile")) as middleware:
-            tokens = middleware.subscription(namespace_of(told) + "/token", ros.TOKEN, READER_QOS)
-            publisher = middleware.publisher(namespace_of(told) + topic, kind, qos)
+        with closing(join(wiring, "hostile")) as middleware:
+            tokens = middleware.subscription(namespace_of(wiring) + "/token", ros.TOKEN, READER_QOS)
+            publisher = middleware.publisher(namespace_of(wiring) + topic, kind, qos)
             wait_until(lambda: bool(publisher.matched() and tokens.matched()), lambda: True, "no server to attack")
             for packed in make():
                 publisher.send(bytearray(packed))
@@ -56,9 +56,9 @@ def publishes(
 def sends_goals(acts: Callable[[Any], Iterable[Any]]) -> Attack:
     """Return an action client that does something, and returns the events that came of it."""
 
-    def attack(told: Wiring[Any]) -> str:
-        with closing(join(told, "hostile")) as middleware:
-            client = middleware.action_client(namespace_of(told) + ACTION, GENERATE_RESPONSE)
+    def attack(wiring: Wiring[Any]) -> str:
+        with closing(join(wiring, "hostile")) as middleware:
+            client = middleware.action_client(namespace_of(wiring) + ACTION, GENERATE_RESPONSE)
             wait_until(client.server_present, lambda: True, "no server to attack")
             return "\n".join(str(said) for said in acts(client))
 
@@ -152,9 +152,9 @@ def _with(image_of_goal: Any) -> Callable[[Any], Iterator[Any]]:
     return act
 
 
-def datagrams(told: Wiring[Any]) -> str:
+def datagrams(wiring: Wiring[Any]) -> str:
     """Send noise to the UDP ports of the domain's first participants (DDSI-RTPS, 9.6.1)."""
-    base = 7400 + 250 * domain_of(told)
+    base = 7400 + 250 * domain_of(wiring)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for port in (base, base + 1, *(base + offset + 2 * index for index in range(4) for offset in (10, 11))):
             for size in (0, 1, 20, 1400, 60_000):

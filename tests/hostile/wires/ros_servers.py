@@ -50,10 +50,10 @@ def tokens(reply: Reply) -> Trap:
     """Return a server of the topic variant."""
 
     @contextmanager
-    def trap(told: Wiring[Any]) -> Iterator[str]:
+    def trap(wiring: Wiring[Any]) -> Iterator[str]:
         namespace, over = f"/hostile_{next(_numbers)}", Event()
-        told, host = settled(told)
-        middleware = join(told, "server", host=host)
+        wiring, host = settled(wiring)
+        middleware = join(wiring, "server", host=host)
         requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
         publisher = middleware.publisher(namespace + "/token", ros.TOKEN, TOKEN_QOS)
 
@@ -68,7 +68,7 @@ def tokens(reply: Reply) -> Trap:
                             publisher.send(bytearray(piece))
 
         with _running(middleware, over, requests, run):
-            yield namespace + "".join(told.address.partition(AT)[1:])
+            yield namespace + "".join(wiring.address.partition(AT)[1:])
 
     return trap
 
@@ -113,10 +113,10 @@ def goals(answer: Callable[[ServerGoal, Event, Callable[[], None]], None]) -> Tr
     """Return a server of the action variant; what answers a goal may also leave."""
 
     @contextmanager
-    def trap(told: Wiring[Any]) -> Iterator[str]:
+    def trap(wiring: Wiring[Any]) -> Iterator[str]:
         namespace, over = f"/hostile_{next(_numbers)}", Event()
-        told, host = settled(told)
-        middleware = join(told, "server", host=host)
+        wiring, host = settled(wiring)
+        middleware = join(wiring, "server", host=host)
         server = middleware.action_server(namespace + ACTION, GENERATE_RESPONSE)
         kept = middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS)
 
@@ -127,7 +127,7 @@ def goals(answer: Callable[[ServerGoal, Event, Callable[[], None]], None]) -> Tr
                         answer(goal, over, middleware.close)
 
         with _running(middleware, over, server, run):
-            yield namespace + "".join(told.address.partition(AT)[1:])
+            yield namespace + "".join(wiring.address.partition(AT)[1:])
         del kept  # the client waits until it has matched it
 
     return trap

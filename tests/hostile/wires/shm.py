@@ -50,11 +50,11 @@ def hello(link: socket.socket, file: int, size: int) -> None:
 def attack(does: Does, seconds: float = 2.0) -> Attack:
     """Return a client that does something and then listens until the server closes, or for ``seconds``."""
 
-    def run(told: Wiring[Any]) -> str:
+    def run(wiring: Wiring[Any]) -> str:
         said = ""
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link, ExitStack() as stack:
             link.settimeout(seconds)
-            link.connect(told.address)
+            link.connect(wiring.address)
             memory = -1
             with suppress(OSError):
                 does(link)

@@ -31,7 +31,7 @@ from s2a_bench.experiments.requests import (
 )
 from s2a_bench.stats import summary_of
 from s2a_bench.trace import RESIDUAL_LIMIT
-from s2a_bench.transport import declared
+from s2a_bench.transport import declared_transport
 from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interval, number
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def latency_sentences(run: StoredRun) -> list[str]:
     found: list[str] = []
     beside: list[str] = []
     for of, cell, base, ratio in ratios(cells, run.bootstrap_seed):
-        if declared(base.pipeline).in_process:
+        if declared_transport(base.pipeline).in_process:
             continue
         if of == metric:
             found.append(_times(cell, base, ratio))

@@ -15,7 +15,7 @@ import numpy as np
 
 from s2a_bench.experiments.requests import RequestCell, payloads_of, stand_ins
 from s2a_bench.stats.line import Estimate, Line, crossing, fit_line
-from s2a_bench.transport import declared
+from s2a_bench.transport import declared_transport
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.style import cell_styles
 from s2a_bench.writers.tables import ABSENT, TextTable, number
@@ -66,7 +66,7 @@ def against_bytes(runs: Split) -> list[FittedPipeline]:
                     found.setdefault((cell.label, payload), []).append((pixels, cell))
     lines = [_pipeline(name, payload, sized) for (name, payload), sized in found.items()]
     order = sorted(
-        lines, key=lambda each: (each.payload != "raw", each.payload, declared(each.path[0]).order, each.name)
+        lines, key=lambda each: (each.payload != "raw", each.payload, declared_transport(each.path[0]).order, each.name)
     )
     return order if any(each.line for each in order) else []
 
@@ -122,7 +122,7 @@ def line_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> 
 
 def crossing_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable | None:
     """Lay out where lines cross, with loopback, which no picture travels over, left out; None where none do."""
-    wired = [each for each in pipelines if not declared(each.path[0]).in_process]
+    wired = [each for each in pipelines if not declared_transport(each.path[0]).in_process]
     rows: list[tuple[str, ...]] = [
         (_said(below), _said(above), _estimate(met))
         for below, above, met in sorted(crossings(wired), key=lambda found: found[2].value)

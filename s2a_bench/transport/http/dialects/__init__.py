@@ -17,7 +17,7 @@ from s2a_bench.types import Action
 if TYPE_CHECKING:
     from s2a_bench.transport.http.dialects.common import Dialect
 
-OWN = "s2a"
+NATIVE = "s2a"
 """The dialect of our own server, in all its variants."""
 
 
@@ -55,7 +55,7 @@ DIALECTS: Final[Registry[Callable[[], Dialect]]] = Registry(
     "dialects",
     "dialect",
     {
-        OWN: "s2a_bench.transport.http.dialects.openai:Own",
+        NATIVE: "s2a_bench.transport.http.dialects.openai:Native",
         "openai": "s2a_bench.transport.http.dialects.openai:OpenAI",
         "llama-server": "s2a_bench.transport.http.dialects.openai:LlamaServer",
         "vllm": "s2a_bench.transport.http.dialects.openai:Vllm",

@@ -29,8 +29,8 @@ from s2a_bench.facts import (
 from s2a_bench.trace import Remote
 from s2a_bench.transport.chunks import NUMBERS as TICKS
 from s2a_bench.transport.chunks import actions_of
-from s2a_bench.transport.http import own as dialect
-from s2a_bench.transport.http.dialects import OWN, EncodedPicture, Event
+from s2a_bench.transport.http import native
+from s2a_bench.transport.http.dialects import NATIVE, EncodedPicture, Event
 from s2a_bench.transport.http.dialects.common import (
     Dialect,
     evaluated,
@@ -72,8 +72,8 @@ class OpenAI(Dialect):
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
         """Return standard fields and one user message."""
         extra = self._extra(request)
-        uris = [dialect.data_uri(picture.media_type, picture.base64) for picture in pictures]
-        return {**dialect.parameters(request, model), **extra, "messages": dialect.messages(request.prompt, uris)}
+        uris = [native.data_uri(picture.media_type, picture.base64) for picture in pictures]
+        return {**native.parameters(request, model), **extra, "messages": native.messages(request.prompt, uris)}
 
     def _extra(self, request: Request) -> dict[str, Any]:  # noqa: ARG002 - for subclasses
         """Return the fields that are this server's own."""
@@ -150,16 +150,16 @@ class Vllm(OpenAI):
         return replace(event, facts=facts)
 
 
-class Own(OpenAI):
+class Native(OpenAI):
     """Our own server: it wants the request's id, and sends empty tokens, token ids and its marks."""
 
-    name = OWN
+    name = NATIVE
     takes_grammar = True
     facts = (*LLAMA, LATENCY_DRAWN_MS)  # our engines behind it
     payloads = (*OpenAI.payloads, "raw")
 
     def _extra(self, request: Request) -> dict[str, Any]:
-        return dialect.own_parameters(request)
+        return native.native_parameters(request)
 
     def event(self, message: Any) -> Event:
         """Read one chunk, the last of which carries the marks."""

@@ -165,7 +165,7 @@ def parameters(request: Request, model: str) -> dict[str, Any]:
     }
 
 
-def own_parameters(request: Request) -> dict[str, Any]:
+def native_parameters(request: Request) -> dict[str, Any]:
     """Return the fields that only our own server knows."""
     more = {"grammar": request.grammar, "state": request.state}
     return {"request_id": request.id, **{name: value for name, value in more.items() if value}}
@@ -177,7 +177,9 @@ def messages(prompt: str, uris: list[str]) -> list[dict[str, Any]]:
     return [{"role": "user", "content": [*parts, {"type": "text", "text": prompt}]}]
 
 
-def chunk(request_id: str, delta: dict[str, str], finish_reason: str | None = None, **extra: Any) -> dict[str, Any]:
+def stream_event(
+    request_id: str, delta: dict[str, str], finish_reason: str | None = None, **extra: Any
+) -> dict[str, Any]:
     """Return one streamed event; with ``usage`` in ``extra`` it is the last and has no choices."""
     choices = [] if "usage" in extra else [{"index": 0, "delta": delta, "finish_reason": finish_reason}]
     return {"id": request_id, "object": "chat.completion.chunk", "model": "s2a", "choices": choices, **extra}
