@@ -86,7 +86,7 @@ def _info(config: InfoConfig, *, json_: Json = False) -> None:
         print_json({"schema": SCHEMA, "command": "model info", "files": [present(info) for info in found]})
         return
     for info in found:
-        for part in parts_of(info):
+        for part in info_sections(info):
             typer.echo(part) if isinstance(part, str) else print_table(part)
 
 
@@ -127,7 +127,7 @@ _TEMPLATE_CHARACTERS = 300
 _CONTROL_TOKENS = 24
 
 
-def parts_of(info: GgufInfo) -> list[str | TextTable]:
+def info_sections(info: GgufInfo) -> list[str | TextTable]:
     """Return what to print, in order."""
     types = "type", "tensors", "parameters", "MB", "bits/weight"
     groups = "tensor", "shape", "type", "tensors", "MB"

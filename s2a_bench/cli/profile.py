@@ -14,7 +14,7 @@ from s2a_bench.cli.experiment import PLAIN, Commands
 from s2a_bench.cli.output import Json, print_json, print_table
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.profile_capture import CaptureConfig, profile_json, ttft_s
-from s2a_bench.machine.environment import board_facts, differences, matches
+from s2a_bench.machine.environment import board_facts, matches, state_changes
 from s2a_bench.store.manifest import plain
 from s2a_bench.writers.tables import TextTable
 
@@ -75,13 +75,13 @@ def match(json_: Json = False) -> None:
     board = board_facts()
     found = [(profile, path) for profile, path in _readable() if matches(profile, board)]
     if json_:
-        same = [profile_json(profile, path, differences(profile, board)) for profile, path in found]
+        same = [profile_json(profile, path, state_changes(profile, board)) for profile, path in found]
         _print_profiles("match", same, board=board)
     else:
         kind = ", ".join(str(board[key]) for key in ("model", "gpu", "cpu") if key in board)
         typer.echo(f"this board: {kind}, {board['cores']} cores")
         for profile, _ in found:
-            typer.echo(line_of(profile) + "".join(f"; {change}" for change in differences(profile, board)))
+            typer.echo(line_of(profile) + "".join(f"; {change}" for change in state_changes(profile, board)))
         if not found:
             typer.echo("no profile is of this board; 's2a-bench profile capture NAME' measures one")
     if not found:

@@ -81,7 +81,7 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
 
 
 def _workers(plan: SweepPlan, ray: str, width: int) -> CellWorkers:
-    workers: CellWorkers = resolve_name(WORKERS["ray" if ray else "here"])(ENTRY, ray, plan, width)
+    workers: CellWorkers = resolve_name(WORKERS["ray" if ray else "local"])(ENTRY, ray, plan, width)
     return workers
 
 

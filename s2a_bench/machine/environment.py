@@ -99,7 +99,7 @@ def matches(profile: Profile, board: Mapping[str, Any]) -> bool:
     return bool(named) and all(_same(key, value, board.get(key)) for key, value in named.items())
 
 
-def differences(profile: Profile, board: Mapping[str, Any]) -> list[str]:
+def state_changes(profile: Profile, board: Mapping[str, Any]) -> list[str]:
     """Say in which state the profile's board was and this one is not, as far as both are known."""
     then = profile.facts.get("board", {})
     return [

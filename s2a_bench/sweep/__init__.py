@@ -91,8 +91,8 @@ class CellWorkers(AbstractContextManager["CellWorkers"], Protocol):
 
 
 WORKERS: dict[str, str] = {
-    "here": "s2a_bench.sweep.perform:Here",
-    "ray": "s2a_bench.sweep.on_ray:OnRay",
+    "local": "s2a_bench.sweep.perform:LocalWorkers",
+    "ray": "s2a_bench.sweep.on_ray:RayWorkers",
 }
 """Name -> what runs cells."""
 

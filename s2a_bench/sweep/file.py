@@ -55,7 +55,7 @@ def _listed(value: Any) -> list[Any]:
 BOARD = "board"
 """The key that is no flag: the machine that a cell needs."""
 Axis = Annotated[list[Any], Field(min_length=1)]
-OWN = {
+RESERVED = {
     "seed": "the seed stands at the top of the file; every repeat has its own from it",
     "output": "--output of 's2a-bench sweep' names the folder of everything",
     "json": "the sweep has --json itself",
@@ -135,8 +135,8 @@ def _check_keys(path: Path, tables: dict[str, dict[str, Any]]) -> None:
                 raise UsageError(f"{path}: '{key}' stands in [{one}] and in [{other}]; keep one of them")
     for name, keys in tables.items():
         for key in keys:
-            if key in OWN:
-                raise UsageError(f"{path}: {name}.{key}: {OWN[key]}")
+            if key in RESERVED:
+                raise UsageError(f"{path}: {name}.{key}: {RESERVED[key]}")
 
 
 def _check_cells(path: Path, settings: tuple[Setting, ...], repeats: int) -> None:

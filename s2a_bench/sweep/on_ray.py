@@ -37,7 +37,7 @@ OBJECT_STORE_BYTES: Final = 256 << 20
 Packed: TypeAlias = tuple[Outcome, bytes]
 
 
-class OnRay:
+class RayWorkers:
     """A cluster that runs there, or one of this machine's cores made for the sweep."""
 
     def __init__(self, entry: str, address: str, plan: SweepPlan, jobs: int) -> None:
@@ -72,7 +72,7 @@ class OnRay:
             archive.extractall(folder, filter="data")
         return outcome
 
-    def __enter__(self) -> OnRay:  # noqa: PYI034 - Self is typing's since 3.11
+    def __enter__(self) -> RayWorkers:  # noqa: PYI034 - Self is typing's since 3.11
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -95,7 +95,7 @@ def _stop_with_parent() -> None:
 DIED = "the worker process died under it (out of memory?)"
 
 
-class Here:
+class LocalWorkers:
     """Two pools of processes, so that a cell that crashes or takes all memory does not take the sweep along."""
 
     def __init__(self, entry: str, _address: str, _plan: SweepPlan, jobs: int) -> None:
@@ -124,7 +124,7 @@ class Here:
             )
         return self._pools[virtual]
 
-    def __enter__(self) -> Here:  # noqa: PYI034 - Self is typing's since 3.11
+    def __enter__(self) -> LocalWorkers:  # noqa: PYI034 - Self is typing's since 3.11
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from s2a_bench.boards.profile import find_profile
 from s2a_bench.errors import UsageError
 from s2a_bench.sweep import SweepCell, SweepCommand
-from s2a_bench.sweep.file import BOARD, OWN, Setting, SweepFile, rounds
+from s2a_bench.sweep.file import BOARD, RESERVED, Setting, SweepFile, rounds
 from s2a_bench.text import like
 
 HASHED_WHOLE = 1 << 20
@@ -73,7 +73,7 @@ def _check_keys(file: SweepFile, command: SweepCommand, setting: Setting) -> Non
             continue
         if key not in command.flags:
             shown = {name for name, kind in command.flags.items() if kind != "hidden"}
-            known = sorted({*shown, BOARD}.difference(OWN))
+            known = sorted({*shown, BOARD}.difference(RESERVED))
             hint = like(key, known) or f"; it has {', '.join(known)}"
             raise UsageError(f"{file.path}: '{key}' is no flag of s2a-bench {command.name}{hint}")
         if command.flags[key] in {"switch", "toggle"}:

@@ -15,7 +15,7 @@ WIDTH_IN: Final = 3.5
 WIDE_IN: Final = 7.16
 """Both columns."""
 
-STALL_LOOK: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
+STALL_STYLE: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
 
 GREY: Final = "#BBBBBB"
 """What is not ours: the paper's values."""

@@ -12,7 +12,7 @@ from s2a_bench.experiments.requests import split
 from s2a_bench.store.run import StoredRun
 from s2a_bench.transport import TRANSPORTS
 from s2a_bench.writers.figures import caption_of
-from s2a_bench.writers.style import _OTHER_LOOKS
+from s2a_bench.writers.style import _OTHER_STYLES
 
 MakeRun = Callable[..., StoredRun]
 FIXED = {"http/binary": 1.0, "ros/topic": 0.2, "loopback": 0.1}
@@ -91,5 +91,5 @@ def test_tables_and_figure_say_what_answered(runs: list[StoredRun]) -> None:
 
 
 def test_every_transport_looks_like_no_other() -> None:
-    looks = [look for _, each in TRANSPORTS.loaded() for look in each.style.values()]
-    assert len({*looks, *_OTHER_LOOKS}) == len(looks) + len(_OTHER_LOOKS)
+    styles = [style for _, each in TRANSPORTS.loaded() for style in each.style.values()]
+    assert len({*styles, *_OTHER_STYLES}) == len(styles) + len(_OTHER_STYLES)

@@ -184,13 +184,13 @@ def gguf_files() -> list[bytes]:
 
 
 def read_gguf(data: bytes) -> None:
-    from s2a_bench.cli.model import parts_of
+    from s2a_bench.cli.model import info_sections
     from s2a_bench.inference.gguf_file import describe
 
     info = describe(as_file("a.gguf", data), "model info")
     assert info.bytes == len(data)
     jsonschema.validate(json.loads(json.dumps(present(info))), MODELS["info"] | {"$defs": MODELS})
-    parts_of(info)
+    info_sections(info)
 
 
 def tomls(*patterns: str) -> Callable[[], list[bytes]]:

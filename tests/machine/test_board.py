@@ -10,7 +10,7 @@ import pytest
 from s2a_bench.boards.gaps import Constant
 from s2a_bench.boards.profile import Profile, load_profile
 from s2a_bench.machine import environment
-from s2a_bench.machine.environment import board_facts, differences, matches
+from s2a_bench.machine.environment import board_facts, matches, state_changes
 
 
 def profile(**facts: Any) -> Profile:
@@ -47,11 +47,11 @@ def test_everything_that_a_profile_names_must_be_the_same() -> None:
 
 def test_another_power_mode_or_governor_is_told() -> None:
     recorded = profile(cpu="a", power_mode="MAXN", governor="performance")
-    assert differences(recorded, {"power_mode": "MODE_15W", "governor": "performance"}) == [
+    assert state_changes(recorded, {"power_mode": "MODE_15W", "governor": "performance"}) == [
         "power mode was MAXN, is MODE_15W"
     ]
-    assert differences(recorded, {"governor": "schedutil"}) == ["governor was performance, is schedutil"]
-    assert differences(profile(), {"governor": "schedutil"}) == []
+    assert state_changes(recorded, {"governor": "schedutil"}) == ["governor was performance, is schedutil"]
+    assert state_changes(profile(), {"governor": "schedutil"}) == []
 
 
 def test_this_machine_is_its_own_kind_of_board() -> None:

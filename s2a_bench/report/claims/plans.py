@@ -29,14 +29,14 @@ from s2a_bench.policy import Floats, Plans
 from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
 from s2a_bench.provenance import UNKNOWN
 from s2a_bench.report.claims import Check, Met, Need, RunPart, Trial
-from s2a_bench.report.claims.requests import LIKE, PAPERS_MODEL, change, emulated, exact, facts_of, on_board, one_of
+from s2a_bench.report.claims.requests import NEAR, PAPERS_MODEL, change, emulated, exact, facts_of, on_board, one_of
 from s2a_bench.scenario.ccrb.labels import PAPER, SAID, law
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import Change
 from s2a_bench.store.run import StoredRun
 
-NAIVE, WAIT, OURS = "naive", "wait-then-act", "stream-to-act"
+NAIVE, WAIT, STREAM = "naive", "wait-then-act", "stream-to-act"
 RTX, ORIN, NANO = paper_throughput()
 _LENGTHS: Final = ("6", "4", "2", "1")
 _PROMISED: Final = 0.01
@@ -122,13 +122,13 @@ def _stall_s(cell: Timelines) -> float:
 
 SEVERAL: Final = Need("L", "two or more", lambda found: ", " in found), more("stall of naive in s", VISIBLE_S)
 WAITS: Final = more("S0 after the first arrival in s", VISIBLE_S)
-ROOM: Final = more("T_max / T_nom", 1)
+STRETCHABLE: Final = more("T_max / T_nom", 1)
 
 
 def figure_5(board: PaperThroughput, *policies: str) -> Trial:
     """Return the trial of a board: tokens at table II's rate, or of the paper's model on it, and all four L."""
     profile, rate = board.name.lower().replace(" ", "-"), board.tokens_per_s
-    like = Need("tokens/s", f"within {LIKE:.0%} of {rate:g}", lambda found: abs(found / rate - 1) <= LIKE)
+    like = Need("tokens/s", f"within {NEAR:.0%} of {rate:g}", lambda found: abs(found / rate - 1) <= NEAR)
     measured = on_board(board.name), *PAPERS_MODEL, like
     either = f"{emulated(profile, rate)}; or {', '.join(f'{need.name} {need.wanted}' for need in measured)}"
     source = _Or("source", either, emulated(profile, rate).__eq__, measured)
@@ -153,7 +153,7 @@ def no_stalls(*policies: str) -> Check:
                 many = f"{share.k} of {share.n} plans stall{spread}, {_stall_s(cell):.2f} s in the mean"
                 stalled.append(f"{cell.policy} at L = {cell.setting[1]}: {many}")
         said = "; ".join(stalled) or f"{', '.join(policies)}: no plan stalls"
-        regrets = [cell.mean("signed_start_regret") for cell in cells if cell.policy == OURS]
+        regrets = [cell.mean("signed_start_regret") for cell in cells if cell.policy == STREAM]
         starts = [late for late in regrets if late is not None]
         late = f" Stream-to-act starts at S0 {_signed(min(starts))} to {_signed(max(starts))}." if starts else ""
         return found, f"{said}; promised: at most {promised:.1%}.{late}"

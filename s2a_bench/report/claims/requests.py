@@ -26,7 +26,7 @@ _MODEL_NAMES: Final = re.compile("minicpmv?26")
 """As files and headers have it, letters and digits only; the paper writes MiniCPM-2.6."""
 _LAYERS: Final = 28
 """Of that model: with as many or more asked for, all are on the GPU."""
-LIKE: Final = 0.10
+NEAR: Final = 0.10
 """Means within this share of the paper's are called the same: it gives no spread from machine to machine."""
 _METRIC: Final = "e2e_without_inference"
 _HTTP, _BINARY, _LLAMA_SERVER, _ROS = "http/as-deployed", "http/binary", "http/llama-server", "ros"

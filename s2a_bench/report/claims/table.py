@@ -11,8 +11,8 @@ from s2a_bench.experiments.paper import paper_latency, paper_throughput
 from s2a_bench.report.claims import CONTRADICTED, REPRODUCED, SUPPORTED, UNDECIDED, Check, Claim, Judged, Trial, judge
 from s2a_bench.report.claims import plans as of
 from s2a_bench.report.claims import requests as timed
-from s2a_bench.report.claims.plans import NAIVE, NANO, ORIN, OURS, RTX, WAIT, figure_5, listed
-from s2a_bench.report.claims.requests import COMPARED, LIKE, on_board, one_of
+from s2a_bench.report.claims.plans import NAIVE, NANO, ORIN, RTX, STREAM, WAIT, figure_5, listed
+from s2a_bench.report.claims.requests import COMPARED, NEAR, on_board, one_of
 from s2a_bench.store.run import StoredRun
 
 _HTTP, _ROS = paper_latency()
@@ -46,10 +46,10 @@ CLAIMS: Final[tuple[Claim, ...]] = (
     Claim(
         "V-B, figure 4",
         f"{_HTTP.mean_ms} against {_ROS.mean_ms} ms: {_RATIO:.2f} times as long, on a Jetson AGX Orin",
-        f"The 95 % interval of the ratio of means lies within {LIKE:.0%} of {_RATIO:.2f} (supported) or wholly outside "
+        f"The 95 % interval of the ratio of means lies within {NEAR:.0%} of {_RATIO:.2f} (supported) or wholly outside "
         f"(contradicted); {_SETTING}.",
         Trial(f"{_BESIDE} (on a Jetson AGX Orin)", timed.pairs, (on_board("Jetson AGX Orin"), *COMPARED)),
-        (Check("HTTP takes {} times as long.", timed.times_as_long, _RATIO * (1 - LIKE), _RATIO * (1 + LIKE)),),
+        (Check("HTTP takes {} times as long.", timed.times_as_long, _RATIO * (1 - NEAR), _RATIO * (1 + NEAR)),),
     ),
     Claim(
         "V-C, figure 6",
@@ -81,14 +81,14 @@ CLAIMS: Final[tuple[Claim, ...]] = (
         Claim(
             "V-D, table II",
             f"{board.name}: {board.tokens_per_s:g} tokens/s",
-            f"The 95 % interval of our mean N / T_eval lies within {LIKE:.0%} of the paper's (which gives no spread). "
+            f"The 95 % interval of our mean N / T_eval lies within {NEAR:.0%} of the paper's (which gives no spread). "
             "Another rate is undecided, not contradicted: the paper does not give its quantisation.",
             Trial(
                 f"s2a-bench throughput --model MINICPM.gguf --mmproj TOWER.gguf --gpu-layers -1 (on a {board.name})",
                 timed.speeds,
                 (on_board(board.name), *timed.PAPERS_MODEL, timed.KNOWN, one_of("T_eval", "the engine's")),
             ),
-            (Check(f"{{}}; the paper: {board.tokens_per_s:g}.", partial(timed.speed_over, board), 1 - LIKE, 1 + LIKE),),
+            (Check(f"{{}}; the paper: {board.tokens_per_s:g}.", partial(timed.speed_over, board), 1 - NEAR, 1 + NEAR),),
             {CONTRADICTED: (UNDECIDED, "Not reproduced at this quantisation; the paper does not say which it used.")},
         )
         for board in paper_throughput()
@@ -112,8 +112,8 @@ CLAIMS: Final[tuple[Claim, ...]] = (
         "V-E, figure 5a",
         "RTX 4080: all policies run smoothly with no noticeable stalls",
         f"At every L and under all three policies {_PROMISE}; noticeable: 20 ms.",
-        figure_5(RTX, NAIVE, WAIT, OURS),
-        (of.no_stalls(NAIVE, WAIT, OURS),),
+        figure_5(RTX, NAIVE, WAIT, STREAM),
+        (of.no_stalls(NAIVE, WAIT, STREAM),),
     ),
     Claim(
         "V-E, figure 5b",
@@ -128,15 +128,15 @@ CLAIMS: Final[tuple[Claim, ...]] = (
         "V-E, figure 5b",
         "AGX Orin: wait-then-act avoids stalls but ends later",
         f"At every L {_PROMISE}, and it ends later than stream-to-act (95 % interval of the ratio of means).",
-        figure_5(ORIN, WAIT, OURS),
-        (of.no_stalls(WAIT), of.after(WAIT, OURS, "end_s", least=1 / _EARLIER)),
+        figure_5(ORIN, WAIT, STREAM),
+        (of.no_stalls(WAIT), of.after(WAIT, STREAM, "end_s", least=1 / _EARLIER)),
     ),
     Claim(
         "V-E, figure 5b",
         "AGX Orin: stream-to-act eliminates stalls",
         f"At every L {_PROMISE}.",
-        figure_5(ORIN, OURS),
-        (of.no_stalls(OURS),),
+        figure_5(ORIN, STREAM),
+        (of.no_stalls(STREAM),),
     ),
     Claim(
         "V-E, figure 5c",
@@ -149,16 +149,16 @@ CLAIMS: Final[tuple[Claim, ...]] = (
         "V-E, figure 5c",
         "Orin Nano: wait-then-act induces excessive delays",
         "Not testable: the paper does not say how long is excessive. The delay is stated.",
-        figure_5(NANO, WAIT, OURS),
-        (of.after(WAIT, OURS, "end_s"),),
+        figure_5(NANO, WAIT, STREAM),
+        (of.after(WAIT, STREAM, "end_s"),),
         _STATED,
     ),
     Claim(
         "V-E, figure 5c",
         "Orin Nano: stream-to-act preserves continuity from S0",
         f"At every L {_PROMISE}.",
-        figure_5(NANO, OURS),
-        (of.no_stalls(OURS),),
+        figure_5(NANO, STREAM),
+        (of.no_stalls(STREAM),),
     ),
     Claim(
         "V-E",
@@ -172,23 +172,23 @@ CLAIMS: Final[tuple[Claim, ...]] = (
         "V-E",
         "Stream-to-act has no significant latency penalty: at the end",
         "Its mean end is at most 1 % after naive's (95 % interval). With fixed durations this is an identity.",
-        Trial(_TIMELINE, of.timelines, (listed("policies", NAIVE, OURS),)),
-        (of.after(OURS, NAIVE, "end_s", most=1.01),),
+        Trial(_TIMELINE, of.timelines, (listed("policies", NAIVE, STREAM),)),
+        (of.after(STREAM, NAIVE, "end_s", most=1.01),),
     ),
     Claim(
         "V-E",
         "Stream-to-act has no significant latency penalty: at the first action",
         "Not testable: the paper does not say what is significant. The delay of the first action is stated.",
-        Trial(_TIMELINE, of.timelines, (listed("policies", NAIVE, OURS),)),
-        (of.after(OURS, NAIVE, "start_s"),),
+        Trial(_TIMELINE, of.timelines, (listed("policies", NAIVE, STREAM),)),
+        (of.after(STREAM, NAIVE, "start_s"),),
         _STATED,
     ),
     Claim(
         "V-E",
         "Stream-to-act is preferable for fast and smooth control (read as: no stalls, and ends before wait-then-act)",
         f"At every L {_PROMISE}, and it ends before wait-then-act (95 % interval of the ratio of means).",
-        Trial(_TIMELINE, of.timelines, (listed("policies", WAIT, OURS),)),
-        (of.no_stalls(OURS), of.after(OURS, WAIT, "end_s", most=_EARLIER)),
+        Trial(_TIMELINE, of.timelines, (listed("policies", WAIT, STREAM),)),
+        (of.no_stalls(STREAM), of.after(STREAM, WAIT, "end_s", most=_EARLIER)),
     ),
     Claim(
         "IV-F",
@@ -201,7 +201,7 @@ CLAIMS: Final[tuple[Claim, ...]] = (
         "IV-F",
         "S0 is minimal: also where skills may be extended up to T_max",
         "One plan that starts before S0 without a stall, within T_min and T_max, contradicts.",
-        Trial(_TIMELINE, of.timelines, (of.WAITS, of.ROOM)),
+        Trial(_TIMELINE, of.timelines, (of.WAITS, of.STRETCHABLE)),
         (Check("If stretching is planned ahead, a plan may start at {} without a stall.", of.stretched, most=0.02),),
         {SUPPORTED: (UNDECIDED, "Proves nothing: other plans may.")},
     ),
@@ -212,14 +212,14 @@ CLAIMS: Final[tuple[Claim, ...]] = (
             "The paper gives no settings, so that no outcome of ours contradicts it: reproduced where it comes about "
             "at the point that was chosen for it (the defaults), with its share of the phase diagram; undecided "
             "elsewhere.",
-            Trial(_CCRB, of.drives, (of.BOARD, one_of("point", "as chosen"), listed("policy", policy, OURS))),
+            Trial(_CCRB, of.drives, (of.BOARD, one_of("point", "as chosen"), listed("policy", policy, STREAM))),
             (Check("Ours: {}.", partial(of.outcome, policy), 1),),
             {SUPPORTED: (REPRODUCED, ""), CONTRADICTED: (UNDECIDED, "")},
         )
         for policy, text in (
             (NAIVE, "naive is hit from behind"),
             (WAIT, "wait-then-act hits the car ahead"),
-            (OURS, "stream-to-act hits nobody"),
+            (STREAM, "stream-to-act hits nobody"),
         )
     ),
     *(
@@ -231,7 +231,7 @@ CLAIMS: Final[tuple[Claim, ...]] = (
             Trial(
                 _CCRB,
                 of.drives,
-                (listed("study", "phase"), one_of("diagram", "as chosen"), listed("policy", policy, OURS)),
+                (listed("study", "phase"), one_of("diagram", "as chosen"), listed("policy", policy, STREAM)),
             ),
             (
                 Check(

@@ -65,20 +65,20 @@ def differences(baseline: StoredRun, other: StoredRun) -> list[Difference]:
     return sorted(found, key=lambda difference: not difference.fatal)
 
 
-def of_machine(difference: Difference) -> bool:
+def is_other_machine(difference: Difference) -> bool:
     """Whether a difference makes it another machine: no other state of it, no other version."""
     return difference.fatal and difference.what in {*_KIND, "GPU name"}
 
 
-def names_of(found: Iterable[Difference]) -> str:
+def differing_names(found: Iterable[Difference]) -> str:
     """Name what both sides know and differ in, machine, model and provenance aside, the first `_TOLD`."""
     aside = "model ", "provenance "
-    known = (one for one in found if _ABSENT not in {one.baseline, one.other} and not of_machine(one))
+    known = (one for one in found if _ABSENT not in {one.baseline, one.other} and not is_other_machine(one))
     names = [*dict.fromkeys(one.what for one in known if not one.what.startswith(aside))]
     return ", ".join(names[:_TOLD]) + (f", and {len(names) - _TOLD} more" if len(names) > _TOLD else "")
 
 
-def in_words(found: Sequence[Difference]) -> str:
+def as_line(found: Sequence[Difference]) -> str:
     """Write differences as one line, the first `_TOLD` of them."""
     more = f"; and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
     return "; ".join(map(str, found[:_TOLD])) + more

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from s2a_bench.errors import UnlikeRuns, UsageError
 from s2a_bench.experiments import EXPERIMENTS, Comparable, Metric, Subject, by_name, experiment_of
 from s2a_bench.provenance import Origins, joined
-from s2a_bench.report.compare.agreement import Difference, differences, in_words
+from s2a_bench.report.compare.agreement import Difference, as_line, differences
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.stats.change import Change, change_between, holm
 from s2a_bench.store.manifest import RunWarning
@@ -119,10 +119,10 @@ def open_comparison(
         )
     fatal = [difference for difference in found if difference.fatal]
     if fatal and not unlike:
-        raise UnlikeRuns(f"the runs are unlike: {in_words(fatal)}; `unlike` compares them all the same")
+        raise UnlikeRuns(f"the runs are unlike: {as_line(fatal)}; `unlike` compares them all the same")
     pairs, only, settings = _match(*sides)
     if settings and not unlike:
-        raise UnlikeRuns(f"cells of one name differ: {in_words(settings)}; `unlike` compares them all the same")
+        raise UnlikeRuns(f"cells of one name differ: {as_line(settings)}; `unlike` compares them all the same")
     if not pairs:
         raise UnlikeRuns(f"no cell is in every run: {', '.join(only[0])} against {', '.join(only[1])}")
     metrics = {**by.metrics, **own}
@@ -271,14 +271,14 @@ def warnings_of(compared: ComparedRuns) -> list[RunWarning]:
     """Return what a reader must know besides the numbers, each with what to do, the weightiest first."""
     found = [RunWarning(*each) for each in (*_of_runs(compared), *_of_cells(compared))]
     if harmless := [one for one in compared.differences if not one.fatal]:
-        found.append(RunWarning("differs", in_words(harmless), "this may be what you compare"))
+        found.append(RunWarning("differs", as_line(harmless), "this may be what you compare"))
     return found
 
 
 def _of_runs(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
     """Yield code, message and advice."""
     if fatal := [one for one in compared.differences if one.fatal]:
-        yield "unlike", f"the runs are unlike: {in_words(fatal)}", "read a change as that of all this together"
+        yield "unlike", f"the runs are unlike: {as_line(fatal)}", "read a change as that of all this together"
     for run in (*compared.baseline, *compared.other):
         if (state := run.manifest["state"]) != "finished":
             yield "state", f"{run.path} is {state}, not finished", "its samples so far count; run it again"

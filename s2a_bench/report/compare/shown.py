@@ -273,7 +273,7 @@ def compare_json(
     return whole
 
 
-_LOOKS: Final = {
+_STYLES: Final = {
     "better": ("#009E73", "^"),
     "worse": ("#D55E00", "v"),
     "lower": ("#0072B2", "<"),
@@ -315,8 +315,10 @@ def build_forest(compared: ComparedRuns) -> Figure | None:
     every[-1].set_xlabel("change (%)")
     seen = list(dict.fromkeys(one.verdict for rows in panels.values() for one in rows))
     handles = [
-        every[0].plot([], [], color=_LOOKS[name][0], marker=_LOOKS[name][1], linestyle="", markersize=4, label=name)[0]
-        for name in _LOOKS
+        every[0].plot([], [], color=_STYLES[name][0], marker=_STYLES[name][1], linestyle="", markersize=4, label=name)[
+            0
+        ]
+        for name in _STYLES
         if name in seen
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, columnspacing=1.0)
@@ -327,7 +329,7 @@ def _panel(axes: Axes, rows: list[CellComparison], least: float) -> None:
     axes.axvspan(-100 * least, 100 * least, color="#EEEEEE", linewidth=0)
     axes.axvline(0, color="black", linewidth=0.6)
     for place, one in enumerate(rows):
-        colour, marker = _LOOKS[one.verdict]
+        colour, marker = _STYLES[one.verdict]
         relative = one.change.relative or 0.0
         if bounds := one.change.bounds:
             axes.plot([100 * bound for bound in bounds], [place, place], color=colour, linewidth=1.2)

@@ -11,8 +11,8 @@ from typing import Any
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments import Shown, experiment_of
-from s2a_bench.report.compare.agreement import SETTING, Difference, differences, names_of, of_machine
-from s2a_bench.report.page.sweeps import overview, pooled, words_of
+from s2a_bench.report.compare.agreement import SETTING, Difference, differences, differing_names, is_other_machine
+from s2a_bench.report.page.sweeps import overview, pooled, settings_text
 from s2a_bench.store.run import StoredRun, fits, read_run
 from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep
 from s2a_bench.writers.tables import Note, TextTable
@@ -68,7 +68,7 @@ def repeat_command(manifest: Mapping[str, Any]) -> str:
     return shlex.join(["s2a-bench", *map(str, manifest.get("argv", [])[1:])])
 
 
-def told_apart(chapters: Sequence[Chapter]) -> list[str]:
+def differences_of(chapters: Sequence[Chapter]) -> list[str]:
     """Return which runs come from another machine than the first, and in one line what else is not the same."""
     said: list[str] = []
     others: list[Difference] = []
@@ -78,12 +78,12 @@ def told_apart(chapters: Sequence[Chapter]) -> list[str]:
         found = differences(chapters[0].run, chapter.run)
         others += [each for each in found if not each.what.startswith(SETTING)]
         others += [each for each in differences(same, chapter.run) if each.what.startswith(SETTING)]
-        if what := "; ".join(str(each) for each in found if of_machine(each)):
+        if what := "; ".join(str(each) for each in found if is_other_machine(each)):
             said.append(
                 f"{chapter.title} ran on another machine than {chapters[0].title} ({what}): "
                 "their numbers stand side by side, and none is made of both."
             )
-    names = names_of(others)
+    names = differing_names(others)
     return [*said, f"The runs are not alike in {names}."] if names else said
 
 
@@ -136,7 +136,7 @@ def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
         what = f"{run.manifest['command']}s of the sweep" + (f", part {place}" if len(pools) > 1 else "")
         yield _chapter(run, what, against_paper, command=command)
     for settings, run in single[:MOST_CHAPTERS]:
-        yield _chapter(run, f"{run.manifest['command']}: {words_of(settings)}", against_paper)
+        yield _chapter(run, f"{run.manifest['command']}: {settings_text(settings)}", against_paper)
 
 
 def _named(chapter: Chapter, place: int, chapters: Sequence[Chapter]) -> Chapter:

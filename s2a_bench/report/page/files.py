@@ -14,7 +14,7 @@ from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.claims import Judged, claim_table
 from s2a_bench.report.claims.table import judge_claims
 from s2a_bench.report.page import GENERATOR, ReportConfig
-from s2a_bench.report.page.chapters import Chapter, told_apart
+from s2a_bench.report.page.chapters import Chapter, differences_of
 from s2a_bench.report.page.page import render, tally
 from s2a_bench.store.run import fits
 from s2a_bench.text import visible
@@ -100,7 +100,7 @@ def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
     runs = [chapter.run for chapter in chapters]
     with fits(*runs):
         judged = judge_claims(runs) if against_paper else []
-    return Report(chapters, judged, told_apart(chapters))
+    return Report(chapters, judged, differences_of(chapters))
 
 
 def write_report(report: Report, config: ReportConfig) -> list[Path]:

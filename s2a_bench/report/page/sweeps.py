@@ -60,7 +60,7 @@ def cell_table(sweep: Sweep) -> TextTable:
     rows: list[tuple[str, ...]] = [
         (
             str(row["cell"]),
-            words_of(json.loads(row["settings"])),
+            settings_text(json.loads(row["settings"])),
             str(row["host"]),
             str(row["state"]) + (f": {row['error']}" if row["error"] else ""),
             str(row["repeat"]),
@@ -74,16 +74,15 @@ def cell_table(sweep: Sweep) -> TextTable:
 
 def measured_table(settings: Sequence[Mapping[str, Any]], runs: Split) -> TextTable | None:
     """Lay out the numbers of latency and throughput cells side by side; None where there are none."""
-    rows = [
-        row for each, (run, cells) in zip(settings, runs, strict=True) for row in _measured(words_of(each), run, cells)
-    ]
+    pairs = zip(settings, runs, strict=True)
+    rows = [row for each, (run, cells) in pairs for row in _measured(settings_text(each), run, cells)]
     if not rows:
         return None
     header = ("settings", "cell", "what", "host", "n", "errors", "mean ± sd", "median", "p99")
     return TextTable("Measured cells side by side", header, rows, 4, notes=tuple(stand_ins(runs)))
 
 
-def words_of(settings: Mapping[str, Any]) -> str:
+def settings_text(settings: Mapping[str, Any]) -> str:
     """Write settings as a person would: payload jpeg, size 640x480."""
     return ", ".join(f"{name} {value}" for name, value in settings.items()) or "as the command has it"
 

@@ -13,7 +13,7 @@ import numpy as np
 from s2a_bench.experiments.chunks.rows import MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
 from s2a_bench.experiments.chunks.view.tables import rows_of, sources_of
 from s2a_bench.writers.figures import LINE_CHARS, new_figure
-from s2a_bench.writers.style import STALL_LOOK, WIDE_IN, ink_on
+from s2a_bench.writers.style import STALL_STYLE, WIDE_IN, ink_on
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -110,7 +110,7 @@ def draw_lane(axes: Axes, lane: CellTicks, place: int, oldest: int) -> None:
     for first, last in runs_of(np.where(stalled, -2, chunk)):
         width = last - first
         if stalled[first]:
-            axes.broken_barh([(first, width)], (top, _BAR), **STALL_LOOK)
+            axes.broken_barh([(first, width)], (top, _BAR), **STALL_STYLE)
         elif chunk[first] >= 0:
             axes.broken_barh([(first, width)], (top, _BAR), color=COLOURS[chunk[first] % len(COLOURS)], linewidth=0)
     for row in lane.requests.to_dict("records"):
@@ -161,7 +161,7 @@ def _legend() -> dict[str, Any]:
     return {
         "actions, a colour a chunk": tuple(Patch(color=colour) for colour in COLOURS),
         "k of its actions thrown away": Line2D([], [], color=_INK, linestyle="", marker="$-k$", markersize=8),
-        "stall": Patch(**STALL_LOOK),
+        "stall": Patch(**STALL_STYLE),
         "request to usable chunk": Line2D([], [], color="#666666", linewidth=0.7, marker="|", markersize=3),
         "age of the observation": Line2D([], [], color="#D55E00", linewidth=0.7),
     }

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from s2a_bench.experiments.paper import paper_colours
 from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, panels, timelines_of
 from s2a_bench.writers.figures import new_figure
-from s2a_bench.writers.style import STALL_LOOK, WIDE_IN, WIDTH_IN, ink_on
+from s2a_bench.writers.style import STALL_STYLE, WIDE_IN, WIDTH_IN, ink_on
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -110,7 +110,7 @@ def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: flo
     for skill in skills:
         start, end, stall, nominal = (skill[f"{name}_ns"] / 1e9 for name in ("start", "end", "stall", "nominal"))
         if skill["stall_ns"] > _VISIBLE_NS:
-            axes.barh(lane, stall, _LANE, start - stall, zorder=3, **STALL_LOOK)
+            axes.barh(lane, stall, _LANE, start - stall, zorder=3, **STALL_STYLE)
         axes.barh(lane, end - start, _LANE, start, color=colour, edgecolor="white", linewidth=0.4, label="skill")
         if (end - start - nominal) * 1e9 > _VISIBLE_NS:
             axes.barh(lane, end - start - nominal, _LANE, start + nominal, color="white", alpha=0.5, linewidth=0)
@@ -147,7 +147,7 @@ def _legend(cells: Sequence[Timelines]) -> list[object]:
         Line2D([], [], color="black", linewidth=0.9, linestyle=(0, (2, 1.5)), label="$S_0$"),
     ]
     if any((cell.skills["stall_ns"] > _VISIBLE_NS).any() for cell in cells):
-        handles.append(Patch(label="stall", **STALL_LOOK))
+        handles.append(Patch(label="stall", **STALL_STYLE))
     if any(_stretched(cell) for cell in cells):
         handles.append(Patch(facecolor="#B5B5B5", linewidth=0, label="stretched (paler)"))
     return handles
