@@ -130,7 +130,7 @@ def extra_of(field: FieldInfo) -> Mapping[str, Any]:
     return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
 
 
-def declared(options: type[Options], name: str) -> tuple[str, bool]:
+def help_place(options: type[Options], name: str) -> tuple[str, bool]:
     """Return the heading of a field's option in ``--help``, and whether it is one of the first there.
 
     A class that declares a field anew, with another default, need not repeat them.
@@ -243,7 +243,7 @@ class OneOf:
         return value
 
 
-def names_of(field: FieldInfo) -> Callable[[], Iterable[str]] | None:
+def completions(field: FieldInfo) -> Callable[[], Iterable[str]] | None:
     """Return what lists the names that an option's value may be, or begin with; None where there are none."""
     checks = (getattr(each, "func", None) for each in field.metadata)
     kinds = (field.annotation, *get_args(field.annotation))

@@ -87,7 +87,7 @@ class Flag:
 
 def flags_of(options: type[Options]) -> Iterator[Flag]:
     """Yield the flags of a configuration, those of a group in its place."""
-    from s2a_bench.options import declared, extra_of, group_of, names_of
+    from s2a_bench.options import completions, extra_of, group_of, help_place
 
     for name, field in options.model_fields.items():
         extra = extra_of(field)
@@ -101,9 +101,9 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
         else:
             flag_name = str(extra.get("flag") or name.replace("_", "-"))
             kind, argument, hidden = _kind(field.annotation), bool(extra.get("argument")), bool(extra.get("hidden"))
-            panel, first = declared(options, name)
+            panel, first = help_place(options, name)
             flag = Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument, hidden)
-            yield replace(flag, panel=panel, first=first, names=names_of(field))
+            yield replace(flag, panel=panel, first=first, names=completions(field))
     for name in options.OLD:
         about = f"the name that --{options.OLD[name][0]} had"
         yield Flag(name.replace("_", "-"), (name,), str, about, hidden=True)

@@ -14,7 +14,7 @@ from pydantic import create_model
 from s2a_bench.cli.adapter import command, flags_of
 from s2a_bench.cli.ros_args import read as read_ros_args
 from s2a_bench.errors import UsageError
-from s2a_bench.inference import ANSWERS, EngineConfig, acting, check_engine, declared
+from s2a_bench.inference import ANSWERS, EngineConfig, acting, check_engine, declared_engine
 from s2a_bench.options import Options, group, option, placed, places
 from s2a_bench.provenance import Provenance
 from s2a_bench.text import none_of, read_text
@@ -160,7 +160,7 @@ def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
 
     def ready(server: ServerProcess) -> None:
         origin = Provenance.of_engine(server.facts["engine"])
-        played = f" of {origin.profile}" if declared(origin.engine).plays else f", {origin.profile}"
+        played = f" of {origin.profile}" if declared_engine(origin.engine).plays else f", {origin.profile}"
         name = f"{origin.engine}{played} (EMULATED)" if origin.emulated else origin.engine
         typer.echo(f"{transport.ready(replace(wiring, address=server.address))}; engine {name}; Ctrl-C ends it")
 

@@ -28,7 +28,7 @@ from s2a_bench.facts import (
     VISION_ENCODE_MS,
     Fact,
 )
-from s2a_bench.inference import declared as declared_engine
+from s2a_bench.inference import declared_engine
 from s2a_bench.machine.resources import ENERGY_J
 from s2a_bench.provenance import UNKNOWN, Provenance
 from s2a_bench.stats import Ratio, Summary, summary_of

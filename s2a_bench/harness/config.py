@@ -201,7 +201,7 @@ class RequestsConfig(Options):
         return all(given.tuned for _, given in self.options)
 
     @property
-    def own_engine(self) -> bool:
+    def serves_engine(self) -> bool:
         """Whether an engine of ours answers over any transport."""
         return not all(pipeline.black_box for pipeline in self.pipelines)
 
@@ -217,7 +217,7 @@ class RequestsConfig(Options):
 
     def answered(self, say: Callable[[str], None]) -> RequestsConfig:
         """Return it with the engine that can answer where none is named, and ``say`` which if that is not llama."""
-        if "name" in self.engine.model_fields_set or not self.own_engine:
+        if "name" in self.engine.model_fields_set or not self.serves_engine:
             return self
         if self.answer == ACTIONS and not self.engine.of_model:
             say("the echo engine answers with actions; a model's are those of its own server, see `url`")
@@ -249,7 +249,7 @@ class RequestsConfig(Options):
         return named and all(each.transport is not cell.transport for each in others)
 
     @property
-    def told_prompt(self) -> str:
+    def sent_prompt(self) -> str:
         """Return the prompt; unless one was given, policies are told a task."""
         given = "prompt" in self.model_fields_set or self.answer != ACTIONS
         return self.prompt if given else DEFAULT_TASK
@@ -257,7 +257,7 @@ class RequestsConfig(Options):
     @property
     def reads_model(self) -> bool:
         """Whether a server of this run loads a model's files."""
-        return self.own_engine or self.starts_program
+        return self.serves_engine or self.starts_program
 
     def check(self) -> None:
         if not self.transports:
@@ -304,7 +304,7 @@ class RequestsConfig(Options):
         alone = carries_alone(ACTIONS, self.pipelines) or "`answer` actions"
         if self.COUNTS_TOKENS:
             raise UsageError(f"{self.COUNTS_TOKENS}, and {alone} brings actions; 's2a-bench latency' measures them")
-        if self.own_engine and "name" in self.engine.model_fields_set and not self.engine.kind.acts:
+        if self.serves_engine and "name" in self.engine.model_fields_set and not self.engine.kind.acts:
             raise UsageError(
                 f"`engine` {self.engine.name} answers with tokens, and {alone} carries actions; use `engine` {acting()}"
             )
@@ -347,7 +347,7 @@ class RequestsConfig(Options):
         observation = f"{self.cameras} x {size}" if self.cameras > 1 else size
         observation += f" as {self.resize[0]}x{self.resize[1]}" if self.resize else ""
         observation += f", state of {self.state}" if self.state else ""
-        more = {"prompt": self.told_prompt, "observation": observation, "tuned": self.tuned}
+        more = {"prompt": self.sent_prompt, "observation": observation, "tuned": self.tuned}
         more |= {"width": width, "height": height, "size": size}
         return {**own, **more, "engine": self.served_engine.to_manifest(), "pipelines": told}
 

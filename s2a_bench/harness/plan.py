@@ -106,7 +106,7 @@ class RunPlan:
     manifest: Mapping[str, Any]
     """What the manifest says of the plan."""
 
-    def telling(self, **facts: Any) -> RunPlan:
+    def with_manifest(self, **facts: Any) -> RunPlan:
         """Return it with more in the manifest, or in place of what was there."""
         return replace(self, manifest={**self.manifest, **facts})
 
@@ -116,7 +116,7 @@ def resolve(config: RequestsConfig) -> RunPlan:
 
     Raises MissingExtra where what an engine of ours, or somebody else's server, needs is not installed.
     """
-    if config.own_engine:
+    if config.serves_engine:
         need_engine(config.engine)
     if config.starts_program:
         extras.need("model", "gguf")
@@ -126,7 +126,7 @@ def resolve(config: RequestsConfig) -> RunPlan:
     large = config.size[0] * config.size[1] > LARGE_PICTURE
     stages = path_of(transport.stages for transport in used)
     facts = [fact for cell in cells for fact in cell.capabilities.facts]
-    facts += engine.kind.facts_for(engine) if config.own_engine else ()
+    facts += engine.kind.facts_for(engine) if config.serves_engine else ()
     facts += (FRAMES_PUBLISHED, FRAMES_LOST) if stream else ()
     facts += SPENT if config.sample_resources_hz else ()
     max_pieces = engine.horizon if config.answer == ACTIONS else config.max_tokens
@@ -138,7 +138,7 @@ def resolve(config: RequestsConfig) -> RunPlan:
             config.source, config.size, config.fps, config.seed, nonce, stream, config.cameras, config.resize
         ),
         request=RequestPlan(
-            config.told_prompt, config.grammar, max_pieces, config.seed, config.state, config.mode, size, stages
+            config.sent_prompt, config.grammar, max_pieces, config.seed, config.state, config.mode, size, stages
         ),
         servers=ServersPlan(
             engine, bool(config.grammar), config.tuned, config.timeout_s, config.deadline_s, max_pieces

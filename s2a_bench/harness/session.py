@@ -72,7 +72,7 @@ class RequestContext:
 
     state: tuple[float, ...] | None = None
     """Of the robot; None: of a robot that nobody has."""
-    heard: Callable[[Piece, int], None] | None = None
+    on_piece: Callable[[Piece, int], None] | None = None
     """Called on the thread that measures, with each piece and the time, in ns, at which it was there."""
     plan: PlanFeed | None = None
     """Told the answer as it arrives, from the start of the capture."""
@@ -171,8 +171,8 @@ class Session:
         try:
             for piece in self.client.request(request, trace):
                 at_ns = now_ns()
-                if asked.heard is not None:
-                    asked.heard(piece, at_ns)
+                if asked.on_piece is not None:
+                    asked.on_piece(piece, at_ns)
                 if plan is not None:
                     plan.token(piece.text, at_ns)
                 yield piece, at_ns

@@ -237,7 +237,7 @@ def acting() -> str:
 
 
 @cache
-def declared(name: str) -> type[Engine]:
+def declared_engine(name: str) -> type[Engine]:
     """Return what is declared of an engine, for showing a run; one that is not installed is like any model's."""
     try:
         return ENGINES[name]
@@ -264,7 +264,7 @@ def need_engine(config: EngineConfig) -> None:
         raise MissingExtra(f"`{config.of_model}`: {error}" if config.of_model else str(error)) from error
 
 
-def leave(tokens: object) -> None:
+def cancel(tokens: object) -> None:
     """Cancel what an engine's iterator has not yielded."""
     close = getattr(tokens, "close", None)
     if close is not None:
@@ -298,7 +298,7 @@ class PacedEngine(Engine):
                 self._clock.sleep_until_ns(first_ns + round(index / self._rate * 1e9))
                 yield token
         finally:
-            leave(tokens)
+            cancel(tokens)
 
     def describe(self) -> dict[str, str | int | float | bool]:
         return {**self._engine.describe(), "paced_tokens_per_s": self._rate}

@@ -18,7 +18,7 @@ from typing import Any
 
 from s2a_bench.errors import EngineError
 from s2a_bench.facts import LLAMA
-from s2a_bench.inference import PENALTY_LAST_N, SAMPLER_ARGUMENTS, Engine, EngineConfig, leave
+from s2a_bench.inference import PENALTY_LAST_N, SAMPLER_ARGUMENTS, Engine, EngineConfig, cancel
 from s2a_bench.types import Piece, Request
 
 AHEAD = 8
@@ -41,7 +41,7 @@ class _Answer:
             while self._room() and (token := next(tokens, None)) is not None:
                 self._tokens.put(token)
         finally:
-            leave(tokens)
+            cancel(tokens)
             self._tokens.put(None)
 
     def _room(self) -> bool:

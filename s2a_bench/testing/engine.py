@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import EngineError
-from s2a_bench.inference import Engine, declared
+from s2a_bench.inference import Engine, declared_engine
 from s2a_bench.types import Frame, Request, Token
 
 
@@ -79,7 +79,7 @@ class EngineSuite:
 
     def test_every_fact_that_it_tells_is_declared(self, engine: Engine) -> None:
         ask(engine, images=(rgb_frame(),))
-        told = declared(str(engine.describe()["engine"])).declared_facts
+        told = declared_engine(str(engine.describe()["engine"])).declared_facts
         assert set(engine.facts) <= set(told)
         assert all(fact.about for fact in told)
 

@@ -22,7 +22,7 @@ from s2a_bench.experiments.timeline.view.figures import timeline_figures
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.timelines.config import TimelineConfig
-from s2a_bench.harness.timelines.link import asks_of
+from s2a_bench.harness.timelines.link import plan_prompts
 from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
@@ -352,16 +352,16 @@ def test_a_prior_knows_bursts_that_single_gaps_hide() -> None:
 
 
 def test_skills_keep_their_own_durations_unless_they_are_given(config: TimelineConfig) -> None:
-    (own,) = asks_of(config.but(t_nom_s=()), None)
+    (own,) = plan_prompts(config.but(t_nom_s=()), None)
     times = [call.skill.durations.nominal_s for call in own.skills.calls]
     assert own.t_nom_s == pytest.approx(np.mean(times))
     assert own.shape.expected_cv == pytest.approx(np.std(times) / np.mean(times))
-    (given,) = asks_of(config, None)
+    (given,) = plan_prompts(config, None)
     assert (given.t_nom_s, given.shape.expected_cv) == (pytest.approx(0.03), 0.0)
     assert given.shape.expected.most_s == pytest.approx(0.045)
     assert "Output exactly 8 of them." in given.prompt
     assert (bool(given.grammar), given.max_tokens) == (True, 48)
-    (free,) = asks_of(config.but(no_grammar=True), None)
+    (free,) = plan_prompts(config.but(no_grammar=True), None)
     assert free.grammar == ""
 
 

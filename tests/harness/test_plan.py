@@ -44,7 +44,7 @@ def test_every_part_says_what_the_configuration_did() -> None:
     assert (plan.record, plan.namespace) == (None, "/arm")
     assert plan.manifest["seeds"] == {"order": 7, "sampling": 7, "source": 7, "bootstrap": 7, "nonce": "again"}
     assert plan.manifest["configuration"]["engine"]["model"] == Path("m.gguf")
-    more = plan.telling(cadence="as it comes")
+    more = plan.with_manifest(cadence="as it comes")
     assert {**more.manifest, "cadence": plan.manifest["cadence"]} == plan.manifest
     with pytest.raises(FrozenInstanceError):
         plan.record = Path("run.mcap")  # type: ignore[misc]

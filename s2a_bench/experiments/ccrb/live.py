@@ -23,7 +23,7 @@ from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.plan import FeedPlan
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
-from s2a_bench.harness.timelines.link import Ask, ModelLink, word
+from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, prepare_requests
 from s2a_bench.harness.timelines.policies import prepare as prepare_policies
 from s2a_bench.plan import Parser
 from s2a_bench.policy import Plans, PlanShape, Timing
@@ -47,9 +47,9 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
         return Stamped(RoadSource(config.scenario.cars, *feed.size, fps=feed.fps), feed.nonce)
 
     with closing(simulator(config.simulator, **config.world)) as world:
-        plan, (ask,) = word(config.request, progress)
+        plan, (ask,) = prepare_requests(config.request, progress)
         live = {**config.request.to_manifest(), "source": RoadSource.name}
-        plan = plan.telling(
+        plan = plan.with_manifest(
             configuration={**config.to_manifest(), "live": live},
             follower_law=config.scenario.follower_law,
             seeds={"sampling": plan.request.seed, "nonce": plan.feed.nonce},
@@ -59,7 +59,7 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
         return run_requests(task, plan, output, progress)
 
 
-def _drive(config: CcrbConfig, ask: Ask, world: Simulator, launch: RunningLaunch) -> None:
+def _drive(config: CcrbConfig, ask: PlanPrompt, world: Simulator, launch: RunningLaunch) -> None:
     progress = launch.progress
     progress.expect(launch.plan.blocks.warmup + 1)
     link = ModelLink(config.request, launch, f"{world.name} simulator")
@@ -71,11 +71,11 @@ def _drive(config: CcrbConfig, ask: Ask, world: Simulator, launch: RunningLaunch
     drive_point(config, ready, world, launch.writer)
 
 
-def _hear(config: CcrbConfig, ask: Ask, link: ModelLink, prior: GapPrior | None) -> Prepared:
+def _hear(config: CcrbConfig, ask: PlanPrompt, link: ModelLink, prior: GapPrior | None) -> Prepared:
     """Make the request, and let the policies have its arrivals; raises TransportError where the plan is not whole."""
     events: list[Event] = []
     feed = PlanFeed(Parser(ask.format), events.append)
-    measured = link.ask(ask, 0, feed)
+    measured = link.request(ask, 0, feed)
     link.require_answers()
     requested_ns = feed.requested_ns or 0
     came_ns = [event.at_ns for event in events if isinstance(event, SkillCame)][: ask.n_skills]
@@ -84,7 +84,7 @@ def _hear(config: CcrbConfig, ask: Ask, link: ModelLink, prior: GapPrior | None)
             f"{link.cell.name}: {len(came_ns)} of {ask.n_skills} skills came; {link.writer.path / 'tokens.csv'} has "
             "what the model wrote"
         )
-    link.saw(feed.token_ns)
+    link.learn_rate(feed.token_ns)
     request_id = measured.sample.request_id
     link.writer.update(request={"request_id": request_id, "requested_ns": requested_ns})
     times = config.scenario.durations

@@ -124,7 +124,7 @@ def warm_up(session: Session, place: Place, horizon: int) -> tuple[Measured, int
         if isinstance(piece, Action):
             actions.append(piece.values)
 
-    measured = session.measure(place, RequestContext(heard=heard))
+    measured = session.measure(place, RequestContext(on_piece=heard))
     if not measured.sample.error:
         check(session, len(actions), horizon)
     return measured, actions[0].size if actions else 0

@@ -126,7 +126,7 @@ def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
     plan = resolve(config.asked.answered(progress.say))
     several = any(each.several for each in config.made.values())
     asked = {**plan.manifest["configuration"], **config.to_manifest()}
-    plan = plan.telling(configuration=asked, cadence=f"a control loop at {config.control_hz:g} Hz")
+    plan = plan.with_manifest(configuration=asked, cadence=f"a control loop at {config.control_hz:g} Hz")
     task = Task("chunks", drive=partial(_drive, config), clients=CLIENTS if several else 1)
     folder = run_requests(task, plan, output, progress)
     if config.export_delays is not None:

@@ -22,7 +22,7 @@ from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
 from s2a_bench.harness.timelines.config import TimelineConfig
-from s2a_bench.harness.timelines.link import Ask, ModelLink, word
+from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, prepare_requests
 from s2a_bench.harness.timelines.policies import Following, prepare
 from s2a_bench.plan import Parser
 from s2a_bench.progress import Progress, watching
@@ -34,9 +34,9 @@ def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
 
     Whatever happens, the timelines so far are in the folder. KeyboardInterrupt passes through, after the robots hold.
     """
-    plan, asks = word(config, progress)
+    plan, asks = prepare_requests(config, progress)
     seed = plan.request.seed
-    plan = plan.telling(
+    plan = plan.with_manifest(
         configuration={**config.to_manifest(), "engine": plan.manifest["configuration"]["engine"]},
         seeds={"sampling": seed, "source": seed, "nonce": plan.feed.nonce},
     )
@@ -49,7 +49,9 @@ def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
         return run_requests(task, plan, output, progress)
 
 
-def _drive(config: TimelineConfig, asks: Sequence[Ask], robots: Sequence[SkillRobot], launch: RunningLaunch) -> None:
+def _drive(
+    config: TimelineConfig, asks: Sequence[PlanPrompt], robots: Sequence[SkillRobot], launch: RunningLaunch
+) -> None:
     """Let every policy execute every plan that is asked for."""
     link, records, progress = ModelLink(config, launch, config.robot), list[Record](), launch.progress
     progress.expect(config.warmup + len(asks) * config.plans_a_cell)
@@ -66,7 +68,12 @@ def _drive(config: TimelineConfig, asks: Sequence[Ask], robots: Sequence[SkillRo
 
 
 def _execute(
-    link: ModelLink, ask: Ask, plan: int, following: Following, robots: Sequence[SkillRobot], records: list[Record]
+    link: ModelLink,
+    ask: PlanPrompt,
+    plan: int,
+    following: Following,
+    robots: Sequence[SkillRobot],
+    records: list[Record],
 ) -> None:
     """Ask for one plan, let every policy execute it as it arrives, and add what they did to ``records``."""
     policies, progress = following.policies(), link.launch.progress
@@ -79,7 +86,7 @@ def _execute(
     try:
         with side_by_side, watching(progress, Scene(title, side_by_side.records, ask.n_skills, span_s)):
             try:
-                request_id = link.ask(ask, plan, feed).sample.request_id
+                request_id = link.request(ask, plan, feed).sample.request_id
             except S2AError as error:  # the run ends, but not in the middle of a skill
                 side_by_side.tell(StreamBroke(now_ns(), "stream-error", f"{type(error).__name__}: {error}"))
                 side_by_side.finish()
@@ -88,7 +95,7 @@ def _execute(
     finally:  # what an interruption leaves is kept too
         executed = side_by_side.records
         records += executed
-        link.saw(max((record.token_ns for record in executed), key=len))
+        link.learn_rate(max((record.token_ns for record in executed), key=len))
         link.launch.warnings.extend(keep(link.writer, link.setting(ask), plan, request_id, policies, executed))
     following.learn(side_by_side.records)
 

@@ -35,7 +35,7 @@ LATE = 1.05
 
 
 @dataclass(frozen=True, slots=True)
-class Ask:
+class PlanPrompt:
     """One setting, ready to be asked for."""
 
     skills: SkillSet
@@ -62,7 +62,7 @@ class Ask:
         return PlanShape(self.n_skills, self.tokens_per_skill, timing, float(nominal_s.std()) / mean_s)
 
 
-def asks_of(config: TimelineConfig, model: Path | None) -> list[Ask]:
+def plan_prompts(config: TimelineConfig, model: Path | None) -> list[PlanPrompt]:
     """Word every setting for the tokenizer of ``model``; raises UsageError where there is no such format."""
     tokenize = None
     if not in_paper_format(config):
@@ -77,7 +77,7 @@ def asks_of(config: TimelineConfig, model: Path | None) -> list[Ask]:
         pinned = None if config.url else tokenize
         counted = tokens if tokenize is not None or config.engine.kind.plays else ROOM
         found.append(
-            Ask(
+            PlanPrompt(
                 skills,
                 format_,
                 tokens,
@@ -104,16 +104,16 @@ def skills_lasting(config: TimelineConfig, t_nom_s: float | None) -> SkillSet:
     return replace(config.skill_set, skills=skills)
 
 
-def word(config: TimelineConfig, progress: Progress) -> tuple[RunPlan, list[Ask]]:
+def prepare_requests(config: TimelineConfig, progress: Progress) -> tuple[RunPlan, list[PlanPrompt]]:
     """Find the model's files, word what it is asked, and plan requests with the room that it needs; raises S2AError."""
     limit_threads()
     requests = requests_of(config)
     if not in_paper_format(config):
         need_engine(requests.engine)
         requests = requests.but(engine=on_files(requests.engine, progress))
-    asks = asks_of(config, requests.engine.model)
-    plan = resolve(requests.but(max_tokens=max(ask.max_tokens for ask in asks)))
-    return replace(plan, finds_model=False), asks
+    prompts = plan_prompts(config, requests.engine.model)
+    plan = resolve(requests.but(max_tokens=max(each.max_tokens for each in prompts)))
+    return replace(plan, finds_model=False), prompts
 
 
 @dataclass
@@ -153,13 +153,13 @@ class ModelLink:
             provenance=Origins(self.origin).to_manifest(), live=live if dummy is None else {**live, "dummy": dummy}
         )
 
-    def warm_up(self, ask: Ask) -> GapPrior | None:
+    def warm_up(self, prompt: PlanPrompt) -> GapPrior | None:
         """Ask as often as the configuration wants, and return what policies learn from that."""
         warmups, progress = self.launch.plan.blocks.warmup, self.launch.progress
         arrivals_ns = []
         for _ in range(warmups):
             progress.stage("warming up")
-            measured = self.ask(ask, 0, None)
+            measured = self.request(prompt, 0, None)
             arrivals_ns.append([token.client_ns for token in measured.tokens])
             progress.advance()
         prior = prior_of(arrivals_ns, self.rate)
@@ -169,12 +169,14 @@ class ModelLink:
             self.writer.update(prior={**about, "warmups": warmups})
         return prior
 
-    def ask(self, ask: Ask, plan: int, feed: PlanFeed | None) -> Measured:
+    def request(self, prompt: PlanPrompt, plan: int, feed: PlanFeed | None) -> Measured:
         """Make one request and keep its rows; raises what ends the run."""
         run = self.session.request
-        asked = replace(run, prompt=ask.prompt, grammar=ask.grammar, max_pieces=ask.max_tokens, seed=run.seed + plan)
+        request = replace(
+            run, prompt=prompt.prompt, grammar=prompt.grammar, max_pieces=prompt.max_tokens, seed=run.seed + plan
+        )
         place = Place(next(self.blocks), 0, warmup=feed is None)
-        measured = self.session.measure(place, RequestContext(plan=feed, request=asked))
+        measured = self.session.measure(place, RequestContext(plan=feed, request=request))
         if self.session.origin != self.origin:
             self._tell_origin()
         self.answers += feed is not None and not measured.sample.error
@@ -186,21 +188,21 @@ class ModelLink:
             raise UsageError(f"{error} (here: `no_grammar`)") from error
         return measured
 
-    def setting(self, ask: Ask) -> PlanSetting:
+    def setting(self, prompt: PlanPrompt) -> PlanSetting:
         """Return the setting of what was asked, at the rate that was seen."""
         return PlanSetting(
             board="",
             title=f"live {self.cell.name}",
             tokens_per_s=float(f"{self.rate or 0.0:.4g}"),
             prompt_s=None,
-            tokens_per_skill=ask.tokens_per_skill,
-            n_skills=ask.n_skills,
-            t_nom_s=ask.t_nom_s,
+            tokens_per_skill=prompt.tokens_per_skill,
+            n_skills=prompt.n_skills,
+            t_nom_s=prompt.t_nom_s,
             mode=MODE,
             emulated=self.origin.emulated,
         )
 
-    def saw(self, token_ns: Sequence[int]) -> None:
+    def learn_rate(self, token_ns: Sequence[int]) -> None:
         """Learn the rate from an answer if nobody set it, and warn where the model was slower."""
         if len(token_ns) < 2:  # noqa: PLR2004 - no gap
             return

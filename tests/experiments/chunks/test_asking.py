@@ -33,7 +33,7 @@ class Server:
         self.places.append(place)
         actions, error = self.answers[len(self.places) - 1]
         for index in range(actions):
-            asked.heard(Action(index, np.full(1, len(self.places), np.float32)), 100 * len(self.places) + index)
+            asked.on_piece(Action(index, np.full(1, len(self.places), np.float32)), 100 * len(self.places) + index)
         sample: Any = SimpleNamespace(error=error, request_id=f"fake-{place.block}", payload_bytes=7)
         return Measured(sample, [], 0)
 
