@@ -141,14 +141,14 @@ class Comparable:
     """What the runs of an experiment can be compared by.
 
     ``origin`` says what did not really answer; ``shown`` are the metrics that are compared unless others are named.
-    ``own`` gives the metrics that only some runs have, as the stages of a transport from elsewhere.
+    ``run_metrics`` gives the metrics that only some runs have, as the stages of a transport from elsewhere.
     """
 
     metrics: Mapping[str, Metric]
     subjects: Callable[[StoredRun], list[Subject]]
     origin: Callable[[StoredRun], Sequence[str]]
     shown: tuple[str, ...]
-    own: Callable[[StoredRun], Iterable[Metric]] = lambda _: ()
+    run_metrics: Callable[[StoredRun], Iterable[Metric]] = lambda _: ()
 
 
 def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:

@@ -191,7 +191,7 @@ class RequestCell:
         return _some(self.fact(PREDICTED_N)).fillna(self.fact("events")) - self.fact(END_N).fillna(0)
 
     @property
-    def told(self) -> bool:
+    def has_engine_time(self) -> bool:
         """Return whether the engine said how long it evaluated; else the paper's rate is the client's."""
         return bool(_some(self.fact(PREDICTED_MS)).notna().any())
 
@@ -373,7 +373,7 @@ def ratios(cells: list[RequestCell], seed: int) -> Iterator[tuple[str, RequestCe
                     yield metric, cell, base, ratio
 
 
-def spelled(metric: str) -> str:
+def metric_phrase(metric: str) -> str:
     """Return the name of what cells are compared by in words: End to end without inference."""
     return metric.replace("e2e", "End to end").replace("_", " ")
 
@@ -391,19 +391,19 @@ def ratio_between(cell: RequestCell, base: RequestCell, metric: str, seed: int) 
     return ratio_of_launches(cell.by_launch(metric), base.by_launch(metric), seed)
 
 
-def asked(run: StoredRun, cells: list[RequestCell]) -> str:
+def observation_of(run: StoredRun, cells: list[RequestCell]) -> str:
     """Return what each request brings, in words: the pictures' sizes, how many, and the robot's state."""
     sizes = sorted({cell.about["size"] for cell in cells})
     return str(run.manifest["configuration"].get("observation") or ", ".join(sizes))
 
 
-def pieces_of(run: StoredRun) -> str:
+def answer_kind(run: StoredRun) -> str:
     """Return what answers are made of: tokens or actions."""
     engine: dict[str, Any] = run.manifest["configuration"].get("engine") or {}
     return "actions" if engine.get("answer") == "actions" else "tokens"
 
 
-def chunks(run: StoredRun) -> str:
+def action_shape(run: StoredRun) -> str:
     """Return the shape of each answer, in words, where answers are chunks of actions that an engine of ours makes."""
     return str((run.manifest.get("model") or {}).get("answer") or "")
 
@@ -535,8 +535,8 @@ def cell_json(
     described: dict[str, Any] = {
         "cell": cell.name,
         **cell.about,
-        "observation": asked(run, [cell]),
-        "answer": pieces_of(run),
+        "observation": observation_of(run, [cell]),
+        "answer": answer_kind(run),
         "profile": origin.profile or None,
         "dummy": {"real": False, "dummy": True, "none": True}.get(origin.weights),
         **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},

@@ -30,8 +30,10 @@ N, L, T_NS = 3, 6, 800_000_000
 REPLAYED = PlanRequest(live=True, transport="loopback", engine=EngineConfig(name="replay"))
 
 
-def drive(asked: PlanRequest, folder: Path, profile: str = "jetson-agx-orin") -> StoredRun:
-    config = CcrbConfig(scenario=CcrbOptions(n_skills=N), tokens_per_skill=L, asked=asked, profile=profile)
+def drive(plan_request: PlanRequest, folder: Path, profile: str = "jetson-agx-orin") -> StoredRun:
+    config = CcrbConfig(
+        scenario=CcrbOptions(n_skills=N), tokens_per_skill=L, plan_request=plan_request, profile=profile
+    )
     with RunProgress() as progress:
         return read_run(run_ccrb(config, folder, progress))
 

@@ -17,7 +17,7 @@ from s2a_bench.boards.gaps import Constant, Lognormal, Markov, Recorded
 from s2a_bench.boards.profile import Profile
 from s2a_bench.boards.tokens import board_of_profile, gaps_of
 from s2a_bench.errors import StoreError, UsageError
-from s2a_bench.experiments.timeline.metrics import timeline_rows
+from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import recordings, run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from s2a_bench.experiments.timeline.metrics import metrics_of
+from s2a_bench.experiments.timeline.build_rows import metrics_of
 from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES
 from s2a_bench.policy import Plans, Schedule
 from tests.made_runs import SCHEMA

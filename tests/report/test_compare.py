@@ -140,7 +140,7 @@ def test_what_is_better_depends_on_the_metric() -> None:
 
 
 def test_metrics_that_only_one_run_has_can_be_named(launch: Launch, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = replace(latency.COMPARED, own=lambda run: [Metric(f"squash{run.manifest['more']}", "ms")])
+    own = replace(latency.COMPARED, run_metrics=lambda run: [Metric(f"squash{run.manifest['more']}", "ms")])
     monkeypatch.setattr(latency, "COMPARED", own)
     both = opened(*(launch(seed, n=6, manifest={**MANIFEST, "more": seed}) for seed in (1, 2)))
     assert list(both.metrics)[-2:] == ["squash1", "squash2"]

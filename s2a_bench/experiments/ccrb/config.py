@@ -88,12 +88,12 @@ class CcrbConfig(Options):
     seeds: int = option(10, "draws of --all-followers and --sensitivity", ge=1, le=1000)
     seed_points: int = option(128, "points that each of them draws", ge=1, le=65_536, hidden=True)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
-    asked: PlanRequest = Field(default_factory=PlanRequest)
+    plan_request: PlanRequest = Field(default_factory=PlanRequest)
 
     @property
     def virtual(self) -> bool:
         """Whether nothing but this process computes."""
-        return not self.asked.live and self.simulator != "carla"
+        return not self.plan_request.live and self.simulator != "carla"
 
     @property
     def world(self) -> dict[str, Any]:
@@ -104,7 +104,10 @@ class CcrbConfig(Options):
         """Return the timeline run whose plans these are: one setting, even tokens."""
         from s2a_bench.harness.timelines.config import TimelineConfig
 
-        durations, rate = self.scenario.durations, self.asked.engine.pace if self.asked.live else self.rate
+        durations, rate = (
+            self.scenario.durations,
+            self.plan_request.engine.pace if self.plan_request.live else self.rate,
+        )
         return TimelineConfig(
             policies=self.policies,
             profiles=() if rate is not None else (self.profile,),
@@ -123,7 +126,7 @@ class CcrbConfig(Options):
         """Return the live timeline whose one plan is driven; raises UsageError naming the field."""
         from s2a_bench.harness.timelines.config import TimelineConfig
 
-        asked = self.asked
+        asked = self.plan_request
         played = asked.engine.kind.plays
         skills, tokens = played or (SKILL_SET, self.tokens_per_skill)
         if self.tokens_per_skill != tokens:
@@ -150,25 +153,27 @@ class CcrbConfig(Options):
                 raise UsageError(f"`{name}`: should be two numbers above 0 and at most {most:g}, the lower first")
         if self.scenario.lane_change and self.simulator == "longitudinal":
             raise UsageError("`lane_change`: the longitudinal simulator knows one lane; take `simulator` embedded")
-        if self.asked.live:
+        if self.plan_request.live:
             self._check_live()
         self.timeline.check()
         self._check_length()
 
     def risks(self) -> Iterator[tuple[str, str, str]]:
-        return self.request.risks() if self.asked.live else super().risks()
+        return self.request.risks() if self.plan_request.live else super().risks()
 
     def to_manifest(self) -> dict[str, Any]:
         """Return the options as plain data, those of the scenario among them, without those of the other mode."""
-        left_out = {"scenario", "asked"}
+        left_out = {"scenario", "plan_request"}
         left_out |= {name for name in DRAWN if getattr(self, name) == type(self).model_fields[name].default}
-        left_out |= {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"} if self.asked.live else set()
+        left_out |= (
+            {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"} if self.plan_request.live else set()
+        )
         own = {**self.model_dump(exclude=left_out), **self.scenario.to_manifest()}
         return {**own, "t_nom_s": self.scenario.durations.nominal_s, "time": "virtual"}
 
     def _check_live(self) -> None:
         """Refuse what is about tokens that are modelled, and what the model cannot be asked."""
-        for name in MODELLED if self.asked.engine.kind.plays else (*MODELLED, "profile"):
+        for name in MODELLED if self.plan_request.engine.kind.plays else (*MODELLED, "profile"):
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")
         _ = self.request

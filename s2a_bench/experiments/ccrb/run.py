@@ -129,7 +129,7 @@ _BOARD = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin"
 
 def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
     """Drive all roll-outs and return the run folder; raises S2AError."""
-    if config.asked.live:
+    if config.plan_request.live:
         from s2a_bench.experiments.ccrb.live import run_ccrb_live
 
         return run_ccrb_live(config, output, progress)

@@ -141,7 +141,7 @@ class ChunksConfig(Options):
         return not self.live
 
     @cached_property
-    def asked(self) -> LiveRequests:
+    def live_requests(self) -> LiveRequests:
         """Return what the control loop asks for, live; raises UsageError naming the field."""
         told: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
         if self.known:
@@ -277,7 +277,7 @@ class ChunksConfig(Options):
         self._check_learning()
         if self.known and len(self.latency) > 1:
             raise UsageError(f"`latency`: live a server keeps one, not {len(self.latency)}; run once for each")
-        if len(self.asked.pipelines) > 1 and self.export_delays is not None:
+        if len(self.live_requests.pipelines) > 1 and self.export_delays is not None:
             raise UsageError("`export_delays`: of one `transport` at a time")
         self._check_file()
 

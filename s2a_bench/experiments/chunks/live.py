@@ -19,10 +19,10 @@ import numpy as np
 from s2a_bench.act import open_robot
 from s2a_bench.act.control import ControlLoop
 from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.experiments.chunks.asking import Asking, Job, warm_up
+from s2a_bench.experiments.chunks.build_rows import stall_metrics, stalls_of, write_cell
 from s2a_bench.experiments.chunks.cells import ChunkCell, LatencyDraw, cells
 from s2a_bench.experiments.chunks.latencies import Source, delay_rows, measured, write_delays
-from s2a_bench.experiments.chunks.metrics import stall_metrics, stalls_of, write_cell
+from s2a_bench.experiments.chunks.requester import ChunkRequester, Job, warm_up
 from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
@@ -51,7 +51,7 @@ class LiveResult:
     setting: ControlSetting
     session: Session
     acted: Acted
-    asking: Asking
+    requester: ChunkRequester
     robot: ActionRobot | None
     triggers: tuple[int, ...] = ()
 
@@ -99,7 +99,7 @@ class LiveResult:
             "late_ticks": int((acted.late_ns >= period_ns).sum()),
             "blocked_s_p99": float(np.quantile(busy_s, 0.99)),
             "blocked_s_max": float(busy_s.max()),
-            "bytes_up_per_s": self.asking.sent_bytes / (acted.chunk.size * period_ns / 1e9),
+            "bytes_up_per_s": self.requester.sent_bytes / (acted.chunk.size * period_ns / 1e9),
         }
 
 
@@ -117,13 +117,13 @@ def write(config: ChunksConfig, writer: RunWriter, live: LiveResult) -> None:
     if cell.mode.streams:  # the closed forms are about a given gap between actions
         more |= dict.fromkeys(("p_stall_closed", "reaction_s_closed", "margin_ticks"))
     whole = ticks.chunk.size  # what is measured is kept
-    late_ns, names = live.acted.late_ns, live.asking.names
+    late_ns, names = live.acted.late_ns, live.requester.names
     write_cell(config, writer, cell, cycles, ticks, whole, more=more, late_ns=late_ns, names=names)
 
 
 def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
     """Act and return the run folder; raises S2AError for what a user can mend."""
-    plan = resolve(config.asked.answered(progress.say))
+    plan = resolve(config.live_requests.answered(progress.say))
     several = any(each.several for each in config.made.values())
     asked = {**plan.manifest["configuration"], **config.to_manifest()}
     plan = plan.with_manifest(configuration=asked, cadence=f"a control loop at {config.control_hz:g} Hz")
@@ -202,24 +202,24 @@ def _act(
     def heard(request: int, actions: Sequence[Any], at_ns: int) -> None:
         loop.arrived(request, actions, at_ns)
 
-    asking = Asking(sessions, config.horizon, config.seed, cell.mode.streams, heard, blocks)
+    requester = ChunkRequester(sessions, config.horizon, config.seed, cell.mode.streams, heard, blocks)
 
     def ask(request: int, tick: int) -> None:
-        asking.jobs.put(Job(request, tick, robot.state() if robot is not None and told else ()))
+        requester.jobs.put(Job(request, tick, robot.state() if robot is not None and told else ()))
 
     send = _nowhere if robot is None else robot.send
     loop = ControlLoop(cell.acting, setting, send, ask, max(2, round(config.seconds * 1e9 / setting.period_ns)))
-    with asking.running():
+    with requester.running():
         try:
             loop.start()
             while not loop.join(LOOK_S):
-                _keep(asking, launch)
+                _keep(requester, launch)
             if any(session.busy for session in sessions):
                 launch.progress.stage("waiting for the last answer")
         finally:
             loop.stop()
-    _keep(asking, launch)
-    return LiveResult(cell, setting, sessions[0], loop.acted(), asking, robot, tuple(loop.stepper.triggers))
+    _keep(requester, launch)
+    return LiveResult(cell, setting, sessions[0], loop.acted(), requester, robot, tuple(loop.stepper.triggers))
 
 
 def _nowhere(action: Vector | None, at_ns: int) -> None:
@@ -234,8 +234,8 @@ def _accepts_state(config: ChunksConfig, session: Session, robot: ActionRobot) -
     return bool(numbers) and cell.capabilities.accepts_state
 
 
-def _keep(asking: Asking, launch: RunningLaunch) -> None:
-    while not asking.done.empty():
-        launch.keep(*asking.done.get())
-    if asking.failure is not None:
-        raise asking.failure
+def _keep(requester: ChunkRequester, launch: RunningLaunch) -> None:
+    while not requester.done.empty():
+        launch.keep(*requester.done.get())
+    if requester.failure is not None:
+        raise requester.failure

@@ -1,6 +1,6 @@
 """The rows of a run of chunks, and the one metric table that columns, JSON and its schema, CSV and tables are made of.
 
-A new metric is a row here, and a value under its name in `metrics.metrics_of`.
+A new metric is a row here, and a value under its name in `build_rows.metrics_of`.
 """
 
 from __future__ import annotations

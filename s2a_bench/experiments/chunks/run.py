@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.chunks.build_rows import stalls_of, write_cell
 from s2a_bench.experiments.chunks.cells import ChunkCell, LatencyDraw, cells, draw, without_trigger
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.latencies import delay_rows, write_delays
-from s2a_bench.experiments.chunks.metrics import stalls_of, write_cell
 from s2a_bench.experiments.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS, MeanRow, TriggerRow
 from s2a_bench.experiments.chunks.smooth import TrackingPlant, follower
 from s2a_bench.machine import environment

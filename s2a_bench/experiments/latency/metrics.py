@@ -59,7 +59,9 @@ def compared(metrics: Sequence[RequestMetric] = METRICS) -> Comparable:
     """Return what latency runs are compared by: metrics, groups of stages, and the stages of a run."""
     groups = [RequestMetric(f"group.{name}", "ms", of=partial(RequestCell.sums_ms, group=name)) for name in GROUPS]
     shown = ("e2e_without_inference", "e2e", "itl")
-    return compared_by((*metrics, *groups), shown, own=lambda run: [RequestMetric(stage, "ms") for stage in run.stages])
+    return compared_by(
+        (*metrics, *groups), shown, run_metrics=lambda run: [RequestMetric(stage, "ms") for stage in run.stages]
+    )
 
 
 def latency_cell(metrics: Sequence[RequestMetric] = METRICS) -> type:

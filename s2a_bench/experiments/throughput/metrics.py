@@ -156,7 +156,9 @@ def ratios_of(run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[st
                 yield RATIO_METRIC, cell.name, name, ratio
     for cell in cells:
         base = _base(cell, cells)
-        if not (base and base.told and cell.told and cell.about["engine"] != base.about["engine"]):
+        if not (
+            base and base.has_engine_time and cell.has_engine_time and cell.about["engine"] != base.about["engine"]
+        ):
             continue
         if ratio := ratio_of_launches(cell.by_launch(ENGINE_METRIC), base.by_launch(ENGINE_METRIC), seed):
             yield ENGINE_METRIC, cell.name, base.name, ratio
@@ -171,7 +173,7 @@ def throughput_json(run: StoredRun) -> dict[str, Any]:
             cell,
             run,
             METRICS,
-            t_eval="engine" if cell.told else "client",
+            t_eval="engine" if cell.has_engine_time else "client",
             positions=[Position(*place, summarise(rates)) for place, rates in rates_by_position(cell).items()],
         )
         for cell in cells

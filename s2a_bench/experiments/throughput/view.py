@@ -63,7 +63,7 @@ def throughput_sentences(run: StoredRun) -> list[str]:
     said, cells = [], throughput_cells(run)
     for cell in cells:
         if found := summary_of(cell.values(ENGINE_METRIC)):
-            source = "the engine's own figure" if cell.told else "as the client saw it"
+            source = "the engine's own figure" if cell.has_engine_time else "as the client saw it"
             times = span_of([found.n], "request")
             said.append(f"{cell.name}: {mean_sd(found)} tokens/s (mean ± sd of {times}, {source}).")
     said += [
@@ -163,7 +163,7 @@ def position_table(run: StoredRun) -> TextTable | None:
 
 
 def _notes(run: StoredRun, cells: list[RequestCell], launches: tuple[str, ...]) -> list[str]:
-    untold = [cell.name for cell in cells if not cell.told]
+    untold = [cell.name for cell in cells if not cell.has_engine_time]
     notes = ["N / T_eval is the engine's own figure, as in the paper."] if len(untold) < len(cells) else []
     notes.append("decode is (n - 1) / (t_last - t_first) at the client.")
     if untold:

@@ -15,7 +15,7 @@ from s2a_bench.act.events import AbortAsked, Event, LiveInbox
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record, SkillRun
 from s2a_bench.clock import SystemClock, now_ns
-from s2a_bench.experiments.timeline.metrics import timeline_rows
+from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.harness.timelines.config import PlanSetting
 from s2a_bench.harness.timelines.policies import finite

@@ -1,6 +1,6 @@
 """The rows of a timeline run, and the one metric table that columns, JSON, CSV, tables and comparison are made of.
 
-A new metric is a row here, and under its name an array of one number a plan in `metrics.metrics_of`.
+A new metric is a row here, and under its name an array of one number a plan in `build_rows.metrics_of`.
 """
 
 from __future__ import annotations

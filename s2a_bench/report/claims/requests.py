@@ -227,7 +227,7 @@ def speeds(run: StoredRun) -> Iterator[RunPart]:
     """Yield every cell that has a rate."""
     for speed in throughput_cells(run):
         if speed.values("tokens_per_s").size:
-            told = {"T_eval": "the engine's" if speed.told else "the client's"}
+            told = {"T_eval": "the engine's" if speed.has_engine_time else "the client's"}
             yield RunPart(run, facts_of(run, [run.origins.of(speed.name)]) | told, speed)
 
 

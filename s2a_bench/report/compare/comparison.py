@@ -111,7 +111,7 @@ def open_comparison(
     with fits(*runs):
         sides = [[launch for run in side for launch in _launches(by.subjects(run))] for side in (baseline, other)]
         found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
-        own = by_name(metric for run in runs for metric in by.own(run))
+        own = by_name(metric for run in runs for metric in by.run_metrics(run))
     if (len(sides[0]) > 1) != (len(sides[1]) > 1):
         raise UsageError(
             "name several launches on both sides, or one on each: the test goes by launches or by requests; "

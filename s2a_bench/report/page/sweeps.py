@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.latency.view import against_bytes
-from s2a_bench.experiments.requests import RequestCell, spelled, split, stand_ins
+from s2a_bench.experiments.requests import RequestCell, metric_phrase, split, stand_ins
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.policy import Floats
 from s2a_bench.provenance import Origins
@@ -149,4 +149,4 @@ def _quantity(cell: RequestCell, run: StoredRun) -> tuple[str, Floats]:
     if run.manifest["command"] == "throughput":
         return "tokens/s", cell.values("tokens_per_s")
     metric = next((name for name in ("e2e_without_inference", "e2e") if cell.values_ms(name).size), "e2e")
-    return f"{spelled(metric)}, ms", cell.values_ms(metric)
+    return f"{metric_phrase(metric)}, ms", cell.values_ms(metric)

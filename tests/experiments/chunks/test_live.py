@@ -267,7 +267,7 @@ def test_without_websockets_packages_it_goes_over_http() -> None:
 import sys
 sys.modules["websockets"] = None
 from s2a_bench.experiments.chunks.config import ChunksConfig
-print(*ChunksConfig(live=True).asked.transports)
+print(*ChunksConfig(live=True).live_requests.transports)
 """
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert told.stdout.split() == ["http/binary"]

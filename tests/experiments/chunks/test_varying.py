@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from s2a_bench.experiments.chunks.build_rows import reactions_s
 from s2a_bench.experiments.chunks.cells import draw
 from s2a_bench.experiments.chunks.config import ChunksConfig
-from s2a_bench.experiments.chunks.metrics import reactions_s
 from s2a_bench.experiments.chunks.run import mean_age, mean_rows, trigger_rows
 from s2a_bench.policy.chunks import ControlSetting, mode
 from s2a_bench.policy.chunks.closed import Closed, closed, mean_reaction_s

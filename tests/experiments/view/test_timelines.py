@@ -13,7 +13,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from s2a_bench.experiments.timeline.metrics import timeline_rows
+from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.view.cells import timelines_json, timelines_of
 from s2a_bench.experiments.timeline.view.chrome_trace import TRACE, to_trace, write_trace

@@ -12,20 +12,20 @@ from s2a_bench.experiments.latency.metrics import METRICS, latency_csv, latency_
 from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import (
     RequestCell,
-    asked,
+    action_shape,
+    answer_kind,
     cells_of,
-    chunks,
     engine_notes,
     failure_notes,
     groups_present,
     launches_note,
+    metric_phrase,
     numbers_ms,
+    observation_of,
     payloads_of,
-    pieces_of,
     ratio_between,
     ratios,
     span_of,
-    spelled,
     stages_present,
     titles,
 )
@@ -66,7 +66,7 @@ def latency_sentences(run: StoredRun) -> list[str]:
     names = ", ".join(dict.fromkeys(cell.label for cell in cells))
     requests = span_of((cell.n for cell in cells), "request")
     pictures = " ".join((" and ".join(payloads_of(cells)), "frames")).lstrip()
-    said = [f"{requests} a cell over {names}; {pictures} of {asked(run, cells)}, {about['mode']} mode."]
+    said = [f"{requests} a cell over {names}; {pictures} of {observation_of(run, cells)}, {about['mode']} mode."]
     comparable = any(cell.values_ms("e2e_without_inference").size for cell in cells)
     metric = "e2e_without_inference" if comparable else "e2e"
     for payload in dict.fromkeys(cell.payload for cell in cells):
@@ -76,7 +76,7 @@ def latency_sentences(run: StoredRun) -> list[str]:
             if cell.payload == payload and (middle := summary_of(cell.values_ms(metric)))
         ]
         if medians:
-            said.append(f"{spelled(metric)}{_of(payload)}, medians: {', '.join(medians)}.")
+            said.append(f"{metric_phrase(metric)}{_of(payload)}, medians: {', '.join(medians)}.")
     found: list[str] = []
     beside: list[str] = []
     for of, cell, base, ratio in ratios(cells, run.bootstrap_seed):
@@ -193,7 +193,7 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
         ratios = ("1" if cell in each else interval(ratio) for each, ratio in zip(bases.values(), over, strict=True))
         rows.append((str(cell.n), str(cell.errors), *entries(cell.values_ms(metric), *figures), *ratios))
     header = ("n", "errors", *figures, *(f"ratio to {base}" for base in bases))
-    title = f"{spelled(metric)} in ms; ratios of medians [95 % interval]"
+    title = f"{metric_phrase(metric)} in ms; ratios of medians [95 % interval]"
     return _by_cell(title, header, cells, rows, (*_notes(run, cells), *launches_note(found)))
 
 
@@ -205,7 +205,7 @@ def token_table(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> T
     columns = [metric for metric in metrics if metric.shown]
     rows = [tuple(text for metric in columns for text in entries(cell.values(metric), *metric.shown)) for cell in cells]
     header = [f"{metric.title} {statistic}" for metric in columns for statistic in metric.shown]
-    title = f"{pieces_of(run).capitalize()} in ms: from one to the next (gap), and engine to client (delay)"
+    title = f"{answer_kind(run).capitalize()} in ms: from one to the next (gap), and engine to client (delay)"
     return _by_cell(title, header, cells, rows, engine_notes(run, cells))
 
 
@@ -238,8 +238,8 @@ def _notes(run: StoredRun, cells: list[RequestCell]) -> tuple[str, ...]:
     counts = span_of(cell.n for cell in cells)
     notes = [f"n = {counts} samples a cell, warm-ups left out." if counts else "No samples."]
     if cells:
-        notes.append(f"{asked(run, cells)}; payload: {', '.join(payloads_of(cells)) or 'none'}.")
-    if shape := chunks(run):
+        notes.append(f"{observation_of(run, cells)}; payload: {', '.join(payloads_of(cells)) or 'none'}.")
+    if shape := action_shape(run):
         notes.append(f"Each answer is a chunk of {shape} numbers, not tokens.")
     notes += engine_notes(run, cells)
     if any(cell.has_ingest for cell in cells):

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from s2a_bench.experiments.paper import CAVEAT, LABEL, paper_latency
 from s2a_bench.experiments.requests import (
     RequestCell,
-    asked,
+    action_shape,
     caption_for,
     cells_of,
-    chunks,
     groups_present,
-    spelled,
+    metric_phrase,
+    observation_of,
     titles,
 )
 from s2a_bench.writers.figures import (
@@ -133,11 +133,11 @@ def _shown(run: StoredRun) -> tuple[list[RequestCell], str]:
 
 
 def _caption(run: StoredRun, cells: list[RequestCell], what: str, metric: str, *notes: str) -> tuple[str, ...]:
-    facts = [asked(run, cells), *sorted({f"{cell.about['mode']} mode" for cell in cells})]
-    facts += [f"chunks of {shape}"] if (shape := chunks(run)) else []
+    facts = [observation_of(run, cells), *sorted({f"{cell.about['mode']} mode" for cell in cells})]
+    facts += [f"chunks of {shape}"] if (shape := action_shape(run)) else []
     shown = {cell.name for cell in cells}
     left_out = [f"{cell.name} not shown (inference unknown)." for cell in cells_of(run) if cell.name not in shown]
-    return caption_for(run, cells, f"{what}: {spelled(metric).lower()}", facts, (*notes, *left_out))
+    return caption_for(run, cells, f"{what}: {metric_phrase(metric).lower()}", facts, (*notes, *left_out))
 
 
 def _axis_label(metric: str) -> str:

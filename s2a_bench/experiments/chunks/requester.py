@@ -18,7 +18,7 @@ from s2a_bench.types import Action
 if TYPE_CHECKING:
     from s2a_bench.types import Piece, Vector
 
-Heard: TypeAlias = "Callable[[int, Sequence[Vector], int], None]"
+OnActions: TypeAlias = "Callable[[int, Sequence[Vector], int], None]"
 """Called with a request's number, what has come of its chunk so far, and when, in ns."""
 
 SEEDS: Final = 2**31
@@ -38,7 +38,7 @@ class Job:
 
 
 @dataclass(slots=True)
-class Asking:
+class ChunkRequester:
     """Asks for chunks in the background; what was measured waits in ``done``.
 
     A request that fails before its chunk is whole is made again, as the robot goes on waiting for it; of the new answer
@@ -49,7 +49,7 @@ class Asking:
     horizon: int
     seed: int
     streams: bool
-    heard: Heard
+    heard: OnActions
     blocks: Iterator[int]
     """Gives each request its place in the run."""
     jobs: SimpleQueue[Job | None] = field(default_factory=SimpleQueue)
@@ -65,7 +65,7 @@ class Asking:
     def running(self) -> Iterator[None]:
         """Ask while the block runs, and until the last answers are there; but for `GRACE_S` where it raises."""
         threads = [
-            Thread(target=self._work, args=(session,), name=f"asking-{place}", daemon=True)
+            Thread(target=self._work, args=(session,), name=f"requester-{place}", daemon=True)
             for place, session in enumerate(self.sessions)
         ]
         for thread in threads:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.asking import Asking, Job
+from s2a_bench.experiments.chunks.requester import ChunkRequester, Job
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.plan import RequestPlan, resolve
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
@@ -38,7 +38,9 @@ class Server:
         return Measured(sample, [], 0)
 
 
-def ask(*answers: tuple[int, str], streams: bool = False) -> tuple[list[tuple[list[float], int]], Asking, Server]:
+def ask(
+    *answers: tuple[int, str], streams: bool = False
+) -> tuple[list[tuple[list[float], int]], ChunkRequester, Server]:
     """Ask once, and return what was heard: the chunk so far, and when."""
     server = Server(list(answers))
     heard: list[tuple[list[float], int]] = []
@@ -46,21 +48,21 @@ def ask(*answers: tuple[int, str], streams: bool = False) -> tuple[list[tuple[li
     def hear(_request: int, actions: Sequence[Vector], at_ns: int) -> None:
         heard.append(([float(action[0]) for action in actions], at_ns))
 
-    asking = Asking([cast("Session", server)], 3, 0, streams, hear, count())
-    with asking.running():
-        asking.jobs.put(Job(0, 0, ()))
-        while asking.done.qsize() < len(answers) and asking.failure is None:
+    requester = ChunkRequester([cast("Session", server)], 3, 0, streams, hear, count())
+    with requester.running():
+        requester.jobs.put(Job(0, 0, ()))
+        while requester.done.qsize() < len(answers) and requester.failure is None:
             pass
-    return heard, asking, server
+    return heard, requester, server
 
 
 def test_a_request_that_fails_is_made_again_and_its_chunk_is_that_of_one_answer() -> None:
-    heard, asking, server = ask((2, "broken"), (3, ""))
+    heard, requester, server = ask((2, "broken"), (3, ""))
     assert heard == [([2.0] * 3, 202)]
     assert [place.position for place in server.places] == [0, 1]
-    assert asking.done.qsize() == 2
-    assert asking.sent_bytes == 14
-    assert asking.names == {0: "fake-1"}
+    assert requester.done.qsize() == 2
+    assert requester.sent_bytes == 14
+    assert requester.names == {0: "fake-1"}
 
 
 def test_of_a_second_answer_only_actions_count_that_had_not_come() -> None:
@@ -70,12 +72,12 @@ def test_of_a_second_answer_only_actions_count_that_had_not_come() -> None:
 
 @pytest.mark.parametrize("streams", [False, True])
 def test_an_answer_that_fails_once_it_is_whole_is_not_asked_for_again(streams: bool) -> None:
-    heard, asking, server = ask((3, "the marks were lost"), streams=streams)
+    heard, requester, server = ask((3, "the marks were lost"), streams=streams)
     assert heard[-1] == ([1.0] * 3, 102)
     assert len(server.places) == 1
-    assert asking.failure is None
+    assert requester.failure is None
 
 
 def test_a_chunk_of_another_length_fails_the_loop() -> None:
-    _, asking, _ = ask((2, ""))
-    assert isinstance(asking.failure, UsageError)
+    _, requester, _ = ask((2, ""))
+    assert isinstance(requester.failure, UsageError)
