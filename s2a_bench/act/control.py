@@ -45,7 +45,7 @@ class Acted:
     """How long after it was due the action left."""
     busy_ns: Ints
     """For how long the loop did something: asking and sending, and not waiting."""
-    asked_tick: Ints
+    request_tick: Ints
     """When each request left: shape (R,)."""
     arrival_ns: Ints
     """How long after that tick began each action was there: shape (R, H), -1 where it never was."""

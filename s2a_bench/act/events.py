@@ -26,14 +26,14 @@ class Requested:
 
 
 @dataclass(frozen=True, slots=True)
-class TokenCame:
+class TokenArrived:
     """A token arrived."""
 
     at_ns: int
 
 
 @dataclass(frozen=True, slots=True)
-class SkillCame:
+class SkillArrived:
     """The next skill of the plan is certain, since the token that arrived at ``at_ns``."""
 
     at_ns: int
@@ -66,14 +66,14 @@ class SkillOver:
 
 
 @dataclass(frozen=True, slots=True)
-class AbortAsked:
+class AbortRequested:
     """Somebody wants the robot to stop."""
 
     at_ns: int
     why: str = "asked to stop"
 
 
-Event: TypeAlias = Requested | TokenCame | SkillCame | StreamEnded | StreamBroke | SkillOver | AbortAsked
+Event: TypeAlias = Requested | TokenArrived | SkillArrived | StreamEnded | StreamBroke | SkillOver | AbortRequested
 
 
 class PlanFeed:
@@ -93,7 +93,7 @@ class PlanFeed:
     def token(self, text: str | bytes, at_ns: int) -> None:
         """Take a token that arrived at ``at_ns``: the skills that it completes arrived then too."""
         self.token_ns.append(at_ns)
-        self._tell(TokenCame(at_ns))
+        self._tell(TokenArrived(at_ns))
         self._parsed(self._parser.feed(text), at_ns)
 
     def ended(self, at_ns: int) -> None:
@@ -106,7 +106,7 @@ class PlanFeed:
     def _parsed(self, events: Sequence[PlanEvent], at_ns: int) -> None:
         for event in events:
             if isinstance(event, SkillParsed):
-                self._tell(SkillCame(at_ns, event.call))
+                self._tell(SkillArrived(at_ns, event.call))
             else:
                 self.broke(f"line {event.line + 1} ({event.problem}): {event.why}", at_ns, "invalid-line")
 

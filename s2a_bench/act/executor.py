@@ -21,16 +21,16 @@ from typing import Final, TypeVar
 
 from s2a_bench.act import Running, SkillRobot
 from s2a_bench.act.events import (
-    AbortAsked,
+    AbortRequested,
     Event,
     EventQueue,
     Fault,
     Requested,
-    SkillCame,
+    SkillArrived,
     SkillOver,
     StreamBroke,
     StreamEnded,
-    TokenCame,
+    TokenArrived,
 )
 from s2a_bench.act.record import Outcome, Record, RobotCommand, SkillRun, What
 from s2a_bench.clock import Clock
@@ -97,15 +97,15 @@ class Executor:
         match event:
             case Requested(at_ns):
                 record.requested_ns = self._heard_ns = at_ns
-            case TokenCame(at_ns) if self._open:
+            case TokenArrived(at_ns) if self._open:
                 record.token_ns.append(at_ns)
                 self._heard_ns = at_ns
                 self._stepper.token(self._tell(at_ns))
-            case SkillCame(at_ns, call) if self._open and not self._whole:
+            case SkillArrived(at_ns, call) if self._open and not self._whole:
                 record.arrivals.append((at_ns, call))
                 times = call.skill.durations
                 self._stepper.fragment(self._tell(at_ns), Timing(times.nominal_s, times.least_s, times.most_s))
-            case SkillCame() if self._open:
+            case SkillArrived() if self._open:
                 record.extra += 1
             case StreamEnded(at_ns):
                 self._close(at_ns)
@@ -113,7 +113,7 @@ class Executor:
                 self._break(at_ns, fault, why)
             case SkillOver(at_ns, index, error):
                 self._over(at_ns, index, error)
-            case AbortAsked(at_ns, why):
+            case AbortRequested(at_ns, why):
                 self._failure = ("aborted", why)
                 self._close(at_ns)
 

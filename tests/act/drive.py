@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from s2a_bench.act import Report, Running, SkillRobot
-from s2a_bench.act.events import Event, Requested, ScriptedInbox, SkillCame, SkillOver, StreamEnded, TokenCame
+from s2a_bench.act.events import Event, Requested, ScriptedInbox, SkillArrived, SkillOver, StreamEnded, TokenArrived
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record
 from s2a_bench.clock import VirtualClock
@@ -33,8 +33,8 @@ def script(token_s: Sequence[float], arrivals: Sequence[tuple[float, Call]], end
     """A stream that ends with the last thing that comes unless told otherwise (never: a negative time)."""
     events: list[Event] = [Requested(ns(0))]
     events += sorted(
-        [*(TokenCame(ns(at)) for at in token_s), *(SkillCame(ns(at), skill) for at, skill in arrivals)],
-        key=lambda event: (event.at_ns, isinstance(event, SkillCame)),
+        [*(TokenArrived(ns(at)) for at in token_s), *(SkillArrived(ns(at), skill) for at, skill in arrivals)],
+        key=lambda event: (event.at_ns, isinstance(event, SkillArrived)),
     )
     last_s = max([*token_s, *(at for at, _ in arrivals)], default=0.0) if end_s is None else end_s
     return [*events, StreamEnded(ns(last_s))] if last_s >= 0 else events

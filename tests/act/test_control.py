@@ -96,7 +96,7 @@ def test_a_chunk_that_never_comes_ends_what_is_decided() -> None:
     acted = act("queue?trigger=1", ControlSetting(PERIOD_NS, HORIZON), [0, 0], VirtualClock(), ticks=50)
     assert acted.whole == 2
     assert acted.chunk.size == 50
-    assert (acted.chunk[int(acted.asked_tick[2]) + 1 :] < 0).all()  # one action was left
+    assert (acted.chunk[int(acted.request_tick[2]) + 1 :] < 0).all()  # one action was left
 
 
 def test_robot_is_sent_each_action_and_each_stall() -> None:

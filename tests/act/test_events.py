@@ -6,10 +6,10 @@ from threading import Timer
 
 import pytest
 
-from s2a_bench.act.events import Event, LiveInbox, ScriptedInbox, StreamEnded, TokenCame
+from s2a_bench.act.events import Event, LiveInbox, ScriptedInbox, StreamEnded, TokenArrived
 from s2a_bench.clock import VirtualClock, now_ns
 
-FIRST, SECOND = TokenCame(5), StreamEnded(5)
+FIRST, SECOND = TokenArrived(5), StreamEnded(5)
 
 
 def test_a_live_inbox_gives_all_there_is_in_order_at_once() -> None:
@@ -41,7 +41,7 @@ def test_a_live_inbox_whose_time_is_past_still_gives_what_there_is() -> None:
 )
 def test_a_script_is_jumped_through(until_ns: int | None, found: list[Event], at_ns: int) -> None:
     clock = VirtualClock(0)
-    inbox = ScriptedInbox(clock, [TokenCame(7), FIRST, SECOND])
+    inbox = ScriptedInbox(clock, [TokenArrived(7), FIRST, SECOND])
     assert inbox.wait(until_ns) == found
     assert clock.now_ns() == at_ns
 

@@ -11,14 +11,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.act.events import (
-    AbortAsked,
+    AbortRequested,
     Event,
     Requested,
     ScriptedInbox,
-    SkillCame,
+    SkillArrived,
     StreamBroke,
     StreamEnded,
-    TokenCame,
+    TokenArrived,
 )
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record
@@ -109,7 +109,7 @@ def test_a_stream_that_dies_anywhere_leaves_the_robot_holding(
     cut = dies.draw(st.integers(1, len(events)))
     kept = events[:cut]
     death_ns = kept[-1].at_ns + 1
-    whole = sum(isinstance(event, SkillCame) for event in kept) == len(calls)
+    whole = sum(isinstance(event, SkillArrived) for event in kept) == len(calls)
     ending = [StreamBroke(death_ns, "stream-error", "cut")] if how == "broke" else []
     known = replace(plan_.shape, safe_start_s=float(safe_start(plan_.arrival_s, plan_.nominal_s)[0]))
     record, robot = run([*kept, *ending], len(calls), by=name, known=known, silence_s=100.0)
@@ -119,7 +119,7 @@ def test_a_stream_that_dies_anywhere_leaves_the_robot_holding(
         assert record.outcome == ("stream-error" if how == "broke" else "silence")
         silence_ns = 0 if how == "broke" else 100 * 10**9
         assert all(skill.start_ns <= death_ns + silence_ns for skill in record.skills)
-    came = [skill for event in kept if isinstance(event, SkillCame) for skill in [event.call.skill.name]]
+    came = [skill for event in kept if isinstance(event, SkillArrived) for skill in [event.call.skill.name]]
     assert [skill.call.skill.name for skill in record.skills] == came[: len(record.skills)]
     assert all(skill.end_ns is not None for skill in record.skills)
     assert robot.told[-1][1] == ("hold" if record.skills else "cruise")
@@ -145,7 +145,7 @@ def test_unless_told_otherwise_silence_is_a_minute_and_a_skill_may_overrun_by_te
 
 
 def test_silence_counts_from_the_last_token() -> None:
-    record, robot = run([Requested(ns(0)), TokenCame(ns(4))], 3, silence_s=10.0)
+    record, robot = run([Requested(ns(0)), TokenArrived(ns(4))], 3, silence_s=10.0)
     assert (record.outcome, record.why, record.skills) == ("silence", "no token for 10 s", [])
     assert record.ended_ns == ns(14)
     assert robot.told == [(-1.0, "cruise")]
@@ -158,8 +158,8 @@ def test_silence_after_the_last_announced_skill_means_nothing() -> None:
 
 def test_a_bad_line_ends_the_plan_where_it_stands() -> None:
     first, second = call("first"), call("second")
-    events = [Requested(ns(0)), SkillCame(ns(1), first), StreamBroke(ns(1.2), "invalid-line", "line 2")]
-    record, _ = run([*events, SkillCame(ns(1.3), second), StreamEnded(ns(2))], 2)
+    events = [Requested(ns(0)), SkillArrived(ns(1), first), StreamBroke(ns(1.2), "invalid-line", "line 2")]
+    record, _ = run([*events, SkillArrived(ns(1.3), second), StreamEnded(ns(2))], 2)
     assert (record.outcome, len(record.arrivals)) == ("invalid-line", 1)
     assert [skill.call for skill in record.skills] == [first]
 
@@ -246,7 +246,7 @@ def test_a_robot_whose_call_raises_ends_the_plan_and_not_the_executor() -> None:
 
 @pytest.mark.parametrize("at_s", [0.5, 1.0, 1.5, 2.5])
 def test_an_abort_ends_everything_at_once(at_s: float) -> None:
-    record, robot = run([*plan([1.0, 4.0])[:-1], AbortAsked(ns(at_s)), StreamEnded(ns(4))], 2)
+    record, robot = run([*plan([1.0, 4.0])[:-1], AbortRequested(ns(at_s)), StreamEnded(ns(4))], 2)
     assert (record.outcome, record.why) == ("aborted", "asked to stop")
     assert len(record.skills) == (at_s > 1)
     assert ends(record) == [min(at_s, 2.0)] * (at_s > 1)
@@ -255,7 +255,7 @@ def test_an_abort_ends_everything_at_once(at_s: float) -> None:
 
 
 def test_an_abort_before_the_request_ends_it_too() -> None:
-    record, _ = run([AbortAsked(ns(-0.5))], 2)
+    record, _ = run([AbortRequested(ns(-0.5))], 2)
     assert (record.outcome, record.requested_ns) == ("aborted", None)
 
 
@@ -294,8 +294,8 @@ class LateInbox:
 def test_being_late_for_several_events_is_jitter_since_the_first() -> None:
     clock = VirtualClock()
     came_ns = 10_000_000
-    skill = SkillCame(came_ns, call("wave", 1.0, 1.0, 1.0))
-    events: list[Event] = [Requested(came_ns), TokenCame(came_ns), skill, TokenCame(came_ns + 8_000_000)]
+    skill = SkillArrived(came_ns, call("wave", 1.0, 1.0, 1.0))
+    events: list[Event] = [Requested(came_ns), TokenArrived(came_ns), skill, TokenArrived(came_ns + 8_000_000)]
     inbox = LateInbox(clock, events, came_ns + 9_000_000)
     record = Executor(Naive(), shape(1), TimedRobot(), inbox, clock).run()
     assert [run.jitter_ns for run in record.skills] == [9_000_000]

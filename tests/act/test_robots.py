@@ -12,7 +12,7 @@ import pytest
 
 from s2a_bench.act import SkillKind, SkillRobot, kind, ros
 from s2a_bench.act.call import CallableRobot, SkillFunction, SkillMotion
-from s2a_bench.act.events import AbortAsked, LiveInbox, Requested, SkillCame, StreamEnded
+from s2a_bench.act.events import AbortRequested, LiveInbox, Requested, SkillArrived, StreamEnded
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record
 from s2a_bench.act.ros import EXECUTE_SKILL, RosSkills
@@ -50,10 +50,10 @@ def execute(robot: SkillRobot, calls: list[Call], *, patience_s: float = 10.0, a
     known = PlanShape(len(calls), 1, Timing(0.04, 0.02, 0.06))
     executor = Executor(policy("naive"), known, robot, inbox, SystemClock(), gap=QUICK.gap, patience_s=patience_s)
     start_ns = now_ns()
-    for event in (Requested(start_ns), *(SkillCame(start_ns, call) for call in calls), StreamEnded(start_ns)):
+    for event in (Requested(start_ns), *(SkillArrived(start_ns, call) for call in calls), StreamEnded(start_ns)):
         inbox.put(event)
     if abort_at is not None:
-        Thread(target=lambda: (abort_at.wait(10), inbox.put(AbortAsked(now_ns()))), daemon=True).start()
+        Thread(target=lambda: (abort_at.wait(10), inbox.put(AbortRequested(now_ns()))), daemon=True).start()
     return executor.run()
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from s2a_bench.act.events import AbortAsked, StreamBroke
+from s2a_bench.act.events import AbortRequested, StreamBroke
 from s2a_bench.act.record import Record
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.experiments.timeline.watch import STALL, Scene, draw, summary
@@ -102,10 +102,10 @@ def test_no_line_is_wider_than_the_terminal(width: int, at_s: float, span_s: flo
     ("event", "words"),
     [
         (StreamBroke(ns(4.5), "stream-error", "cable"), "2/4 stream-error"),
-        (AbortAsked(ns(4.5)), "2/4 aborted"),
+        (AbortRequested(ns(4.5)), "2/4 aborted"),
     ],
 )
-def test_what_went_wrong_stands_where_the_numbers_would(event: StreamBroke | AbortAsked, words: str) -> None:
+def test_what_went_wrong_stands_where_the_numbers_would(event: StreamBroke | AbortRequested, words: str) -> None:
     events = [each for each in plan(ARRIVALS) if each.at_ns <= ns(4.5)]
     record, _ = run([*events, event], len(ARRIVALS))
     line = lane(text(scene([record]), 9.0, 100), "naive")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from s2a_bench.act.events import Event, PlanFeed, SkillCame
+from s2a_bench.act.events import Event, PlanFeed, SkillArrived
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
@@ -78,7 +78,7 @@ def _hear(config: CcrbConfig, ask: PlanPrompt, link: ModelLink, prior: GapPrior 
     measured = link.request(ask, 0, feed)
     link.require_answers()
     requested_ns = feed.requested_ns or 0
-    came_ns = [event.at_ns for event in events if isinstance(event, SkillCame)][: ask.n_skills]
+    came_ns = [event.at_ns for event in events if isinstance(event, SkillArrived)][: ask.n_skills]
     if len(came_ns) < ask.n_skills:
         raise TransportError(
             f"{link.cell.name}: {len(came_ns)} of {ask.n_skills} skills came; {link.writer.path / 'tokens.csv'} has "

@@ -68,7 +68,7 @@ class LiveResult:
         acted, ticks = self.acted, self.acted.chunk.size
         arrival_ns = acted.arrival_ns[:, -1]
         delay = np.where(arrival_ns < 0, ticks, self.setting.delay_ticks(np.maximum(arrival_ns, 0)))
-        return gather(acted.asked_tick, acted.asked_tick + delay, acted.chunk, acted.index, self.setting.horizon)
+        return gather(acted.request_tick, acted.request_tick + delay, acted.chunk, acted.index, self.setting.horizon)
 
     def agreement(self) -> float:
         """Return the share of the ticks in which it did what virtual time says of the same arrivals."""

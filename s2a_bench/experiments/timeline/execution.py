@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from s2a_bench.act import SkillRobot
-from s2a_bench.act.events import AbortAsked, Event, LiveInbox
+from s2a_bench.act.events import AbortRequested, Event, LiveInbox
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record, SkillRun
 from s2a_bench.clock import SystemClock, now_ns
@@ -65,7 +65,7 @@ class SideBySide:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
-            self.tell(AbortAsked(now_ns(), "the run was ended"))
+            self.tell(AbortRequested(now_ns(), "the run was ended"))
         self._pool.shutdown()
 
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.act.events import Requested, SkillCame, StreamEnded, TokenCame
+from s2a_bench.act.events import Requested, SkillArrived, StreamEnded, TokenArrived
 from s2a_bench.act.executor import SILENCE_S
 from s2a_bench.act.record import Record
 from s2a_bench.act.timed import TimedRobot
@@ -266,9 +266,9 @@ def _play(play: _Play, tokens_per_skill: int, executors: SideBySide) -> None:
     for place, due_s in enumerate(play.token_s, start=1):
         clock.sleep_until_ns(requested_ns + round(float(due_s) * 1e9))
         at_ns = clock.now_ns()
-        executors.tell(TokenCame(at_ns))
+        executors.tell(TokenArrived(at_ns))
         if place % tokens_per_skill == 0:
-            executors.tell(SkillCame(at_ns, next(calls)))
+            executors.tell(SkillArrived(at_ns, next(calls)))
     executors.tell(StreamEnded(clock.now_ns()))
     executors.finish()
 

@@ -30,7 +30,7 @@ from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
 from s2a_bench.provenance import UNKNOWN
 from s2a_bench.report.claims import Check, Met, Need, RunPart, Trial
 from s2a_bench.report.claims.requests import NEAR, PAPERS_MODEL, change, emulated, exact, facts_of, on_board, one_of
-from s2a_bench.scenario.ccrb.labels import PAPER, SAID, law
+from s2a_bench.scenario.ccrb.labels import OUTCOME_LABELS, PAPER, law
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import Change
@@ -287,8 +287,9 @@ def outcome(policy: str, part: RunPart) -> tuple[list[Ratio], str]:
         found = share_of(scenes_of(part.run, "phase", asked["gap"]), "paper").value
         share = f"the paper's outcomes of all three policies hold at {found:.1%} of the diagram"
     point = f"R = {row['tokens_per_s']:g}, front gap {asked['front_gap_m']:g} m, rear gap {asked['rear_gap_m']:g} m"
-    said = f"{SAID[str(row['outcome'])]}{speed}; {share}. {tokens_line(part.run)} {point}, gap behaviour {asked['gap']}"
-    return [exact(float(row["outcome"] == PAPER[policy]))], f"{said}; {law(asked)}"
+    outcome = f"{OUTCOME_LABELS[str(row['outcome'])]}{speed}; {share}. {tokens_line(part.run)}"
+    note = f"{outcome} {point}, gap behaviour {asked['gap']}; {law(asked)}"
+    return [exact(float(row["outcome"] == PAPER[policy]))], note
 
 
 def worse(policy: str, part: RunPart) -> tuple[list[Ratio], str]:

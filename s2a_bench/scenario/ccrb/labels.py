@@ -10,12 +10,12 @@ from s2a_bench.scenario.ccrb import FOLLOWERS
 
 PAPER: Final = {"naive": "rear", "wait-then-act": "front", "stream-to-act": "none"}
 """The outcomes that the paper states (section V-F)."""
-NAIVE, WAIT, OURS = PAPER
+NAIVE, WAIT, STREAM_TO_ACT = PAPER
 ORDERING: Final = "The paper's ordering: naive hit from behind, wait-then-act hits the lead, stream-to-act nobody."
 NO_SCORE: Final = "The scenario is in the manner of Euro NCAP's CCRb; nothing here is an NCAP score."
 MARK: Final = "\N{DAGGER}"
 """Stands behind a rear outcome that says nothing of the policy."""
-SAID: Final = {
+OUTCOME_LABELS: Final = {
     "none": "no impact",
     "front": "hits the lead",
     "rear": "hit from behind",
@@ -33,9 +33,9 @@ def ahead(asked: Mapping[str, Any]) -> str:
     return f"front gap {asked['front_gap_m']:g} m, lead -{asked['lead_decel_mps2']:g} m/s\N{SUPERSCRIPT TWO}"
 
 
-def said(outcome: str, survives: bool) -> str:
+def outcome_label(outcome: str, survives: bool) -> str:
     """Return an outcome in words, marked where the car behind would have hit any ego."""
-    return SAID[outcome] + marked(outcome, survives)
+    return OUTCOME_LABELS[outcome] + marked(outcome, survives)
 
 
 def marked(outcome: str, survives: bool) -> str:
@@ -43,7 +43,7 @@ def marked(outcome: str, survives: bool) -> str:
     return f" {MARK}" if outcome in {"rear", "both"} and not survives else ""
 
 
-def check(asked: Mapping[str, Any], survives: bool) -> str:
+def follower_check(asked: Mapping[str, Any], survives: bool) -> str:
     """Return whether the car behind stops behind an ego that never stalls, and what follows from that."""
     ego = "an ego whose tokens come at once"
     at = f"at a gap of {asked['rear_gap_m']:g} m"

@@ -13,7 +13,7 @@ from s2a_bench.errors import StoreError
 from s2a_bench.experiments.ccrb.view.figures import path_of, rest_of
 from s2a_bench.experiments.ccrb.view.outcomes import configuration, rollouts_of, tokens_line
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES
-from s2a_bench.scenario.ccrb.labels import SAID, law
+from s2a_bench.scenario.ccrb.labels import OUTCOME_LABELS, law
 from s2a_bench.scenario.ccrb.render import TopView
 from s2a_bench.store.requests import SKILLS
 
@@ -99,7 +99,7 @@ class RoadPanel:
         if hit:
             speed = self._row["rear_impact_mps" if self._row["outcome"] in {"rear", "both"} else "front_impact_mps"]
             first = "rear" if self._row["outcome"] == "both" else self._row["outcome"]
-            return f"{SAID[first]}: {speed:.1f} m/s"
+            return f"{OUTCOME_LABELS[first]}: {speed:.1f} m/s"
         if now["phase"] == "acting":
             return f"skill {int(now['skill']) + 1}: {self._texts[int(now['skill'])]}"
         return _PHASES[now["phase"]]

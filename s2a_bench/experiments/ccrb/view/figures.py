@@ -24,7 +24,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 )
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.cars import Cars
-from s2a_bench.scenario.ccrb.labels import NAIVE, NO_SCORE, ORDERING, PAPER, ahead, law, operating_point, said
+from s2a_bench.scenario.ccrb.labels import NAIVE, NO_SCORE, ORDERING, PAPER, ahead, law, operating_point, outcome_label
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.style import WIDE_IN
@@ -171,7 +171,7 @@ def _draw_gaps(axes: Axes, path: pd.DataFrame, row: dict[Any, Any]) -> None:
 
 
 def _verdict(row: dict[Any, Any], survives: bool) -> str:
-    return said(row["outcome"], survives) + (" (late)" if row["late"] is True else "")
+    return outcome_label(row["outcome"], survives) + (" (late)" if row["late"] is True else "")
 
 
 def _title(run: StoredRun) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from s2a_bench.experiments import TIME
 from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
-from s2a_bench.scenario.ccrb.labels import NAIVE, OURS, PAPER, WAIT, check, law
+from s2a_bench.scenario.ccrb.labels import NAIVE, PAPER, STREAM_TO_ACT, WAIT, follower_check, law
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
@@ -72,7 +72,7 @@ def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
     rows = rollouts_of(run, study)
     rows = rows[rows["gap_behaviour"] == gap]
     policies = {name: group.set_index("draw").sort_index() for name, group in rows.groupby("policy")}
-    mine = policies[OURS]
+    mine = policies[STREAM_TO_ACT]
     found = mine[["tokens_per_s", "rear_gap_m", "front_gap_m", "reaction_s", "lead_decel_mps2"]].copy()
     for name, group in policies.items():
         found[name] = group["outcome"]
@@ -156,7 +156,7 @@ def origin_notes(run: StoredRun) -> tuple[str, ...]:
     asked = configuration(run)
     notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
     notes.append(f"Rear: {law(asked)}.")
-    notes.append(check(asked, survives_of(rollouts_of(run, "point"))))
+    notes.append(follower_check(asked, survives_of(rollouts_of(run, "point"))))
     reflex = "on" if asked["reflex"] else "off"
     notes.append(f"Front: while no skill is valid the ego does '{asked['gap']}'; the reflex layer is {reflex}.")
     return tuple(notes)

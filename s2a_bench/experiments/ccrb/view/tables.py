@@ -37,7 +37,17 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 )
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.cars import OUTCOMES as CODES
-from s2a_bench.scenario.ccrb.labels import MARK, NAIVE, NO_SCORE, ORDERING, PAPER, law, marked, operating_point, said
+from s2a_bench.scenario.ccrb.labels import (
+    MARK,
+    NAIVE,
+    NO_SCORE,
+    ORDERING,
+    PAPER,
+    law,
+    marked,
+    operating_point,
+    outcome_label,
+)
 from s2a_bench.store.schema import PROVENANCE, Count, Facts, Fraction, Many, Positive, about
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import cell_of_row, frame
@@ -72,7 +82,8 @@ def ccrb_sentences(run: StoredRun) -> list[str]:
     rows = rollouts_of(run, "point")
     survives = survives_of(rows)
     told = [
-        f"{row['policy']}: {said(row['outcome'], survives)}, {row['stalls']} stalls of {row['stall_ns'] / 1e9:.2f} s."
+        f"{row['policy']}: {outcome_label(row['outcome'], survives)}, "
+        f"{row['stalls']} stalls of {row['stall_ns'] / 1e9:.2f} s."
         for row in rows.to_dict("records")
     ]
     told += [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
@@ -192,7 +203,7 @@ def outcome_table(run: StoredRun) -> TextTable:
     """Lay out what became of the three cars under each policy."""
     rows, shown = [], [metric for metric in (*TIMES, *IMPACTS) if metric.title]
     for cell in cells_of(run):
-        outcome = said(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
+        outcome = outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
         rows.append((cell["policy"], outcome, *(_entry(cell, metric) for metric in shown)))
     asked = configuration(run)
     title = f"CCRB with a car behind, {asked['simulator']} simulator: {operating_point(asked)}"
