@@ -87,7 +87,7 @@ def test_a_sweep_is_listed_without_extras_and_names_all_of_them_at_once(tmp_path
     hint = "pip install 's2a-bench[websocket,zmq,zenoh]'"
     assert listed.returncode == 0
     assert "48 of 48 cells to run" in listed.stdout
-    assert listed.stderr.endswith(f"not everything that its cells need is installed; {hint}\n")
+    assert listed.stderr.endswith(f"its cells need packages that are not installed; {hint}\n")
     started = without(missing, tmp_path, "sweep", "transports")
     assert (started.returncode, started.stderr) == (1, f"error: {listed.stderr}")
     assert not (tmp_path / "results").exists()

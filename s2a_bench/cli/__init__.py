@@ -1,6 +1,6 @@
 """The command line: one module per command, and one place where errors become a line and an exit code.
 
-Modules here import heavy libraries inside their functions only, so that ``--help`` answers at once.
+The modules of this package import heavy libraries inside functions, so that ``--help`` is fast.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import typer
 from s2a_bench import __version__
 from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import PLAIN, Commands, ParseError
-from s2a_bench.cli.output import shown
+from s2a_bench.cli.output import print_error
 from s2a_bench.cli.ros_args import folded
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS
@@ -26,7 +26,7 @@ INTERRUPTED = 130
 
 
 class TopCommands(Commands):
-    """The commands below, and the experiments."""
+    """All commands: those listed below, and the experiments."""
 
     experiments = EXPERIMENTS
     lazy: ClassVar[dict[str, tuple[str, str]]] = {
@@ -37,16 +37,20 @@ class TopCommands(Commands):
                 "report:compare",
                 "Compare run B with run A: effect sizes with intervals, one test, gates for CI.",
             ),
-            ("doctor", "doctor:doctor", "Check this machine: a line for each finding, warnings with what mends them."),
+            ("doctor", "doctor:doctor", "Check this machine: a line for each finding, warnings with their fix."),
             ("model", "model:app", "Fetch, make and inspect model files."),
-            ("profile", "profile:app", "Measure this machine as a hardware profile, and look at profiles."),
+            ("profile", "profile:app", "Measure this machine as a hardware profile, and show profiles."),
             (
                 "report",
                 "report:report",
                 "Make one page of runs, and their tables and figures for a paper. Measures nothing.",
             ),
-            ("serve", "serve:serve", "Serve a model until interrupted: over HTTP, as a ROS 2 node, or otherwise."),
-            ("sweep", "sweep:sweep", "Run a command for every cell of a grid; what is done is kept, and it can go on."),
+            (
+                "serve",
+                "serve:serve",
+                "Serve a model until interrupted: over HTTP, ROS 2 or another transport.",
+            ),
+            ("sweep", "sweep:sweep", "Run a command for every cell of a grid; an interrupted sweep can be resumed."),
         )
     }
 
@@ -79,42 +83,40 @@ def main() -> None:
         with tuning.allowed():
             code = app(args=folded(sys.argv[1:]), prog_name=app.info.name, standalone_mode=False)
         if code == INTERRUPTED:  # newer typer turns Ctrl-C into this code itself
-            _say("interrupted", INTERRUPTED)
+            print_error("interrupted")
     except S2AError as error:
-        code = _say(f"error: {with_flags(str(error))}", error.exit_code)
+        print_error(f"error: {with_flags(str(error))}")
+        code = error.exit_code
     except ParseError as error:
         context = getattr(error, "ctx", None)
         hint = f" (see '{context.command_path} --help')" if context else ""
         if close := getattr(error, "possibilities", None):  # of an unknown option, the closest first
-            old = {name for each in context.command.params if each.hidden for name in each.opts} if context else ()
-            error.possibilities = close = [name for name in close if name not in old]
+            hidden = {name for each in context.command.params if each.hidden for name in each.opts} if context else ()
+            error.possibilities = close = [name for name in close if name not in hidden]
         message = f"{error.message}; did you mean {close[0]}?" if close else error.format_message()
-        code = _say(f"error: {message}{hint}", error.exit_code)
+        print_error(f"error: {message}{hint}")
+        code = error.exit_code
     except (KeyboardInterrupt, typer.Abort):
-        code = _say("interrupted", INTERRUPTED)
-    except BrokenPipeError:  # the reader of our output has gone, as with `| head`
+        print_error("interrupted")
+        code = INTERRUPTED
+    except BrokenPipeError:  # the reader of the output has ended, as `| head` does
         sys.stderr.close()
         code = 1
     except (OSError, MemoryError, RuntimeError, ImportError) as error:
-        line = shortage(error)
-        if line is None:
+        if (line := shortage(error)) is None:
             raise
-        code = _say(f"error: {line}", 1)
+        print_error(f"error: {line}")
+        code = 1
     sys.exit(code if isinstance(code, int) else 0)
-
-
-def _say(line: str, code: int) -> int:
-    print(shown(line), file=sys.stderr)  # noqa: T201 - the command line's own output
-    return code
 
 
 LEAST_FILES: Final = 64
 LEAST_BYTES: Final = 2**30
-"""Of address space; with less the numerical libraries end the process as they are loaded."""
+"""Address space; with less, loading the numerical libraries ends the process."""
 
 
 def check_limits() -> None:
-    """Raise S2AError where the limits of this process leave too little for any command."""
+    """Raise S2AError if this process may use too few files or too little address space for any command."""
     files, space = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_NOFILE, resource.RLIMIT_AS))
     if files != resource.RLIM_INFINITY and files < LEAST_FILES:
         raise S2AError(f"this process may open {files} files, and {LEAST_FILES} are needed; raise `ulimit -n`")
@@ -126,15 +128,15 @@ def check_limits() -> None:
 
 
 def shortage(error: Exception) -> str | None:
-    """Return what there is too little of, and the way out; None where the error is another one."""
+    """Return a line that names the exhausted resource and the way out; None for any other error."""
     number = getattr(error, "errno", None)
     text = str(error)
     if number in {EMFILE, ENFILE}:
-        return "too many open files; raise `ulimit -n`, or stop what else has files open"
+        return "too many open files; raise `ulimit -n`, or stop other programs that have files open"
     if number in {ENOSPC, EDQUOT}:
-        return f"{text}; make room there, or choose another folder"
+        return f"{text}; free some space, or choose another folder"
     if isinstance(error, MemoryError) or number == ENOMEM or "failed to map segment" in text:
-        return "out of memory; stop what else runs, raise `ulimit -v`, or ask for less"
+        return "out of memory; stop other programs, raise `ulimit -v`, or ask for less"
     if number == EAGAIN or "can't start new thread" in text:
         return "no more processes or threads may be started; raise `ulimit -u` or `ulimit -v`"
     return None

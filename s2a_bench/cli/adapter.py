@@ -1,4 +1,4 @@
-"""From declared options to the command line: the one place that turns a configuration's fields into typer's options."""
+"""Turn the fields of a configuration into typer's options; nothing else does."""
 
 from __future__ import annotations
 
@@ -23,47 +23,45 @@ if TYPE_CHECKING:
 FIELD = re.compile(r"`([a-z][a-z0-9_]*)`")
 DEFAULT = re.compile(r" ?\[default: ([^\]]*)\]$")
 PLAIN: tuple[type, ...] = (bool, int, float, Path)
-"""What typer reads by itself; every other type is read from text by its field."""
-
-
+"""Types that typer reads; every other type is read from text by its field."""
 MANY = 16
-"""Flags of a command that its help shows at once."""
+"""A command with more flags than this shows only the `first` ones in its help."""
 HELP_ALL = "help_all"
-"""The parameter that shows every flag, and the key in a context's `meta` that wants it."""
+"""The parameter that shows every flag, and its key in a context's `meta`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """One option of a command: where in the configuration its value goes."""
+    """One option of a command."""
 
     name: str
-    """As typed, without dashes in front: max-tokens."""
+    """Without dashes: max-tokens."""
     path: tuple[str, ...]
-    """The field, behind the fields of the groups that it is in."""
+    """The field, preceded by the groups that it is in."""
     kind: type
     about: str
     needed: bool = False
     argument: bool = False
-    """Whether it is given by its place."""
+    """True for a positional argument."""
     hidden: bool = False
-    whose: str = ""
-    """What stands before the help, as its group says."""
+    prefix: str = ""
+    """Text of the group before the help."""
     panel: str = ""
-    """The heading that it stands under in the help."""
+    """Its heading in the help."""
     first: bool = False
-    """Whether it is among those that the help of a command with many flags shows."""
+    """True if the help of a command with many flags shows it."""
     names: Callable[[], Iterable[str]] | None = None
-    """What lists the names that its value, or each of several, may be or begin with."""
+    """Lists the names that complete its value, or each of several with commas."""
 
     @property
     def spelled(self) -> str:
-        """Return it as people write it: --max-tokens, or NAME for an argument."""
+        """Return --max-tokens, or NAME for an argument."""
         return self.name.upper() if self.argument else f"--{self.name}"
 
     @property
     def parameter(self) -> inspect.Parameter:
-        """Return it as a parameter of the function that typer reads; None says that it was not given."""
-        default, about = inspect.Parameter.empty if self.needed else None, with_flags(self.whose + self.about)
+        """Return a parameter of the function that typer reads; None means that it was not given."""
+        default, about = inspect.Parameter.empty if self.needed else None, with_flags(self.prefix + self.about)
         declared: Any = (
             typer.Argument(
                 metavar=self.spelled + "..." * (get_origin(self.kind) is list), help=about, show_default=False
@@ -86,7 +84,7 @@ class Flag:
 
 
 def flags_of(options: type[Options]) -> Iterator[Flag]:
-    """Yield the flags of a configuration, those of a group in its place."""
+    """Yield the flags of a configuration in the order of its fields, groups included."""
     from s2a_bench.options import completions, extra_of, group_of, help_place
 
     for name, field in options.model_fields.items():
@@ -97,7 +95,7 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
             for flag in flags_of(group):
                 if not only or {flag.path[0], *group.OLD.get(flag.path[0], ())} & {*only}:
                     shown = flag.first if first is None else flag.path[0] in first
-                    yield replace(flag, path=(name, *flag.path), whose=f"{about}{flag.whose}", first=shown)
+                    yield replace(flag, path=(name, *flag.path), prefix=f"{about}{flag.prefix}", first=shown)
         else:
             flag_name = str(extra.get("flag") or name.replace("_", "-"))
             kind, argument, hidden = _kind(field.annotation), bool(extra.get("argument")), bool(extra.get("hidden"))
@@ -105,35 +103,35 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
             flag = Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument, hidden)
             yield replace(flag, panel=panel, first=first, names=completions(field))
     for name in options.OLD:
-        about = f"the name that --{options.OLD[name][0]} had"
+        about = f"old name of --{options.OLD[name][0]}"
         yield Flag(name.replace("_", "-"), (name,), str, about, hidden=True)
 
 
 def command(function: Callable[..., None], *options: type[Options], about: str = "") -> Callable[..., None]:
     """Return a function for typer that builds every class of ``options`` from its flags and calls ``function``.
 
-    ``function`` gets one configuration a class, in order; its keyword-only parameters that are declared as typer has
-    them are flags too. ``about`` is what ``--help`` says, where its declaration does not.
+    ``function`` receives one configuration a class, in order. Its keyword-only parameters annotated for typer are
+    flags too. ``about`` is the text of ``--help``.
     """
-    own = _keywords(function)
-    flags = distinct([flag for each in options for flag in flags_of(each)], taken=own)
+    keywords = _keywords(function)
+    flags = distinct([flag for each in options for flag in flags_of(each)], taken=keywords)
     listed = [flag for flag in flags if not (flag.hidden or flag.argument)]
     later = [flag.key for flag in listed if not flag.first]
     rest = later if MANY < len(listed) > len(later) else []
-    more = [_help_all(len(listed) + len(own))] if rest else []
+    more = [_help_all(len(listed) + len(keywords))] if rest else []
 
     def run(**given: Any) -> None:
         with flags_named(*options):
-            function(*(build(each, given) for each in options), **{name: given[name] for name in own})
+            function(*(build(each, given) for each in options), **{name: given[name] for name in keywords})
 
-    run.__signature__ = inspect.Signature([*(flag.parameter for flag in flags), *own.values(), *more])  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature([*(flag.parameter for flag in flags), *keywords.values(), *more])  # type: ignore[attr-defined]
     run.__doc__ = about
     run.rest = rest  # type: ignore[attr-defined]
     return run
 
 
 def _help_all(count: int) -> inspect.Parameter:
-    """Return the flag that shows the help with every flag of a command."""
+    """Return --help-all of a command with ``count`` flags."""
 
     def show(ctx: typer.Context, value: bool) -> None:
         if value and not ctx.resilient_parsing:
@@ -147,7 +145,7 @@ def _help_all(count: int) -> inspect.Parameter:
 
 
 def _completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Return what completes a name, or the last of several with commas."""
+    """Return a function that completes a name, or the last of several with commas."""
 
     def complete(incomplete: str) -> list[str]:
         done = incomplete[: incomplete.rfind(",") + 1]
@@ -157,9 +155,9 @@ def _completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]
 
 
 def distinct(flags: Sequence[Flag], taken: Iterable[str] = ()) -> list[Flag]:
-    """Return the flags whose names are not ``taken``; of several with one name that in the fewest groups, the first.
+    """Return the flags whose names are not ``taken``, one for each name.
 
-    It stands for all that are in groups beside its own.
+    Of several it is that in the fewest groups, the first. It sets all of them that are in groups beside its own.
     """
     names = {name.strip("_").replace("_", "-") for name in taken}
     chosen = _owners(flags)
@@ -168,11 +166,8 @@ def distinct(flags: Sequence[Flag], taken: Iterable[str] = ()) -> list[Flag]:
 
 
 def _owners(flags: Iterable[Flag]) -> dict[str, Flag]:
-    """Return of all flags with one name the one that is typed."""
-    owners: dict[str, Flag] = {}
-    for flag in sorted(flags, key=lambda flag: len(flag.path)):
-        owners.setdefault(flag.name, flag)
-    return owners
+    """Return, by name, the flag that is typed: that in the fewest groups, the first of several."""
+    return {flag.name: flag for flag in sorted(flags, key=lambda flag: len(flag.path))[::-1]}
 
 
 def _same(flag: Flag, other: Flag) -> bool:
@@ -182,9 +177,9 @@ def _same(flag: Flag, other: Flag) -> bool:
 
 
 def _shared(flags: Sequence[Flag]) -> Flag:
-    """Return the flag that stands for several: all owners before its help, and behind it the defaults that differ."""
+    """Return one flag for several: its help begins with their groups and ends with the defaults that differ."""
     first = flags[0]
-    owners = [flag.whose.removesuffix(": ") for flag in flags]
+    owners = [flag.prefix.removesuffix(": ") for flag in flags]
     if len(set(owners)) == 1:
         return first
     defaults = {
@@ -192,16 +187,13 @@ def _shared(flags: Sequence[Flag]) -> Flag:
     }
     about = first.about
     if len(set(defaults.values())) > 1:
-        told = ", ".join(f"{owner} {default}" for owner, default in defaults.items())
-        about = DEFAULT.sub(f" [default: {told}]", about)
-    return replace(first, whose=f"{', '.join(owners)}: ", about=about)
+        listed = ", ".join(f"{owner} {default}" for owner, default in defaults.items())
+        about = DEFAULT.sub(f" [default: {listed}]", about)
+    return replace(first, prefix=f"{', '.join(owners)}: ", about=about)
 
 
 def build(options: type[Options], given: Mapping[str, Any]) -> Options:
-    """Return the configuration that a command's parameters make, what is not given left to the defaults.
-
-    Raises UsageError naming the field.
-    """
+    """Build a configuration from a command's parameters; raises UsageError naming the field."""
     from s2a_bench.options import nested
 
     flags = [*flags_of(options)]
@@ -214,7 +206,7 @@ def build(options: type[Options], given: Mapping[str, Any]) -> Options:
 
 @contextmanager
 def flags_named(*options: type[Options]) -> Iterator[None]:
-    """Let errors name the flags of ``options`` in place of their fields."""
+    """Translate the fields in UsageErrors to the flags of ``options``."""
     try:
         yield
     except UsageError as error:
@@ -223,26 +215,25 @@ def flags_named(*options: type[Options]) -> Iterator[None]:
 
 
 def with_flags(message: str, spelled: Mapping[str, str] | None = None) -> str:
-    """Return a library's message with its fields, `max_tokens`, as flags, --max-tokens, or as ``spelled``."""
+    """Replace the fields in a message, `max_tokens`, by flags: --max-tokens, or as ``spelled`` has them."""
     return FIELD.sub(lambda field: (spelled or {}).get(field[1]) or f"--{field[1].replace('_', '-')}", message)
 
 
 def _keywords(function: Callable[..., None]) -> dict[str, inspect.Parameter]:
-    """Return the keyword-only parameters of a function that are declared for typer."""
+    """Return the keyword-only parameters that are annotated for typer."""
     every = inspect.signature(function, eval_str=True).parameters.values()
     declared = (each for each in every if each.kind is each.KEYWORD_ONLY and get_origin(each.annotation) is Annotated)
     return {each.name: each for each in declared}
 
 
 def _kind(annotation: Any) -> type:
-    """Return what typer should read: a plain type, or text."""
     if get_origin(annotation) in {Union, UnionType}:
         annotation = next(arg for arg in get_args(annotation) if arg is not NoneType)
     return annotation if annotation in PLAIN or get_origin(annotation) is list else str
 
 
 def _about(field: FieldInfo) -> str:
-    """Return a field's help, with its default where the text does not speak of it."""
+    """Return a field's help, with its default unless the text names it."""
     about = field.description or ""
     default = field.get_default(call_default_factory=False)
     if field.is_required() or "[default" in about or default is None or default is False or default in ("", (), []):

@@ -1,8 +1,8 @@
-"""`s2a-bench doctor`: what of this machine would distort a measurement, and the command that mends it."""
+"""`s2a-bench doctor`: what on this machine distorts a measurement, and the command that fixes it."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import typer
@@ -19,7 +19,7 @@ STYLES = {"state": "green", "advice": "cyan", "warning": "yellow", "error": "bol
 
 
 def _doctor(config: DoctorConfig, *, json_: Json = False) -> None:
-    machine = replace(Machine(), output=config.output)
+    machine = Machine(output=config.output)
     findings = risks.examine(config.url) if config.url else examine(machine, all_checks())
     if json_:
         print_json(_as_json(findings))
@@ -33,7 +33,7 @@ doctor = command(_doctor, DoctorConfig)
 
 
 def all_checks() -> dict[str, str]:
-    """Return the checks of the machine, then those that engines and transports declare."""
+    """Return the checks of the machine, of the engines and of the transports, by code."""
     checks = {**CHECKS, **OF_ENGINES}
     for _, transport in TRANSPORTS.loaded():
         checks |= transport.checks
@@ -57,7 +57,7 @@ def _show(findings: list[Finding]) -> None:
 
 
 def _as_json(findings: list[Finding]) -> dict[str, Any]:
-    """Return the object of ``--json``: every finding, and the warnings and errors as runs store them."""
+    """Return the ``--json`` object: every finding, and the warnings and errors as runs store them."""
     packages = [package for _, transport in TRANSPORTS.loaded() for package in transport.packages]
     return {
         "schema": SCHEMA,

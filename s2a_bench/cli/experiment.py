@@ -1,4 +1,4 @@
-"""The command of an experiment: its options become flags, it runs, and what its run shows is written and printed."""
+"""The command of an experiment: it runs one, then writes and prints the tables and figures of the run."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from s2a_bench.cli import output as terminal
 from s2a_bench.cli.adapter import HELP_ALL, build, command, flags_named
 from s2a_bench.cli.output import Json, print_json, print_line
-from s2a_bench.cli.output import console as open_console
-from s2a_bench.cli.output import shown as shown_line
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, write_shown
 from s2a_bench.text import like
@@ -26,27 +25,23 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 PLAIN: dict[str, Any] = {"rich_markup_mode": None, "pretty_exceptions_enable": False, "add_completion": False}
-"""How our commands look."""
+"""Keywords of typer for every group of commands."""
 ParseError: Any = typer.BadParameter.__mro__[1]
-"""Click's UsageError: newer typer brings a click of its own, so it cannot be named by import."""
+"""Click's UsageError, which newer typer brings with it, so that it cannot be imported by name."""
 
 
 class Commands(TyperGroup):
-    """The commands of one group: those by hand, those in ``lazy``, and its ``experiments``.
-
-    What is not by hand is imported when it is looked up.
-    """
+    """The commands of one group; those in ``lazy`` and its ``experiments`` are imported when they are looked up."""
 
     experiments: ClassVar[Collection[str]] = ()
-    """Names of the experiments that are commands here."""
+    """Names of experiments."""
     lazy: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    """Name of a command -> its function or group, as "module:attribute", and what its help says."""
+    """Name of a command -> its function or group, as "module:attribute", and its help."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return sorted({*super().list_commands(ctx), *self.lazy, *self.experiments})
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command, made from its declaration when it is first asked for."""
         if cmd_name not in self.commands and cmd_name in self.lazy:
             where, about = self.lazy[cmd_name]
             self.commands[cmd_name] = _click(cmd_name, resolve_name(where), about)
@@ -55,25 +50,25 @@ class Commands(TyperGroup):
         return super().get_command(ctx, cmd_name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Take no word at all for a wish for help."""
+        """Show the help if there is no argument."""
         parsed: list[str] = super().parse_args(ctx, args or ["--help"])
         return parsed
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return a command by its name; fails naming the one that was perhaps meant."""
+        """Find a command; the error for an unknown name suggests a similar one."""
         known = self.list_commands(ctx)
         if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
             ctx.fail(f"No such command '{args[0]}'{like(args[0], known)}")
         return super().resolve_command(ctx, args)
 
     def _abouts(self) -> dict[str, str]:
-        """Return every command's sentence by its name, without importing what experiments are made of."""
+        """Return name -> help of every command, without importing the experiments."""
         abouts = {name: made.get_short_help_str(limit=150) for name, made in self.commands.items()}
         abouts |= {name: experiment.about for name, experiment in EXPERIMENTS.loaded() if name in self.experiments}
         return dict(sorted({**abouts, **{name: about for name, (_, about) in self.lazy.items()}}.items()))
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """Complete the names of commands, which are not made for that: the process ends with it."""
+        """Complete names of commands without importing them; the process ends afterwards."""
         self.commands = {name: TyperCommand(name, help=about) for name, about in self._abouts().items()}
         return super().shell_complete(ctx, incomplete)
 
@@ -83,7 +78,6 @@ class Commands(TyperGroup):
 
 
 def _click(name: str, made: Any, about: str | None = None) -> Any:
-    """Return Click's command of a function, or of a group."""
     group = made
     if not isinstance(made, typer.Typer):
         group = typer.Typer(**PLAIN)
@@ -95,13 +89,13 @@ def _click(name: str, made: Any, about: str | None = None) -> Any:
 
 
 class Flagged(TyperCommand):
-    """A command with many flags: its help has them under headings, and at first those alone that matter first."""
+    """A command with many flags: its help has them under headings, and only the `first` ones without --help-all."""
 
     rest: Collection[str] = ()
     """The parameters that only `--help-all` shows."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """List the flags under their headings, in the order of their declarations, those without one last."""
+        """List the flags under their headings in the order of declaration, those without a heading last."""
         panels: dict[str, list[tuple[str, str]]] = {"Arguments": []}
         for each in sorted(self.get_params(ctx), key=lambda each: each.name == HELP_ALL):
             record = each.get_help_record(ctx)
@@ -123,19 +117,19 @@ def click_command(name: str) -> Any:
 
 
 def options_of(experiment: Experiment) -> tuple[type[Options], ...]:
-    """Return the classes of an experiment's options: what is run, and how it is shown."""
+    """Return the classes of an experiment's options: of the run, and of its view."""
     return tuple(resolve_name(name) for name in (experiment.config, experiment.view_options) if name)
 
 
 def config_of(experiment: Experiment, given: Mapping[str, Any]) -> Options:
-    """Return the configuration that a command's parameters make; raises UsageError naming the flag."""
+    """Build the configuration of a run from a command's parameters; raises UsageError naming the flag."""
     config = options_of(experiment)[0]
     with flags_named(config):
         return build(config, given)
 
 
 def command_of(experiment: Experiment) -> Callable[..., None]:
-    """Return the function that typer makes the experiment's command of."""
+    """Return the experiment's command as a function for typer."""
 
     def run(
         config: Any,
@@ -145,7 +139,8 @@ def command_of(experiment: Experiment) -> Callable[..., None]:
             bool, typer.Option("--data-only", help="write no tables and figures into the run folder")
         ] = False,
         verbose: Annotated[
-            bool, typer.Option("--verbose", help="also print the other tables, what measuring costs, the environment")
+            bool,
+            typer.Option("--verbose", help="also print the other tables, the cost of measuring, the environment"),
         ] = False,
         json_: Json = False,
     ) -> None:
@@ -175,8 +170,8 @@ def command_of(experiment: Experiment) -> Callable[..., None]:
 
 
 def present(run: StoredRun, shown: Shown, *, verbose: bool = False) -> None:
-    """Print the main table, what a run says, and where the rest is; every table where ``verbose``."""
-    console = open_console()
+    """Print the main table, or every table if ``verbose``, the sentences and notes, and the paths of the files."""
+    console = terminal.console()
     first = [*(shown.main[:1] or shown.tables)]
     names = [*dict.fromkeys((*first, *shown.tables))] if verbose else first
     rest = [name for name in shown.tables if name not in names]
@@ -190,7 +185,7 @@ def present(run: StoredRun, shown: Shown, *, verbose: bool = False) -> None:
         notes |= dict.fromkeys(table.notes)
     details = _details(run.manifest) if verbose else ()
     for line in filter(None, (*shown.sentences, " ".join(notes), *details, run.origins.line)):
-        console.print(shown_line(line), markup=False, highlight=False)
+        console.print(terminal.shown(line), markup=False, highlight=False)
     if rest:
         written = f"{run.path / 'tables'}; " if (run.path / "tables").exists() else ""
         print_line(f"more tables ({', '.join(rest)}): {written}--verbose prints them")
@@ -201,7 +196,6 @@ def present(run: StoredRun, shown: Shown, *, verbose: bool = False) -> None:
 
 
 def _details(manifest: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what measuring costs, and the environment."""
     if "mark_cost_ns" in manifest:
         yield f"a mark costs {manifest['mark_cost_ns']} ns"
     if sampled := manifest.get("resources"):

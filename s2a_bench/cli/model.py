@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,48 +24,48 @@ if TYPE_CHECKING:
 
     from s2a_bench.inference.fetch import Fetched
 
-
 SCHEMA = "s2a-bench-model/1"
-"""Of `--json`; described by ``docs/schema/s2a-bench-model-1.json``."""
+"""The schema of `--json`, ``docs/schema/s2a-bench-model-1.json``."""
+_TEMPLATE_CHARACTERS = 300
+_CONTROL_TOKENS = 24
 
-
-app = typer.Typer(cls=Commands, help="Fetch model files, write dummy ones, say what is in them.", **PLAIN)
+app = typer.Typer(cls=Commands, help="Fetch model files, write dummy ones, and show their contents.", **PLAIN)
 
 
 def _fetch(config: FetchConfig, *, json_: Json = False) -> None:
     from s2a_bench.inference import fetch
 
     extras.need("model", "huggingface_hub", "gguf")
-    want = fetch.wanted(config.what, config.quant, config.mmproj)
+    wanted = fetch.wanted(config.what, config.quant, config.mmproj)
     with _bytes_bar() as bar:
         tasks: dict[str, TaskID] = {}
 
-        def show(name: str, there: int, total: int) -> None:
+        def show(name: str, done: int, total: int) -> None:
             if name not in tasks:
                 tasks[name] = bar.add_task(name)
-            bar.update(tasks[name], completed=there, total=total)
+            bar.update(tasks[name], completed=done, total=total)
 
-        done = fetch.fetch(want, show)
-    for file in done.files:
+        fetched = fetch.fetch(wanted, show)
+    for file in fetched.files:
         read_header(file.path, "model fetch")
-    latency = _latency_command(done)
+    latency = _latency_command(fetched)
     if json_:
-        files = [present(file) for file in done.files]
-        facts = {"endpoint": done.endpoint, "repository": done.repository, "commit": done.commit, "files": files}
-        more = {"latency": latency} if latency else {}
-        print_json({"schema": SCHEMA, "command": "model fetch", **facts, **more})
+        names = "endpoint", "repository", "commit"
+        whole: dict[str, Any] = {"schema": SCHEMA, "command": "model fetch"}
+        whole |= {name: getattr(fetched, name) for name in names} | {"files": [*map(present, fetched.files)]}
+        print_json(whole | ({"latency": latency} if latency else {}))
         return
-    for file in done.files:
+    for file in fetched.files:
         typer.echo(file.path)
     if latency:
         typer.echo(latency)
 
 
-def _latency_command(done: Fetched) -> str | None:
-    """Return the command that measures with these files; None where they are no language model with its mmproj."""
+def _latency_command(fetched: Fetched) -> str | None:
+    """Return the command that measures with these files; None unless they are a language model with its mmproj."""
     from s2a_bench.inference.models import load_headers
 
-    model, *mmproj = (file.path for file in done.files)
+    model, *mmproj = (file.path for file in fetched.files)
     try:
         files = load_headers(EngineConfig(model=model, mmproj=mmproj[0] if mmproj else None))
     except ModelError as error:
@@ -86,8 +86,8 @@ def _info(config: InfoConfig, *, json_: Json = False) -> None:
         print_json({"schema": SCHEMA, "command": "model info", "files": [present(info) for info in found]})
         return
     for info in found:
-        for part in info_sections(info):
-            typer.echo(part) if isinstance(part, str) else print_table(part)
+        for section in info_sections(info):
+            typer.echo(section) if isinstance(section, str) else print_table(section)
 
 
 def _bytes_bar(*, disable: bool = False) -> Progress:
@@ -117,33 +117,34 @@ def _dummy(config: DummyConfig) -> None:
 
 
 for _name, _function, _config, _about in (
-    ("fetch", _fetch, FetchConfig, "Fetch a model from the hub: resumed, and checked against the hub's SHA-256."),
-    ("info", _info, InfoConfig, "Say what is in a GGUF file: shapes, types, vision tower, vocabulary, licence, hash."),
-    ("dummy", _dummy, DummyConfig, "Write weights of random numbers in MiniCPM-V 2.6's shapes, to measure speed with."),
+    ("fetch", _fetch, FetchConfig, "Fetch a model from the hub: resumable, checked against the hub's SHA-256."),
+    ("info", _info, InfoConfig, "Show what is in a GGUF file: shapes, types, vision tower, vocabulary, licence, hash."),
+    ("dummy", _dummy, DummyConfig, "Write random weights in the shapes of MiniCPM-V 2.6, to measure speed."),
 ):
     app.command(_name)(command(_function, _config, about=_about))
 
-_TEMPLATE_CHARACTERS = 300
-_CONTROL_TOKENS = 24
-
 
 def info_sections(info: GgufInfo) -> list[str | TextTable]:
-    """Return what to print, in order."""
+    """Return the texts and tables of a file, in the order of printing."""
     types = "type", "tensors", "parameters", "MB", "bits/weight"
     groups = "tensor", "shape", "type", "tensors", "MB"
-    parts: list[str | TextTable] = [
+    sections: list[str | TextTable] = [
         "\n".join(_head(info)),
         TextTable("weights by type", types, [*_types(info)], 1),
         TextTable("weights by tensor (N: the layer)", groups, [*_groups(info)], 3),
+        "settings: " + _clean(_pairs(info.settings)),
     ]
-    parts.append("settings: " + _clean(", ".join(f"{key} {value}" for key, value in info.settings.items())))
     if info.vocabulary is not None:
-        parts.append("\n".join(_vocabulary(info.vocabulary, info.tokenizer)))
+        sections.append("\n".join(_vocabulary(info.vocabulary, info.tokenizer)))
     if info.chat_template is not None:
         text, cut = info.chat_template, len(info.chat_template) > _TEMPLATE_CHARACTERS
         more = f" ... ({len(text)} characters; --json has all of them)" if cut else ""
-        parts.append(f"chat template: {text[:_TEMPLATE_CHARACTERS]!r}{more}")
-    return parts
+        sections.append(f"chat template: {text[:_TEMPLATE_CHARACTERS]!r}{more}")
+    return sections
+
+
+def _pairs(facts: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in facts.items())
 
 
 def _clean(text: object) -> str:
@@ -152,15 +153,14 @@ def _clean(text: object) -> str:
 
 def _head(info: GgufInfo) -> list[str]:
     kind = "mmproj (vision tower and projector)" if info.mmproj else "language model"
-    lines = [
+    size = f"{info.bytes / 1e9:.3f} GB, {info.parameters:,} parameters, GGUF version {info.gguf_version}"
+    return [
         f"{info.path}",
         f"{kind}, architecture {_clean(info.architecture) or 'not given'}" + (", DUMMY WEIGHTS" if info.dummy else ""),
+        *(f"{key}: {_clean(value)}" for key, value in info.general.items()),
+        size + (f", file type {info.file_type}" if info.file_type else ""),
+        f"sha256: {info.sha256}" if info.sha256 else "sha256: not computed; --hash computes it",
     ]
-    lines += [f"{key}: {_clean(value)}" for key, value in info.general.items()]
-    size = f"{info.bytes / 1e9:.3f} GB, {info.parameters:,} parameters, GGUF version {info.gguf_version}"
-    lines.append(size + (f", file type {info.file_type}" if info.file_type else ""))
-    lines.append(f"sha256: {info.sha256}" if info.sha256 else "sha256: not computed; --hash computes it")
-    return lines
 
 
 def _types(info: GgufInfo) -> Iterator[tuple[str, ...]]:
@@ -176,12 +176,11 @@ def _groups(info: GgufInfo) -> Iterator[tuple[str, ...]]:
 
 
 def _vocabulary(vocabulary: Vocabulary, tokenizer: dict[str, Any]) -> list[str]:
-    named = ", ".join(f"{key} {value}" for key, value in tokenizer.items())
     special = ", ".join(f"{role} {token.id} {token.text!r}" for role, token in vocabulary.special.items())
     control = vocabulary.control
     more = f" ... ({len(control)} in all)" if len(control) > _CONTROL_TOKENS else ""
     return [
-        f"vocabulary: {vocabulary.tokens} tokens, {vocabulary.merges} merges; tokeniser {_clean(named)}",
+        f"vocabulary: {vocabulary.tokens} tokens, {vocabulary.merges} merges; tokeniser {_clean(_pairs(tokenizer))}",
         f"special tokens: {special or 'none named'}",
         f"control tokens: {_clean(' '.join(control[:_CONTROL_TOKENS])) or 'none'}{more}",
     ]

@@ -1,4 +1,4 @@
-"""How commands end on the terminal: one JSON object, or a console of a fixed width where there is no terminal."""
+"""What commands print: one JSON object, or tables and lines on a console."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 WIDTH = 100
-"""Columns of the tables where the output is no terminal and COLUMNS does not say."""
+"""Columns of a table if the output is no terminal and COLUMNS is not set."""
 
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output")]
 
 
 def shown(line: str) -> str:
-    """Return one line as it may be printed: all letters visible, no secret."""
+    """Return a text as one printable line: every character visible, no secret."""
     return one_line(struck(line))
 
 
 def print_json(whole: dict[str, Any]) -> None:
     """Print one strict JSON object on standard output."""
     text = json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False)
-    sys.stdout.write(visible(text) + "\n")  # hidden letters are in strings only, and escaped as JSON does
+    sys.stdout.write(visible(text) + "\n")  # invisible characters occur in strings only, and are escaped as in JSON
 
 
 def console() -> Console:
-    """Return the console for tables: the terminal's, or one of COLUMNS, else `WIDTH`."""
+    """Return a console of the terminal's width, else of COLUMNS, else of `WIDTH`."""
     from rich.console import Console
 
     terminal = Console()
@@ -48,5 +48,10 @@ def print_table(table: TextTable) -> None:
 
 
 def print_line(line: str, to: Console | None = None) -> None:
-    """Print one line as it is, however long, on a console; without one, on standard output."""
+    """Print one line without wrapping it, on a console or else on standard output."""
     (to or console()).print(shown(line), markup=False, highlight=False, soft_wrap=True)
+
+
+def print_error(line: str) -> None:
+    """Print one line on standard error."""
+    print(shown(line), file=sys.stderr)  # noqa: T201 - the command line's own output

@@ -1,4 +1,4 @@
-"""`s2a-bench profile`: measure this machine as a hardware profile, and look at those there are."""
+"""`s2a-bench profile`: measure this machine as a hardware profile; list, show and match profiles."""
 
 from __future__ import annotations
 
@@ -18,18 +18,14 @@ from s2a_bench.machine.environment import board_facts, matches, state_changes
 from s2a_bench.store.manifest import plain
 from s2a_bench.writers.tables import TextTable
 
-app = typer.Typer(
-    cls=Commands,
-    help="Measure this machine as a hardware profile, and look at profiles.",
-    **PLAIN,
-)
+app = typer.Typer(cls=Commands, help="Measure this machine as a hardware profile, and show profiles.", **PLAIN)
 SCHEMA = "s2a-bench-profile/1"
-"""Of `--json`; described by ``docs/schema/s2a-bench-profile-1.json``."""
+"""The schema of `--json`, ``docs/schema/s2a-bench-profile-1.json``."""
 
 
 @app.command("list")
 def list_(json_: Json = False) -> None:
-    """List the profiles that can be given by name; a wrong file is named on standard error."""
+    """List the profiles that have a name; an unreadable file is named on standard error."""
     found = _readable()
     if json_:
         _print_profiles("list", [profile_json(profile, path) for profile, path in found])
@@ -38,8 +34,8 @@ def list_(json_: Json = False) -> None:
     for profile, _ in found:
         ttft = f"{ttft_s(profile):.3g}" + (" (assumed)" if "prompt_s" in profile.assumed else "")
         origin = profile.origin + (", dummy" if profile.dummy else "")
-        numbers = f"{profile.tokens_per_s:.3g}", ttft
-        rows.append((profile.name, profile.title, origin, _gaps(profile, full=False), *numbers))
+        gaps, rate = _gaps(profile, full=False), f"{profile.tokens_per_s:.3g}"
+        rows.append((profile.name, profile.title, origin, gaps, rate, ttft))
     print_table(TextTable("Profiles", ("name", "board", "origin", "gaps", "tokens/s", "TTFT s"), rows, 4))
 
 
@@ -50,7 +46,7 @@ def show(
     ],
     json_: Json = False,
 ) -> None:
-    """Show one profile: its numbers, where they are from, and what is known of board, model and fit."""
+    """Show one profile: its numbers and their origin, and the facts of board, model and fit."""
     path = find_profile(name)
     profile = read_profile(path)
     if json_:
@@ -65,13 +61,12 @@ def show(
     for table, facts in profile.facts.items():
         typer.echo(f"{table}:")
         for key, value in facts.items():
-            shown = " ".join(str(value).split())
-            typer.echo(f"  {key}: {shown}")
+            typer.echo(f"  {key}: {' '.join(str(value).split())}")
 
 
 @app.command("match")
 def match(json_: Json = False) -> None:
-    """Say which profiles are of a board like this one; exit code 1 where none is."""
+    """List the profiles of boards of this kind; exit with 1 if there is none."""
     board = board_facts()
     found = [(profile, path) for profile, path in _readable() if matches(profile, board)]
     if json_:
@@ -89,7 +84,7 @@ def match(json_: Json = False) -> None:
 
 
 def _readable() -> list[tuple[Profile, Path]]:
-    """Read the profiles that can be given by name, and name those that cannot be read."""
+    """Read the profiles that have a name; print the error of each unreadable one."""
     found = []
     for path in profile_files().values():
         try:
@@ -100,7 +95,7 @@ def _readable() -> list[tuple[Profile, Path]]:
 
 
 def _gaps(profile: Profile, *, full: bool = True) -> str:
-    """Name the family, with its parameters where ``full``, and how many gaps were recorded."""
+    """Return the family of gaps, with its parameters if ``full``, and the number of recorded gaps."""
     table = to_table(profile.gaps)
     numbers = "".join(f" {key} {value:.3g}" for key, value in table.items() if full and isinstance(value, int | float))
     recorded = f", {len(profile.trace_s)} recorded" if profile.trace_s else ""
@@ -109,7 +104,7 @@ def _gaps(profile: Profile, *, full: bool = True) -> str:
 
 
 def line_of(profile: Profile) -> str:
-    """Return what a profile is, in one line."""
+    """Return name, title, speed and origin of a profile."""
     origin = profile.origin + (", dummy weights" if profile.dummy else "")
     rate = f"{profile.tokens_per_s:.4g} tokens/s, first token after {ttft_s(profile):.3g} s"
     return f"{profile.name}: {profile.title}, {rate} ({origin})"
@@ -123,7 +118,7 @@ def _capture(
     config: CaptureConfig,
     *,
     output: Annotated[Path, typer.Option(help="folder for the file")] = Path("profiles"),
-    force: Annotated[bool, typer.Option("--force", help="replace a profile of this name")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace a profile of the same name")] = False,
     json_: Json = False,
 ) -> None:
     from s2a_bench.cli.progress import RunProgress
@@ -148,5 +143,5 @@ def _capture(
     typer.echo(f"profile: {path}")
 
 
-_ABOUT = "Measure this machine: rate, time to first token and every gap between tokens, for others to replay."
+_ABOUT = "Measure this machine: rate, time to first token and every gap between tokens, to be replayed elsewhere."
 app.command("capture")(command(_capture, CaptureConfig, about=_ABOUT))

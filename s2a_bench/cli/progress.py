@@ -1,4 +1,4 @@
-"""How a run shows on the terminal: a bar with the time left, or plain lines where there is no terminal."""
+"""Progress of a run: a bar with the time left on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from s2a_bench.progress import LiveView
 
 REFRESHES_HZ = 8
 PLAIN_STEPS = 5
-"""Without a terminal, progress is told this often."""
+"""Lines of progress that a run prints without a terminal."""
 
 
 class RunProgress:
-    """Progress of one run, on standard error. Use as a context manager."""
+    """Progress of one run on standard error, as a context manager."""
 
     def __init__(self, unit: str = "samples") -> None:
         self._unit = unit
@@ -39,7 +39,7 @@ class RunProgress:
         )
         self._task = self._bar.add_task("starting", total=None)
         self._total, self._done, self._started_ns = 0, 0, now_ns()
-        self._said = ""
+        self._stage = ""
 
     def __enter__(self) -> RunProgress:  # noqa: PYI034 - Self is typing's since 3.11
         self._bar.start()
@@ -53,7 +53,7 @@ class RunProgress:
 
     @contextmanager
     def watch(self, picture: LiveView) -> Iterator[None]:
-        """Show a picture while the context lasts; its last state stays on the terminal."""
+        """Show a live view while the context lasts; its last state stays on the terminal."""
         if not self.console.is_terminal:
             yield
             for line in picture.lines():
@@ -75,9 +75,9 @@ class RunProgress:
 
     def stage(self, text: str) -> None:
         self._bar.update(self._task, description=escape(shown(text)))
-        if self._bar.disable and text != self._said:
+        if self._bar.disable and text != self._stage:
             self.say(text)
-        self._said = text
+        self._stage = text
 
     def expect(self, samples: int) -> None:
         self._total = samples

@@ -1,15 +1,14 @@
-"""`compare`: what changed between runs, with gates on it; `report`: runs as one page, or for a paper."""
+"""`compare`: changes between runs, and gates on them; `report`: runs as one page, or as files for a paper."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import typer
 
 from s2a_bench.cli.adapter import command
-from s2a_bench.cli.output import Json, print_json, print_line, print_table, shown
+from s2a_bench.cli.output import Json, print_error, print_json, print_line, print_table
 from s2a_bench.errors import TRIPPED, UNDECIDED
 from s2a_bench.report.compare import CompareConfig
 from s2a_bench.report.page import ReportConfig
@@ -34,7 +33,7 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     found = warnings_of(compared)
     whole = compare_json(compared, judgements, found)
     for warning in found:
-        _say(f"note [{warning.code}]: {warning.message}; {warning.advice}")
+        print_error(f"note [{warning.code}]: {warning.message}; {warning.advice}")
     written = write_comparison(config.output, compared, whole) if config.output else []
     if json_:
         print_json(whole)
@@ -47,22 +46,19 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
 
 
 def _gate_code(judgements: Sequence[Judgement]) -> int:
-    """Print what the gates found, and return the exit code: a tripped gate before one that cannot be judged."""
+    """Print the outcome of every gate and return the exit code: a tripped gate before an undecided one."""
     from s2a_bench.report.compare import gates as compare_gates
     from s2a_bench.report.compare.shown import change_text, seen_text
 
     for one in judgements:
         line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {change_text(one.comparison)}"
-        p = "" if one.comparison.p_holm is None else f", p = {one.comparison.p_holm:.2g}"
-        seen = "; too few values for a test" if one.detectable is None else f", sees {seen_text(one.detectable)}"
-        few = "; measure more launches (--launches), compare less (--metric), or --strict"
-        _say(line + p + seen + few * (one.outcome == compare_gates.UNDECIDED))
+        line += "" if one.comparison.p_holm is None else f", p = {one.comparison.p_holm:.2g}"
+        line += "; too few values for a test" if one.detectable is None else f", sees {seen_text(one.detectable)}"
+        if one.outcome == compare_gates.UNDECIDED:
+            line += "; measure more launches (--launches), compare less (--metric), or --strict"
+        print_error(line)
     outcomes = {one.outcome for one in judgements}
     return TRIPPED if compare_gates.TRIPPED in outcomes else UNDECIDED if compare_gates.UNDECIDED in outcomes else 0
-
-
-def _say(line: str) -> None:
-    print(shown(line), file=sys.stderr)  # noqa: T201 - the command line's own output
 
 
 compare = command(_compare, CompareConfig)
@@ -75,14 +71,14 @@ def _report(config: ReportConfig) -> None:
 
     against_paper = bool(config.against)
     found = make_report(read_chapters(config.runs, against_paper=against_paper), against_paper=against_paper)
-    unfinished = [f"{chapter.title}: {caveat}" for chapter in found.chapters for caveat in chapter.caveats]
-    for caveat in (*found.caveats, *unfinished):
-        _say(f"warning: {caveat}")
+    of_chapters = (f"{chapter.title}: {caveat}" for chapter in found.chapters for caveat in chapter.caveats)
+    for caveat in (*found.caveats, *of_chapters):
+        print_error(f"warning: {caveat}")
     written = write_report(found, config)
     if found.judged:
         print_line(f"the paper's claims: {tally(found.judged)}")
-    outputs = (config.page, "page"), (config.markdown, "Markdown"), (config.latex, "LaTeX"), (config.csv, "CSV")
-    for path, what in outputs:
+    outputs = {"page": config.page, "Markdown": config.markdown, "LaTeX": config.latex, "CSV": config.csv}
+    for what, path in outputs.items():
         if path is not None:
             inside = sum(path in (each, *each.parents) for each in written)
             count = f", {inside} files" if inside > 1 else ""

@@ -1,7 +1,7 @@
-"""``--ros-args`` as every ROS 2 node takes them: they become options of `serve ros`.
+"""``--ros-args`` as every ROS 2 node accepts them: they become options of `serve ros`.
 
-Of a file of parameters the sections count that are for our node, ``/**`` and other wildcards included; there, names
-that are none of ours are another node's and left out.
+A file of parameters counts as far as its sections match the node, ``/**`` and other wildcards included. In a section
+with a wildcard an unknown name belongs to another node and is left out.
 """
 
 from __future__ import annotations
@@ -27,42 +27,42 @@ VALUED: Final = {
     "--log-level": "log_level",
 }
 QUIET: Final = re.compile("--(en|dis)able-(rosout|stdout|external-lib)-logs")
-"""What is understood and left out: our log goes to /rosout and, from warnings on, to stderr."""
+"""Ignored flags: the log goes to /rosout and, from warnings on, to stderr."""
 SIM_TIME: Final = "use_sim_time"
 OF_EVERY_NODE: Final = frozenset({SIM_TIME, "start_type_description_service"})
-"""Parameters that launch files give every node."""
+"""Parameters that launch files set for every node."""
 PARAMETERS: Final = "ros__parameters"
 
 
 def folded(arguments: Sequence[str]) -> list[str]:
-    """Return a command line with what stands between ``--ros-args`` and ``--`` or the end as one value of that flag."""
+    """Return a command line whose arguments from ``--ros-args`` to ``--`` or the end are one value of that flag."""
     ordinary: list[str] = []
-    ours: list[str] = []
+    of_ros: list[str] = []
     into = ordinary
     for argument in arguments:
         if argument == FLAG:
-            into = ours
-        elif into is ours and argument == END:
+            into = of_ros
+        elif into is of_ros and argument == END:
             into = ordinary
         else:
             into.append(argument)
-    return [*ordinary, f"{FLAG}={shlex.join(ours)}"] if FLAG in arguments else ordinary
+    return [*ordinary, f"{FLAG}={shlex.join(of_ros)}"] if FLAG in arguments else ordinary
 
 
 @dataclass(slots=True)
 class Read:
-    """What the arguments say."""
+    """The parsed arguments."""
 
     options: dict[str, Any] = field(default_factory=dict)
-    """Parameters of our node: what `serve ros` has as options."""
+    """Options of `serve ros`."""
     notes: list[str] = field(default_factory=list)
-    """Lines about what was left out."""
+    """A line for everything that was left out."""
 
 
 def read(text: str, known: Sequence[str], node: Mapping[str, str]) -> Read:
-    """Read the arguments for a node with ``known`` parameters; ``node`` has its namespace and node_name so far.
+    """Read the arguments for a node with ``known`` parameters; ``node`` has its default namespace and node_name.
 
-    Raises UsageError for what is none, and for parameters that the node does not have.
+    Raises UsageError for an unknown argument, and for a parameter that the node does not have.
     """
     found = Read()
     given = list(_given(shlex.split(text)))
@@ -97,7 +97,7 @@ def _given(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 
 def _pair(text: str, flag: str, node_name: str) -> tuple[str, str] | None:
-    """Return both sides of ``[node:]left:=right``; None where it is for a node of another name."""
+    """Return both sides of ``[node:]left:=right``; None if it is for a node of another name."""
     left, assigned, right = text.partition(":=")
     if not (assigned and left and right):
         raise UsageError(f"`ros_args`: {flag} {text} should look like {'from:=to' if flag == '-r' else 'name:=value'}")
@@ -106,7 +106,7 @@ def _pair(text: str, flag: str, node_name: str) -> tuple[str, str] | None:
 
 
 def _take(found: Read, values: Mapping[str, Any], known: Sequence[str], where: str, *, shared: bool = False) -> None:
-    """Keep parameters; raises UsageError for unknown ones, unless they are ``shared`` with other nodes."""
+    """Store parameters; raises UsageError for an unknown one unless the section is ``shared`` with other nodes."""
     for name, value in values.items():
         if name in OF_EVERY_NODE:
             if name == SIM_TIME and value is True:
@@ -127,10 +127,10 @@ def _read_file(found: Read, path: Path, known: Sequence[str], node_name: str) ->
     sections = list(_sections(whole, ""))
     if not sections:
         raise UsageError(f"`ros_args`: --params-file {path} has no '{PARAMETERS}'")
-    ours = [(pattern, values) for pattern, values in sections if _means(pattern, node_name)]
-    for pattern, values in ours:
+    matching = [(pattern, values) for pattern, values in sections if _matches(pattern, node_name)]
+    for pattern, values in matching:
         _take(found, dict(_flat(values, "")), known, f"--params-file {path}, {pattern}", shared="*" in pattern)
-    if not ours:
+    if not matching:
         listed = ", ".join(pattern for pattern, _ in sections)
         found.notes.append(f"--params-file {path} has nothing for {node_name}, only for {listed}")
 
@@ -144,14 +144,14 @@ def _sections(tree: Any, path: str) -> Iterator[tuple[str, Any]]:
             yield from _sections(inner, f"{path}/{str(key).strip('/')}")
 
 
-def _means(pattern: str, node_name: str) -> bool:
-    """Whether a pattern means a node: * stands for one part of its name, ** for any number."""
+def _matches(pattern: str, node_name: str) -> bool:
+    """Return True if a pattern matches: * stands for one part of the name, ** for any number."""
     parts = ({"**": "(/[^/]+)*", "*": "/[^/]+"}.get(part, "/" + re.escape(part)) for part in pattern.split("/") if part)
     return re.fullmatch("".join(parts), node_name) is not None
 
 
 def _flat(tree: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield parameters, those that nest with dots between their names."""
+    """Yield parameters, nested ones under dotted names."""
     for key, value in tree.items() if isinstance(tree, dict) else ():
         if isinstance(value, dict):
             yield from _flat(value, f"{path}{key}.")
@@ -166,5 +166,4 @@ def _yaml(text: str, where: str) -> Any:
     try:
         return YAML(typ="safe", pure=True).load(text)
     except (YAMLError, ValueError, RecursionError) as error:
-        said = str(error).splitlines() or [""]
-        raise UsageError(f"`ros_args`: {where} is no YAML: {said[0]}") from error
+        raise UsageError(f"`ros_args`: {where} is no YAML: {next(iter(str(error).splitlines()), '')}") from error

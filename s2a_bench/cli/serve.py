@@ -1,4 +1,4 @@
-"""`s2a-bench serve`: the servers of the harness as long-running programs, for a robot's own clients."""
+"""`s2a-bench serve`: the servers of the harness as long-running programs, for the clients of a robot."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
     from s2a_bench.harness.processes import ServerProcess
 
 ENGINE = ("name", "model", "mmproj", "threads", "gpu_layers", "context", "profile", "gaps", "latency", *ANSWERS)
-"""The engine's options that a server takes; ``gaps`` in its file alone."""
+"""The engine's options of a server; ``gaps`` has no flag, only a key of the file."""
 Sorted: TypeAlias = "tuple[dict[str, Any], dict[str, Any], dict[str, Any]]"
 _NUMBER = EngineConfig.model_fields["threads"]
 
 
 def served_options(transport: Transport[Any]) -> list[str]:
-    """Return the options that the server of a transport is told."""
+    """Return the names of the options that the server of a transport has."""
     names: list[str] = transport.options.of_sides(SERVER, SERVING)
     return names
 
 
 def _as_served(transport: Transport[Any]) -> type[Options]:
-    """Return a transport's options with the defaults that they have here."""
+    """Return a transport's options with the defaults of `serve`."""
     fields: dict[str, Any] = {}
     for name, default in transport.options.SERVE_DEFAULTS.items():
         field = copy(transport.options.model_fields[name])
@@ -51,40 +51,39 @@ def _as_served(transport: Transport[Any]) -> type[Options]:
 
 
 def _config() -> type[Options]:
-    """Make the options of `serve`: the engine's, a group of what each transport's server is told, and the limits."""
+    """Make the options of `serve`: the engine's, a group for each transport's server, and the limits."""
     about = "http, ros, or another, as TRANSPORT[/VARIANT][?OPTION=VALUE&...]"
     fields: dict[str, Any] = {
         "pipeline": (str, option(..., about, flag="transport", argument=True, names=paths)),
         "engine": (EngineConfig, group(EngineConfig, only=[name for name in ENGINE if name != "gaps"])),
     }
     for name, each in TRANSPORTS.loaded():
-        if told := served_options(each):
-            flags = [option for option in told if option not in each.options.NOT_SERVE_FLAGS]
+        if names := served_options(each):
+            flags = [option for option in names if option not in each.options.NOT_SERVE_FLAGS]
             fields[name] = (_as_served(each), group(_as_served(each), only=flags, about=f"{name}: "))
     fields["limits"] = (Limits, group(Limits, only=SET, about="limit: "))
     fields["config"] = (Path | None, option(None, "TOML file with these flags as keys; a flag wins over it"))
-    about = "ros: what follows, up to -- or the end, as ROS 2 nodes take it: -r, -p, --params-file, --log-level"
+    about = "ros: all arguments up to -- or the end are those of a ROS 2 node: -r, -p, --params-file, --log-level"
     fields["ros_args"] = (str, option("", about))
     return create_model("ServeConfig", __base__=Options, **fields)
 
 
 def _serve(config: Any) -> None:
-    """Serve what was asked for; raises UsageError for an option of another transport."""
+    """Serve a pipeline; raises UsageError for an option of another transport."""
     chosen = TRANSPORTS[config.pipeline.partition("?")[0].partition("/")[0]]
-    own = getattr(config, chosen.name, None)
     for other, _ in TRANSPORTS.loaded():
         if stray := [each for each in getattr(config, other, Options()).given() if each not in served_options(chosen)]:
             raise UsageError(f"`{stray[0]}` is no option of {chosen.name}; it has {', '.join(served_options(chosen))}")
-    flags = _given(own) if own else {}
+    flags = _given(getattr(config, chosen.name, Options()))
     values = _toml(config.config) if config.config else {}
     of_file = _sorted(values, f"`config` {config.config}", chosen)
     of_args = _ros_args(config.ros_args, chosen, {**of_file[1], **flags})
-    of_engine, of_transport, of_limits = (found | said for found, said in zip(of_file, of_args, strict=True))
+    of_engine, of_transport, of_limits = (low | high for low, high in zip(of_file, of_args, strict=True))
     limits = Limits(**of_limits | _given(config.limits))
     pipeline = one_pipeline(config.pipeline, **{**chosen.options.SERVE_DEFAULTS, **of_transport, **flags})
-    told = EngineConfig(**of_engine | _given(config.engine))
+    engine = EngineConfig(**of_engine | _given(config.engine))
     address = next(iter(pipeline.options.addresses()))
-    _run(pipeline.wiring(address, limits=limits), _answering(told, pipeline))
+    _run(pipeline.wiring(address, limits=limits), _answering(engine, pipeline))
 
 
 def _given(options: Options) -> dict[str, Any]:
@@ -92,7 +91,7 @@ def _given(options: Options) -> dict[str, Any]:
 
 
 def _answering(engine: EngineConfig, pipeline: Pipeline) -> EngineConfig:
-    """Return the engine, told what to answer with; raises UsageError for one that cannot."""
+    """Return the engine with its kind of answer set; raises UsageError if it cannot answer so."""
     answer = answer_over(engine.answer, [pipeline])
     if answer == ACTIONS and not engine.kind.acts:
         raise UsageError(
@@ -110,26 +109,26 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def _ros_args(text: str, chosen: Transport[Any], given: Mapping[str, Any]) -> Sorted:
-    """Read --ros-args, which rename the node that is ``given`` otherwise, and say what is left out."""
+    """Read --ros-args for the node that ``given`` names, and print what is left out."""
     if not text:
         return {}, {}, {}
     if "node_name" not in served_options(chosen):
         raise UsageError(f"`ros_args` are for ROS 2 nodes, not for serve {chosen.name}")
     node = {name: given.get(name, getattr(_as_served(chosen)(), name)) for name in ("namespace", "node_name")}
-    read = read_ros_args(text, _known(chosen), node)
-    for note in read.notes:
+    found = read_ros_args(text, _known(chosen), node)
+    for note in found.notes:
         typer.echo(f"--ros-args: {note}", err=True)
-    return _sorted(read.options, "`ros_args`", chosen)
+    return _sorted(found.options, "`ros_args`", chosen)
 
 
 def _known(chosen: Transport[Any]) -> list[str]:
-    """Return the names of all options of a server, as a file has them."""
+    """Return the names of all options of a server, as keys of a file."""
     limits = [flag.name.replace("-", "_") for flag in flags_of(Limits) if flag.path[0] in SET]
     return ["engine", *ENGINE[1:], *served_options(chosen), *limits]
 
 
 def _sorted(values: Mapping[str, Any], where: str, chosen: Transport[Any]) -> Sorted:
-    """Return options of the engine, of the transport, and limits; raises UsageError naming the key."""
+    """Sort options into those of the engine, of the transport, and limits; raises UsageError naming the key."""
     known = _known(chosen)
     for name, value in values.items():
         if name not in known:
@@ -151,7 +150,7 @@ def _sorted(values: Mapping[str, Any], where: str, chosen: Transport[Any]) -> So
 
 
 def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
-    """Serve until SIGINT or SIGTERM, then end cleanly with exit code 0; a server that died is started again once."""
+    """Serve until SIGINT or SIGTERM, then exit with 0; a server that died is restarted once."""
     from s2a_bench.harness.processes import keep_serving
     from s2a_bench.harness.serving import ServerJob
 

@@ -1,4 +1,4 @@
-"""`s2a-bench sweep`: a grid of settings from a file, and how it sees the commands that it repeats."""
+"""`s2a-bench sweep`: run a command for a grid of settings from a file."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from pkgutil import resolve_name
 from typing import Any
 from urllib.parse import urlsplit
 
-import typer
-
 from s2a_bench import extras
 from s2a_bench.cli.adapter import command, flags_named
 from s2a_bench.cli.experiment import ParseError, click_command, config_of, options_of
-from s2a_bench.cli.output import Json, print_json, print_line, print_table, shown
+from s2a_bench.cli.output import Json, print_error, print_json, print_line, print_table
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import MissingExtra, S2AError, UsageError
 from s2a_bench.experiments import EXPERIMENTS
@@ -40,9 +38,8 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
     resume, source, boards = config.resume, config.source, config.boards
     trust = " --trust-file" if config.trust_file else ""
     file = read_sweep_file(source)
-    repeated = command_of(file.command, f"{source}: command", trusted=config.trust_file)
     with extras.noted() as missing:
-        plan = plan_sweep(file, repeated, boards)
+        plan = plan_sweep(file, command_of(file.command, f"{source}: command", trusted=config.trust_file), boards)
     if resume is not None:
         check_resume(resume, plan)
     if config.dry_run:
@@ -52,11 +49,12 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
         raise MissingExtra(_lacking(source, missing))
     with RunProgress("cells") as progress, ExitStack() as stack:
         workers = _workers(plan, config.ray, config.width)
-        if resume is not None:
-            stack.enter_context(only_one(resume))
-        writer = RunWriter.reopen(resume, [CELLS]) if resume else start_sweep(plan, source, config.output, boards)
         if resume is None:
+            writer = start_sweep(plan, source, config.output, boards)
             stack.enter_context(only_one(writer.path))
+        else:
+            stack.enter_context(only_one(resume))
+            writer = RunWriter.reopen(resume, [CELLS])
         progress.opened(writer.path)
         try:
             with writer:
@@ -86,7 +84,7 @@ def _workers(plan: SweepPlan, ray: str, width: int) -> CellWorkers:
 
 
 def _lacking(source: Path, missing: Collection[str]) -> str:
-    return f"{source}: not everything that its cells need is installed; {extras.how_to_install(*missing)}"
+    return f"{source}: its cells need packages that are not installed; {extras.how_to_install(*missing)}"
 
 
 def _show_plan(plan: SweepPlan, config: SweepConfig, missing: Collection[str], *, as_json: bool) -> None:
@@ -99,7 +97,7 @@ def _show_plan(plan: SweepPlan, config: SweepConfig, missing: Collection[str], *
     else:
         print_plan(plan, cells, expected)
     if missing:
-        typer.echo(shown(_lacking(config.source, missing)), err=True)
+        print_error(_lacking(config.source, missing))
 
 
 sweep = command(_sweep, SweepConfig)
@@ -108,16 +106,12 @@ MINUTE_S, HOUR_S = 60, 3600
 
 
 def print_plan(plan: SweepPlan, cells: Sequence[SweepCell], expected: Expected) -> None:
-    """Print every cell as the command that it is, and the time to expect."""
+    """Print the command of every cell, and the expected time."""
     console = open_console()
     for cell in cells:
-        where = f"  on {cell.board}" if cell.board else ""
-        console.print(
-            visible(f"{cell.label}  s2a-bench {shlex.join(cell.argv)}{where}"),
-            markup=False,
-            highlight=False,
-            soft_wrap=True,
-        )
+        board = f"  on {cell.board}" if cell.board else ""
+        line = visible(f"{cell.label}  s2a-bench {shlex.join(cell.argv)}{board}")
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     virtual = sum(cell.virtual for cell in cells)
     counts = f"{len(cells)} of {len(plan.cells)} cells to run, {virtual} virtual and {len(cells) - virtual} measured"
     rests = f", {plan.rest_s:g} s of rest after each measured one" if plan.rest_s and virtual < len(cells) else ""
@@ -127,7 +121,7 @@ def print_plan(plan: SweepPlan, cells: Sequence[SweepCell], expected: Expected) 
 
 
 def print_sweep(sweep: Sweep) -> None:
-    """Print the failed cells, and a line for all."""
+    """Print a table of the failed cells, and how many finished."""
     cells = sweep.cells
     failed = cells[cells["state"] == "failed"]
     if len(failed):
@@ -141,7 +135,7 @@ def print_sweep(sweep: Sweep) -> None:
 
 
 def duration(seconds: float) -> str:
-    """Write a time for people."""
+    """Write a time in s, min or h."""
     if seconds < MINUTE_S:
         return f"{max(seconds, 1):.0f} s"
     if seconds < HOUR_S:
@@ -150,13 +144,13 @@ def duration(seconds: float) -> str:
 
 
 ENTRY = f"{__name__}:run"
-"""Where a worker finds `run`."""
+"""`run`, as a worker imports it."""
 
 
 def command_of(name: str, key: str = "command", *, trusted: bool = False) -> SweepCommand:
     """Describe a command; raises UsageError for one that cannot be swept.
 
-    Its cells may run programs, and send keys and files to a URL, if the file that wants that is ``trusted``.
+    Cells of a ``trusted`` file may run programs, and send keys and files to a URL.
     """
     known = sorted(EXPERIMENTS)
     if name not in known:
@@ -182,32 +176,32 @@ def run(argv: Sequence[str]) -> None:
 
 
 def _check(name: str, argv: Sequence[str], *, trusted: bool) -> bool:
-    """Parse arguments and run nothing; return True if the command would compute and measure nothing."""
+    """Parse arguments without running them; return True if the command only computes and measures nothing."""
     try:
         given = click_command(name).make_context(name, list(argv)).params
     except ParseError as error:
         raise UsageError(error.format_message()) from error
     experiment = EXPERIMENTS[name]
     config = config_of(experiment, given)
-    if not trusted and (danger := _danger([*config.risks()])):
+    if not trusted and (risk := _risk([*config.risks()])):
         with flags_named(*options_of(experiment)):
-            raise UsageError(f"{danger}; read the file, and allow it with `trust_file`")
+            raise UsageError(f"{risk}; read the file, and allow it with `trust_file`")
     return config.virtual
 
 
-def _danger(risks: Sequence[tuple[str, str, str]]) -> str:
-    """Return what a file should not decide by itself, or nothing."""
+def _risk(risks: Sequence[tuple[str, str, str]]) -> str:
+    """Return the risk that an untrusted file may not take, "" if there is none."""
     named = {risk: name for name, risk, _ in risks}
     if "program" in named:
         return f"`{named['program']}` runs a program"
     if {"url", "key"} <= named.keys():
         return f"`{named['key']}` sends a key to a URL"
-    away = (name for name, risk, value in risks if risk == "url" and not _is_loopback(value))
-    return next((f"`{name}` sends requests off this machine" for name in away), "")
+    remote = (name for name, risk, value in risks if risk == "url" and not _is_loopback(value))
+    return next((f"`{name}` sends requests off this machine" for name in remote), "")
 
 
 def _is_loopback(url: str) -> bool:
-    """Whether a URL, or an endpoint as tcp/HOST:PORT, has an address of loopback; no name is resolved."""
+    """Return True if a URL, or an endpoint as tcp/HOST:PORT, is on loopback; no name is resolved."""
     host = urlsplit(url if "://" in url else url.replace("/", "://", 1)).hostname or ""
     try:
         return ip_address(host).is_loopback

@@ -107,7 +107,7 @@ def test_a_size_is_width_and_height() -> None:
 
 def test_of_a_group_only_some_fields_may_be_flags() -> None:
     assert run("go", "--threads", "2", options=Named).engine == Engine(threads=2)
-    about = {flag.name: flag.whose + flag.about for flag in flags_of(Named)}
+    about = {flag.name: flag.prefix + flag.about for flag in flags_of(Named)}
     assert about["threads"].startswith("the model's CPU threads; 0: all")
     assert "model" not in about
 
@@ -119,7 +119,7 @@ def test_groups_beside_each_other_share_a_flag() -> None:
         == Both(here=Here(port=7, own=True), there=There(port=7))
         == Both(**placed(Both, {"port": 7, "own": True}))
     )
-    about = {flag.name: flag.whose + flag.about for flag in distinct([*flags_of(Both)])}
+    about = {flag.name: flag.prefix + flag.about for flag in distinct([*flags_of(Both)])}
     assert about == {
         "port": "here, there: port of the server [default: here 0, there 8]",
         "own": "here: what nobody else has",

@@ -60,7 +60,7 @@ def test_a_file_that_may_not_grow_ends_the_run_with_its_samples(tmp_path: Path) 
     ("error", "said"),
     [
         (OSError(errno.EMFILE, "Too many open files"), "too many open files; raise `ulimit -n`"),
-        (OSError(errno.ENOSPC, "No space left on device", "/a/b"), "/a/b'; make room there"),
+        (OSError(errno.ENOSPC, "No space left on device", "/a/b"), "/a/b'; free some space"),
         (MemoryError(), "out of memory; "),
         (ImportError("x.so: failed to map segment from shared object"), "out of memory; "),
         (RuntimeError("can't start new thread"), "no more processes or threads"),
