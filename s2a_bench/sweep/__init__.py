@@ -1,7 +1,7 @@
-"""Sweeps: a file names a command and axes, every cell of the grid runs once, and what has run survives.
+"""Sweeps: a file names a command and axes, every cell of the grid runs once, and finished cells are kept.
 
-A cell is one command line of ours, so that nothing about a command is written down twice: its own parser reads the
-settings, its own run folder holds the data. `CellWorkers` is the seam where cells run: on this machine, or on Ray.
+A cell is one command line of this program: the command's own parser reads the settings, its own run folder holds the
+data. `CellWorkers` is the seam that runs cells: on this machine, or on Ray.
 """
 
 from __future__ import annotations
@@ -21,34 +21,34 @@ from s2a_bench.store.run import read_run
 from s2a_bench.sweep.file import find_sweep, sweep_files
 
 Flag: TypeAlias = Literal["value", "hidden", "switch", "toggle", "argument"]
-"""A switch is given or not; a toggle has its opposite too, as --animation and --no-animation; no hint names what is
-hidden."""
+"""A switch is given or not; a toggle has an opposite, as --animation and --no-animation; no hint names a hidden
+one."""
 
 
 @dataclass(frozen=True, slots=True)
 class SweepCommand:
-    """What a sweep must know of the command that it repeats."""
+    """The command that a sweep repeats."""
 
     name: str
     flags: Mapping[str, Flag]
-    """What can be set, without the dashes."""
+    """By name, without dashes."""
     check: Callable[[Sequence[str]], bool]
-    """Parse arguments as the command line does, and run nothing; raises UsageError. Return True for a cell that is
-    virtual: computed, so that many may run at once, anywhere; False for one that measures."""
+    """Parses arguments without running them; raises UsageError. Returns True for a virtual cell: it is computed, so
+    that many may run at once, anywhere. Returns False for one that measures."""
 
 
 @dataclass(frozen=True, slots=True)
 class SweepCell:
-    """One setting, one time."""
+    """One repeat of one setting."""
 
     number: int
     repeat: int
     settings: dict[str, Any]
     argv: tuple[str, ...]
-    """The command and its flags, but for the output folder."""
+    """The command and its flags, without the output folder."""
     virtual: bool
     board: str
-    """The machine that it needs; empty: any."""
+    """The machine that it needs, empty for any."""
     config_hash: str
 
     @property
@@ -66,27 +66,27 @@ class SweepCell:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a cell went; an empty error means well."""
+    """The result of a cell; an empty error means success."""
 
     error: str
     wall_s: float
     started: str
     machine: dict[str, Any]
-    """The environment that its run folder names."""
+    """The environment in its manifest."""
 
 
 class CellWorkers(AbstractContextManager["CellWorkers"], Protocol):
-    """Where cells run. Use as a context manager; leaving it early ends what is under way."""
+    """Runs cells, as a context manager; leaving it early ends the running ones."""
 
     width: int
-    """How many virtual cells run at once."""
+    """Virtual cells at once."""
 
     def submit(self, cell: SweepCell, folder: Path) -> Future[Any]:
-        """Start a cell, or queue it; ``folder`` does not exist yet."""
+        """Start or queue a cell; ``folder`` must not exist yet."""
         ...
 
     def collect(self, future: Future[Any], folder: Path) -> Outcome:
-        """Return how a cell went whose future is done; its run folder then is below ``folder``."""
+        """Return the outcome of a finished future; the run folder of its cell is then below ``folder``."""
         ...
 
 
@@ -94,15 +94,12 @@ WORKERS: dict[str, str] = {
     "local": "s2a_bench.sweep.perform:LocalWorkers",
     "ray": "s2a_bench.sweep.on_ray:RayWorkers",
 }
-"""Name -> what runs cells."""
-
-
 COPY: Final = "sweep.toml"
-"""The sweep file as it was, in the sweep's folder."""
+"""The copy of the sweep file in the sweep's folder."""
 
 
 class SweepConfig(Options):
-    """A sweep to start, or one to go on with."""
+    """A sweep to start or to resume."""
 
     file: str = option(
         "",
@@ -110,34 +107,33 @@ class SweepConfig(Options):
         argument=True,
         names=sweep_files,
     )
-    resume: Path | None = option(None, "folder of a sweep that was interrupted: run what it has not run yet")
+    resume: Path | None = option(None, "folder of an interrupted sweep: run the cells that it has not run yet")
     retry_failed: bool = option(False, "with --resume: run the cells that failed once more")
     dry_run: bool = option(False, "print the cells and how long they will take, and run nothing")
     trust_file: bool = option(
-        False, "run a file that names programs, URLs off this machine, or keys for a URL: only one that you have read"
+        False, "allow a file to name programs, URLs off this machine, or keys for a URL: only one that you have read"
     )
-    board: Names = option((), "what this machine is in the file's 'board' axis; several with commas")
+    board: Names = option((), "name of this machine in the file's 'board' axis; several with commas")
     ray: str = option("", "run on a Ray cluster: its ADDRESS, auto, or local (a cluster of this machine)")
     jobs: int = option(0, "virtual cells at once on this machine; 0: one a core", ge=0)
     output: Path = option(Path("results"), "folder for the sweep's folder")
 
     def check(self) -> None:
-        """Refuse what makes no sense together; raises UsageError naming the fields."""
         if self.retry_failed and self.resume is None:
             raise UsageError("`retry_failed`: name the sweep's folder with `resume`")
         if self.board and self.ray:
-            raise UsageError("`board` and `ray` are two things: on Ray every node offers its own boards")
+            raise UsageError("`board` and `ray` exclude each other: on Ray every node offers its own boards")
         if not self.file and self.resume is None:
             raise UsageError("name a sweep file, or the folder of a sweep with `resume`")
 
     @property
     def source(self) -> Path:
-        """Return the sweep file; raises UsageError where none has that name."""
+        """Return the path of the sweep file; raises UsageError for an unknown name."""
         return self.resume / COPY if self.resume and not self.file else find_sweep(self.file)
 
     @cached_property
     def boards(self) -> tuple[str, ...] | None:
-        """Return what this machine is called, now or when the sweep began; None where Ray knows. Raises StoreError."""
+        """Return the names of this machine, of now or of the sweep's start; None on Ray. Raises StoreError."""
         if self.ray or self.board or self.resume is None:
             return None if self.ray else self.board
         return tuple(read_run(self.resume).manifest["configuration"].get("boards") or ())

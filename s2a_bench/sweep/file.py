@@ -1,4 +1,4 @@
-"""The sweep file: strict TOML, every complaint one line that names file and key; its axes as settings, its rounds."""
+"""The sweep file: strict TOML, whose errors name file and key; its settings and the order of its rounds."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Item = TypeVar("Item")
 
 
 def expand(grid: Axes, zipped: Axes, excluded: Sequence[Mapping[str, Any]] = ()) -> list[Setting]:
-    """List every setting: each combination of the grid with each row of the zipped axes, which are of one length.
+    """Return every setting: each combination of the grid with each row of the zipped axes, which have one length.
 
-    A setting is left out where it agrees with every key of an exclude; a list there stands for any of its values.
+    A setting is left out if it agrees with every key of an exclude, where a list stands for any of its values.
     """
     rows = [dict(zip(zipped, row, strict=True)) for row in zip(*zipped.values(), strict=True)] if zipped else [{}]
     whole = [dict(zip(grid, point, strict=True)) | row for point in product(*grid.values()) for row in rows]
@@ -32,9 +32,9 @@ def expand(grid: Axes, zipped: Axes, excluded: Sequence[Mapping[str, Any]] = ())
 
 
 def rounds(items: Sequence[Item], repeats: int, seed: int) -> Iterator[tuple[int, Item]]:
-    """Yield all items once, then all again: repeats are far apart, so that a machine's drift meets all alike.
+    """Yield repeat, from 1, and item: all items once, then all again, so that a machine's drift meets all of them.
 
-    Each round has a random order of its own, from the seed. Repeats count from 1.
+    Each round has its own random order, from the seed.
     """
     for repeat in range(1, repeats + 1):
         order = list(items)
@@ -44,7 +44,6 @@ def rounds(items: Sequence[Item], repeats: int, seed: int) -> Iterator[tuple[int
 
 
 def _agrees(setting: Setting, pattern: Mapping[str, Any]) -> bool:
-    """Return whether every key of the pattern has, or lists, the setting's value."""
     return all(key in setting and setting[key] in _listed(value) for key, value in pattern.items())
 
 
@@ -53,42 +52,42 @@ def _listed(value: Any) -> list[Any]:
 
 
 BOARD = "board"
-"""The key that is no flag: the machine that a cell needs."""
+"""The one key that is no flag: the machine that a cell needs."""
 Axis = Annotated[list[Any], Field(min_length=1)]
 RESERVED = {
-    "seed": "the seed stands at the top of the file; every repeat has its own from it",
-    "output": "--output of 's2a-bench sweep' names the folder of everything",
+    "seed": "the seed is a key at the top of the file; every repeat derives its own from it",
+    "output": "--output of 's2a-bench sweep' names the folder of all cells",
     "json": "the sweep has --json itself",
-    "data-only": "cells keep data only, always",
+    "data-only": "cells always keep data only",
     "help": "it is no setting",
     "help-all": "it is no setting",
 }
-"""Flags that a sweep sets itself, and what to do instead."""
+"""Flags that a sweep sets itself -> what to do instead."""
 MOST_CELLS = 100_000
 
 
 @dataclass(frozen=True, slots=True)
 class SweepFile:
-    """What a sweep file says, before a command has looked at its settings."""
+    """A sweep file; its settings are not checked by the command yet."""
 
     path: Path
     command: str
     repeats: int
     rest_s: float
-    """Between the cells that are measured, so that the board cools down."""
+    """Pause between measured cells, in which the board cools down."""
     seed: int
     settings: tuple[Setting, ...]
-    """The fixed settings and those of the axes together, one each cell."""
+    """Fixed settings and one point of the axes, for each cell."""
 
 
 def sweep_files() -> dict[str, Path]:
-    """Return the file of every name that can be given, sorted by name; a name found twice is the first folder's."""
+    """Return name -> file, sorted; of two files with one name, that in the first folder of the search path."""
     folders = [folder / "sweeps" for folder in search_path()]
     return dict(sorted((path.stem, path) for folder in reversed(folders) for path in folder.glob("*.toml")))
 
 
 def find_sweep(name: str) -> Path:
-    """Return a sweep file given as a path, or by a name in ./profiles/sweeps, the user's folder or the package."""
+    """Return the path of a sweep file, given as a path or as a name; raises UsageError for an unknown name."""
     if "/" in name or name.endswith(".toml"):
         return Path(name)
     files = sweep_files()
@@ -98,7 +97,7 @@ def find_sweep(name: str) -> Path:
 
 
 class _SweepFile(TomlTable):
-    """What the file may hold."""
+    """The keys of the file."""
 
     command: str
     repeats: int = Field(1, ge=1)
@@ -128,11 +127,10 @@ def read_sweep_file(path: Path) -> SweepFile:
 
 
 def _check_keys(path: Path, tables: dict[str, dict[str, Any]]) -> None:
-    """Refuse what stands in two tables, and flags that a sweep sets itself."""
     for (one, keys), (other, others) in combinations(tables.items(), 2):
         for key in keys:
             if key in others:
-                raise UsageError(f"{path}: '{key}' stands in [{one}] and in [{other}]; keep one of them")
+                raise UsageError(f"{path}: '{key}' is in [{one}] and in [{other}]; keep one of them")
     for name, keys in tables.items():
         for key in keys:
             if key in RESERVED:
@@ -141,7 +139,7 @@ def _check_keys(path: Path, tables: dict[str, dict[str, Any]]) -> None:
 
 def _check_cells(path: Path, settings: tuple[Setting, ...], repeats: int) -> None:
     if not settings:
-        raise UsageError(f"{path}: exclude: nothing is left; take one of them out")
+        raise UsageError(f"{path}: exclude: no cell is left; remove an exclude")
     if len(settings) * repeats > MOST_CELLS:
         raise UsageError(f"{path}: {len(settings) * repeats} cells are more than {MOST_CELLS}; shorten an axis")
     if len({repr(sorted(setting.items())) for setting in settings}) < len(settings):

@@ -1,4 +1,4 @@
-"""Sweeps as ``--json`` objects: what would run, and how it went."""
+"""Sweeps as ``--json`` objects: the cells of a dry run, and the results of a sweep."""
 
 from __future__ import annotations
 
@@ -28,28 +28,26 @@ class _Setting:
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedCell(_Setting):
-    """One setting, one time, as a dry run lists it."""
+    """One repeat of one setting in a dry run."""
 
     state: Literal["planned"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweptCell(_Setting):
-    """One setting, one time; the latest attempt at it."""
+    """The latest attempt at one repeat of one setting."""
 
     attempt: Annotated[int, {"minimum": 1}]
     state: Literal["finished", "failed"]
     error: Annotated[str | None, {"minLength": 1}]
     host: str
-    run: Annotated[
-        str | None, {"description": "The cell's run folder; null where it did not come to have one.", "minLength": 1}
-    ]
+    run: Annotated[str | None, {"description": "The cell's run folder; null if it has none.", "minLength": 1}]
     started: str
     wall_s: Annotated[float, {"minimum": 0}]
 
 
 def plan_json(cells: Sequence[SweepCell], expected: Expected, environment: dict[str, Any]) -> dict[str, Any]:
-    """Return what would run as the ``--json`` object."""
+    """Return the ``--json`` object of a dry run."""
     planned = [
         PlannedCell(
             cell=cell.name,
@@ -72,7 +70,7 @@ def plan_json(cells: Sequence[SweepCell], expected: Expected, environment: dict[
 
 
 def sweep_json(sweep: Sweep) -> dict[str, Any]:
-    """Return how a sweep went as the ``--json`` object."""
+    """Return the ``--json`` object of a sweep."""
     return frame(sweep, [plain(_cell(sweep, row)) for row in sweep.cells.to_dict("records")], [])
 
 

@@ -1,8 +1,8 @@
-"""Cells on a Ray cluster: those that need a board go where it is, virtual ones to every core of every node.
+"""Cells on a Ray cluster: a measured one runs on the node with its board, virtual ones on every core of every node.
 
 A node offers its board as a custom resource, ``ray start --address=HEAD:6379 --resources='{"board:NAME": 1}'``.
-A cell's run folder comes back through Ray, so that nodes need no common disk. Ray runs the cells of a lost node again
-elsewhere, or waits until a node has the board.
+A cell's run folder is returned through Ray, so that nodes need no common disk. Ray runs the cells of a lost node again
+on another one, or waits until a node has the board.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from s2a_bench.sweep.plan import SweepPlan
 
 LOCAL: Final = "local"
 TRIES: Final = 5
-"""How often a cell is run again because its node or process was lost."""
+"""Retries of a cell whose node or process was lost."""
 AHEAD: Final = 2
-"""Virtual cells given to Ray for each core: one runs, one waits."""
+"""Virtual cells submitted for each core: one runs, one waits."""
 PROBE_S: Final = 5.0
 OBJECT_STORE_BYTES: Final = 256 << 20
-"""Of a local cluster: run folders are small."""
+"""For a local cluster: run folders are small."""
 
 Packed: TypeAlias = tuple[Outcome, bytes]
 
 
 class RayWorkers:
-    """A cluster that runs there, or one of this machine's cores made for the sweep."""
+    """A running cluster, or one of this machine's cores made for the sweep."""
 
     def __init__(self, entry: str, address: str, plan: SweepPlan, jobs: int) -> None:
-        """Connect; raises MissingExtra without Ray, UsageError where it does not answer or no node has a board."""
+        """Connect; raises MissingExtra without Ray, UsageError for an unreachable cluster or a missing board."""
         ray = self._ray = connect(address, jobs)
         self._entry = entry
         self._refs: set[Any] = set()
@@ -54,7 +54,7 @@ class RayWorkers:
         self.width = max(AHEAD * int(resources.get("CPU", 1)), 1)
         self._remote = ray.remote(max_retries=TRIES)(packed)
 
-    def submit(self, cell: SweepCell, folder: Path) -> Future[Packed]:  # noqa: ARG002 - it is unpacked later
+    def submit(self, cell: SweepCell, folder: Path) -> Future[Packed]:  # noqa: ARG002 - `collect` unpacks into it
         wants = {} if cell.virtual else {"resources": {resource(cell.board): 1}}
         ref = self._remote.options(name=cell.label, **wants).remote(cell, self._entry)
         self._refs.add(ref)
@@ -63,11 +63,10 @@ class RayWorkers:
         return future
 
     def collect(self, future: Future[Packed], folder: Path) -> Outcome:
-        """Unpack a cell's run folder and return how it went."""
         try:
             outcome, data = future.result()
         except self._ray.exceptions.RayError as error:
-            return Outcome(f"Ray gave it up: {str(error).splitlines()[0]}", 0.0, utc_now(), collect())
+            return Outcome(f"Ray gave up: {str(error).splitlines()[0]}", 0.0, utc_now(), collect())
         with tarfile.open(fileobj=io.BytesIO(data)) as archive:
             archive.extractall(folder, filter="data")
         return outcome
@@ -76,7 +75,6 @@ class RayWorkers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Cancel what is under way and leave the cluster."""
         for ref in list(self._refs):
             self._ray.cancel(ref, force=True)
         self._ray.shutdown()
@@ -84,7 +82,7 @@ class RayWorkers:
 
 def connect(address: str, jobs: int) -> Any:
     """Join the cluster at an address, or make one of ``jobs`` cores for "local", and return Ray; raises S2AError."""
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is told to anybody
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage statistics
     ray = extras.require("ray", "ray")
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address == LOCAL:
@@ -92,7 +90,7 @@ def connect(address: str, jobs: int) -> Any:
         return ray
     try:
         host, colon, port = address.rpartition(":")
-        if colon and port.isdecimal():  # Ray itself would try for minutes
+        if colon and port.isdecimal():  # Ray itself tries for minutes
             socket.create_connection((host.rpartition("/")[2], int(port)), PROBE_S).close()
         ray.init(address=address, **quiet)
     except (OSError, ValueError, RuntimeError) as error:
@@ -113,12 +111,12 @@ def _check(plan: SweepPlan, resources: Mapping[str, float]) -> None:
 
 
 def resource(board: str) -> str:
-    """Name the custom resource of a board."""
+    """Return the name of a board's custom resource."""
     return f"board:{board}"
 
 
 def packed(cell: SweepCell, entry: str) -> Packed:
-    """Carry out a cell on a node and pack its folder."""
+    """Run a cell on a node; return its outcome and its folder as a tar file."""
     with TemporaryDirectory(prefix="s2a-bench-cell-") as place:
         folder = Path(place) / "cell"
         outcome = perform(cell, folder, entry)

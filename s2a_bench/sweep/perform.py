@@ -1,4 +1,4 @@
-"""One cell carried out, in this process where it is virtual, else in one of its own; and many on this machine."""
+"""Run one cell, in this process if it is virtual, else in its own; and many of them on this machine."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import sys
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from pkgutil import resolve_name
@@ -29,11 +30,11 @@ LOG: Final = "stderr.txt"
 def perform(cell: SweepCell, folder: Path, entry: str) -> Outcome:
     """Run a cell's command with ``--output`` at a new folder; ``entry`` is "module:function" of the command line.
 
-    Whatever goes wrong in the cell is the outcome's error.
+    Every exception of the cell is the outcome's error.
     """
     folder.mkdir(parents=True)
     argv = [*cell.argv, f"--output={folder}"]
-    started, before_ns = manifests.utc_now(), now_ns()
+    started, before_ns = utc_now(), now_ns()
     error = _inside(argv, entry) if cell.virtual else _outside(argv, folder / LOG)
     wall_s = (now_ns() - before_ns) / 1e9
     path = run_folder(folder)
@@ -41,27 +42,27 @@ def perform(cell: SweepCell, folder: Path, entry: str) -> Outcome:
         error = "it left no run folder"
     try:
         environment = manifests.read(path)["environment"] if path else collect()
-    except StoreError as wrong:
-        environment, error = collect(), error or str(wrong)
+    except StoreError as damage:
+        environment, error = collect(), error or str(damage)
     return Outcome(error, wall_s, started, environment)
 
 
 def run_folder(folder: Path) -> Path | None:
-    """Find the one run folder in a cell's folder."""
+    """Return the run folder in a cell's folder, None if there is none."""
     return next((path.parent for path in folder.glob(f"*/{manifests.NAME}")), None)
 
 
 def _inside(argv: list[str], entry: str) -> str:
-    """Run the command here, quietly; return what went wrong."""
+    """Run the command in this process without output; return its error."""
     run: Any = resolve_name(entry)
     given = sys.argv
-    sys.argv = ["s2a-bench", *argv]  # what the run's manifest says
+    sys.argv = ["s2a-bench", *argv]  # for the run's manifest
     try:
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
             run(argv)
     except S2AError as error:
         return str(error)
-    except Exception as error:  # noqa: BLE001 - a cell that breaks is told, and the others go on
+    except Exception as error:  # noqa: BLE001 - it is the cell's error, and the other cells run
         return f"{type(error).__name__}: {error}"
     finally:
         sys.argv = given
@@ -69,7 +70,7 @@ def _inside(argv: list[str], entry: str) -> str:
 
 
 def _outside(argv: list[str], log: Path) -> str:
-    """Run the command as a user would, in a process that may crash; return what went wrong."""
+    """Run the command as a user does, in a process that may crash; return its error."""
     with log.open("wb") as errors:
         done = subprocess.run(  # noqa: S603 - our own command line
             [sys.executable, "-m", "s2a_bench", *argv],
@@ -77,26 +78,19 @@ def _outside(argv: list[str], log: Path) -> str:
             stdout=subprocess.DEVNULL,
             stderr=errors,
             check=False,
-            start_new_session=True,  # Ctrl-C is the sweep's to handle
-            preexec_fn=_stop_with_parent,
+            start_new_session=True,  # the sweep handles Ctrl-C
+            preexec_fn=partial(end_with_parent, signal.SIGTERM),
         )
     if not done.returncode:
         return ""
     lines = log.read_text(errors="replace").strip().splitlines()
-    told = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
+    errors_of_cell = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
     how = how_it_ended(done.returncode)
-    return told[-1] if told else f"{how}: {lines[-1][:200]}" if lines else how
-
-
-def _stop_with_parent() -> None:
-    end_with_parent(signal.SIGTERM)
-
-
-DIED = "the worker process died under it (out of memory?)"
+    return errors_of_cell[-1] if errors_of_cell else f"{how}: {lines[-1][:200]}" if lines else how
 
 
 class LocalWorkers:
-    """Two pools of processes, so that a cell that crashes or takes all memory does not take the sweep along."""
+    """Two pools of processes: a cell that crashes or exhausts memory does not end the sweep."""
 
     def __init__(self, entry: str, _address: str, _plan: SweepPlan, jobs: int) -> None:
         self.width = jobs
@@ -111,11 +105,11 @@ class LocalWorkers:
             del self._pools[cell.virtual]
             return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
 
-    def collect(self, future: Future[Outcome], folder: Path) -> Outcome:  # noqa: ARG002 - it lies there already
+    def collect(self, future: Future[Outcome], folder: Path) -> Outcome:  # noqa: ARG002 - the worker has written into it
         try:
             return future.result()
         except BrokenProcessPool:
-            return Outcome(DIED, 0.0, utc_now(), collect())
+            return Outcome("the worker process died under it (out of memory?)", 0.0, utc_now(), collect())
 
     def _pool(self, virtual: bool) -> ProcessPoolExecutor:
         if virtual not in self._pools:
@@ -128,7 +122,7 @@ class LocalWorkers:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Close the pools; after an interruption end what they are doing."""
+        """Close the pools; after an exception end their processes."""
         for pool in self._pools.values():
             pool.shutdown(wait=kind is None, cancel_futures=True)
         if kind is not None:
@@ -138,6 +132,6 @@ class LocalWorkers:
 
 
 def prepare() -> None:
-    """Prepare a worker: Ctrl-C is the sweep's to handle, and nothing outlives it."""
+    """Prepare a worker: the sweep handles Ctrl-C, and no worker outlives it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()

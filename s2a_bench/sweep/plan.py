@@ -1,4 +1,4 @@
-"""From a sweep file to cells: each setting as the command line that its command reads, in the order they run."""
+"""From a sweep file to cells: each setting as a command line, in the order in which they run."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from s2a_bench.sweep.file import BOARD, RESERVED, Setting, SweepFile, rounds
 from s2a_bench.text import like
 
 HASHED_WHOLE = 1 << 20
-"""Bytes up to which a file that a setting names is known by its content; a larger one, by size and time."""
+"""Bytes; a larger file that a setting names is identified by size and time, a smaller one by its content."""
 
 
 @dataclass(frozen=True, slots=True)
 class SweepPlan:
-    """The cells of a sweep in the order in which they run."""
+    """The cells of a sweep, in order."""
 
     command: str
     cells: tuple[SweepCell, ...]
@@ -31,7 +31,7 @@ class SweepPlan:
 
     @property
     def config_hash(self) -> str:
-        """Tell this sweep from any other: a changed value, axis, order or profile changes it."""
+        """Identify the sweep: a changed value, axis, order or profile changes the hash."""
         return _hash([self.command, self.rest_s, self.seed, [[*cell.key, cell.config_hash] for cell in self.cells]])
 
     @property
@@ -40,25 +40,25 @@ class SweepPlan:
 
 
 def plan_sweep(file: SweepFile, command: SweepCommand, boards: Collection[str] | None = None) -> SweepPlan:
-    """Make the cells, those for ``boards`` and those that need none; None: all.
+    """Make the cells for ``boards`` and those that need no board; None makes all.
 
-    Raises UsageError, naming the file and the key, for a flag that the command does not have or a value that its
-    parser refuses.
+    Raises UsageError, naming file and key, for an unknown flag and for a value that the command's parser refuses.
     """
     settings = list(enumerate(file.settings, 1))
     for _, setting in settings:
         _check_keys(file, command, setting)
-    here = [(number, each) for number, each in settings if boards is None or each.get(BOARD, "") in {"", *boards}]
-    if not here:
+    chosen = [(number, each) for number, each in settings if boards is None or each.get(BOARD, "") in {"", *boards}]
+    if not chosen:
         wanted = ", ".join(dict.fromkeys(str(setting[BOARD]) for _, setting in settings))
         raise UsageError(f"`board`: {file.path} has cells for {wanted} only; name one of them, or use `ray`")
     cells = []
-    for repeat, (number, setting) in rounds(here, file.repeats, file.seed):
+    for repeat, (number, setting) in rounds(chosen, file.repeats, file.seed):
         argv = _argv(file, command, setting, file.seed + repeat - 1)
         try:
             virtual = command.check(argv[1:])
         except UsageError as error:
-            raise UsageError(f"{file.path}: {_words(setting)}: {error}") from error
+            label = " ".join(f"{key}={value}" for key, value in setting.items())
+            raise UsageError(f"{file.path}: {label}: {error}") from error
         found = _hash([argv, setting.get(BOARD), [_content(path) for path in _files(setting)]])
         plain = {key: _text(value) if isinstance(value, list) else value for key, value in setting.items()}
         cells.append(SweepCell(number, repeat, plain, tuple(argv), virtual, setting.get(BOARD, ""), found))
@@ -86,7 +86,7 @@ def _check_keys(file: SweepFile, command: SweepCommand, setting: Setting) -> Non
 
 
 def _argv(file: SweepFile, command: SweepCommand, setting: Setting, seed: int) -> list[str]:
-    """Write a setting as a command line; a list becomes values with commas, as flags take several."""
+    """Return a setting as a command line; a list becomes one value with commas."""
     flags, arguments = [], []
     for key, value in setting.items():
         if key == BOARD:
@@ -112,7 +112,7 @@ def _text(value: Any) -> str:
 
 
 def _files(setting: Setting) -> Iterator[Path]:
-    """Find the files that settings name, profiles by their names too: their content is part of the configuration."""
+    """Yield the files that settings name, also profiles by name: their content is part of the configuration."""
     for key, value in setting.items():
         for text in _text(value).split(","):
             if key == "profile" and text:
@@ -123,7 +123,7 @@ def _files(setting: Setting) -> Iterator[Path]:
 
 
 def _named_file(text: str) -> Path | None:
-    """Return the file that a text names, as ``PATH``, ``@PATH`` or ``video:PATH``, if there is one."""
+    """Return the file of ``PATH``, ``@PATH`` or ``video:PATH``, None if there is none."""
     path = Path(text.removeprefix("@").rpartition(":")[2])
     try:
         return path if path.is_file() else None
@@ -140,7 +140,3 @@ def _content(path: Path) -> list[Any]:
 
 def _hash(value: Any) -> str:
     return sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _words(setting: Setting) -> str:
-    return " ".join(f"{key}={value}" for key, value in setting.items())

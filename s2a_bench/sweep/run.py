@@ -1,4 +1,4 @@
-"""The sweep itself: each cell is on disk with its row before the next counts; going on later; the time to expect."""
+"""Run a sweep: every finished cell is on disk with its row; resume a sweep; estimate its time."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from s2a_bench.sweep.perform import run_folder
 from s2a_bench.sweep.plan import SweepPlan
 
 UNDER_WAY = ".under-way"
-"""Cells that are running; what a killed sweep leaves there is the work that is lost."""
+"""Folder of the running cells; what a killed sweep leaves there is lost."""
 
 
 def start_sweep(plan: SweepPlan, source: Path, output: Path, boards: Sequence[str] | None) -> RunWriter:
-    """Make the sweep's folder; ``boards`` are what this machine is called, None where Ray knows. Raises StoreError."""
+    """Make the sweep's folder; ``boards`` are the names of this machine, None on Ray. Raises StoreError."""
     facts = {
         "configuration": {
             "command": plan.command,
@@ -52,23 +52,24 @@ def start_sweep(plan: SweepPlan, source: Path, output: Path, boards: Sequence[st
 
 
 def check_resume(folder: Path, plan: SweepPlan) -> None:
-    """Refuse to go on with another configuration or on another machine; raises UsageError."""
+    """Raise UsageError if the folder is of another configuration or of another machine."""
     run = read_run(folder)
     if not is_sweep(run.manifest):
         raise UsageError(f"`resume`: {folder} is the folder of a {run.manifest['command']} run, not of a sweep")
     if run.manifest["configuration"].get("hash") != plan.config_hash:
         raise UsageError(
             f"`resume`: the sweep in {folder} was another one: its file is {folder / COPY}, and the profiles and files "
-            "that it names count too; start a new sweep, or put back what was changed"
+            "that it names count too; start a new sweep, or undo the changes"
         )
-    here = facts_of(environment.collect())
-    if other := difference(here, facts_of(run.manifest["environment"])):
-        raise UsageError(f"`resume`: {folder} was measured elsewhere: {other}; go on there, or start a new sweep here")
+    if other := difference(facts_of(environment.collect()), facts_of(run.manifest["environment"])):
+        raise UsageError(
+            f"`resume`: {folder} was measured on another machine: {other}; resume it there, or start a new sweep"
+        )
 
 
 @contextmanager
 def only_one(folder: Path) -> Iterator[None]:
-    """Hold a sweep's folder for this process alone; raises StoreError where another one has it."""
+    """Lock a sweep's folder; raises StoreError if another process holds it."""
     with (folder / ".lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -78,22 +79,22 @@ def only_one(folder: Path) -> Iterator[None]:
 
 
 def latest(rows: Iterable[Mapping[Any, Any]]) -> dict[tuple[str, int], tuple[int, str]]:
-    """Return the last attempt at each cell, and how it ended."""
+    """Return cell and repeat -> number and state of the last attempt."""
     return {(row["cell"], row["repeat"]): (row["attempt"], row["state"]) for row in rows}
 
 
 def pending(plan: SweepPlan, rows: Iterable[Mapping[Any, Any]], *, retry_failed: bool) -> list[SweepCell]:
-    """List the cells of a plan that have still to run, in their order."""
+    """Return the cells of a plan that must still run, in order."""
     over = {"finished"} if retry_failed else {"finished", "failed"}
     ended = latest(rows)
     return [cell for cell in plan.cells if ended.get(cell.key, (0, ""))[1] not in over]
 
 
 class SweepRun:
-    """One sitting at a sweep."""
+    """One session of a sweep."""
 
     def __init__(self, writer: RunWriter, plan: SweepPlan, progress: Progress, clock: Clock | None = None) -> None:
-        """Look at what earlier sittings left; the folder must be held by `only_one`."""
+        """Read the rows of earlier sessions; the folder must be held by `only_one`."""
         self._writer = writer
         self._plan = plan
         self._progress = progress
@@ -110,7 +111,7 @@ class SweepRun:
         return pending(self._plan, self._rows, retry_failed=retry_failed)
 
     def work(self, cells: Sequence[SweepCell], workers: CellWorkers) -> None:
-        """Run cells: measured ones first, one at a time on each board; then the virtual ones, many at once."""
+        """Run the measured cells, one at a time on each board, then the virtual ones, many at once."""
         self._progress.expect(len(cells))
         lanes: dict[str, deque[SweepCell]] = {}
         for cell in cells:
@@ -122,14 +123,13 @@ class SweepRun:
 
     def finish(self) -> None:
         shutil.rmtree(self._writer.path / UNDER_WAY, ignore_errors=True)
-        failed = self.failed
-        text = f"{failed} of {len(self._plan.cells)} cells failed" if failed else None
-        self._writer.finish("failed" if failed else "finished", text)
+        error = f"{self.failed} of {len(self._plan.cells)} cells failed" if self.failed else None
+        self._writer.finish("failed" if error else "finished", error)
 
     def _drain(
         self, lanes: dict[str, deque[SweepCell]], width: dict[str, int], workers: CellWorkers, rest_ns: int
     ) -> None:
-        """Keep every lane busy until its cells are done, with a rest after each."""
+        """Keep every lane busy until its cells are done, with a pause after each."""
         running: dict[Future[Any], tuple[str, SweepCell, Path]] = {}
         ready_ns = dict.fromkeys(lanes, 0)
         while running or any(lanes.values()):
@@ -152,15 +152,15 @@ class SweepRun:
                 ready_ns[lane] = self._clock.now_ns() + rest_ns
 
     def _keep(self, cell: SweepCell, outcome: Outcome, folder: Path) -> None:
-        """Move a cell's run folder to its place and write its row: from then on it is done."""
+        """Move a cell's run folder to its place and append its row; then it is done."""
         attempt = self._latest.get(cell.key, (0, ""))[0] + 1
         host = str(outcome.machine.get("host", ""))
-        error = outcome.error or self._stranger(cell, outcome)
+        error = outcome.error or self._other_machine(cell, outcome)
         found = run_folder(folder) if folder.exists() else None
         kept = self._writer.path / "cells" / (cell.label + (f"-{attempt}" if attempt > 1 else ""))
         if found is not None:
             kept.parent.mkdir(exist_ok=True)
-            shutil.rmtree(kept, ignore_errors=True)  # moved, but killed before its row: it counts as not done
+            shutil.rmtree(kept, ignore_errors=True)  # of a sweep killed between move and row
             found.rename(kept)
         shutil.rmtree(folder, ignore_errors=True)
         if host not in self._writer.manifest["machines"]:
@@ -188,8 +188,8 @@ class SweepRun:
             self._progress.stage(f"cell {cell.name} failed: {error}")
         self._progress.advance()
 
-    def _stranger(self, cell: SweepCell, outcome: Outcome) -> str:
-        """Remember what machine a board is, and refuse an unlike one of that name."""
+    def _other_machine(self, cell: SweepCell, outcome: Outcome) -> str:
+        """Record the machine of a board; return an error if a cell ran on a different one."""
         if not cell.board or cell.virtual:
             return ""
         kind = facts_of(outcome.machine, KIND)
@@ -201,18 +201,18 @@ class SweepRun:
 
 
 KIND = ("s2a_bench", "machine", "board", "cpu", "cores", "gpus", "power_mode")
-"""Facts of `bench.environment` that two boards of one kind share."""
+"""Facts of the environment that two boards of one kind share."""
 IDENTITY = ("host", *KIND)
-"""Those that tell one machine from any other."""
+"""Facts that identify one machine."""
 
 
 def facts_of(environment: dict[str, Any], names: tuple[str, ...] = IDENTITY) -> dict[str, Any]:
-    """Pick the facts that identify a machine; an unreadable one is absent."""
+    """Return the facts that identify a machine; an unreadable one is absent."""
     return {name: environment[name] for name in names if name in environment}
 
 
 def difference(now: dict[str, Any], then: dict[str, Any]) -> str:
-    """Say in words what differs; nothing where all is the same."""
+    """Return a text of the facts that differ, "" if none does."""
     names = [name for name in IDENTITY if now.get(name) != then.get(name)]
     return ", ".join(f"{name} is {_plain(now.get(name))}, was {_plain(then.get(name))}" for name in names)
 
@@ -225,14 +225,14 @@ def _plain(value: Any) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """A time to expect, and where it is from; None: not known."""
+    """An expected time, None if it is unknown, and its source."""
 
     seconds: float | None
     source: str
 
 
 def earlier(output: Path, command: str) -> list[Sweep]:
-    """Find sweeps of a command on this machine below a folder, the newest first."""
+    """Return the sweeps of a command on this machine below a folder, the newest first."""
     here = facts_of(environment.collect())
     found = []
     for folder in sorted(output.glob("*-sweep-*"), reverse=True):
@@ -240,8 +240,8 @@ def earlier(output: Path, command: str) -> list[Sweep]:
             sweep = read_sweep(folder)
         except StoreError:
             continue
-        asked = sweep.manifest["configuration"].get("command")
-        if asked == command and not difference(here, facts_of(sweep.manifest["environment"])):
+        swept = sweep.manifest["configuration"].get("command")
+        if swept == command and not difference(here, facts_of(sweep.manifest["environment"])):
             found.append(sweep)
     return found
 
@@ -249,16 +249,15 @@ def earlier(output: Path, command: str) -> list[Sweep]:
 def expect(
     cells: Sequence[SweepCell], rest_s: float, width: int, sweeps: Sequence[Sweep], workers: CellWorkers
 ) -> Expected:
-    """Return how long cells will take, by the times of the same cells, of the same command, or of the first."""
+    """Estimate the time of cells from earlier sweeps of the command, or by running the first virtual cell."""
     for sweep in sweeps:
         done = sweep.cells[sweep.cells["state"] == "finished"]
         if len(done):
             times = {str(name): float(value) for name, value in done.groupby("config_hash")["wall_s"].median().items()}
             typical = float(done["wall_s"].median())
             known = sum(cell.config_hash in times for cell in cells)
-            source = f"as {known} of these cells took in {sweep.path}"
-            if known < len(cells):
-                source += f", {typical:.1f} s for each of the others"
+            rest = f", {typical:.1f} s for each of the others" if known < len(cells) else ""
+            source = f"as {known} of these cells took in {sweep.path}{rest}"
             spent = [(cell, times.get(cell.config_hash, typical)) for cell in cells]
             return Expected(_total(spent, rest_s, width), source)
     first = next((cell for cell in cells if cell.virtual), None)
@@ -270,12 +269,12 @@ def expect(
             for folder in (Path(place) / "first", Path(place) / "second")
         ]
     source = f"cell {first.name} was run for it and took {turns[1]:.2f} s, not counting the first time"
-    start_s = turns[0] - turns[1]
-    return Expected(_total([(cell, turns[1]) for cell in cells], rest_s, width) + max(start_s, 0), source)
+    total_s = _total([(cell, turns[1]) for cell in cells], rest_s, width)
+    return Expected(total_s + max(turns[0] - turns[1], 0), source)
 
 
 def _total(spent: Sequence[tuple[SweepCell, float]], rest_s: float, width: int) -> float:
-    """Add up: measured cells one after another on their board, boards side by side, then virtual ones."""
+    """Sum up: measured cells in sequence on each board, the boards in parallel, then the virtual cells."""
     boards: dict[str, float] = {}
     for cell, seconds in spent:
         if not cell.virtual:

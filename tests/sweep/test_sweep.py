@@ -99,20 +99,20 @@ def write(folder: Path, text: str) -> Path:
         ('command = "t"\n[grid]\nrate = 3', "grid.rate: 3 should be a list"),
         ('command = "t"\n[grid]\nrate = []', "grid.rate: is empty"),
         ('command = "t"\n[grid]\nrate = [3, 3]', "an axis has a value twice; use repeats"),
-        ('command = "t"\n[settings]\nrate = 1\n[grid]\nrate = [3]', "'rate' stands in [settings] and in [grid]"),
-        ('command = "t"\n[grid]\nrate = [3]\n[zip]\nrate = [3]', "'rate' stands in [grid] and in [zip]"),
+        ('command = "t"\n[settings]\nrate = 1\n[grid]\nrate = [3]', "'rate' is in [settings] and in [grid]"),
+        ('command = "t"\n[grid]\nrate = [3]\n[zip]\nrate = [3]', "'rate' is in [grid] and in [zip]"),
         (
             'command = "t"\n[zip]\na = [1, 2]\nb = [1]',
             "zip: axes go side by side and need one length, but have a 2, b 1",
         ),
-        ('command = "t"\n[settings]\nseed = 1', "settings.seed: the seed stands at the top of the file"),
+        ('command = "t"\n[settings]\nseed = 1', "settings.seed: the seed is a key at the top of the file"),
         ('command = "t"\n[settings]\noutput = "x"', "settings.output: --output of 's2a-bench sweep'"),
         (
             'command = "t"\n[grid]\nrate = [3]\n[[exclude]]\nrates = 3',
             "exclude.rates: it is no axis; did you mean rate?",
         ),
         ('command = "t"\n[grid]\nrate = [3]\n[[exclude]]\nrate = 4', "exclude.rate: 4 is no value of that axis"),
-        ('command = "t"\n[grid]\nrate = [3]\n[[exclude]]\nrate = 3', "exclude: nothing is left"),
+        ('command = "t"\n[grid]\nrate = [3]\n[[exclude]]\nrate = 3', "exclude: no cell is left"),
         ('command = "t"\nrepeats = 60000\n[grid]\nrate = [3, 4]', "120000 cells are more than 100000"),
     ],
 )
@@ -404,7 +404,7 @@ def test_a_changed_configuration_another_machine_and_no_sweep_are_refused(folder
     manifest["environment"] |= {"host": "elsewhere", "cpu": "Z80"}
     path.write_text(json.dumps(manifest))
     with pytest.raises(
-        UsageError, match=r"was measured elsewhere: host is .*, was elsewhere, cpu is .*, was Z80; go on"
+        UsageError, match=r"was measured on another machine: host is .*, was elsewhere, cpu is .*, was Z80; resume it there"
     ):
         check_resume(folder, PLAN)
     with RunWriter.create(tmp_path, "latency", {}) as writer:
