@@ -1,1 +1,1 @@
-"""What is kept: run folders with manifest, environment and raw samples; append, never overwrite."""
+"""Run folders: manifest, environment and raw samples; appended to, never overwritten."""

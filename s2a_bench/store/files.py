@@ -1,8 +1,8 @@
-r"""Tables on disk: a CSV that grows by whole records, the Parquet file made from it, and what is said of a full disk.
+r"""Tables on disk: a CSV that grows by whole records, the Parquet file made from it, and errors of a full disk.
 
-A record goes to the kernel in one write, so a killed process loses at most the record under way. A record ends
-at a line feed with an even number of quotation marks before it (RFC 4180, with ``\n``); what follows the last
-such line feed is torn and is dropped when read. An empty field is null, in text columns the empty text.
+A record is written in one system call, so a killed process loses at most the last record. A record ends at a line feed
+with an even number of quotation marks before it (RFC 4180, with ``\n``); anything after the last such line feed is
+torn and is dropped when read. An empty field is null, in text columns the empty text.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 RESERVE: Final = ".reserve"
 RESERVE_BYTES: Final = 256 * 1024
-"""Kept in a run folder while it is written, so that a run that fills its disk can still say so in its manifest."""
+"""Reserved in a run folder while it is written, so that a run that fills its disk can still write its manifest."""
 
 
 class CsvFile:
     """One table's CSV, open for appending."""
 
     def __init__(self, path: Path, columns: Iterable[str], *, reopen: bool = False) -> None:
-        """Create the file, which must not exist, with its header; ``reopen`` goes on after its last whole record."""
+        """Create the file, which must not exist, with its header; ``reopen`` appends to its whole records."""
         self.path = path
         try:
             self._file = path.open("r+b" if reopen else "xb", buffering=0)
@@ -47,17 +47,14 @@ class CsvFile:
         self._write("".join(",".join(map(_field, table.values(row, provenance(row)))) + "\n" for row in rows))
 
     def close(self) -> None:
-        """Close the file; may be called twice."""
         self._file.close()
 
     def _write(self, text: str) -> None:
         """Append the text as a whole or not at all."""
-        # A model may yield half a character; the file must stay valid UTF-8.
-        data = text.encode("utf-8", "backslashreplace")
+        data = text.encode("utf-8", "backslashreplace")  # a model may yield half a character
         try:
             written = self._file.write(data)
-            while written < len(data):
-                # Cut short: the rest either goes through now or says why not (the disk is full).
+            while written < len(data):  # the next write succeeds, or raises the reason: the disk is full
                 written += self._file.write(data[written:])
         except OSError as error:
             self._file.truncate(self._end)
@@ -67,7 +64,7 @@ class CsvFile:
 
 
 def _field(value: Value) -> str:
-    """Write one field; floats in full, so that they read back as they were."""
+    """Format one field; floats with all digits."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -77,26 +74,26 @@ def _field(value: Value) -> str:
 
 
 ROWS: Final = 10_000_000
-"""The most rows of a Parquet file that are read, by its footer: a few bytes can stand for any number of equal rows."""
+"""Limit on the rows of a Parquet file, by its footer: a few bytes can encode any number of equal rows."""
 
 
 def _arrow(path: Path) -> tuple[Any, Any, Any]:
-    """Return pyarrow, its CSV and its Parquet; raises MissingExtra where it does not load, as for another NumPy."""
+    """Return pyarrow, its CSV and its Parquet module; raises MissingExtra if it does not load beside this NumPy."""
     try:
         import pyarrow as pa
         from pyarrow import csv, parquet
     except (ImportError, AttributeError, RuntimeError) as error:
-        why = str(error).strip().splitlines()[:1]
+        reason = "".join(str(error).strip().splitlines()[:1]) or type(error).__name__
         raise MissingExtra(
-            f"pyarrow does not load beside NumPy {version('numpy')} ({''.join(why) or type(error).__name__}): the CSV "
-            f"files in {path.parent} are whole and the rest can be made of them; beside NumPy 1, as ROS wants it, "
+            f"pyarrow does not load beside NumPy {version('numpy')} ({reason}): the CSV files in {path.parent} are "
+            "complete and all else can be made from them; beside NumPy 1, which ROS needs, "
             "pip install -c constraints-ros-jazzy.txt pyarrow"
         ) from error
     return pa, csv, parquet
 
 
 def count_rows(path: Path) -> int:
-    """Count the rows of a table's Parquet or CSV file without reading their values."""
+    """Return the number of rows of a Parquet or CSV file without reading their values."""
     if path.suffix == ".parquet":
         return int(_arrow(path)[2].read_metadata(path).num_rows)
     return max(sum(1 for _ in _ends(path.read_bytes())) - 1, 0)
@@ -108,7 +105,7 @@ def whole_records(data: bytes) -> bytes:
 
 
 def _ends(data: bytes) -> Iterator[int]:
-    """Yield where each whole record ends."""
+    """Yield the end of each whole record."""
     position = quotes = 0
     for line in data.split(b"\n")[:-1]:
         position += len(line) + 1
@@ -118,9 +115,9 @@ def _ends(data: bytes) -> Iterator[int]:
 
 
 def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
-    """Read a table's CSV as a ``pyarrow.Table``, without its torn end; a file that is not there is an empty table.
+    """Read a CSV as a ``pyarrow.Table``, without its torn end; an absent file is an empty table.
 
-    A column that it does not have is null throughout: schema 1 may gain columns.
+    An absent column is null: schema 1 may gain columns.
     """
     pa, csv, _ = _arrow(path)
     schema = _schema(pa, columns)
@@ -130,7 +127,7 @@ def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
     try:
         return csv.read_csv(
             pa.BufferReader(data),
-            # One block: a quoted line feed may stand anywhere.
+            # one block, as a quoted line feed may be anywhere
             read_options=csv.ReadOptions(use_threads=False, block_size=len(data) + 1),
             # an empty line is a row of one column that is empty
             parse_options=csv.ParseOptions(newlines_in_values=True, ignore_empty_lines=False),
@@ -157,12 +154,12 @@ def write_parquet(path: Path, table: Any) -> None:
         part.replace(path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        whole = OSError(error.errno or EIO, os.strerror(error.errno or EIO))  # not Arrow's own words
+        whole = OSError(error.errno or EIO, os.strerror(error.errno or EIO))  # without the text of Arrow
         raise StoreError(f"cannot write {path}: {why(whole, path)}; the CSV files are complete") from error
 
 
 def read_parquet(path: Path, columns: dict[str, Kind]) -> Any:
-    """Read a table's Parquet file as a ``pyarrow.Table``."""
+    """Read a Parquet file as a ``pyarrow.Table``; raises StoreError for a damaged one."""
     pa, _, parquet = _arrow(path)
     schema = _schema(pa, columns)
     try:
@@ -177,7 +174,7 @@ def read_parquet(path: Path, columns: dict[str, Kind]) -> Any:
 
 
 def to_pandas(table: Any) -> pd.DataFrame:
-    """Turn a ``pyarrow.Table`` into a DataFrame whose integers stay integers and whose nulls stay nulls."""
+    """Convert a ``pyarrow.Table`` to a DataFrame with nullable types: integers stay integers, nulls stay nulls."""
     import pandas as pd
     import pyarrow as pa
 
@@ -192,26 +189,26 @@ def _schema(pa: Any, columns: dict[str, Kind]) -> Any:
 
 
 def why(error: OSError, path: Path) -> str:
-    """Return why a path could not be written; where there was no room, on which file system."""
-    said = error.strerror or str(error)
+    """Return the reason why a path cannot be written; of a full disk also the file system and the free bytes."""
+    reason = error.strerror or str(error)
     if error.errno not in {ENOSPC, EDQUOT}:
-        return said
+        return reason
     mount = next(place for place in (path.resolve(), *path.resolve().parents) if os.path.ismount(place))
     try:
         free = f", {shutil.disk_usage(mount).free:,} bytes free"
     except OSError:
         free = ""
-    return f"{said} (file system {mount}{free}; make room, or choose another `output`)"
+    return f"{reason} (file system {mount}{free}; free some space, or choose another `output`)"
 
 
 def reserve(folder: Path) -> None:
-    """Keep room in a folder; on a file system that has none the run ends here, before anything is measured."""
+    """Reserve space in a folder; raises OSError on a full file system, before anything is measured."""
     with (folder / RESERVE).open("wb") as file:
-        file.write(bytes(RESERVE_BYTES))  # not only allocated: some file systems promise more than they have
+        file.write(bytes(RESERVE_BYTES))  # written, as some file systems allocate more than they have
 
 
 def release(folder: Path) -> bool:
-    """Give the room back; return whether there was any."""
+    """Free the reserved space; return False if there was none."""
     try:
         (folder / RESERVE).unlink()
     except FileNotFoundError:

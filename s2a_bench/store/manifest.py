@@ -1,4 +1,4 @@
-"""The manifest of a run: what was asked, where it ran, how it ended; one JSON file, replaced atomically."""
+"""The manifest of a run: configuration, environment and state; one JSON file, replaced atomically."""
 
 from __future__ import annotations
 
@@ -22,17 +22,15 @@ from s2a_bench.store.schema import SCHEMA
 
 NAME = "manifest.json"
 SWEEP: Final = "sweep"
-"""The command of a sweep, whose folder holds runs."""
+"""The command of a sweep."""
 MAX_BYTES: Final = 64 * 2**20
-"""Of a manifest; a sweep's of 100,000 cells is far below."""
-
+"""Limit on a manifest; that of a sweep of 100,000 cells is far smaller."""
 
 Facts = dict[str, Any]
-"""Of whoever measures, by name."""
 
 
 class _Shape(BaseModel):
-    """Base of what a manifest's objects hold at least; whoever measures adds facts."""
+    """Base of the objects in a manifest; experiments add facts."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
@@ -50,7 +48,7 @@ class _Warning(_Shape):
 
 
 class _Manifest(_Shape):
-    """What readers of every run go by; a key may be absent, as each experiment writes what it has."""
+    """The keys that readers of every run use; a key may be absent."""
 
     command: str
     state: Literal["running", "finished", "interrupted", "failed"]
@@ -84,7 +82,7 @@ class _SweepManifest(_Manifest):
 
 @dataclass(frozen=True, slots=True)
 class RunWarning:
-    """One warning: what was seen, and the way out."""
+    """One warning, with advice."""
 
     code: Annotated[str, {"pattern": "^[a-z0-9-]+$"}]
     message: Annotated[str, {"minLength": 1}]
@@ -95,12 +93,12 @@ class RunWarning:
 
 
 def utc_now() -> str:
-    """Tell the time for people, in UTC; durations never come from it."""
+    """Return the time in UTC as text; durations are never computed from it."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def merge(into: dict[str, Any], facts: Mapping[str, Any]) -> None:
-    """Merge facts: mappings key by key, anything else replaces what was there."""
+    """Merge facts: mappings key by key, any other value replaces the old one."""
     for key, value in facts.items():
         name = plain(str(key))  # a cell's name may hold a secret
         old = into.get(name)
@@ -111,9 +109,9 @@ def merge(into: dict[str, Any], facts: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Turn a value into what JSON holds: dataclasses into objects, paths into text, NaN and infinity into null.
+    """Convert a value to JSON types: dataclasses to objects, paths to text, NaN and infinity to null.
 
-    Secrets are struck out; half a surrogate pair, as in an argument that is no UTF-8, is written out.
+    Secrets are struck out; half a surrogate pair, as in an argument that is no UTF-8, is escaped.
     """
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
@@ -131,16 +129,16 @@ def plain(value: Any) -> Any:
 
 
 def present(value: Any) -> dict[str, Any]:
-    """Return a dataclass as `plain` data; a field whose default is None is an absent key where it has no value."""
+    """Return a dataclass as `plain` data, without the keys whose value and default are None."""
     items = ((item, getattr(value, item.name)) for item in dataclasses.fields(value))
     return {item.name: plain(inner) for item, inner in items if inner is not None or item.default is not None}
 
 
 def write(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest; a reader sees the old one or the new one, never half of one."""
+    """Replace the manifest atomically."""
     path, part = folder / NAME, folder / f"{NAME}.part"
     try:
-        # half a surrogate pair, as bytes of argv that are no UTF-8 have, becomes JSON's own escape of it
+        # half a surrogate pair, from bytes of argv that are no UTF-8, becomes the escape of JSON
         with part.open("w", encoding="utf-8", errors="backslashreplace") as file:
             json.dump(manifest, file, indent=2, ensure_ascii=False, allow_nan=False)
             file.write("\n")
@@ -153,7 +151,7 @@ def write(folder: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """Read a run's manifest; raises StoreError where there is none, another version's, or one of another shape."""
+    """Read a run's manifest; raises StoreError if it is absent, damaged or of another version."""
     path = folder / NAME
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -163,7 +161,7 @@ def read(folder: Path) -> dict[str, Any]:
         raise StoreError(f"{folder} is no run folder: {path}: {error.strerror}") from error
     try:
         manifest = json.loads(text)
-        json.dumps(manifest, ensure_ascii=False).encode()  # half a surrogate pair cannot be shown
+        json.dumps(manifest, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
     schema = manifest.get("schema") if isinstance(manifest, dict) else None
@@ -176,13 +174,12 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def _check(manifest: Mapping[str, Any], path: Path) -> None:
-    """Raise StoreError naming the first key that is missing or wrong."""
+    """Raise StoreError naming the first missing or wrong key."""
     try:
         (_SweepManifest if manifest.get("command") == SWEEP else _Manifest).model_validate(manifest)
     except ValidationError as error:
         first = error.errors()[0]
         key = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in first["loc"])
-        wrong = "is missing"
-        if first["type"] != "missing":
-            wrong = first["msg"].replace("Input", reprlib.repr(first["input"]), 1)
-        raise StoreError(f"{path} is damaged: {reprlib.repr(key.lstrip('.'))[1:-1]}: {wrong}") from None
+        problem = first["msg"].replace("Input", reprlib.repr(first["input"]), 1)
+        problem = "is missing" if first["type"] == "missing" else problem
+        raise StoreError(f"{path} is damaged: {reprlib.repr(key.lstrip('.'))[1:-1]}: {problem}") from None

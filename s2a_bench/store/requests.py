@@ -1,8 +1,7 @@
 """The rows of requests: samples, tokens, the frames of a stream, and the skills of plans.
 
-A row's own fields are what was observed; *derived* columns are computed from its chain of marks by `trace.budget`,
-never typed a second time. A stage that the chain does not have is null, never zero; where the request failed every
-derived column is null.
+The fields of a row are observed; *derived* columns are computed from its chain of marks by `trace.budget`. A stage that
+the chain does not have is null, never zero; every derived column of a failed request is null.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ from s2a_bench.trace import Budget, Mark, budget
 
 @dataclass(frozen=True, slots=True)
 class SampleRow:
-    """One request: which cell, where in the run, its whole chain of marks, and what is known besides.
+    """One request: its cell, its place in the run, its chain of marks, and more facts.
 
-    ``cell`` is what is compared, e.g. ``http/as-deployed``. ``payload`` is what travels: raw, yuyv, jpeg,
-    jpeg-preencoded or png, nothing for loopback. An empty ``error`` means that the request succeeded.
-    ``frame_age_ns`` is the frame's age when inference starts. ``rgb_source`` is a checksum of the RGB that a reference
-    conversion of the source frame gives, ``rgb_engine`` of the RGB at the engine; null where unknown, as behind a
-    black box. ``launch`` counts the sets of servers from 0, ``block`` on over all of them.
+    ``cell`` is the unit of comparison, e.g. ``http/as-deployed``. ``payload`` is raw, yuyv, jpeg, jpeg-preencoded or
+    png, empty for loopback. An empty ``error`` means success. ``frame_age_ns`` is the age of the frame when inference
+    starts. ``rgb_source`` is a checksum of the RGB from a reference conversion of the source frame, ``rgb_engine`` of
+    the RGB at the engine; null if unknown, as behind a black box. ``launch`` counts the sets of servers from 0,
+    ``block`` counts over all launches.
     """
 
     cell: str
@@ -56,7 +55,7 @@ class SampleRow:
 
 @dataclass(frozen=True, slots=True)
 class TokenRow:
-    """One token: when it left the engine (null where the server is a black box) and when the client saw it."""
+    """One token: when it left the engine (null behind a black box) and when the client received it."""
 
     request_id: str
     cell: str
@@ -69,7 +68,7 @@ class TokenRow:
 
 @dataclass(frozen=True, slots=True)
 class FrameRow:
-    """One frame of a stream-mode run; ``used_by`` is the request that looked at it, or empty."""
+    """One frame of a stream-mode run; ``used_by`` is the request that used it, or empty."""
 
     cell: str
     frame_index: int
@@ -80,10 +79,10 @@ class FrameRow:
 
 @dataclass(frozen=True, slots=True)
 class SkillRow:
-    """One skill of a plan: when its fragment was complete, when it ran; ``stall_ns`` is the stall before it.
+    """One skill of a plan: when its fragment was complete, and when it ran; ``stall_ns`` is the stall before it.
 
-    Times count from the request. ``text`` is the call, empty where no model wrote one. ``due_ns``, of skills that were
-    really executed, is when the reason to start was there; it is null where times were computed.
+    Times count from the request. ``text`` is the call, empty if no model wrote one. ``due_ns`` is the time at which an
+    executed skill could start; it is null if times were computed.
     """
 
     cell: str
@@ -106,11 +105,11 @@ def _stage_values(spent: Budget) -> dict[str, Value]:
 
 
 FIRST_TOKEN: Final = frozenset({"return", "ingest", "server"})
-"""A chain with one of these stages ends when the client sees the first token; the last two stand for black boxes."""
+"""A chain with one of these stages ends when the client receives the first token; the last two are of black boxes."""
 
 
 def _derive_sample(row: SampleRow) -> dict[str, Value]:
-    """Compute a sample's durations; a chain that does not reach the first token has no end to end."""
+    """Return a sample's durations; a chain that does not reach the first token has none."""
     if row.error or not any(stage in FIRST_TOKEN for stage, _ in row.marks):
         return {}
     spent = budget(row.marks)
@@ -118,11 +117,11 @@ def _derive_sample(row: SampleRow) -> dict[str, Value]:
 
 
 def _without_model_ns(row: SampleRow, spent: Budget) -> int | None:
-    """Return e2e minus what the model computed; a llama-server, whose `ingest` preprocesses, tells that itself."""
+    """Return e2e minus the model's time, which a llama-server reports, as its `ingest` includes preprocessing."""
     if "ingest" not in spent.stages_ns:
         return spent.e2e_without_model_ns
-    told_ms = row.server_prompt_ms
-    return spent.e2e_ns - round(told_ms * 1e6) if told_ms and 0 < told_ms * 1e6 <= spent.e2e_ns else None
+    model_ns = round((row.server_prompt_ms or 0) * 1e6)
+    return spent.e2e_ns - model_ns if 0 < model_ns <= spent.e2e_ns else None
 
 
 _OF_SAMPLE: Final[Mapping[str, tuple[Kind, Callable[[SampleRow, Budget], Value]]]] = {
@@ -133,11 +132,11 @@ _OF_SAMPLE: Final[Mapping[str, tuple[Kind, Callable[[SampleRow, Budget], Value]]
     "residual_ns": ("int64", lambda _, spent: spent.residual_ns),
     "residual_share": ("float64", lambda _, spent: spent.residual_share),
 }
-"""What is derived of a request besides its stages; `ttft_ns` counts from the prompt, which stream mode begins with."""
+"""Derived columns besides the stages; `ttft_ns` counts from the prompt, with which stream mode begins."""
 
 
 def _derive_frame(row: FrameRow) -> dict[str, Value]:
-    """Compute a frame's durations up to its last mark, from capture and from the time it was due."""
+    """Return a frame's durations up to its last mark, from capture and from the intended time."""
     if not row.marks:
         return {}
     spent = budget(row.marks)
@@ -150,11 +149,10 @@ def _derive_frame(row: FrameRow) -> dict[str, Value]:
 
 
 TOKENS: Final[Table[TokenRow]] = Table("tokens", TokenRow)
-"""One row a token."""
 
 
 def _derive_skill(row: SkillRow) -> dict[str, Value]:
-    """Compute how long a skill lay ready, its duration over the nominal one, and how late the robot had the order."""
+    """Return how long a skill waited, its duration over the nominal one, and how late the robot got the command."""
     stretch = (row.end_ns - row.start_ns) / row.nominal_ns if row.nominal_ns else None
     jitter_ns = None if row.due_ns is None else row.start_ns - row.due_ns
     return {"queue_wait_ns": row.start_ns - row.arrival_ns, "stretch": stretch, "start_jitter_ns": jitter_ns}
@@ -166,7 +164,6 @@ SKILLS: Final[Table[SkillRow]] = Table(
     {"queue_wait_ns": "int64", "stretch": "float64", "start_jitter_ns": "int64"},
     _derive_skill,
 )
-"""One row a skill."""
 
 
 def samples_table(stages: Mapping[str, str]) -> Table[SampleRow]:

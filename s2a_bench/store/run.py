@@ -1,4 +1,4 @@
-"""A run folder: opened before measuring, appended row by row, readable at any moment, even after a kill."""
+"""A run folder: made before measuring, appended row by row, readable at any moment, even after a kill."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STATES = ("running", "finished", "interrupted", "failed")
-"""A run that says "running" and whose process is gone was killed; its rows are whole."""
+"""A killed run stays "running"; its rows are whole."""
 
 
 @final
 class RunWriter(AbstractContextManager["RunWriter"]):
-    """Writes one run folder. Use as a context manager; not thread-safe.
+    """Writes one run folder, as a context manager; not thread-safe.
 
-    Leaving the block finishes the run: "finished", "interrupted" on KeyboardInterrupt, "failed" on any other
-    exception, unless `finish` was called before. A folder that `create` made is removed on an exception before the
+    Leaving the block finishes the run, unless `finish` was called before: "finished", "interrupted" on
+    KeyboardInterrupt, "failed" on any other exception. A folder made by `create` is removed on an exception before the
     first row, unless it holds a folder.
     """
 
     def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
-        """Open the files in an existing, empty folder; `create` makes it."""
+        """Open an existing folder; raises StoreError if it cannot be written."""
         self.path = path
         self._manifest = manifest
         self._finished = False
@@ -71,12 +71,11 @@ class RunWriter(AbstractContextManager["RunWriter"]):
     def create(
         cls, root: Path, command: str, manifest: dict[str, Any], tables: Iterable[Table[Any]] | None = None
     ) -> RunWriter:
-        """Make ``<root>/<UTC time>-<command>-<host>`` and open the files of ``tables``, those of requests unless told.
+        """Make ``<root>/<UTC time>-<command>-<host>`` and open the files of ``tables``, by default those of requests.
 
-        Others open at their first row. ``manifest`` may bring ``stages`` (stage -> group, which samples get columns
-        for), ``provenance`` (`Origins.to_manifest`), ``argv``, ``configuration``, ``environment``, ``warnings``,
-        ``seeds`` and more.
-        Raises StoreError, naming ``--output``, where the folder cannot be made.
+        Other tables open at their first row. ``manifest`` may have ``stages`` (stage -> group; each is a column of the
+        samples), ``provenance`` (`Origins.to_manifest`), ``argv``, ``configuration``, ``environment``, ``warnings``,
+        ``seeds`` and more. Raises StoreError, naming ``--output``, if the folder cannot be made.
         """
         host = socket.gethostname()
         stem = f"{datetime.now(timezone.utc):%Y%m%dT%H%M%SZ}-{_slug(command)}-{_slug(host)}"
@@ -110,9 +109,9 @@ class RunWriter(AbstractContextManager["RunWriter"]):
 
     @classmethod
     def reopen(cls, path: Path, tables: Iterable[Table[Any]]) -> RunWriter:
-        """Go on writing a run folder that nobody else writes, with its manifest and the whole records of ``tables``.
+        """Resume a run folder with its manifest and the whole records of ``tables``; no other process may write it.
 
-        Raises StoreError where it is no run folder, another version's, or cannot be written.
+        Raises StoreError if it is no run folder, of another version, or cannot be written.
         """
         manifest = manifests.read(path) | {"state": "running", "error": None, "finished": None}
         run = cls(path, manifest)
@@ -124,11 +123,11 @@ class RunWriter(AbstractContextManager["RunWriter"]):
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """The manifest as last written; change it through `update`."""
+        """The manifest as last written; `update` changes it."""
         return self._manifest
 
     def append(self, table: Table[Row], rows: Iterable[Row]) -> None:
-        """Append rows to a table in one write; the first call creates its file."""
+        """Append rows to a table in one write; the first call creates the file."""
         if table.name not in self._files:
             self._files[table.name] = table, CsvFile(self.path / f"{table.name}.csv", table.columns)
         kept = [*rows]
@@ -136,9 +135,9 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         self._rows += len(kept)
 
     def _provenance(self, row: object) -> str:
-        """Return where a row's numbers come from: what it says itself, its cell's engine told, or the run's."""
-        if own := getattr(row, PROVENANCE, ""):
-            return str(own)
+        """Return the origin of a row's numbers: its own field, that of its cell's engine, or that of the run."""
+        if of_row := getattr(row, PROVENANCE, ""):
+            return str(of_row)
         cell = getattr(row, "cell", "")
         if cell not in self._codes:
             self._codes[cell] = Origins.of_manifest(self._manifest).of_row(cell)
@@ -178,31 +177,30 @@ class RunWriter(AbstractContextManager["RunWriter"]):
             for table, file in self._files.values():
                 write_parquet(self.path / f"{table.name}.parquet", read_csv(file.path, table.columns))
         except MissingExtra:
-            pass  # the CSV files are whole; whoever reads them is told
+            pass  # the CSV files are complete, and reading them raises it again
         except StoreError as full:
             state, error = "failed", error or str(full)
             raise
         finally:
-            # The state is written even where there is no room for Parquet, or Ctrl-C comes a second time.
+            # the state is written even if the disk is full, or at a second Ctrl-C
             self.update(state=state, error=error, finished=manifests.utc_now())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        useless = self._made and not (self._rows or self._finished) and str(self.path) not in str(error)
-        if error is not None and useless and self._discard():
+        empty = self._made and not (self._rows or self._finished) and str(self.path) not in str(error)
+        if error is not None and empty and self._discard():
             return
         state = "finished" if error is None else "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         try:
             self.finish(state, None if error is None else str(error) or type(error).__name__)
         except StoreError:
-            # What went wrong first matters more; the CSV files are complete.
-            if error is None:
+            if error is None:  # else the first error matters more
                 raise
 
     def _discard(self) -> bool:
-        """Remove the folder, and those made for it if they are empty; return False where it holds a folder."""
-        with suppress(OSError):  # what went wrong first matters more
+        """Remove the folder and the empty ones made for it; return False if it holds a folder."""
+        with suppress(OSError):  # the first error matters more
             if any(map(Path.is_dir, self.path.iterdir())):
                 return False
             self._finished = True
@@ -216,7 +214,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
 
 @dataclass(frozen=True, slots=True)
 class StoredRun:
-    """One run as read: the manifest, and its tables as DataFrames, each read when it is first asked for.
+    """One run: the manifest, and its tables as DataFrames, each read at its first use.
 
     Times are integers (Int64) in ns, `marks` and `facts` JSON text; a missing value is ``pd.NA``.
     """
@@ -224,14 +222,16 @@ class StoredRun:
     path: Path
     manifest: dict[str, Any]
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
-    """By name, what was read so far; what is put in here is not looked for in the folder."""
+    """The tables read so far, by name."""
     derived: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """What views computed of the tables once, by a name of theirs."""
+    """Values that views compute from the tables once, by name."""
 
     def table(self, table: Table[Any]) -> pd.DataFrame:
-        """Return a table with all its columns, empty where the run has none; raises StoreError for a damaged file."""
+        """Return a table with all its columns, empty if the run has none; raises StoreError for a damaged file."""
         if table.name not in self.tables:
-            self.tables[table.name] = _read(self.path, table)
+            parquet = self.path / f"{table.name}.parquet"  # of a run that has ended
+            read, path = (read_parquet, parquet) if parquet.exists() else (read_csv, parquet.with_suffix(".csv"))
+            self.tables[table.name] = to_pandas(read(path, table.columns))
         return self.tables[table.name]
 
     @property
@@ -240,11 +240,10 @@ class StoredRun:
 
     @property
     def bootstrap_seed(self) -> int:
-        """Return the seed of intervals: the manifest's ``seeds.bootstrap``, else 0."""
         return int(self.manifest.get("seeds", {}).get("bootstrap") or 0)
 
     def row_counts(self) -> dict[str, int]:
-        """Return how many rows each table of the run has, whoever declared it; empty tables are left out."""
+        """Return the number of rows of every file of a table, without the empty ones."""
         counts = {name: len(table) for name, table in self.tables.items()}
         for file in sorted([*self.path.glob("*.parquet"), *self.path.glob("*.csv")]):
             if file.stem not in counts:
@@ -258,12 +257,11 @@ class StoredRun:
 
     @property
     def facts(self) -> dict[str, dict[str, str]]:
-        """Fact -> unit and meaning, of all that may be told of a request."""
+        """Fact of a request -> unit and meaning."""
         return dict(self.manifest.get("facts", {}))
 
     @property
     def samples(self) -> pd.DataFrame:
-        """One row a request."""
         return self.table(samples_table(self.stages))
 
     @property
@@ -272,19 +270,18 @@ class StoredRun:
 
     @property
     def frames(self) -> pd.DataFrame:
-        """One row a frame of a stream."""
         return self.table(frames_table(self.stages))
 
 
 def read_run(path: Path) -> StoredRun:
-    """Open a run folder for reading; raises StoreError where it is none, or another version's."""
+    """Open a run folder for reading; raises StoreError if it is none, or of another version."""
     path = Path(path)
     return StoredRun(path, manifests.read(path))
 
 
 @contextmanager
 def fits(*runs: StoredRun) -> Iterator[None]:
-    """Raise StoreError, naming the runs, where the block misses something in their rows or manifests."""
+    """Turn an error about missing or wrong data in the block into a StoreError that names the runs."""
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
@@ -292,20 +289,12 @@ def fits(*runs: StoredRun) -> Iterator[None]:
         raise StoreError(f"{paths}: rows and manifest do not fit: {error!r}") from error
 
 
-def _read(path: Path, table: Table[Any]) -> pd.DataFrame:
-    """Read Parquet where the run came to its end, else the whole records of the CSV file."""
-    parquet = path / f"{table.name}.parquet"
-    if parquet.exists():
-        return to_pandas(read_parquet(parquet, table.columns))
-    return to_pandas(read_csv(path / f"{table.name}.csv", table.columns))
-
-
 def _slug(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9._]+", "-", name).strip("-.") or "unnamed"
 
 
 def _make_unique(root: Path, stem: str) -> Path:
-    """Create a folder that nobody else has; the second of one second gets the suffix -2."""
+    """Create a new folder; the second one of the same second gets the suffix -2."""
     root.mkdir(parents=True, exist_ok=True)
     if not os.access(root, os.W_OK | os.X_OK):
         raise PermissionError(13, "permission denied", str(root))

@@ -1,7 +1,7 @@
-"""What a table of a run folder is: rows of a dataclass, whose fields are the columns, and columns derived from them.
+"""Tables of a run folder: rows of a dataclass, whose fields are the columns, and columns derived from them.
 
-Who measures declares its own tables, beside what it measures; nothing here knows any of them. Between what numbers lie
-stands in the annotations of rows and of the cells of ``--json``; docs/schema follows from that.
+Every experiment declares its own tables. The annotations of rows and of the cells of ``--json`` have the bounds of
+numbers; docs/schema is generated from them.
 """
 
 from __future__ import annotations
@@ -17,20 +17,17 @@ from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar, 
 from s2a_bench.secrets import struck
 
 SCHEMA: Final = "s2a-bench/1"
-"""The version of folder, columns and ``--json``; it changes when a column changes its meaning or goes."""
+"""The version of folder, columns and ``--json``; it changes if a column changes its meaning or is removed."""
 
 Kind: TypeAlias = Literal["string", "int64", "float64", "bool"]
-"""What a column holds, by its Arrow name."""
+"""The type of a column, by its Arrow name."""
 
 Value: TypeAlias = str | int | float | bool | None
-"""One field as stored; None is null."""
-
 
 PROVENANCE: Final = "provenance"
-"""The last column of every table: where a row's numbers come from, in one word."""
+"""The last column of every table: a code of the origin of a row's numbers."""
 
 Row = TypeVar("Row")
-"""The dataclass of a table's rows."""
 
 
 def _nothing(_row: object) -> dict[str, Value]:
@@ -39,7 +36,7 @@ def _nothing(_row: object) -> dict[str, Value]:
 
 @dataclass(frozen=True, eq=False)
 class Table(Generic[Row]):
-    """One file of a run folder: its rows' dataclass, and the columns that are derived from a row."""
+    """One table: the dataclass of its rows, and the columns derived from a row."""
 
     name: str
     row: type[Row]
@@ -48,17 +45,17 @@ class Table(Generic[Row]):
 
     @cached_property
     def columns(self) -> dict[str, Kind]:
-        """Return the columns in order: the row's fields, the derived ones, then where the numbers come from."""
+        """The columns in order: the row's fields, the derived ones, the provenance."""
         hints = get_type_hints(self.row)
-        return {name: _kind(hints[name]) for name in self._own} | self.derived | {PROVENANCE: "string"}
+        return {name: _kind(hints[name]) for name in self._fields} | self.derived | {PROVENANCE: "string"}
 
     @cached_property
-    def _own(self) -> tuple[str, ...]:
+    def _fields(self) -> tuple[str, ...]:
         return tuple(item.name for item in fields(self.row) if item.name != PROVENANCE)  # type: ignore[arg-type]  # a row is a dataclass
 
     def values(self, row: Row, provenance: str = "") -> Iterator[Value]:
-        """Yield one value a column, the row's own fields first; lists and dicts become JSON text."""
-        for name in self._own:
+        """Yield one value a column; lists and dicts become JSON text."""
+        for name in self._fields:
             yield _stored(getattr(row, name))
         derived = self.derive(row)
         for name in self.derived:
@@ -76,7 +73,7 @@ def _stored(value: Any) -> Value:
 
 
 def _sound(value: Any) -> Any:
-    """Strike out secrets, and make null of numbers that no reader takes: NaN, whole ones of more than 64 bits."""
+    """Strike out secrets, and replace numbers that no reader accepts by null: NaN, integers of more than 64 bits."""
     if isinstance(value, dict):
         return {name: _sound(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -89,14 +86,14 @@ def _sound(value: Any) -> Any:
 
 
 def _kind(hint: Any) -> Kind:
-    """Name the column type of an annotation; whatever is no plain number travels as text."""
+    """Return the column type of an annotation: text unless it is a plain number or a bool."""
     plain = next((arg for arg in get_args(hint) if arg is not NoneType), hint) if NoneType in get_args(hint) else hint
     kinds: dict[Any, Kind] = {int: "int64", float: "float64", bool: "bool"}
     return kinds.get(plain, "string")
 
 
 class Facts(dict[str, Any]):
-    """What an annotation says of a field, in the words of JSON Schema; hashable, so that ``| None`` may follow."""
+    """An annotation of a field in terms of JSON Schema; hashable, so that ``| None`` may follow."""
 
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(tuple(self))
@@ -110,16 +107,16 @@ Fraction = Annotated[float, Facts(minimum=0, maximum=1)]
 
 
 def about(description: str) -> Facts:
-    """Return what an annotation says of a field for people."""
+    """Return an annotation that describes a field."""
     return Facts(description=description)
 
 
 def with_fields(
     name: str, about: str, base: type, fields: Mapping[str, Any], own: Mapping[str, Any] | None = None
 ) -> Any:
-    """Return a dataclass with more fields than its base, then ``own`` ones, which have no default.
+    """Return a dataclass with the fields of its base, ``fields``, and ``own`` ones, which have no default.
 
-    What one of the ``fields`` may lack is None, its default: an absent key of ``--json``.
+    One of ``fields`` that may be None has that default: an absent key of ``--json``.
     """
     made: list[Any] = [
         (key, hint, field(default=None)) if _may_lack(hint) else (key, hint) for key, hint in fields.items()

@@ -1,4 +1,4 @@
-"""A sweep as read: one row a cell with its settings, and the run folder of each."""
+"""A sweep: one row a cell with its settings, and the run folder of each."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CellRow:
-    """One attempt at one cell of a sweep; the latest attempt of a cell is the one that counts.
+    """One attempt at one cell of a sweep; the latest attempt counts.
 
-    ``cell`` names the setting and ``repeat`` which time it ran. ``state`` is finished or failed, ``error`` why.
-    ``board`` is the machine that the cell asked for, empty where any would do; ``host`` the one that it got.
-    ``folder`` is its run folder below the sweep's, empty where it did not come to have one, ``provenance`` that run's.
+    ``cell`` and ``repeat`` identify the cell. ``state`` is finished or failed, ``error`` the reason. ``board`` is the
+    machine that the cell needs, empty for any; ``host`` is the machine that ran it. ``folder`` is its run folder below
+    the sweep's, empty if it has none; ``provenance`` is that of the run.
     """
 
     cell: str
@@ -45,15 +45,13 @@ class CellRow:
 
 
 CELLS: Final[Table[CellRow]] = Table("cells", CellRow)
-"""One row an attempt at a cell of a sweep."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """One sweep: the manifest, every attempt, and the cells.
+    """One sweep: the manifest, every attempt (`CELLS`), and the cells.
 
-    ``attempts`` is the table `CELLS` as it was written. ``cells`` has one row a cell and repeat, the latest attempt,
-    and one column more for every setting, by its flag's name.
+    ``cells`` has the latest attempt of each cell and repeat, and a column more for every setting, by its flag's name.
     """
 
     path: Path
@@ -63,7 +61,6 @@ class Sweep:
 
     @property
     def origins(self) -> Origins:
-        """Return where the numbers of its finished cells come from."""
         return joined(run.origins for _, run in self.runs())
 
     def runs(self) -> Iterator[tuple[dict[str, Any], StoredRun]]:
@@ -73,12 +70,12 @@ class Sweep:
 
 
 def is_sweep(manifest: dict[str, Any]) -> bool:
-    """Return whether a run folder is a sweep's."""
+    """Return True for the manifest of a sweep."""
     return bool(manifest.get("command") == SWEEP)
 
 
 def read_sweep(path: Path) -> Sweep:
-    """Read a sweep's folder, at any moment of its life; raises StoreError where it is none."""
+    """Read a sweep's folder, finished or not; raises StoreError if it is none."""
     import pandas as pd
 
     run = read_run(path)

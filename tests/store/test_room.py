@@ -20,7 +20,7 @@ def test_where_there_is_no_room_the_file_system_and_what_is_free_are_told(
     monkeypatch.setattr(os.path, "ismount", lambda path: path == tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=12_345 if path == tmp_path else 0))
     full = OSError(number, os.strerror(number))
-    told = f"{full.strerror} (file system {tmp_path}, 12,345 bytes free; make room, or choose another `output`)"
+    told = f"{full.strerror} (file system {tmp_path}, 12,345 bytes free; free some space, or choose another `output`)"
     assert why(full, tmp_path / "a" / "b.csv") == told
     monkeypatch.setattr(shutil, "disk_usage", lambda _: (_ for _ in ()).throw(OSError()))
     assert why(full, tmp_path) == told.replace(", 12,345 bytes free", "")
