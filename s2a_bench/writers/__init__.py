@@ -1,1 +1,1 @@
-"""From tables and figures to files and terminals; knows no experiment."""
+"""Write tables and figures to files and terminals; knows no experiment."""

@@ -1,4 +1,4 @@
-"""The tables of a run as files; those for programs as CSV, every digit kept, each row with its numbers' provenance."""
+"""The tables of a run as files: Markdown, LaTeX, and CSV with every digit and the provenance of each row."""
 
 from __future__ import annotations
 
@@ -25,16 +25,13 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 SUMMARY = ("n", "median", "mean", "sd", "p90", "p99")
-"""The columns of a summary, in the order of every table."""
-
-
+"""The columns of a summary in every table."""
 summary_values: Callable[[Summary], tuple[object, ...]] = attrgetter(*SUMMARY)
-"""A summary's values in the order of `SUMMARY`."""
 
 
 @dataclass(frozen=True, slots=True)
 class CsvTable:
-    """A table for programs; None is an empty field."""
+    """A table for CSV; None is an empty field."""
 
     header: tuple[str, ...]
     rows: list[tuple[object, ...]]
@@ -45,25 +42,24 @@ class CsvTable:
 
     @classmethod
     def of_frame(cls, rows: pd.DataFrame) -> CsvTable:
-        """Keep the rows of a DataFrame; what is missing is an empty field."""
         whole = rows.astype(object).where(rows.notna(), None)
         return cls.of(map(str, rows.columns), whole.itertuples(index=False, name=None))
 
     def text(self, origins: Origins) -> str:
-        """Write it; the last column says where a row's numbers come from: those of its ``cell``, or of the run."""
+        """Return the CSV; its last column is the provenance of a row: that of its ``cell``, or of the run."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        told = PROVENANCE in self.header  # a table of the store has it already
+        has_provenance = PROVENANCE in self.header  # a table of the store
         cell = self.header.index("cell") if "cell" in self.header else None
-        writer.writerow(map(_inert, self.header if told else (*self.header, PROVENANCE)))
+        writer.writerow(map(_inert, self.header if has_provenance else (*self.header, PROVENANCE)))
         for row in self.rows:
             code = origins.code if cell is None else origins.of_row(str(row[cell]))
-            writer.writerow(map(_inert, row if told else (*row, code)))
+            writer.writerow(map(_inert, row if has_provenance else (*row, code)))
         return out.getvalue()
 
 
 def _inert(value: object) -> object:
-    """Return a value of visible letters that no spreadsheet takes for a formula (OWASP, CSV injection)."""
+    """Return a value of visible characters that is no formula in a spreadsheet (OWASP, CSV injection)."""
     if not isinstance(value, str):
         return value
     value = visible(value)
@@ -77,7 +73,7 @@ def _inert(value: object) -> object:
 
 
 def write_texts(run: StoredRun, tables: Mapping[str, TextTable], csvs: Mapping[str, CsvTable]) -> list[Path]:
-    """Write ``tables/``: each table as .md and .tex, and those for programs under their names; raises StoreError."""
+    """Write each table to ``tables/`` as .md and .tex, and the CSV files; raises StoreError."""
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
     texts |= {f"{name}.tex": to_latex(table) for name, table in tables.items()}
     texts |= {name: table.text(run.origins) for name, table in csvs.items()}

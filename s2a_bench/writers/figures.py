@@ -1,7 +1,7 @@
-"""What every figure is made with: one column wide, rows named on the left, numbers beside them, PNG and PDF.
+"""Building blocks of figures: one column wide, rows named on the left, numbers beside them, PNG and PDF.
 
-A figure's caption, a title and notes in plain text, is declared where the figure is made and is not drawn: the page,
-LaTeX, notebooks and ``captions.md`` set it below. Drawn is one line that says where the numbers come from.
+A figure has a caption, a title and notes in plain text, that is not drawn: the page, LaTeX, notebooks and
+``captions.md`` set it below. One line with the origin of the numbers is drawn.
 """
 
 from __future__ import annotations
@@ -27,19 +27,16 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 WIDE_SPREAD = 10
-"""Values that spread by more than this factor get a logarithmic axis, or a panel of shares."""
+"""A larger ratio of the extremes needs a logarithmic axis, or a panel of shares."""
 
 LINE_CHARS = 62
-"""As many characters of 7 point fit into one column."""
+"""Characters of 7 point that fit into one column."""
 
 WHISKERS = "Bars are medians; whiskers reach from the 10th to the 90th percentile."
 
 
 def new_figure(height_in: float, caption: Iterable[str], width_in: float = WIDTH_IN) -> Figure:
-    """Make a figure that draws itself with Agg, without pyplot and its global state.
-
-    ``caption`` are a title, without a full stop, and notes.
-    """
+    """Make a figure on Agg, without pyplot and its global state; ``caption`` has a title and notes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -50,7 +47,7 @@ def new_figure(height_in: float, caption: Iterable[str], width_in: float = WIDTH
 
 
 def caption_of(figure: Figure) -> tuple[str, ...]:
-    """Return a figure's title and notes; the last one says where its numbers come from."""
+    """Return a figure's title and notes; the last note of a `marked` one is the origin of its numbers."""
     return tuple(str(figure.get_label()).split("\n"))
 
 
@@ -61,7 +58,7 @@ def markdown_caption(figure: Figure) -> str:
 
 
 def name_rows(axes: Axes, names: list[str]) -> None:
-    """Put the names to the left, the first one on top."""
+    """Name the rows on the left, the first one on top."""
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.tick_params(axis="y", length=0)
@@ -73,7 +70,7 @@ def write_beside(axes: Axes, place: float, text: str) -> None:
 
 
 def draw_over(axes: Axes, x: Sequence[float], y: Sequence[float], style: str, label: str = "") -> None:
-    """Draw a dark line with a white edge, to be seen on a bar of any colour."""
+    """Draw a dark line with a white edge, visible on a bar of any colour."""
     from matplotlib.patheffects import withStroke
 
     edge = [withStroke(linewidth=2.4, foreground="white")]
@@ -81,7 +78,7 @@ def draw_over(axes: Axes, x: Sequence[float], y: Sequence[float], style: str, la
 
 
 def logarithmic(axes: Axes, spread: float) -> None:
-    """Make the x axis logarithmic with plain numbers: 0.1, 1, 10; 2 and 5 as well where there is room."""
+    """Make the x axis logarithmic with plain numbers: 0.1, 1, 10; also 2 and 5 if there is space."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
@@ -92,7 +89,7 @@ def logarithmic(axes: Axes, spread: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """One row of `build_bars`; ``whisker`` is from where to where it reaches, None where that is not known."""
+    """One row of `build_bars`; ``whisker`` has both ends, None if they are unknown."""
 
     name: str
     value: float
@@ -102,7 +99,7 @@ class Bar:
 
     @classmethod
     def of(cls, name: str, values: NDArray[np.float64], colour: str) -> Bar:
-        """Return the median of values with `WHISKERS`."""
+        """Return a bar of the median with `WHISKERS`."""
         import numpy as np
 
         low, median, high = np.percentile(values, (10, 50, 90)).tolist()
@@ -112,9 +109,9 @@ class Bar:
 def build_bars(
     caption: Iterable[str], bars: Sequence[Bar], label: str, paper: str = "", *, scaled: bool = False
 ) -> Figure:
-    """Draw a row a bar, from zero; ``paper`` names the grey ones.
+    """Draw one row a bar, from zero; ``paper`` is the legend of the grey ones.
 
-    If ``scaled``, bars too far apart for one scale become points on a logarithmic axis.
+    If ``scaled``, values that spread by more than `WIDE_SPREAD` become points on a logarithmic axis.
     """
     from matplotlib.patches import Patch
 
@@ -153,7 +150,7 @@ def build_distribution(
     label: str,
     columns: int = 2,
 ) -> Figure:
-    """Draw empirical distributions: name -> values, colour and line style; logarithmic if they spread widely."""
+    """Draw empirical distributions: name -> values, colour and line style."""
     figure = new_figure(2.35 + 0.14 * -(-len(lines) // 2), caption)
     axes = figure.subplots()
     for name, (values, (colour, style)) in lines.items():
@@ -173,14 +170,14 @@ _DAY = len("2026-11-23")
 
 
 def source_line(runs: Iterable[StoredRun]) -> str:
-    """Return in one line who answered runs, whether anything was emulated, paced or a dummy, the hosts and the days."""
+    """Return one line with the origin of the numbers of runs, the hosts and the days."""
     manifests = [run.manifest for run in runs]
     facts = (str(each.get(name, ""))[:most] for name, most in (("host", None), ("started", _DAY)) for each in manifests)
     return " · ".join(dict.fromkeys((joined(run.origins for run in runs).brief, *filter(None, facts))))
 
 
 def marked(build: Callable[[], Figure], *runs: StoredRun) -> Figure:
-    """Build a figure of runs; where its numbers come from is drawn above it in one line, and ends its caption."""
+    """Build a figure of runs; the origin of its numbers is drawn above it in one line, and ends its caption."""
     figure = build()
     line = figure.suptitle(source_line(runs), x=0.01, horizontalalignment="left", color="#444444", parse_math=False)
     too_wide = line.get_window_extent().width / (0.95 * figure.bbox.width)
@@ -190,12 +187,11 @@ def marked(build: Callable[[], Figure], *runs: StoredRun) -> Figure:
 
 
 def save(folder: Path, builders: Mapping[str, Callable[[], Figure]]) -> list[Path]:
-    """Build each figure and write it as ``<name>.png`` and ``<name>.pdf``, and what they show as ``captions.md``.
+    """Build and write each figure as ``<name>.png`` and ``<name>.pdf``, and the captions as ``captions.md``.
 
-    Raises StoreError where that fails, ValueError for a figure that does not say where its numbers come from.
+    Raises StoreError if it cannot be written, ValueError for a figure without the origin of its numbers.
     """
-    written = []
-    captions = []
+    written, captions = [], []
     try:
         folder.mkdir(exist_ok=True)
         for name, build in builders.items():
@@ -204,9 +200,8 @@ def save(folder: Path, builders: Mapping[str, Callable[[], Figure]]) -> list[Pat
                 required(name, figure.get_suptitle())
                 captions.append(f"**{name}**: {markdown_caption(figure)}\n")
                 for suffix in ("png", "pdf"):
-                    path = folder / f"{name}.{suffix}"
-                    figure.savefig(path)
-                    written.append(path)
+                    written.append(folder / f"{name}.{suffix}")
+                    figure.savefig(written[-1])
         (folder / "captions.md").write_text("\n".join(captions), encoding="utf-8")
     except OSError as error:
         raise StoreError(f"cannot write {folder}: {why(error, folder)}; the samples are kept") from error

@@ -1,4 +1,4 @@
-"""What the ``--json`` objects of all commands share; times in ms, for people."""
+"""The common parts of the ``--json`` objects of all commands; times are in ms."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 class RatioJson:
     """The median of one cell over that of another; ``ci95`` by the test of compare, None with too few blocks.
 
-    Over several launches it is their geometric mean, ``ci95`` holds for launches like them, and ``launch_sd`` is the
-    standard deviation of the logarithms of theirs; ``ci95`` of one launch holds for that launch.
+    Over several launches it is the geometric mean, ``ci95`` is between launches, and ``launch_sd`` is the standard
+    deviation of the logarithms of their ratios; ``ci95`` of one launch is within that launch.
     """
 
     metric: str
@@ -38,7 +38,7 @@ class RatioJson:
 def frame(
     run: StoredRun | Sweep, cells: list[dict[str, Any]], ratios: list[dict[str, Any]], **more: Any
 ) -> dict[str, Any]:
-    """Return what the objects of all commands share, around a command's own cells."""
+    """Return the ``--json`` object of a run with a command's cells and ratios."""
     return {
         "schema": SCHEMA,
         "command": run.manifest["command"],
@@ -54,16 +54,11 @@ def frame(
 
 
 def cell_of_row(
-    name: str,
-    about: str,
-    row: type,
-    *,
-    without: Sequence[str],
-    own: Mapping[str, Any] | None = None,
+    name: str, about: str, row: type, *, without: Sequence[str], own: Mapping[str, Any] | None = None
 ) -> type:
-    """Return the class of a cell with the fields of a row, ``without`` some, and with some of its ``own``.
+    """Return the class of a cell with the fields of a row, ``without`` some, and with ``own`` ones.
 
-    What a row may lack is an absent key.
+    A field that may be None is an absent key.
     """
     hints = {key: hint for key, hint in get_type_hints(row, include_extras=True).items() if key not in without}
     made: type = with_fields(name, about, object, hints, own)
@@ -71,11 +66,11 @@ def cell_of_row(
 
 
 def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
-    """Return one ratio of the object."""
+    """Return one entry of `ratios`."""
     return present(RatioJson(metric, of, to, ratio.value, ratio.ci95, ratio.launches, ratio.launch_sd))
 
 
 def summaries(metrics: Iterable[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:
-    """Summarise the metrics that have values; ``n`` tells where only some samples have a stage."""
+    """Summarise the metrics that have values; ``n`` is smaller if only some samples have a stage."""
     found = ((name, summary_of(values)) for name, values in metrics)
     return {name: asdict(summary) for name, summary in found if summary}

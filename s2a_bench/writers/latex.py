@@ -1,8 +1,7 @@
 r"""Text tables as LaTeX for papers: booktabs rules, and numbers set by siunitx.
 
-`to_latex` needs booktabs alone. For `to_siunitx`, whose packages `PREAMBLE` names, a column whose entries are all
-plain numbers, with or without a deviation, becomes an ``S`` column, aligned at the decimal marker; in others every
-number stands in ``\num``.
+`to_latex` needs booktabs alone, `to_siunitx` the packages of `PREAMBLE`: a column of plain numbers, with or without a
+deviation, becomes an ``S`` column, aligned at the decimal marker; in other columns every number is set in ``\num``.
 """
 
 from __future__ import annotations
@@ -54,14 +53,11 @@ PREAMBLE: Final = r"""\documentclass[a4paper,landscape]{article}
 \usepackage{array,booktabs,graphicx,longtable,siunitx}
 \sisetup{separate-uncertainty=true,retain-explicit-plus=true}
 """
-"""What the tables need, and a page wide enough for them."""
+"""The packages of the tables, and a page wide enough for them."""
 
 
 def to_latex(table: TextTable) -> str:
-    """Write a table as a LaTeX ``tabular`` for the package booktabs; title and notes are comments.
-
-    Where its numbers come from stands as its last line, which is printed with it.
-    """
+    """Return a LaTeX ``tabular`` for booktabs: title and notes are comments, the provenance is a printed last line."""
     lines = [f"% {one_line(note)}" for note in (table.title, *table.footer)]
     lines += [f"\\begin{{tabular}}{{{'l' * table.left}{'r' * (len(table.header) - table.left)}}}", "\\toprule"]
     lines += [_row(map(escape, table.header)), "\\midrule"]
@@ -72,9 +68,8 @@ def to_latex(table: TextTable) -> str:
 
 
 def to_siunitx(table: TextTable, widths: Sequence[str] = (), *, long: bool = False) -> str:
-    r"""Write a table as a LaTeX ``table``, or a ``longtable`` over several pages.
+    r"""Return a LaTeX ``table``, or a ``longtable`` over several pages; title, notes and provenance are the caption.
 
-    Title, notes and provenance are the caption.
     ``widths`` are those of columns of running text (``60mm``, empty for an ordinary one).
     """
     columns = list(zip(*table.rows, strict=True)) if table.rows else [()] * len(table.header)
@@ -106,19 +101,19 @@ def to_siunitx(table: TextTable, widths: Sequence[str] = (), *, long: bool = Fal
 
 
 def document(title: str, parts: Sequence[str]) -> str:
-    """Write a document that compiles and shows parts of LaTeX one after the other."""
+    """Return a document that compiles, with parts of LaTeX, each on a new page."""
     body = "\n\\clearpage\n".join(parts)
     head = f"{PREAMBLE}\\title{{{escape(title)}}}\n\\date{{}}\n"
     return f"{head}\\begin{{document}}\n\\maketitle\n{body}\n\\end{{document}}\n"
 
 
 def escape(text: str) -> str:
-    """Write any text so that LaTeX sets it; a sign that it does not have becomes its letter, or its code."""
+    """Escape a text for LaTeX; an unsupported character becomes its base letter, or its code."""
     return "".join(_SIGNS.get(char) or _sign(char) for char in text)
 
 
 def _sign(char: str) -> str:
-    """Keep what Latin fonts have."""
+    """Return a character that Latin fonts have, or a replacement."""
     if char in "\n\r\t":
         return " "
     if (
@@ -153,8 +148,7 @@ def _entry(text: str, kind: str, *, names: bool) -> str:
         return "{--}" if text == ABSENT else _plain(text)
     if names or kind != "r":
         return escape(text)
-    # Texts between numbers are escaped, numbers are left to siunitx.
-    done, place = "", 0
+    done, place = "", 0  # text between numbers is escaped, numbers are left to siunitx
     for found in _NUMBER.finditer(text):
         done += escape(text[place : found.start()]) + f"\\num{{{_plain(found[0])}}}"
         place = found.end()
@@ -166,5 +160,5 @@ def _plain(number: str) -> str:
 
 
 def _row(entries: Iterable[str]) -> str:
-    """Join a row; one that opens with a bracket would be read as an option of the rule before it."""
+    """Join a row; an entry that opens with a bracket would be an option of the rule before it."""
     return " & ".join(f"{{{text}}}" if text.startswith("[") else text for text in entries) + r" \\"

@@ -1,4 +1,4 @@
-"""How figures look: one paper column wide, colour-blind safe (Okabe and Ito), nothing told by colour alone."""
+"""The style of figures: one paper column wide, safe for the colour-blind (Okabe and Ito), never colour alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WIDE_IN: Final = 7.16
 STALL_STYLE: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
 
 GREY: Final = "#BBBBBB"
-"""What is not ours: the paper's values."""
+"""The colour of the paper's values."""
 
 GROUP_FILLS: Final = {
     "capture": ("#56B4E9", ""),
@@ -41,7 +41,7 @@ _OTHER_STYLES: Final = (("#56B4E9", "-."), ("#F0E442", "--"), ("#999999", ":"), 
 
 
 def ink_on(colour: str) -> str:
-    """Return the colour of text that is read on ``#RRGGBB``."""
+    """Return a colour of text that is legible on ``#RRGGBB``."""
     red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
     return "white" if 0.299 * red + 0.587 * green + 0.114 * blue < 128 else "black"  # noqa: PLR2004 - half way
 
@@ -49,8 +49,8 @@ def ink_on(colour: str) -> str:
 def cell_styles(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, str]]:
     """Return name -> colour and line style, for cells given as name -> (transport, variant).
 
-    A cell as its transport declares it looks the same in every figure of every run, dotted where its name has a
-    payload; others get other styles: those with options of their own, and those whose transport is not here.
+    A cell has the style that its transport declares, in every figure of every run, dotted if its name has a payload. A
+    cell with other options, or of an unknown transport, gets one of the other styles.
     """
     styles: dict[str, tuple[str, str]] = {}
     for name, (transport, variant) in cells.items():

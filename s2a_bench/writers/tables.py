@@ -1,4 +1,4 @@
-"""Text tables: their cells as text, rounded to three digits, and the whole as Markdown or for a terminal."""
+"""Text tables: entries rounded to three digits, written as Markdown or for a terminal."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 
 ABSENT = "\N{EN DASH}"
-"""Stands where a cell does not have a stage or a ratio."""
+"""The entry of an absent stage or ratio."""
 
 MEAN_SD = "mean ± sd"
 
 EMULATED, DUMMY = "emulated", "dummy weights"
 PAPERS, ASSUMED, DRAWN = "paper's claim", "assumption", "drawn, not measured"
-"""Labels that several experiments give to their runs."""
+"""Labels of runs that several experiments use."""
 
 
 class Note(str):
-    """A note below a table. Its labels mark the run wherever runs are listed; a plain string is a note without any."""
+    """A note below a table. Its labels mark the run in every list of runs; a plain string is a note without labels."""
 
     __slots__ = ("labels",)
     labels: tuple[str, ...]
@@ -41,17 +41,16 @@ class Note(str):
         return note
 
     def sentence(self) -> Note:
-        """Return it as a sentence: a capital first, a full stop last."""
+        """Return the note with a capital and a full stop."""
         return Note(f"{self[0].upper()}{self[1:]}.", *self.labels)
 
 
 @dataclass(frozen=True, slots=True)
 class TextTable:
-    """One table: ``left`` columns of names, then columns of numbers; ``rules`` are the rows that a line precedes.
+    """One table: ``left`` columns of names, then columns of numbers; a line precedes each row of ``rules``.
 
-    ``notes`` are strings, or `Note` where they bear labels. ``provenance`` says in one line where the numbers come
-    from (`Origins.line`); without it a table is not written to a file. ``brief`` is what a terminal shows where it has
-    no room for the table.
+    ``notes`` are strings, or `Note` if they have labels. ``provenance`` is the origin of the numbers in one line
+    (`Origins.line`); without it a table cannot be written to a file. A terminal that is too narrow shows ``brief``.
     """
 
     title: str
@@ -74,7 +73,7 @@ class TextTable:
         *,
         once: int = 0,
     ) -> TextTable:
-        """Lay out groups of rows with a line between them, the first ``once`` names in a group's first row alone."""
+        """Make a table of groups with a line between them; only a group's first row has the first ``once`` names."""
         rows: list[tuple[str, ...]] = []
         rules = set()
         for group in groups:
@@ -84,30 +83,30 @@ class TextTable:
 
     @property
     def footer(self) -> tuple[str, ...]:
-        """Return notes and provenance; raises ValueError where nobody said where the numbers come from."""
+        """Return notes and provenance; raises ValueError if there is no provenance."""
         return (*self.notes, required(self.title, self.provenance))
 
 
 def required(title: str, provenance: str) -> str:
-    """Return a provenance; raises ValueError where there is none: a bug of who made the table or figure."""
+    """Return a provenance; raises ValueError if it is empty, which is a bug of the caller."""
     if not provenance:
         raise ValueError(f"'{title}' does not say where its numbers come from; give it a provenance")
     return provenance
 
 
 def number(value: float) -> str:
-    """Write a time in ms, or a ratio, with three digits; never more than three decimals."""
+    """Format a time in ms, or a ratio, with three digits and at most three decimals."""
     return f"{value:.{_decimals(value)}f}"
 
 
 def mean_sd(summary: Summary) -> str:
-    """Write mean ± standard deviation with the decimals of the mean."""
+    """Format mean ± standard deviation with the decimals of the mean."""
     places = _decimals(summary.mean)
     return f"{summary.mean:.{places}f}" + ("" if summary.sd is None else f" ± {summary.sd:.{places}f}")
 
 
 def entries(values: NDArray[np.float64], *statistics: str) -> list[str]:
-    """Write statistics of values, those of `Summary` by their names, or `MEAN_SD`; absent where there are no values."""
+    """Format statistics of values, fields of `Summary` or `MEAN_SD`; `ABSENT` if there are no values."""
     found = summary_of(values)
     if found is None:
         return [ABSENT] * len(statistics)
@@ -115,7 +114,7 @@ def entries(values: NDArray[np.float64], *statistics: str) -> list[str]:
 
 
 def interval(ratio: Ratio | None) -> str:
-    """Write a ratio with its interval."""
+    """Format a ratio with its interval."""
     if ratio is None or ratio.value is None:
         return ABSENT
     if ratio.low is None or ratio.high is None:
@@ -125,7 +124,7 @@ def interval(ratio: Ratio | None) -> str:
 
 
 def to_markdown(table: TextTable) -> str:
-    """Write a table as Markdown, its title and notes around it."""
+    """Return a table as Markdown between its title and its notes."""
     rule = ["---"] * table.left + ["---:"] * (len(table.header) - table.left)
     header, *rows = (tuple(map(markdown_text, row)) for row in (table.header, *table.rows))
     lines = ["| " + " | ".join(row) + " |" for row in (header, tuple(rule), *rows)]
@@ -136,7 +135,7 @@ _MARKED = re.compile(r"[\\|*<]|(?<=\])(?=\()")
 
 
 def markdown_text(text: str) -> str:
-    """Return a text on one line in which Markdown finds no cell, emphasis, tag or link."""
+    """Escape a text for one line of Markdown: no cell, emphasis, tag or link."""
     return _MARKED.sub(lambda found: f"\\{found[0]}", one_line(text))
 
 
@@ -148,40 +147,40 @@ def _decimals(value: float) -> int:
 
 
 def fits(table: TextTable, width: int) -> bool:
-    """Whether a terminal of ``width`` columns has room for a table in one block."""
+    """Return True if a table fits in ``width`` columns in one block."""
     wide = _widths(table)
     return sum(wide) + len(wide) - 1 <= width
 
 
 def lay_out(table: TextTable, width: int) -> RenderableType:
-    """Turn a table into one for a terminal of ``width`` columns; no letter of a cell is lost.
+    """Return a table for a terminal of ``width`` columns, with all the text of its cells.
 
-    Where it has no room, gaps are narrowed and headers broken, then long names are folded, and columns of numbers
-    that are still too many follow in further blocks, each with the names again.
+    If it is too wide, gaps are narrowed and headers broken, then long names folded; the columns of numbers that still
+    do not fit follow in further blocks, each with the names.
     """
     from rich.console import Group
     from rich.text import Text
 
-    parts = [part for each in _blocks(table, width) for part in (_block(table, *each), Text())]
-    return Group(Text(one_line(table.title), "bold"), *parts)
+    blocks = [item for each in _blocks(table, width) for item in (_block(table, *each), Text())]
+    return Group(Text(one_line(table.title), "bold"), *blocks)
 
 
 def _widths(table: TextTable, *, folded: bool = False) -> list[int]:
-    """Return how wide each column is; with ``folded`` headers of numbers are broken between words too."""
+    """Return the width of each column; if ``folded``, headers of numbers are also broken at spaces."""
     from rich.cells import cell_len
 
-    def parts(place: int, name: str) -> list[str]:
+    def lines(place: int, name: str) -> list[str]:
         return re.split(r"\s", name) if folded and place >= table.left else name.split("\n")
 
     cells = [[one_line(row[place]) for row in table.rows] for place in range(len(table.header))]
     return [
-        max(map(cell_len, (*parts(place, name), *column)))
+        max(map(cell_len, (*lines(place, name), *column)))
         for place, (name, column) in enumerate(zip(_headings(table), cells, strict=True))
     ]
 
 
 def _blocks(table: TextTable, width: int) -> Iterator[tuple[list[int], list[int], int]]:
-    """Yield the columns of each block, the widths of all columns, and the gap between them."""
+    """Yield the columns of each block, the widths of all columns, and the gap."""
     left, wide, gap = table.left, _widths(table), 2
     if sum(wide) + gap * (len(wide) - 1) > width:
         gap = 1
@@ -204,7 +203,7 @@ def _blocks(table: TextTable, width: int) -> Iterator[tuple[list[int], list[int]
 
 
 def _fold_names(table: TextTable, wide: list[int], most: int) -> None:
-    """Narrow the columns of names to ``most`` together: between words first, within them where that is not enough."""
+    """Narrow the columns of names to ``most`` in total, first at spaces, then within words."""
     words = [
         max((len(word) for row in table.rows for word in row[place].split(" ")), default=0)
         for place in range(table.left)
@@ -232,7 +231,7 @@ def _block(table: TextTable, columns: Sequence[int], wide: Sequence[int], gap: i
 
 
 def _headings(table: TextTable) -> list[str]:
-    """Return the headings, those of numbers broken where long names have a joint."""
+    """Return the headings, those of numbers broken at their joints."""
     return [*table.header[: table.left], *map(_broken, table.header[table.left :])]
 
 
