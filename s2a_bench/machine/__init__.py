@@ -1,1 +1,1 @@
-"""What this machine is: checks before measuring, what it does meanwhile, and the facts beside every result."""
+"""This machine: checks before measuring, its resources meanwhile, and the facts beside every result."""

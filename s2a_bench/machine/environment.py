@@ -1,4 +1,4 @@
-"""Facts of this machine that belong beside every result, and its kind of board; an unreadable fact is an absent key."""
+"""Facts of this machine beside every result, and its kind of board; an unreadable fact is an absent key."""
 
 from __future__ import annotations
 
@@ -15,15 +15,8 @@ from s2a_bench.machine.doctor import Machine
 from s2a_bench.machine.doctor.gpu import current_power_mode, identity, nvml
 from s2a_bench.machine.doctor.software import installed
 
-PACKAGES = (
-    "huggingface-hub",
-    "llama-cpp-python",
-    "numpy",
-    "nvidia-ml-py",
-    "opencv-python-headless",
-    "pydantic",
-)
-"""The packages that matter to every result; transports name their own."""
+PACKAGES = ("huggingface-hub", "llama-cpp-python", "numpy", "nvidia-ml-py", "opencv-python-headless", "pydantic")
+"""The packages that matter to every result; transports add theirs."""
 ROS_VARIABLES = (
     "ROS_DISTRO",
     "ROS_DOMAIN_ID",
@@ -40,18 +33,17 @@ KERNEL_FACTS = {
     "board": "proc/device-tree/model",
 }
 
-
 KIND = ("model", "gpu", "cpu", "cores")
-"""What a board is known by: device tree, GPU, CPU, and how many cores may be used."""
+"""The facts of a kind of board: device tree, GPU, CPU, and the number of usable cores."""
 STATE = ("power_mode", "governor")
-"""What makes one board faster or slower."""
+"""The facts that make one board faster or slower."""
 
 
 def collect(packages: Iterable[str] = ()) -> dict[str, Any]:
-    """Read the environment, and the versions of these packages besides."""
+    """Return the environment, with the versions of `PACKAGES` and of ``packages``."""
     machine = Machine()
     with nvml() as (lib, cards):
-        gpus = [known for card in cards if (known := identity(lib, card))]
+        gpus = [names for card in cards if (names := identity(lib, card))]
     facts: dict[str, Any] = {
         "s2a_bench": __version__,
         "host": platform.node(),
@@ -81,7 +73,7 @@ def _cpu_model(cpuinfo: str) -> str:
 
 
 def board_facts() -> dict[str, Any]:
-    """Read device-tree model, GPU, CPU, cores, memory, power mode and governor."""
+    """Return device-tree model, GPU, CPU, cores, memory, power mode and governor."""
     known = collect()
     facts = {
         "model": known.get("board"),
@@ -94,13 +86,13 @@ def board_facts() -> dict[str, Any]:
 
 
 def matches(profile: Profile, board: Mapping[str, Any]) -> bool:
-    """Return whether everything that a profile says of its kind of board holds for this one."""
+    """Return True if this board has all facts of a profile's kind of board."""
     named = {key: value for key, value in profile.facts.get("board", {}).items() if key in KIND}
     return bool(named) and all(_same(key, value, board.get(key)) for key, value in named.items())
 
 
 def state_changes(profile: Profile, board: Mapping[str, Any]) -> list[str]:
-    """Say in which state the profile's board was and this one is not, as far as both are known."""
+    """Return the facts of state in which this board differs from the profile's, as far as both are known."""
     then = profile.facts.get("board", {})
     return [
         f"{key.replace('_', ' ')} was {then[key]}, is {board[key]}"
@@ -110,8 +102,8 @@ def state_changes(profile: Profile, board: Mapping[str, Any]) -> list[str]:
 
 
 def _same(key: str, wanted: Any, found: Any) -> bool:
-    """Compare one fact; a device tree adds words as "Developer Kit" to a board's name, a GPU's next word is another."""
+    """Compare one fact; a device tree may append "Developer Kit" to a board's name, a GPU's name must be equal."""
     if not isinstance(wanted, str) or not isinstance(found, str):
         return bool(wanted == found)
-    words, here = (re.sub(r"^nvidia\s+", "", text.lower()).split() for text in (wanted, found))
-    return words == (here[: len(words)] if key == "model" else here)
+    expected, name = (re.sub(r"^nvidia\s+", "", text.lower()).split() for text in (wanted, found))
+    return expected == (name[: len(expected)] if key == "model" else name)

@@ -1,7 +1,7 @@
-"""Processes of the harness: settings by which they measure more evenly, and children that never outlive their parent.
+"""Processes of the harness: settings for steadier measurements, and children that never outlive their parent.
 
-Settings are recorded in the manifest. The command line, the servers and the library allow them, each as long as it
-measures; then they are what they were before. Where they are not allowed nothing is changed.
+The settings are recorded in the manifest. The command line, the servers and the library allow them while they measure;
+afterwards the old settings are restored. Nothing is changed unless it is allowed.
 """
 
 from __future__ import annotations
@@ -23,25 +23,24 @@ M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
 M_ARENA_MAX = -8
 KEEP_BYTES = 1 << 25
-"""Blocks up to this size, the most that glibc takes everywhere, stay with the process: a frame of 3840x2160 in RGB is
-smaller. Without it glibc returns every frame's memory to the kernel and each new frame faults its pages in again,
-2.6 us a page. What is larger, as a request at its limit, goes back at once."""
+"""Freed blocks up to this size, glibc's upper limit, stay in the process: a frame of 3840x2160 in RGB is smaller.
+Otherwise glibc returns every frame's memory to the kernel and each new frame faults its pages in again, 2.6 us a page.
+A larger block, as a request at its limit, is returned at once."""
 
 KEEP_FREE_BYTES = 1 << 30
-"""So much may lie free at the end of the heap."""
+"""Free bytes that may stay at the end of the heap."""
 
 SINGLE_THREADED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-
 _undo: ExitStack | None = None
-"""Where this process may be tuned: what puts its settings back."""
+"""Restores the settings; None if this process may not be tuned."""
 
 
 @contextmanager
 def allowed(yes: bool = True) -> Iterator[None]:
-    """Allow this process to be tuned inside the block; after it the settings are those from before.
+    """Allow this process to be tuned inside the block; the old settings are restored after it.
 
-    What glibc cannot take back: its thresholds are no longer its own to move, and new threads may share one arena.
+    glibc cannot restore two things: it no longer adapts its thresholds, and new threads may share one arena.
     """
     global _undo  # noqa: PLW0603 - settings of a process are global
     if _undo is not None or not yes:
@@ -56,27 +55,27 @@ def allowed(yes: bool = True) -> Iterator[None]:
 
 
 def is_allowed() -> bool:
-    """Whether this process may be tuned."""
+    """Return True if this process may be tuned."""
     return _undo is not None
 
 
 def keep_large_blocks() -> bool:
-    """Tell glibc to keep large freed blocks; returns whether it did (not allowed, or musl, which has no mallopt).
+    """Make glibc keep large freed blocks; return False if that is not allowed, or on musl, which has no mallopt.
 
-    All threads share them: an arena each would keep the most that each thread ever held.
+    All threads share one arena: several would each keep the most that their threads ever held.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if _undo is None or mallopt is None:
         return False
     _undo.callback(give_back_memory)
-    _undo.callback(mallopt, M_TRIM_THRESHOLD, 2 * KEEP_BYTES)  # what glibc comes to by itself with blocks of that size
+    _undo.callback(mallopt, M_TRIM_THRESHOLD, 2 * KEEP_BYTES)  # the value that glibc adapts to with such blocks
     _undo.callback(mallopt, M_ARENA_MAX, 0)
     mallopt(M_ARENA_MAX, 1)
-    return all(mallopt(*told) for told in ((M_TRIM_THRESHOLD, KEEP_FREE_BYTES), (M_MMAP_THRESHOLD, KEEP_BYTES)))
+    return all(mallopt(*pair) for pair in ((M_TRIM_THRESHOLD, KEEP_FREE_BYTES), (M_MMAP_THRESHOLD, KEEP_BYTES)))
 
 
 def give_back_memory() -> None:
-    """Free what lies in cycles, and give what lies free to the kernel: a block that grew in place stays in the heap."""
+    """Collect cycles, and return free memory to the kernel: a block that grew in place stays in the heap."""
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:  # musl has none
@@ -84,10 +83,10 @@ def give_back_memory() -> None:
 
 
 def limit_threads() -> None:
-    """Keep OpenCV and numeric libraries to one thread each, unless the user decided; llama.cpp has a flag of its own.
+    """Limit OpenCV and numeric libraries to one thread each, unless the user set it; llama.cpp has its own flag.
 
-    One conversion of a picture takes a fraction of a millisecond: OpenCV's worker threads save little of it and compete
-    with the model and the middleware for cores, which would disturb what is measured.
+    A conversion of a picture takes a fraction of a millisecond: OpenCV's worker threads save little of it and compete
+    with the model and the middleware for cores, which disturbs the measurement.
     """
     if _undo is None:
         return
@@ -101,21 +100,21 @@ def limit_threads() -> None:
 
 
 def end_with_parent(number: signal.Signals = signal.SIGKILL) -> None:
-    """Have the kernel end this process when the thread that started it is gone, however it went."""
+    """Make the kernel end this process when the thread that started it ends."""
     _prctl(PR_SET_PDEATHSIG, number)
 
 
 def start_child(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:
-    """Start a program that the kernel kills, stopped or not, when this process is gone; options are those of `Popen`.
+    """Start a program that the kernel kills, stopped or not, when this process ends; options are those of `Popen`.
 
-    The kernel acts when the *thread* that started the program ends. Away from the main thread a thread of its own
-    starts it therefore, and stays until the program has ended.
+    The kernel acts when the *thread* that started the program ends. Outside the main thread a new thread starts it
+    therefore, and stays until the program has ended.
     """
     parent = os.getpid()
 
     def tie() -> None:
         end_with_parent()
-        if os.getppid() != parent:  # it ended before the kernel was told
+        if os.getppid() != parent:  # the parent ended before the call
             os.kill(os.getpid(), signal.SIGKILL)
 
     def start() -> subprocess.Popen[bytes]:
@@ -128,11 +127,11 @@ def start_child(command: Sequence[str], **options: Any) -> subprocess.Popen[byte
     def start_and_stay() -> None:
         try:
             child = start()
-        except BaseException as error:  # noqa: BLE001 - it is the caller's
+        except BaseException as error:  # noqa: BLE001 - raised in the caller
             started.set_exception(error)
             return
         started.set_result(child)
-        with suppress(ChildProcessError):  # whoever has the child has seen it end
+        with suppress(ChildProcessError):  # the caller has waited for it
             os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
 
     Thread(target=start_and_stay, name="starter", daemon=True).start()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import platform
+import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -384,8 +384,7 @@ def test_the_disk_of_a_folder_that_is_not_there_yet_is_its_parents(make: Make, t
 
 @pytest.mark.parametrize(("free_gib", "level"), [(0.5, "warning"), (3, "advice"), (50, "state")])
 def test_disk_space_is_judged(make: Make, monkeypatch: pytest.MonkeyPatch, free_gib: float, level: str) -> None:
-    room = SimpleNamespace(f_bavail=int(free_gib * (1 << 20)), f_frsize=1024)
-    monkeypatch.setattr(os, "statvfs", lambda _path: room)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=int(free_gib * (1 << 30))))
     assert see(make({}), "disk").level == level
 
 

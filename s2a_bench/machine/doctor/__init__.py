@@ -1,8 +1,8 @@
-"""Checks of this machine before measuring: what is, what could be better, what distorts results, what cannot work.
+"""Checks of this machine before measuring: its state, possible improvements, distorting settings, and failures.
 
-A check is a function of a `Machine` that returns one Finding, or None where it has nothing to look at. It reads files
-below the machine's root, its environment and its programs, so that tests run it on recorded trees; NVML and the
-packages of this Python are asked as they are.
+A check is a function of a `Machine` that returns one Finding, or None if it does not apply. It reads files below the
+machine's root, its environment and its programs, so that tests run it on recorded trees; NVML and the packages of this
+Python are read directly.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 Level: TypeAlias = Literal["state", "advice", "warning", "error"]
 LEVELS: tuple[Level, ...] = ("state", "advice", "warning", "error")
-"""State: as it should be, or simply so. Advice: would make results better or steadier. Warning: distorts results.
-Error: what the check is about does not work."""
+"""State: correct, or a plain fact. Advice: makes results better or steadier. Warning: distorts results. Error: does not
+work."""
 
 COMMAND_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What one check saw; ``fix`` is the command that changes it, and every warning and error has one."""
+    """The result of one check; ``fix`` is the command that changes it, which every warning and error has."""
 
     code: str
     level: Level
@@ -42,7 +42,7 @@ class Finding:
 
 
 def _run(command: Sequence[str]) -> str | None:
-    """Return what a program prints on standard output, None where it is missing, fails or hangs."""
+    """Return the standard output of a program, None if it is missing, fails or hangs."""
     try:
         done = subprocess.run(  # noqa: S603 - the checks' own commands
             command, capture_output=True, text=True, errors="replace", check=False, timeout=COMMAND_TIMEOUT_S
@@ -53,43 +53,42 @@ def _run(command: Sequence[str]) -> str | None:
 
 
 def _cameras() -> list[CameraInfo]:
-    """List this machine's cameras; their module brings OpenCV, which a run's checks do not need."""
-    from s2a_bench.frames.v4l2 import list_cameras
+    from s2a_bench.frames.v4l2 import list_cameras  # it imports OpenCV, which the checks of a run do not need
 
     return list_cameras()
 
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Everything that checks may look at; the defaults are this machine and this process."""
+    """The inputs of checks; the defaults are this machine and this process."""
 
     root: Path = Path("/")
     environ: Mapping[str, str] = field(default_factory=lambda: os.environ)
     cpus: frozenset[int] = field(default_factory=lambda: frozenset(os.sched_getaffinity(0)))
     output: Path = Path("results")
-    """Where run folders go."""
+    """The folder for run folders."""
     run: Callable[[Sequence[str]], str | None] = _run
     which: Callable[[str], str | None] = shutil.which
     finds: Callable[[str], bool] = extras.installed
-    """Whether this Python has a package."""
+    """Returns True if this Python has a package."""
     cameras: Callable[[], list[CameraInfo]] = _cameras
 
     def read(self, path: str) -> str | None:
-        """Return a file's text without blanks and NULs around it; None where it cannot be read."""
+        """Return a file's text without surrounding blanks and NULs; None if it cannot be read."""
         try:
             return (self.root / path).read_text(errors="replace").strip("\0\n ")
         except OSError:
             return None
 
     def number(self, path: str) -> int | None:
-        """Return the number in a file; None where there is none."""
+        """Return the number in a file; None if there is none."""
         try:
             return int(self.read(path) or "")
         except ValueError:
             return None
 
     def read_all(self, pattern: str) -> dict[str, str]:
-        """Return the texts of the files that match, by path below the root."""
+        """Return path below the root -> text of the files that match."""
         found = (str(path.relative_to(self.root)) for path in sorted(self.root.glob(pattern)))
         return {name: text for name in found if (text := self.read(name)) is not None}
 
@@ -116,16 +115,16 @@ CHECKS: dict[str, str] = {
     "disk": "s2a_bench.machine.doctor.host:disk",
     "cameras": "s2a_bench.machine.doctor.host:cameras",
 }
-"""Code of the findings -> check, in the order in which they are shown; engines and transports declare their own."""
+"""Code of the findings -> check, in the order of the output; engines and transports declare more."""
 
 BEFORE_RUN = (
     *("cpus", "cpu-governor", "jetson-clocks", "load", "temperature", "gpu-throttling", "clock-source", "disk"),
 )
-"""The checks that concern every measurement: those whose trouble distorts its numbers or ends it half-way."""
+"""The checks before every measurement: their findings distort its numbers or end it early."""
 
 
 def examine(machine: Machine, checks: Mapping[str, str] = CHECKS) -> list[Finding]:
-    """Make the checks (code -> ``module:function``); those with nothing to look at are left out."""
+    """Run the checks (code -> ``module:function``) and return their findings."""
     found = (resolve_name(check)(machine) for check in checks.values())
     return [finding for finding in found if finding is not None]
 
@@ -137,12 +136,12 @@ def worst(findings: Iterable[Finding]) -> Level:
 
 def warnings_of(findings: Iterable[Finding]) -> list[RunWarning]:
     """Return the warnings and errors as runs store them."""
-    return [RunWarning(seen.code, seen.message, seen.fix) for seen in findings if seen.level in {"warning", "error"}]
+    return [RunWarning(each.code, each.message, each.fix) for each in findings if each.level in {"warning", "error"}]
 
 
 class DoctorConfig(Options):
-    """How a machine is examined."""
+    """Options of `doctor`."""
 
-    output: Path = option(Path("results"), "folder for run folders, whose disk is looked at")
-    url: str = option("", "instead of this machine, a server that somebody else runs: what it does that is dangerous")
+    output: Path = option(Path("results"), "folder for run folders, whose disk is checked")
+    url: str = option("", "check a server of another operator for risks, instead of this machine")
     strict: bool = option(False, "exit with 1 on warnings too")

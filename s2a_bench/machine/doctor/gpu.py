@@ -1,4 +1,4 @@
-"""GPUs: an NVIDIA card through its driver, or a Jetson's board with its power mode and clocks."""
+"""Checks of GPUs: an NVIDIA card through its driver, or a Jetson's board with its power mode and clocks."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from s2a_bench.machine.doctor import Finding, Machine
 GIB = 1 << 30
 NVIDIA_VENDOR, DISPLAY_CLASS = "0x10de", "0x03"
 TOO_HOT = {0x08: "hardware slowdown", 0x20: "too warm (driver)", 0x40: "too warm (hardware)", 0x80: "power brake"}
-"""Bits of nvmlDeviceGetCurrentClocksThrottleReasons that mean trouble; idle and the power limit are everyday."""
+"""Bits of nvmlDeviceGetCurrentClocksThrottleReasons that distort results; idle and the power limit are normal."""
 FULL_POWER = "MAXN"
 JETSON_CLOCKS = {
     "CPU": ("sys/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_min_freq", ""),
     "GPU": ("sys/class/devfreq/*/min_freq", "gpu|gv11b|ga10b|gp10b|gm20b"),
 }
-"""Name -> the files with each clock's lowest frequency, and which of them are meant."""
+"""Name -> the files with each clock's lowest frequency, and a pattern that selects among them."""
 
 
 @contextmanager
 def nvml() -> Iterator[tuple[Any, list[Any]]]:
-    """Open NVML and hand out the module and the GPUs; no GPUs where there is no driver, or no nvidia-ml-py."""
+    """Open NVML and yield the module and the GPUs; no GPUs without a driver or nvidia-ml-py."""
     try:
         pynvml = extras.require("pynvml", "nvidia")
     except MissingExtra:
@@ -46,7 +46,7 @@ def nvml() -> Iterator[tuple[Any, list[Any]]]:
 
 
 def identity(lib: Any, card: Any) -> dict[str, str]:
-    """Name a GPU and its driver, as far as NVML tells: a Jetson's knows next to nothing."""
+    """Return name and driver of a GPU, as far as NVML has them: a Jetson's has little."""
     facts = {}
     with suppress(lib.NVMLError):
         facts["name"] = str(lib.nvmlDeviceGetName(card))
@@ -56,18 +56,18 @@ def identity(lib: Any, card: Any) -> dict[str, str]:
 
 
 def is_jetson(machine: Machine) -> bool:
-    """Tell a Jetson by its release file or its device tree (which a container sees too)."""
+    """Return True if the release file or the device tree, which a container has too, is a Jetson's."""
     model = machine.read("proc/device-tree/model") or ""
     return machine.read("etc/nv_tegra_release") is not None or "jetson" in model.lower()
 
 
 def has_nvidia(machine: Machine) -> bool:
-    """Return whether there is a working NVIDIA GPU."""
+    """Return True if an NVIDIA driver is loaded."""
     return machine.read("proc/driver/nvidia/version") is not None or is_jetson(machine)
 
 
 def board(machine: Machine) -> Finding | None:
-    """Name a single-board computer and its system software."""
+    """Report a single-board computer and its system software."""
     model = machine.read("proc/device-tree/model")
     if not model:
         return None
@@ -76,7 +76,7 @@ def board(machine: Machine) -> Finding | None:
 
 
 def gpu(machine: Machine) -> Finding:
-    """Name the GPUs and their driver; an NVIDIA card without one is found on the PCI bus."""
+    """Report the GPUs and their driver; an NVIDIA card without a driver is found on the PCI bus."""
     with nvml() as (lib, gpus):
         if gpus:
             return _cards(lib, gpus)
@@ -97,54 +97,51 @@ def gpu(machine: Machine) -> Finding:
 
 
 def _cards(lib: Any, gpus: list[Any]) -> Finding:
-    """Describe the cards that NVML knows."""
-    told, sleepy, driver = [], False, ""
+    texts, sleepy, driver = [], False, ""
     for card in gpus:
-        known = identity(lib, card)
-        text, driver = known.get("name", "a GPU without a name"), known.get("driver", "unknown")
+        facts = identity(lib, card)
+        text, driver = facts.get("name", "a GPU without a name"), facts.get("driver", "unknown")
         with suppress(lib.NVMLError):
             memory = lib.nvmlDeviceGetMemoryInfo(card)
             text += f", {memory.free / GIB:.1f} of {memory.total / GIB:.1f} GiB free"
         with suppress(lib.NVMLError):
             sleepy = sleepy or not lib.nvmlDeviceGetPersistenceMode(card)
-        told.append(text)
-    message = f"{'; '.join(told)}; driver {driver}"
+        texts.append(text)
+    message = f"{'; '.join(texts)}; driver {driver}"
     if sleepy:
         return Finding("gpu", "advice", f"{message}; the driver unloads between runs", "sudo nvidia-smi -pm 1")
     return Finding("gpu", "state", message)
 
 
 def gpu_throttling(machine: Machine) -> Finding | None:  # noqa: ARG001 - NVML knows one machine
-    """See whether a GPU is being slowed down at this moment."""
+    """Check that no GPU is slowed down at this moment."""
     with nvml() as (lib, gpus):
-        reasons: set[str] = set()
-        asked = False
+        bits: list[int] = []
         for card in gpus:
             with suppress(lib.NVMLError):
-                bits = lib.nvmlDeviceGetCurrentClocksThrottleReasons(card)
-                asked = True
-                reasons |= {reason for bit, reason in TOO_HOT.items() if bits & bit}
-    if not asked:
+                bits.append(lib.nvmlDeviceGetCurrentClocksThrottleReasons(card))
+    if not bits:
         return None
-    if reasons:
+    if reasons := {reason for bit, reason in TOO_HOT.items() for found in bits if found & bit}:
         fix = "cool it, see nvidia-smi -q -d PERFORMANCE, or lower its limit: sudo nvidia-smi -pl WATTS"
         return Finding("gpu-throttling", "warning", f"the GPU is slowed down: {', '.join(sorted(reasons))}", fix)
     return Finding("gpu-throttling", "state", "the GPU is not slowed down")
 
 
 def current_power_mode(machine: Machine) -> tuple[str, dict[str, str]] | None:
-    """Return the name of a Jetson's nvpmodel mode and all modes as id -> name; None where it cannot be read."""
+    """Return the name of a Jetson's nvpmodel mode, and all modes as id -> name; None if it cannot be read."""
     modes = dict(re.findall(r"POWER_MODEL\s+ID=(\d+)\s+NAME=(\S+)", machine.read("etc/nvpmodel.conf") or ""))
     status = re.search(r"pmode:(\d+)", machine.read("var/lib/nvpmodel/status") or "")
     if status:
         number = str(int(status[1]))
         return modes.get(number, number), modes
-    told = re.search(r"NV Power Mode:\s*(\S+)", (machine.run(["nvpmodel", "-q"]) if is_jetson(machine) else "") or "")
-    return (told[1], modes) if told else None
+    reply = (machine.run(["nvpmodel", "-q"]) if is_jetson(machine) else "") or ""
+    mode = re.search(r"NV Power Mode:\s*(\S+)", reply)
+    return (mode[1], modes) if mode else None
 
 
 def power_mode(machine: Machine) -> Finding | None:
-    """Name a Jetson's power mode; a smaller one than MAXN may well be wanted, and is part of the result."""
+    """Report a Jetson's power mode; one below MAXN may be intended, and is part of the result."""
     known = current_power_mode(machine)
     if known is None:
         return None
@@ -156,7 +153,7 @@ def power_mode(machine: Machine) -> Finding | None:
 
 
 def jetson_clocks(machine: Machine) -> Finding | None:
-    """See whether a Jetson's CPU and GPU clocks are locked, without asking jetson_clocks, which wants root."""
+    """Check that a Jetson's CPU and GPU clocks are locked, without jetson_clocks, which needs root."""
     if not is_jetson(machine):
         return None
     loose = [
@@ -169,6 +166,6 @@ def jetson_clocks(machine: Machine) -> Finding | None:
         )
     ]
     if loose:
-        told = f"the clock of {' and '.join(loose)} follows the load: the first tokens of every answer are slow"
-        return Finding("jetson-clocks", "warning", told, "sudo jetson_clocks")
+        message = f"the clock of {' and '.join(loose)} follows the load: the first tokens of every answer are slow"
+        return Finding("jetson-clocks", "warning", message, "sudo jetson_clocks")
     return Finding("jetson-clocks", "state", "clocks locked")

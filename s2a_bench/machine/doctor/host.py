@@ -1,46 +1,46 @@
-"""The computer: its CPUs and their clock, memory, disk, socket buffers, and cameras."""
+"""Checks of the computer: its CPUs and their clock, memory, disk, socket buffers, and cameras."""
 
 from __future__ import annotations
 
 import os
+import shutil
 
 from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.machine.doctor.gpu import is_jetson
 
 CPU = "sys/devices/system/cpu"
 HOT_MARGIN_C = 5
-"""A zone this near to where it slows down counts as hot."""
+"""A zone this near to its throttling temperature counts as hot."""
 GOOD_CLOCKS = ("tsc", "arch_sys_counter")
 """Clock sources that are read without a system call."""
-
 
 GIB = 1 << 30
 FULL_MODEL_BYTES = 6 * GIB
 """MiniCPM-V 2.6 at 4 bits (4.4 GiB), its vision tower (1 GiB), and the cache of a 4096-token context."""
 LEAST_DISK_BYTES = 1 * GIB
-"""A long run with its figures takes less than a tenth of it."""
+"""A long run with its figures needs less than a tenth of it."""
 MODEL_DISK_BYTES = 6 * GIB
 RMEM_WANTED = 4 << 20
-"""Bytes of receive buffer that hold a large picture's fragments while the reader is busy (docs/latency.md)."""
+"""Bytes of receive buffer for a large picture's fragments while the reader is busy (docs/latency.md)."""
 
 
 def cpus(machine: Machine) -> Finding | None:
-    """Compare the CPUs this process may use with those there are: affinity, and the cgroup's quota."""
+    """Compare the CPUs this process may use with the online ones: affinity, and the cgroup's quota."""
     online = len(_listed(machine.read(f"{CPU}/online"))) or len(machine.cpus)
-    told = f"{len(machine.cpus)} of {online} CPUs may be used"
+    message = f"{len(machine.cpus)} of {online} CPUs may be used"
     if (quota := cgroup_quota(machine)) is not None and quota < len(machine.cpus):
         return Finding(
             "cpus",
             "warning",
-            f"{told}, but the cgroup stops this process after {quota:g} CPUs' worth of time: jumps of up to 100 ms",
+            f"{message}, but the cgroup stops this process after {quota:g} CPUs' worth of time: jumps of up to 100 ms",
             "start the container without --cpus; use --cpuset-cpus to give it whole CPUs",
         )
     isolated = machine.read(f"{CPU}/isolated")
-    return Finding("cpus", "state", told + (f"; isolated: {isolated}" if isolated else ""))
+    return Finding("cpus", "state", message + (f"; isolated: {isolated}" if isolated else ""))
 
 
 def cgroup_quota(machine: Machine) -> float | None:
-    """Return how many CPUs' time this process's cgroup may use (v2, then v1); None without a limit."""
+    """Return the CPUs' worth of time that this process's cgroup may use (v2, then v1); None without a limit."""
     quota, _, period = (machine.read("sys/fs/cgroup/cpu.max") or "").partition(" ")
     if not quota:
         quota = machine.read("sys/fs/cgroup/cpu/cpu.cfs_quota_us") or ""
@@ -51,7 +51,7 @@ def cgroup_quota(machine: Machine) -> float | None:
 
 
 def governor(machine: Machine) -> Finding | None:
-    """See whether every CPU keeps its clock up."""
+    """Check that every CPU keeps its clock high."""
     found = machine.read_all(f"{CPU}/cpu[0-9]*/cpufreq/scaling_governor")
     if not found:
         return None
@@ -69,7 +69,7 @@ def governor(machine: Machine) -> Finding | None:
 
 
 def turbo(machine: Machine) -> Finding | None:
-    """See whether the clock may rise above the nominal one: faster, and less steady as the chip warms."""
+    """Report whether the clock may exceed the nominal one: faster, but less steady as the chip warms."""
     no_turbo = machine.number(f"{CPU}/intel_pstate/no_turbo")
     boost = machine.number(f"{CPU}/cpufreq/boost")
     if no_turbo is None and boost is None:
@@ -86,19 +86,19 @@ def turbo(machine: Machine) -> Finding | None:
 
 
 def load(machine: Machine) -> Finding | None:
-    """See whether others use the CPUs that are to be measured."""
+    """Check that other programs leave the CPUs free."""
     text = machine.read("proc/loadavg")
     if not text:
         return None
     average, count = float(text.split()[0]), len(machine.cpus)
-    told = f"load average {average:.1f} on {count} cores"
+    message = f"load average {average:.1f} on {count} cores"
     if average > count / 2:
-        return Finding("load", "warning", told, "stop what else runs (top shows it), or wait")
-    return Finding("load", "state", told)
+        return Finding("load", "warning", message, "stop other programs (top shows them), or wait")
+    return Finding("load", "state", message)
 
 
 def throttling(machine: Machine) -> Finding | None:
-    """See how often the CPU has been slowed down for its temperature since the machine started."""
+    """Count how often the CPU was throttled for its temperature since the machine started."""
     counts = machine.read_all(f"{CPU}/cpu[0-9]*/thermal_throttle/core_throttle_count")
     if not counts:
         return None
@@ -108,13 +108,13 @@ def throttling(machine: Machine) -> Finding | None:
             "cpu-throttling",
             "advice",
             f"the cores were throttled {total} times since the start: it can happen again under load",
-            "clean or strengthen the cooling; a run that is throttled says so",
+            "clean or strengthen the cooling; a run that is throttled has a warning",
         )
     return Finding("cpu-throttling", "state", "never since the machine started")
 
 
 def temperature(machine: Machine) -> Finding | None:
-    """Compare each thermal zone with the lowest temperature at which it slows something down."""
+    """Compare each thermal zone with its lowest throttling temperature."""
     hottest: tuple[float, str] | None = None
     for path, kind in machine.read_all("sys/class/thermal/thermal_zone[0-9]*/type").items():
         zone = path.rpartition("/")[0]
@@ -136,7 +136,7 @@ def temperature(machine: Machine) -> Finding | None:
 
 
 def clock_source(machine: Machine) -> Finding | None:
-    """See whether reading the clock, which every mark does, takes nanoseconds or a system call."""
+    """Check that reading the clock, which every mark does, needs no system call."""
     folder = "sys/devices/system/clocksource/clocksource0"
     source = machine.read(f"{folder}/current_clocksource")
     if source is None:
@@ -145,16 +145,12 @@ def clock_source(machine: Machine) -> Finding | None:
         return Finding("clock-source", "state", source)
     available = (machine.read(f"{folder}/available_clocksource") or "").split()
     better = next((name for name in GOOD_CLOCKS if name in available), None)
-    fix = (
-        f"echo {better} | sudo tee /{folder}/current_clocksource"
-        if better
-        else "look for 'tsc' in dmesg for the reason"
-    )
+    fix = f"echo {better} | sudo tee /{folder}/current_clocksource" if better else "dmesg | grep tsc shows the reason"
     return Finding("clock-source", "warning", f"{source}: reading the time is slow, and every mark does it", fix)
 
 
 def _listed(text: str | None) -> list[int]:
-    """Read the kernel's lists, as 0-3,6."""
+    """Parse a list of the kernel, as 0-3,6."""
     found: list[int] = []
     for part in (text or "").split(","):
         first, _, last = part.partition("-")
@@ -164,7 +160,7 @@ def _listed(text: str | None) -> list[int]:
 
 
 def memory(machine: Machine) -> Finding | None:
-    """Compare the memory that is available, to this cgroup too, with what the full model needs."""
+    """Compare the available memory, also of this cgroup, with the need of the full model."""
     lines = (machine.read("proc/meminfo") or "").splitlines()
     known = {name: int(rest.split()[0]) * 1024 for name, _, rest in (line.partition(":") for line in lines) if rest}
     if "MemAvailable" not in known:
@@ -173,60 +169,62 @@ def memory(machine: Machine) -> Finding | None:
     limit = machine.read("sys/fs/cgroup/memory.max") or machine.read("sys/fs/cgroup/memory/memory.limit_in_bytes") or ""
     bounded = limit.isdecimal() and int(limit) < total
     usable = min(available, int(limit)) if bounded else available
-    told = f"{usable / GIB:.1f} of {total / GIB:.1f} GiB can be used" + (" in this cgroup" if bounded else "")
+    message = f"{usable / GIB:.1f} of {total / GIB:.1f} GiB can be used" + (" in this cgroup" if bounded else "")
     if usable < FULL_MODEL_BYTES:
         return Finding(
             "memory",
             "advice",
-            f"{told}: the tiny dummy model fits, MiniCPM-V 2.6 at 4 bits needs {FULL_MODEL_BYTES / GIB:.0f} GiB",
-            "close what else runs, or keep to the default model",
+            f"{message}: the tiny dummy model fits, MiniCPM-V 2.6 at 4 bits needs {FULL_MODEL_BYTES / GIB:.0f} GiB",
+            "close other programs, or keep to the default model",
         )
-    return Finding("memory", "state", told)
+    return Finding("memory", "state", message)
 
 
 def disk(machine: Machine) -> Finding | None:
-    """See whether run folders can be made and have room."""
+    """Check that run folders can be made, and the free space for them."""
     folder = machine.output.absolute()
     while not folder.exists():
         folder = folder.parent
     if not os.access(folder, os.W_OK | os.X_OK):
         return Finding("disk", "error", f"no permission to write in {folder}", "name another folder with --output")
-    room = os.statvfs(folder)
-    free = room.f_bavail * room.f_frsize
-    told = f"{free / GIB:.1f} GiB free for results in {folder}"
+    free = shutil.disk_usage(folder).free
+    message = f"{free / GIB:.1f} GiB free for results in {folder}"
     if free < LEAST_DISK_BYTES:
         return Finding(
-            "disk", "warning", f"{told}: a run may end for want of room", f"sudo du -xh {folder} | sort -h | tail"
+            "disk",
+            "warning",
+            f"{message}: the disk may be full before a run ends",
+            f"sudo du -xh {folder} | sort -h | tail",
         )
     if free < MODEL_DISK_BYTES:
         return Finding(
-            "disk", "advice", f"{told}: too little for a full model's file", "S2A_BENCH_CACHE names another disk"
+            "disk", "advice", f"{message}: too little for a full model's file", "S2A_BENCH_CACHE names another disk"
         )
-    return Finding("disk", "state", told)
+    return Finding("disk", "state", message)
 
 
 def rmem_max(machine: Machine) -> Finding | None:
-    """See how large a socket's receive buffer may be; DDS asks for as much as it gets."""
+    """Check the limit on a socket's receive buffer; DDS uses all of it."""
     rmem = machine.number("proc/sys/net/core/rmem_max")
     if rmem is None:
         return None
-    told = f"net.core.rmem_max is {rmem}"
+    message = f"net.core.rmem_max is {rmem}"
     if rmem >= RMEM_WANTED:
-        return Finding("rmem-max", "state", told)
-    told += ": DDS loses fragments of large pictures and stalls by 200 ms"
-    return Finding("rmem-max", "warning", told, f"sudo sysctl -w net.core.rmem_max={RMEM_WANTED}")
+        return Finding("rmem-max", "state", message)
+    message += ": DDS loses fragments of large pictures and stalls by 200 ms"
+    return Finding("rmem-max", "warning", message, f"sudo sysctl -w net.core.rmem_max={RMEM_WANTED}")
 
 
 def cameras(machine: Machine) -> Finding:
-    """List the cameras with their formats; the harness reads YUYV."""
+    """Report the cameras with their formats; the harness reads YUYV."""
     found = machine.cameras()
     if not found:
         return Finding("cameras", "state", "none; the synthetic source needs none")
     if closed := [f"{camera.path}: {camera.problem}" for camera in found if camera.problem]:
         return Finding("cameras", "warning", "; ".join(closed), "sudo usermod -aG video $USER, and log in again")
-    told = "; ".join(f"{camera.path} {camera.card}: {camera.summary()}" for camera in found)
+    message = "; ".join(f"{camera.path} {camera.card}: {camera.summary()}" for camera in found)
     if not any("YUYV" in camera.formats for camera in found):
         return Finding(
-            "cameras", "advice", f"{told}; none offers YUYV", "use a USB camera that does, or --source bag:FILE"
+            "cameras", "advice", f"{message}; none offers YUYV", "use a USB camera that does, or --source bag:FILE"
         )
-    return Finding("cameras", "state", told)
+    return Finding("cameras", "state", message)

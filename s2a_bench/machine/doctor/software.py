@@ -1,4 +1,4 @@
-"""Python, packages and compiler."""
+"""Checks of Python, packages and compiler."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from s2a_bench.machine.doctor import Finding, Machine
 
 
 def python(machine: Machine) -> Finding:
-    """Name the interpreter and the platform."""
+    """Report the interpreter and the platform."""
     release = re.search(r'^PRETTY_NAME="?([^"\n]+)', machine.read("etc/os-release") or "", re.MULTILINE)
     system = f"{release[1]}, " if release else ""
-    told = f"s2a-bench {__version__}, Python {platform.python_version()} on {platform.machine()}"
-    return Finding("python", "state", f"{told}; {system}Linux {platform.release()}")
+    message = f"s2a-bench {__version__}, Python {platform.python_version()} on {platform.machine()}"
+    return Finding("python", "state", f"{message}; {system}Linux {platform.release()}")
 
 
 def packages(machine: Machine) -> Finding:  # noqa: ARG001 - the packages of this interpreter
-    """Compare the packages that are installed with those that are needed here, and say which extras are there."""
+    """Compare the installed packages with the requirements, and report the missing extras."""
     try:
         stated = [Requirement(text) for text in requires("s2a-bench") or ()]
     except PackageNotFoundError:
@@ -48,7 +48,7 @@ def _applies(requirement: Requirement, extra: str = "") -> bool:
 
 
 def installed(package: str) -> str:
-    """Return a package's version; "" where it is not there."""
+    """Return a package's version, "" if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -56,7 +56,7 @@ def installed(package: str) -> str:
 
 
 def _problem(requirement: Requirement) -> str:
-    """Return what is wrong with a package that is needed, "" if nothing is."""
+    """Return the problem with a required package, "" if there is none."""
     found = installed(requirement.name)
     if not found:
         return f"{requirement.name} is missing"
@@ -65,7 +65,7 @@ def _problem(requirement: Requirement) -> str:
 
 
 def compiler(machine: Machine) -> Finding:
-    """Find what llama-cpp-python is compiled with."""
+    """Report the compilers that llama-cpp-python is built with."""
     name = next((name for name in ("c++", "g++", "clang++") if machine.which(name)), None)
     if name is None:
         return Finding(

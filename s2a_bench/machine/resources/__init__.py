@@ -1,7 +1,7 @@
-"""What a run costs the machine beside time: CPU, memory, GPU and power, read while it goes on.
+"""Resources of a run besides time: CPU, memory, GPU and power, read while it measures.
 
-A Reader reads one source; those that this machine has are opened, the others are named with the reason. The Sampler
-(`resources.sampler`) polls them and answers what happened between two moments.
+A `Reader` reads one source; the sources of this machine are opened, the others are listed with the reason. The
+`ResourceSampler` (`resources.sampler`) polls them and summarises the time between two moments.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from s2a_bench.store.schema import Table
 
 @dataclass(frozen=True, slots=True)
 class ResourceRow:
-    """One reading of one reader; ``cost_ns`` is how long reading took, ``at_ns`` (CLOCK_MONOTONIC) its middle.
+    """One reading of one reader; ``cost_ns`` is the time that reading took, ``at_ns`` (CLOCK_MONOTONIC) its middle.
 
-    Columns whose names end in ``_cpu_ns`` or ``_energy_j`` count up from some moment; the others hold for the moment.
+    Columns whose names end in ``_cpu_ns`` or ``_energy_j`` are counters; the others are values of the moment.
     ``client`` is the harness, ``server`` all servers together; ``*_busy`` are shares from 0 to 1.
     """
 
@@ -44,8 +44,6 @@ class ResourceRow:
 
 
 RESOURCES: Final[Table[ResourceRow]] = Table("resources", ResourceRow)
-"""One row a reading beside the run."""
-
 
 BOARD_ENERGY_J = Fact("board_energy_j", "J", "energy at the board's input")
 ENERGY_J = Fact("energy_j", "J", "energy of the board, else of the GPUs and CPU packages that can be read")
@@ -67,27 +65,27 @@ SPENT: Final = (
     Fact("board_power_w", "W", "power at the board's input, mean"),
     *(BOARD_ENERGY_J, ENERGY_J, POWER_W),
 )
-"""The facts of a request that are read beside it, under the columns' names."""
+"""The facts of a request from the readers, by the names of the columns."""
 
 
 class Unreadable(S2AError):
-    """This machine does not have a reader's source, or does not let us read it."""
+    """This machine does not have a reader's source, or gives no permission to read it."""
 
 
 class Reader(Protocol):
     """Reads one source. Built as ``Class(pids)`` with the servers' process ids; raises Unreadable."""
 
     about: str
-    """What is read, for the manifest: a device's name, or a program's."""
+    """Name of the device or program, for the manifest."""
     cheap: bool
-    """Whether a reading takes microseconds, so that it may be taken before and after every request."""
+    """True if a reading takes microseconds, so that it is taken before and after every request."""
 
     def read(self) -> Mapping[str, float]:
-        """Return columns of `ResourceRow` by name; what cannot be read at the moment is absent."""
+        """Return columns of `ResourceRow` by name; an unreadable one is absent."""
         ...
 
     def close(self) -> None:
-        """Let go of the source; may be called twice."""
+        """Close the source; may be called twice."""
         ...
 
 
@@ -98,11 +96,11 @@ READERS: dict[str, str] = {
     "nvml": "s2a_bench.machine.resources.nvidia:Nvml",
     "tegrastats": "s2a_bench.machine.resources.nvidia:Tegrastats",
 }
-"""Name -> class, in the order in which they are tried."""
+"""Name -> class, in the order of opening."""
 
 
 def open_readers(pids: Sequence[int]) -> tuple[dict[str, Reader], dict[str, str]]:
-    """Open what this machine has: readers by name, and the reason for each one left out."""
+    """Open the readers of this machine, by name; also return the reason for each one left out."""
     readers: dict[str, Reader] = {}
     left_out: dict[str, str] = {}
     for name, where in READERS.items():

@@ -1,4 +1,4 @@
-"""CPU time and memory of the harness and its servers, and of the whole machine; energy of its CPU packages (RAPL)."""
+"""CPU time and memory of the harness, its servers and the machine; energy of the CPU packages (RAPL)."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 def cpu_clock(pid: int) -> int:
-    """Name the CPU-time clock of a process, all its threads together: what clock_getcpuclockid(3) returns.
+    """Return the CPU-time clock of a process with all its threads, as clock_getcpuclockid(3) does.
 
-    Read by clock_gettime it has nanoseconds, where /proc has ticks of 10 ms.
+    clock_gettime reads it in nanoseconds, whereas /proc has ticks of 10 ms.
     """
     return (~pid << 3) | 2
 
 
 class CpuTimes:
-    """CPU time spent so far by this process (``client``) and by the servers together."""
+    """CPU time of this process (``client``) and of all servers together."""
 
     cheap = True
 
     def __init__(self, pids: Sequence[int]) -> None:
-        """Find the clocks; raises Unreadable for a kernel without them."""
         self._servers = [cpu_clock(pid) for pid in pids]
         self.about = f"this process and {len(pids)} servers"
         try:
@@ -39,7 +38,7 @@ class CpuTimes:
             raise Unreadable(f"the kernel has no CPU clocks of processes: {error.strerror}") from error
 
     def read(self) -> Mapping[str, float]:
-        """Return nanoseconds of CPU time; none for the servers once one of them is gone."""
+        """Return CPU times; that of the servers is absent after one has ended."""
         values = {"client_cpu_ns": time.process_time_ns()}
         if self._servers:
             with suppress(OSError):
@@ -56,19 +55,18 @@ class HostMemory:
     cheap = False
 
     def __init__(self, pids: Sequence[int], root: Path = PROC) -> None:
-        """Read everything once; raises Unreadable where there is no /proc to read."""
         self.about = str(root)
         self._root = root
         self._pids = [pid for pid in pids if (root / str(pid)).is_dir()]
         try:
             self._rss("self")
             self._available()
-            self._times = self._cpu_times()  # the first reading has nothing else to compare with
+            self._times = self._cpu_times()  # the base of the first reading
         except (OSError, LookupError, ValueError) as error:
             raise Unreadable(f"{root}: {error}") from error
 
     def read(self) -> Mapping[str, float]:
-        """Return bytes, and the share of all CPUs that was busy since the last reading, from 0 to 1."""
+        """Return memory, and the busy share of all CPUs since the last reading."""
         values: dict[str, float] = {}
         sources: dict[str, Callable[[], float]] = {
             "client_rss_bytes": lambda: self._rss("self"),
@@ -89,13 +87,12 @@ class HostMemory:
         return int((self._root / process / "statm").read_text().split()[1]) * PAGE_BYTES
 
     def _available(self) -> int:
-        """Return what programs could still have without swapping."""
         lines = (self._root / "meminfo").read_text().splitlines()
         (line,) = (line for line in lines if line.startswith("MemAvailable:"))
         return int(line.split()[1]) << 10
 
     def _cpu_times(self) -> tuple[int, int]:
-        """Return the ticks of all CPUs so far: busy, and all. Guests' are in the user's already."""
+        """Return the ticks of all CPUs, busy and in total; the user's include the guests'."""
         user, nice, system, idle, iowait, *interrupts = map(int, (self._root / "stat").read_text().split()[1:9])
         busy = user + nice + system + sum(interrupts)
         return busy, busy + idle + iowait
@@ -108,7 +105,7 @@ class HostMemory:
 
 @dataclass(slots=True)
 class Zone:
-    """One package's counter, which starts again at zero above ``range_uj``."""
+    """One package's counter, which wraps to zero above ``range_uj``."""
 
     file: int
     range_uj: int
@@ -116,7 +113,7 @@ class Zone:
     turns: int = 0
 
     def read_uj(self) -> int:
-        """Read the counter, wraps undone; one between two readings is seen, two are not (they take minutes)."""
+        """Read the counter and undo one wrap since the last reading (two take minutes)."""
         now_uj = int(os.pread(self.file, 32, 0))
         self.turns += now_uj < self.last_uj
         self.last_uj = now_uj
@@ -124,9 +121,9 @@ class Zone:
 
 
 class Rapl:
-    """The packages' energy in joules since some moment; cores and memory controller are parts of it.
+    """The packages' energy in joules, cores and memory controller included.
 
-    RAPL as the kernel's powercap interface shows it (Intel, and AMD since Zen).
+    The source is RAPL in the kernel's powercap interface (Intel, and AMD since Zen).
     """
 
     cheap = True
@@ -146,7 +143,7 @@ class Rapl:
             self.close()
             raise Unreadable(
                 f"{packages[0] / 'energy_uj'}: {getattr(error, 'strerror', error)}; "
-                f"sudo chmod o+r {root}/intel-rapl*/energy_uj lets everybody read it until the next start"
+                f"sudo chmod o+r {root}/intel-rapl*/energy_uj allows it until the next start"
             ) from error
         self.about = f"{len(packages)} CPU packages"
 
@@ -159,7 +156,7 @@ class Rapl:
 
 
 def _is_package(zone: Path) -> bool:
-    """Tell a package from its parts (intel-rapl:0:1) and from ``psys``, which holds the packages."""
+    """Return False for a zone inside a package (intel-rapl:0:1) and for ``psys``, which contains the packages."""
     try:
         return (zone / "name").read_text().startswith("package")
     except OSError:

@@ -1,7 +1,7 @@
-"""NVIDIA's GPUs through NVML, all of the machine together; a Jetson's board through tegrastats.
+"""All NVIDIA GPUs of the machine through NVML; a Jetson's board through tegrastats.
 
-A Jetson's GPU shares the board's memory, so there is no GPU memory of its own. ``board_power_w`` is the module's input
-(VDD_IN, POM_5V_IN) or, on an AGX Orin, which has no such rail, the sum of the three that make it up.
+A Jetson's GPU shares the board's memory, so there is no GPU memory. ``board_power_w`` is the module's input (VDD_IN,
+POM_5V_IN) or, on an AGX Orin, which has no such rail, the sum of the three rails that make it up.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Query = Callable[[Any], float]
 INTERVAL_MS = 100
 INPUTS = ("VDD_IN", "POM_5V_IN")
 AGX_ORIN = ("VDD_GPU_SOC", "VDD_CPU_CV", "VIN_SYS_5V0")
-"""Its VDDQ_VDD2_1V8AO is fed by VIN_SYS_5V0 and must not be counted twice."""
+"""VIN_SYS_5V0 feeds VDDQ_VDD2_1V8AO, which must not be counted twice."""
 
 RAIL = re.compile(r"\b([A-Z][A-Z0-9_]+) (\d+)(?:mW)?/\d+(?:mW)?(?= |$)")
 GPU = re.compile(r"\bGR3D_FREQ (\d+)%(?:@\[?(\d+))?")
@@ -36,7 +36,7 @@ class Nvml:
     cheap = False
 
     def __init__(self, pids: Sequence[int] = ()) -> None:  # noqa: ARG002 - a GPU's figures are the whole GPU's
-        """Load the driver's library and ask each GPU what it can tell; raises Unreadable without it or a GPU."""
+        """Load the driver's library and find what every GPU can report; raises Unreadable without library or GPU."""
         try:
             pynvml = self._nvml = extras.require("pynvml", "nvidia")
         except MissingExtra as error:
@@ -57,7 +57,7 @@ class Nvml:
         self._queries = {name: query for name, query in _queries(pynvml).items() if self._answers(query[1])}
         if not self._queries:
             self.close()
-            raise Unreadable(f"NVML: {', '.join(names) or 'no GPU'} tells nothing that is recorded")
+            raise Unreadable(f"NVML: {', '.join(names) or 'no GPU'} reports nothing that is recorded")
         self.about = f"{', '.join(names)} (driver {driver})"
 
     def read(self) -> Mapping[str, float]:
@@ -74,7 +74,7 @@ class Nvml:
                 self._nvml.nvmlShutdown()
 
     def _answers(self, query: Query) -> bool:
-        """Return whether there is a GPU, and whether all answer; boards differ in what they measure."""
+        """Return True if there is a GPU and all of them answer; boards measure different things."""
         try:
             return bool([query(gpu) for gpu in self._gpus])
         except self._failed:
@@ -82,7 +82,7 @@ class Nvml:
 
 
 def _queries(nvml: Any) -> dict[str, tuple[Callable[[list[float]], float], Query]]:
-    """List each column with how GPUs are combined, and how one is asked."""
+    """Return column -> how the values of GPUs are combined, and the query of one GPU."""
     return {
         "gpu_busy": (max, lambda gpu: nvml.nvmlDeviceGetUtilizationRates(gpu).gpu / 100),
         "gpu_memory_bytes": (sum, lambda gpu: nvml.nvmlDeviceGetMemoryInfo(gpu).used),
@@ -94,7 +94,7 @@ def _queries(nvml: Any) -> dict[str, tuple[Callable[[list[float]], float], Query
 
 
 def parse_tegrastats(line: str) -> dict[str, float]:
-    """Read a line of tegrastats (JetPack 4 to 6); a rail's first figure is the present, its second a mean."""
+    """Parse a line of tegrastats (JetPack 4 to 6); a rail's first figure is the current value, its second a mean."""
     values: dict[str, float] = {}
     if found := GPU.search(line):
         values["gpu_busy"] = int(found[1]) / 100
@@ -107,7 +107,7 @@ def parse_tegrastats(line: str) -> dict[str, float]:
 
 
 def board_power(rails_w: Mapping[str, float]) -> float | None:
-    """Return the whole board's power from that of its rails, in watts; None for a board we do not know."""
+    """Return the whole board's power in W from that of its rails; None for an unknown board."""
     for name in INPUTS:
         if name in rails_w:
             return rails_w[name]
@@ -115,12 +115,12 @@ def board_power(rails_w: Mapping[str, float]) -> float | None:
 
 
 class Tegrastats:
-    """The program, running beside; each reading takes the newest whole line it has written."""
+    """The program in the background; each reading is its newest whole line."""
 
     cheap = False
 
     def __init__(self, pids: Sequence[int] = ()) -> None:  # noqa: ARG002 - the whole board's
-        """Start it; raises Unreadable where it is not installed."""
+        """Start the program; raises Unreadable if it is not installed."""
         program = shutil.which("tegrastats")
         if program is None:
             raise Unreadable("no tegrastats: this is no Jetson, or the program is not in the container")
@@ -134,10 +134,10 @@ class Tegrastats:
         os.set_blocking(self._pipe, False)
 
     def read(self) -> Mapping[str, float]:
-        """Return the newest line's values, each line once; nothing where no line came since."""
+        """Return the newest line's values, nothing without a new line."""
         with suppress(BlockingIOError):
-            while chunk := os.read(self._pipe, 65536):
-                self._text += chunk
+            while block := os.read(self._pipe, 65536):
+                self._text += block
         whole, newline, self._text = self._text.rpartition(b"\n")
         return parse_tegrastats(whole.rpartition(b"\n")[2].decode(errors="replace")) if newline else {}
 

@@ -1,8 +1,8 @@
-"""The thread that polls the readers, and the answer to what happened between two moments.
+"""The thread that polls the readers, and the summary of a window between two moments.
 
-A counter's rise is exact between two readings of it, so the cheap readers are read before and after every request
-(`ResourceSampler.edge`), by the thread that makes the request and outside of its time; the others at the poll rate
-only. A window too short for a reader's rate gets no rise from it: absent, rather than a share of other work.
+A counter's rise is exact between two readings, so the cheap readers are read before and after every request
+(`ResourceSampler.edge`), by the thread of the request and outside of its time; the others at the poll rate only. A
+window too short for a reader's rate has no rise from it: absent, rather than a share of other work.
 """
 
 from __future__ import annotations
@@ -20,23 +20,22 @@ from s2a_bench.machine.resources import BOARD_ENERGY_J, ENERGY_J, POWER_W, RESOU
 from s2a_bench.store.run import RunWriter
 
 COUNTERS = ("client_cpu_ns", "server_cpu_ns", "package_energy_j", "gpu_energy_j")
-"""Columns that count up; a window's value is the rise."""
+"""Counters; a window's value is the rise."""
 PEAKS = ("client_rss_bytes", "server_rss_bytes", "gpu_memory_bytes", "gpu_temperature_c")
-"""Columns of which a window keeps the largest; of all others it keeps the mean."""
+"""Columns whose value in a window is the largest; that of all others is the mean."""
 ENERGY_OF_POWER = {"gpu_power_w": "gpu_energy_j", "board_power_w": BOARD_ENERGY_J}
-"""Power that is summed over time where the source has no counter of energy."""
-PARTS = ("gpu_energy_j", "package_energy_j")
-"""What ``energy_j`` adds up where the board's own input is not measured."""
-
+"""Power -> energy, integrated if the source has no counter of energy."""
+COMPONENTS = ("gpu_energy_j", "package_energy_j")
+"""The terms of ``energy_j`` if the board's input is not measured."""
 KEPT = 20_000
-"""Readings kept for windows: half an hour at 10 Hz, and requests are shorter; all go to the run folder."""
+"""Readings kept for windows: half an hour at 10 Hz, longer than a request. The run folder has all."""
 COVERED = 0.5
-"""The least part of a window that the readings inside it must span for a rise to be stretched to the whole."""
+"""The least share of a window that its readings must span for a rise to be extrapolated to the window."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What one reader said at one moment."""
+    """The values of one reader at one moment."""
 
     at_ns: int
     values: Mapping[str, float]
@@ -44,7 +43,7 @@ class Reading:
 
 @dataclass(slots=True)
 class _Source:
-    """One reader, its readings, and what reading cost."""
+    """One reader, its readings and their costs."""
 
     name: str
     reader: Reader
@@ -55,13 +54,13 @@ class _Source:
 
 
 def open_sampler(hz: float, pids: Sequence[int]) -> ResourceSampler:
-    """Make the sampler of a run whose servers have ``pids``; one that reads nothing for ``hz`` 0."""
+    """Make the sampler of a run whose servers have ``pids``; with ``hz`` 0 it reads nothing."""
     readers, left_out = open_readers(pids) if hz else ({}, {})
     return ResourceSampler(readers, hz or 1, left_out)
 
 
 class ResourceSampler:
-    """Polls readers ``hz`` times a second on a thread of its own. Use as a context manager."""
+    """Polls readers ``hz`` times a second on a thread, as a context manager."""
 
     def __init__(
         self,
@@ -70,10 +69,7 @@ class ResourceSampler:
         left_out: Mapping[str, str] | None = None,
         clock: Callable[[], int] = now_ns,
     ) -> None:
-        """Take readers, which it closes; ``left_out`` names the others with their reasons, for the manifest.
-
-        Without readers it does nothing at all.
-        """
+        """Own the readers; ``left_out`` has the reasons for the others, for the manifest."""
         self._sources = [_Source(name, reader) for name, reader in readers.items()]
         self._cheap = [source for source in self._sources if source.reader.cheap]
         self._left_out = dict(left_out or {})
@@ -104,36 +100,36 @@ class ResourceSampler:
         self._polls += 1
 
     def edge(self) -> None:
-        """Read the cheap readers: the border of a window, exactly here. Callable from any thread."""
+        """Read the cheap readers at the border of a window; may be called from any thread."""
         for source in self._cheap:
             self._read(source)
 
     def flush(self, run: RunWriter) -> None:
-        """Append the rows since the last call to a run; the file is made with the first of them."""
+        """Append the rows since the last call to a run."""
         if rows := [self._rows.popleft() for _ in range(len(self._rows))]:
             run.append(RESOURCES, rows)
 
     def window(self, start_ns: int, end_ns: int) -> dict[str, float]:
-        """Return what was spent from ``start_ns`` to ``end_ns``: facts of a sample, under the columns' names.
+        """Summarise the time from ``start_ns`` to ``end_ns`` as facts of a sample, by the names of the columns.
 
-        Counters give their rise, power and shares their mean, memory and temperature their largest value. ``power_w``
-        and ``energy_j`` are the board's where it is measured, else the sum of the readable parts.
+        A counter gives its rise, power and shares their mean, memory and temperature their largest value. ``power_w``
+        and ``energy_j`` are the board's if it is measured, else the sum of the readable components.
         """
         facts: dict[str, float] = {}
         for source in self._sources:
             with source.lock:
                 facts |= _facts(source.readings, start_ns, end_ns, int(1e9 / self._hz))
-        parts = [facts[name] for name in PARTS if name in facts]
+        components = [facts[name] for name in COMPONENTS if name in facts]
         if BOARD_ENERGY_J in facts:
             facts[ENERGY_J] = facts[BOARD_ENERGY_J]
-        elif parts:
-            facts[ENERGY_J] = sum(parts)
+        elif components:
+            facts[ENERGY_J] = sum(components)
         if ENERGY_J in facts and end_ns > start_ns:
             facts[POWER_W] = facts[ENERGY_J] / (end_ns - start_ns) * 1e9
         return facts
 
     def describe(self) -> dict[str, Any]:
-        """Return the manifest's word on it: readers, polls, and what they cost; nothing where nothing is read."""
+        """Return the manifest's facts: readers, polls, and their cost; none without readers."""
         if not self._sources:
             return {}
         elapsed_ns = self._seen_ns - self._started_ns
@@ -151,14 +147,14 @@ class ResourceSampler:
         }
 
     def _read(self, source: _Source) -> None:
-        """Take a reading; a reader that fails is read no more, and ends no run."""
-        with source.lock:  # so that a source's readings are in the order of their times
+        """Take a reading; a reader that fails is not read again, and ends no run."""
+        with source.lock:  # keeps a source's readings in order of time
             if source.broken:
                 return
             before = self._clock()
             try:
                 values = source.reader.read()
-            except Exception as error:  # noqa: BLE001 - drivers and other people's clients fail in their own ways
+            except Exception as error:  # noqa: BLE001 - drivers and foreign clients raise anything
                 source.broken = True
                 self._left_out[source.name] = f"stopped after {len(source.costs_ns)} readings: {error!r}"
                 return
@@ -169,7 +165,7 @@ class ResourceSampler:
             self._rows.append(ResourceRow(at_ns, source.name, cost_ns, **values))  # type: ignore[arg-type]
 
     def _run(self) -> None:
-        """Poll at absolute times, so that what a poll takes does not add up; a missed time is left out."""
+        """Poll at absolute times, so that the time of polls does not add up; a missed time is skipped."""
         period_ns = int(1e9 / self._hz)
         self._started_ns = due_ns = self._clock()
         while True:
@@ -185,7 +181,7 @@ class ResourceSampler:
 
 
 def _facts(readings: deque[Reading], start_ns: int, end_ns: int, period_ns: int) -> dict[str, float]:
-    """Summarise one source's readings of a window; the last one before it stands in where there is none inside."""
+    """Summarise one source's readings of a window; without any it uses a recent one before it."""
     inside: list[Reading] = []
     before: Reading | None = None
     for reading in reversed(readings):
@@ -204,14 +200,14 @@ def _facts(readings: deque[Reading], start_ns: int, end_ns: int, period_ns: int)
         elif (rise := _rise(values, start_ns, end_ns)) is not None:
             facts[name] = rise
     for power, energy in ENERGY_OF_POWER.items():
-        seen = [reading.at_ns for reading in inside if power in reading.values]
-        if energy not in facts and len(seen) > 1 and seen[-1] - seen[0] >= COVERED * (end_ns - start_ns):
+        times = [reading.at_ns for reading in inside if power in reading.values]
+        if energy not in facts and len(times) > 1 and times[-1] - times[0] >= COVERED * (end_ns - start_ns):
             facts[energy] = facts[power] * (end_ns - start_ns) / 1e9
     return facts
 
 
 def _rise(values: list[tuple[int, float]], start_ns: int, end_ns: int) -> float | None:
-    """Return how much a counter rose in a window; None where its readings do not span enough of it."""
+    """Return a counter's rise in a window; None if its readings do not span `COVERED` of it."""
     (first_ns, first), (last_ns, last) = values[0], values[-1]
     if last_ns <= first_ns or last_ns - first_ns < COVERED * (end_ns - start_ns):
         return None
